@@ -29,12 +29,18 @@ def commands() -> str:
     from humangs_jax.cli import COMMANDS
 
     texts = [f"```text\n{help_of()}\n```"]
-    return "\n\n".join(texts + [f"## humangs {name}\n\n```text\n{help_of(name)}\n```" for name in COMMANDS])
+    return "\n\n".join(
+        texts + [f"## humangs {name}\n\n```text\n{help_of(name)}\n```" for name in COMMANDS]
+    )
 
 
 def help_of(*command: str) -> str:
     """What `humangs COMMAND --help` prints, without colors."""
     run = [sys.executable, "-m", "humangs_jax.cli", *command, "--help"]
     environment = os.environ | {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "86"}
-    text = subprocess.run(run, capture_output=True, text=True, check=True, env=environment).stdout.strip()
-    return "\n".join(textwrap.fill(line, 86) if line[:1].isalpha() else line for line in text.split("\n"))
+    text = subprocess.run(
+        run, capture_output=True, text=True, check=True, env=environment
+    ).stdout.strip()
+    return "\n".join(
+        textwrap.fill(line, 86) if line[:1].isalpha() else line for line in text.split("\n")
+    )

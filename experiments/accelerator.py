@@ -30,14 +30,26 @@ from humangs_jax.refinement.refine import refine
 from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.splatting import render
 
-SCENES = ((20_000, 256), (20_000, 512), (52_000, 512), (52_000, 1024), (140_000, 1024), (500_000, 1024))
+SCENES = (
+    (20_000, 256),
+    (20_000, 512),
+    (52_000, 512),
+    (52_000, 1024),
+    (140_000, 1024),
+    (500_000, 1024),
+)
 """Gaussians of the scenes, pixels a side."""
 Stage = Literal["check", "splatting", "people", "reconstruct"]
 Measurement = tuple[str, Callable[[], dict[str, Any]]]
 
 
 @entry
-def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: bool = False, earlier: tuple[Path, ...] = ()) -> int:
+def accelerator(
+    run: Run,
+    stage: tuple[Stage, ...] = get_args(Stage),
+    small: bool = False,
+    earlier: tuple[Path, ...] = (),
+) -> int:
     """What an accelerator does: agreement with the CPU, and times.
 
     What fails is noted, the next one begins, and the exit status is 1.
@@ -54,11 +66,24 @@ def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: boo
     if earlier:
         records = [json.loads(path.read_text()) for path in earlier]
         rows = {name: row for record in records for name, row in record["rows"].items()}
-        made = {name: records[0][name] for name in ("script", "arguments", "date", "machine", "versions")}
-        publish(page_of(run.table), run.table, table_of(records[0]["settings"]["device"], rows), rows, made)
+        made = {
+            name: records[0][name]
+            for name in ("script", "arguments", "date", "machine", "versions")
+        }
+        publish(
+            page_of(run.table),
+            run.table,
+            table_of(records[0]["settings"]["device"], rows),
+            rows,
+            made,
+        )
         return 0
     settings = {"device": jax.devices()[0].device_kind, "small": small}
-    cases = {f"{name}: {what}": functools.partial(_tried, measure) for name in stage for what, measure in STAGES[name](small)}
+    cases = {
+        f"{name}: {what}": functools.partial(_tried, measure)
+        for name in stage
+        for what, measure in STAGES[name](small)
+    }
     found = run.rows(cases, settings)
     run.show(table_of(settings["device"], found), found)
     return int(any("failed" in numbers for numbers in found.values()))
@@ -91,25 +116,42 @@ def check(small: bool) -> Iterator[Measurement]:
         found = {}
         for name, place in places.items():
             with jax.default_device(place):
-                found[name] = jax.tree.map(np.asarray, jax.jit(function)(*jax.device_put(inputs, place)))
+                found[name] = jax.tree.map(
+                    np.asarray, jax.jit(function)(*jax.device_put(inputs, place))
+                )
         return found
 
     def errors(found):
-        pairs = zip(*(jax.tree_util.tree_leaves_with_path(found[name]) for name in ("device", "CPU")), strict=True)
-        relative = lambda a, b: float(np.linalg.norm(np.float64(a) - b) / (np.linalg.norm(np.float64(b)) + 1e-300))
-        return {jax.tree_util.keystr(path, simple=True, separator="."): relative(a, b) for (path, a), (_, b) in pairs}
+        pairs = zip(
+            *(jax.tree_util.tree_leaves_with_path(found[name]) for name in ("device", "CPU")),
+            strict=True,
+        )
+        relative = lambda a, b: float(
+            np.linalg.norm(np.float64(a) - b) / (np.linalg.norm(np.float64(b)) + 1e-300)
+        )
+        return {
+            jax.tree_util.keystr(path, simple=True, separator="."): relative(a, b)
+            for (path, a), (_, b) in pairs
+        }
 
     def pass_once():
         variables, config = load_weights()
-        body, views = gaussian_body(load_body(), config), standardize(load_capture(DEMO_CAPTURE), 256)
+        body, views = (
+            gaussian_body(load_body(), config),
+            standardize(load_capture(DEMO_CAPTURE), 256),
+        )
         inputs = jax.jit(prepare_inputs, static_argnames="config")(body, views, config)
-        return errors(everywhere(lambda v, x: apply_humangs(v, x, config)[0].gaussians, variables, inputs))
+        return errors(
+            everywhere(lambda v, x: apply_humangs(v, x, config)[0].gaussians, variables, inputs)
+        )
 
     def splat():
         scene = demo_scene(64 if small else 256, 1_000 if small else SCENES[0][0])
         gaussians, camera = scene
         config = plan_buffers(gaussians, camera)
-        target = jnp.asarray(np.random.default_rng(1).random((camera.height, camera.width, 3), np.float32))
+        target = jnp.asarray(
+            np.random.default_rng(1).random((camera.height, camera.width, 3), np.float32)
+        )
 
         def loss(gaussians):
             rgb = render(gaussians, camera, config).rgb
@@ -130,9 +172,18 @@ def splatting(small: bool) -> Iterator[Measurement]:
         draw = jax.jit(lambda g: render(g, camera, config).rgb)
         gradient = jax.jit(jax.grad(lambda g: jnp.mean(render(g, camera, config).rgb ** 2)))
         runs = {"forward": draw, "with gradients": gradient}
-        runs = {name: lambda run=run: jax.block_until_ready(run(gaussians)) for name, run in runs.items()}
-        first = {f"{name}, first s": timed(run)[0] / 1e3 for name, run in runs.items()}  # compilation
-        return {name: float(wall) for name, (wall, _) in medians(runs, 5).items()} | first | {"pairs": config.max_pairs}
+        runs = {
+            name: lambda run=run: jax.block_until_ready(run(gaussians))
+            for name, run in runs.items()
+        }
+        first = {
+            f"{name}, first s": timed(run)[0] / 1e3 for name, run in runs.items()
+        }  # compilation
+        return (
+            {name: float(wall) for name, (wall, _) in medians(runs, 5).items()}
+            | first
+            | {"pairs": config.max_pairs}
+        )
 
     for count, size in ((1_000, 64),) if small else SCENES:
         yield f"{count} Gaussians, {size} pixels", functools.partial(measure, count, size)
@@ -145,10 +196,18 @@ def people(small: bool) -> Iterator[Measurement]:
     def bank():
         seeds, body = SPLITS["train"][: 1 if small else 8], load_body()
         displaced = gaussian_body(body, load_weights()[1])
-        return build_bank(seeds, body, "train", displaced=displaced, processes=min(len(seeds), os.cpu_count() or 1))
+        return build_bank(
+            seeds,
+            body,
+            "train",
+            displaced=displaced,
+            processes=min(len(seeds), os.cpu_count() or 1),
+        )
 
     def measure(batch, size):
-        config = OnTheFlyConfig(input_size=size, target_size=size, views_at_once=7, pixels_per_step=1 << 30, depths=True)
+        config = OnTheFlyConfig(
+            input_size=size, target_size=size, views_at_once=7, pixels_per_step=1 << 30, depths=True
+        )
         keys = jax.random.split(jax.random.key(0), batch)
         make = jax.jit(jax.vmap(functools.partial(on_the_fly_example, bank(), config=config)))
         time = float(medians({"all": lambda: jax.block_until_ready(make(keys))}, 3)["all"][0])

@@ -61,7 +61,12 @@ def appearance(
     """
     start = people.start()
     networks = {net: load_lpips(net) for net in NETS}
-    settings: dict[str, Any] = {"sizes": sizes, "off": off, "variants": tuple(VARIANTS), "refiner": shipped_digest(SHIPPED)}
+    settings: dict[str, Any] = {
+        "sizes": sizes,
+        "off": off,
+        "variants": tuple(VARIANTS),
+        "refiner": shipped_digest(SHIPPED),
+    }
 
     def measure(seed):
         row: dict[str, Any] = {}
@@ -69,13 +74,21 @@ def appearance(
         for size, wrong in itertools.product(sorted(sizes), off):  # pictures are of the last
             subject = with_body_off(person(size), wrong)
             truth, inputs = subject.held_out, subject.inputs(VIEWS)
-            drawn = {name: draw_views(_made(start, inputs, *how), truth) for name, how in VARIANTS.items()}
+            drawn = {
+                name: draw_views(_made(start, inputs, *how), truth)
+                for name, how in VARIANTS.items()
+            }
             scores = {name: by_task(each, truth, networks) for name, each in drawn.items()}
-            row |= {f"{size} {wrong:g} {task}": {name: scores[name][task] for name in scores} for task in scores[DEFAULT]}
+            row |= {
+                f"{size} {wrong:g} {task}": {name: scores[name][task] for name in scores}
+                for task in scores[DEFAULT]
+            }
         view = frontal_view(subject.photos, truth, task_views(truth)["novel"].tolist())
         pictures = [truth.images[view], *(each.images[view] for each in drawn.values())]
         row["loose"] = looseness(person(min(sizes)).inputs(VIEWS), start.config)
-        return row, [np.concatenate(list(details(image, truth, view)), axis=1) for image in pictures]
+        return row, [
+            np.concatenate(list(details(image, truth, view)), axis=1) for image in pictures
+        ]
 
     rows = start.rows(run, measure, settings, again=bool(details_sheet))
     numbers = {group: means(chosen) for group, chosen in groups_of(rows, BEFORE).items()}
@@ -83,8 +96,24 @@ def appearance(
     for case in [case for case in numbers["all"] if case != "loose"]:
         size, wrong, task = case.split()
         for (group, mean), name in itertools.product(numbers.items(), VARIANTS):
-            table.append([f"{size} px", f"{wrong} mm", TASKS[task], group, name, *cells(mean[case][name], SHOWN)])
-    header = ["photos", "body off", "views", "people", "avatar", *(heading for heading, _ in SHOWN.values())]
+            table.append(
+                [
+                    f"{size} px",
+                    f"{wrong} mm",
+                    TASKS[task],
+                    group,
+                    name,
+                    *cells(mean[case][name], SHOWN),
+                ]
+            )
+    header = [
+        "photos",
+        "body off",
+        "views",
+        "people",
+        "avatar",
+        *(heading for heading, _ in SHOWN.values()),
+    ]
     about = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other cameras."
     text = f"{about}\n\n{markdown_table(header, table, 'lllll' + 'r' * len(SHOWN))}"
     run.show(text, {"settings": start.settings | settings, "means": numbers, "people": len(rows)})
@@ -123,13 +152,20 @@ def by_task(drawn: Any, truth: Any, networks: dict[str, Any]) -> dict[str, dict[
     """`scores_of` the drawn views of each task that has some."""
     views = {task: chosen for task, chosen in task_views(truth).items() if len(chosen)}
     alpha = np.asarray(drawn.alpha)
-    return {task: scores_of(drawn.images[at], alpha[at], truth.select(at), networks) for task, at in views.items()}
+    return {
+        task: scores_of(drawn.images[at], alpha[at], truth.select(at), networks)
+        for task, at in views.items()
+    }
 
 
-def scores_of(images: np.ndarray, alpha: np.ndarray, truth: Any, networks: dict[str, Any]) -> dict[str, float]:
+def scores_of(
+    images: np.ndarray, alpha: np.ndarray, truth: Any, networks: dict[str, Any]
+) -> dict[str, float]:
     masks, errors = truth.masks, np.square(np.clip(images, 0, 1) - truth.images).mean(-1)
     decibels = lambda squared: float(-10 * np.log10(np.maximum(squared, 1e-10)).mean())
-    faces = lambda images: np.stack([details(image, truth, i)[0] for i, image in enumerate(images)]).astype(np.float32)
+    faces = lambda images: np.stack(
+        [details(image, truth, i)[0] for i, image in enumerate(images)]
+    ).astype(np.float32)
     heads = faces(images), faces(truth.images)
     found = {
         "psnr": decibels(errors.mean((1, 2))),
@@ -137,6 +173,10 @@ def scores_of(images: np.ndarray, alpha: np.ndarray, truth: Any, networks: dict[
         "outside": float(((1 - masks) * alpha).sum() / masks.sum()),
     }
     for net, weights in networks.items():
-        found[net] = float(np.mean([_lpips(weights, *pair) for pair in zip(images, truth.images, strict=True)]))
-        found[f"{net}_head"] = float(np.mean([_lpips(weights, *pair) for pair in zip(*heads, strict=True)]))
+        found[net] = float(
+            np.mean([_lpips(weights, *pair) for pair in zip(images, truth.images, strict=True)])
+        )
+        found[f"{net}_head"] = float(
+            np.mean([_lpips(weights, *pair) for pair in zip(*heads, strict=True)])
+        )
     return found

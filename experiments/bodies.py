@@ -56,9 +56,17 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
         return row
 
     rows = start.rows(run, measure, {"views": views})
-    bodies = means([{name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row} for row in rows])
+    bodies = means(
+        [
+            {name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row}
+            for row in rows
+        ]
+    )
     for name, case in cases.items():
-        bodies[name] |= {"body_vertices": len(case.body.template), "vertices": len(case.carrier.template)}
+        bodies[name] |= {
+            "body_vertices": len(case.body.template),
+            "vertices": len(case.carrier.template),
+        }
     numbers = {"bodies": bodies, "settings": start.settings | {"views": views}, "people": len(rows)}
     run.show(f"{start.about()} {views} photos.\n\n{bodies_table(bodies)}", numbers)
 
@@ -66,13 +74,17 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
 def bodies_table(bodies: dict[str, Any]) -> str:
     """A row a body, and how well it matches."""
     tasks = [task for task in TASKS if task in bodies[PAINTED]]
-    keys = [key for key in ("psnr", "psnr_fg", "lpips") if bodies[PAINTED]["novel"].get(key) is not None]
+    keys = [
+        key for key in ("psnr", "psnr_fg", "lpips") if bodies[PAINTED]["novel"].get(key) is not None
+    ]
     columns = {key: COLUMNS[key] for key in keys}
     header = ["body", "vertices", "that carry Gaussians"]
     header += [f"{TASKS[task]}: {heading}" for task in tasks for heading, _ in columns.values()]
     facts = lambda body: [body.get("body_vertices", "-"), body.get("vertices", "-")]
     scores = lambda body: [number for task in tasks for number in cells(body[task], columns)]
-    return markdown_table(header, [[name, *facts(body), *scores(body)] for name, body in bodies.items()])
+    return markdown_table(
+        header, [[name, *facts(body), *scores(body)] for name, body in bodies.items()]
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,7 +145,9 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
     # each side gives the triangle at its own tail; its twin gives the one at the other end
     turned = np.stack([tails, across, middles], axis=-1)
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
-    linear = {name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None}
+    linear = {
+        name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None
+    }
     grown = {name: np.concatenate([x, x[faces].mean(axis=1)]) for name, x in linear.items()}
     return replace(
         body,
@@ -147,7 +161,9 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
     )
 
 
-def write_smplx(path: Path, body: BodyModel, directions: np.ndarray | None = None, **more: np.ndarray) -> dict[str, np.ndarray]:
+def write_smplx(
+    path: Path, body: BodyModel, directions: np.ndarray | None = None, **more: np.ndarray
+) -> dict[str, np.ndarray]:
     """A body with SMPL-X's joints as an SMPL-X model file, no correctives if it has none; its arrays.
 
     directions: (n, 3, columns) of shapes and expressions; by default those of the body, and no expressions. more: arrays
@@ -158,10 +174,16 @@ def write_smplx(path: Path, body: BodyModel, directions: np.ndarray | None = Non
         raise ValueError(f"body '{body.name}' has other joints than SMPL-X")
     if directions is None:
         if count > SHAPE_COLUMNS:
-            raise ValueError(f"body '{body.name}' has {count} shape directions, SMPL-X's format holds {SHAPE_COLUMNS}")
+            raise ValueError(
+                f"body '{body.name}' has {count} shape directions, SMPL-X's format holds {SHAPE_COLUMNS}"
+            )
         directions = np.zeros((n, 3, SHAPE_COLUMNS + EXPRESSION_COLUMNS), np.float32)
         directions[..., :count] = body.shape_directions
-    correctives = np.zeros((n, 3, POSE_FEATURES), np.float32) if body.pose_directions is None else body.pose_directions
+    correctives = (
+        np.zeros((n, 3, POSE_FEATURES), np.float32)
+        if body.pose_directions is None
+        else body.pose_directions
+    )
     parents = np.asarray(body.parents, np.int64) % 2**32  # the root's as the format has it
     stored = {
         "v_template": body.template,

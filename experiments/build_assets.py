@@ -25,7 +25,10 @@ ASSETS = REPOSITORY / "humangs_jax" / "assets"
 PACKAGE = "@mediapipe/pose@0.5.1675469404"
 DETECTION, LANDMARKS = "pose_detection.tflite", "pose_landmark_heavy.tflite"
 FILES = {
-    "pose_solution_packed_assets.data": (DETECTION, "a63c614bef30d35947f13be361820b1e4e3bec9cfeebf4d11216a18373108e85"),
+    "pose_solution_packed_assets.data": (
+        DETECTION,
+        "a63c614bef30d35947f13be361820b1e4e3bec9cfeebf4d11216a18373108e85",
+    ),
     LANDMARKS: (LANDMARKS, "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe"),
 }
 """Of the package: our name, and the SHA-256 sum."""
@@ -39,12 +42,16 @@ def checked(package: Path) -> dict[str, bytes]:
             member = archive.extractfile(f"package/{source}")
             found[name] = b"" if member is None else member.read()
             if (got := hashlib.sha256(found[name]).hexdigest()) != expected:
-                raise ValueError(f"{package}: {source}: expected the SHA-256 sum {expected}, got {got}")
+                raise ValueError(
+                    f"{package}: {source}: expected the SHA-256 sum {expected}, got {got}"
+                )
     return found
 
 
 @entry
-def build_blazepose(run: Run, out: Path = ASSETS / "blazepose", package: Path | None = None) -> None:
+def build_blazepose(
+    run: Run, out: Path = ASSETS / "blazepose", package: Path | None = None
+) -> None:
     """Fetches the networks that find people in photos, from the public npm package @mediapipe/pose, and checks them.
 
     The files are written unchanged; nothing is written if a sum differs.
@@ -65,7 +72,9 @@ def build_blazepose(run: Run, out: Path = ASSETS / "blazepose", package: Path | 
 
 
 @entry
-def build_demo_capture(run: Run, seed: int = 3_000_002, out: Path = ASSETS / "demo_capture") -> None:
+def build_demo_capture(
+    run: Run, seed: int = 3_000_002, out: Path = ASSETS / "demo_capture"
+) -> None:
     """Makes the capture folder that ships with the package: a synthetic person, four photos and held-out views.
 
     The person's seed lies outside of every range that training draws from.
@@ -90,7 +99,12 @@ TOE_LIFT = {0.0: 6, 0.12: 0, 0.40: 3, 0.54: 26, 0.64: 12, 0.75: 4, 0.90: 8}
 ARM_LAG = 0.04
 """Arms follow the legs a little late, strides."""
 ARM_DOWN = 72.0
-FINGER_CURL = {"index": (10, 18, 10), "middle": (14, 22, 12), "ring": (18, 26, 14), "pinky": (20, 28, 16)}
+FINGER_CURL = {
+    "index": (10, 18, 10),
+    "middle": (14, 22, 12),
+    "ring": (18, 26, 14),
+    "pinky": (20, 28, 16),
+}
 WAVE_BEGIN, WAVE_UP, WAVE_DOWN, WAVE_END = 4, 15, 32, 46
 """Frames: the right arm starts to rise, is up, starts to sink, is down."""
 
@@ -116,12 +130,19 @@ def build():
         for name, matrix in frame_rotations(frame).items():
             rotations[frame, JOINT_NAMES.index(name)] = Rotation.from_matrix(matrix).as_rotvec()
     stride = 2 * np.pi * STRIDES * np.arange(FRAMES) / FRAMES
-    translations = np.stack([0.018 * np.sin(stride), np.zeros(FRAMES), 0.006 * np.sin(2 * stride)], axis=-1)
+    translations = np.stack(
+        [0.018 * np.sin(stride), np.zeros(FRAMES), 0.006 * np.sin(2 * stride)], axis=-1
+    )
     lowest = jax.jit(lambda pose: pose_body(body, rest, pose).vertices[:, 1].min())
     for frame in range(FRAMES):
-        pose = BodyPose(jnp.asarray(rotations[frame], jnp.float32), jnp.asarray(translations[frame], jnp.float32))
+        pose = BodyPose(
+            jnp.asarray(rotations[frame], jnp.float32),
+            jnp.asarray(translations[frame], jnp.float32),
+        )
         translations[frame, 1] = -float(lowest(pose))
-    return Motion(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), float(FPS))
+    return Motion(
+        jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), float(FPS)
+    )
 
 
 def frame_rotations(frame: int) -> dict:
@@ -141,19 +162,27 @@ def frame_rotations(frame: int) -> dict:
     joints["pelvis"] = _y(heading + pelvis_turn) @ _z(pelvis_list) @ _x(2.5)
     # the spine turns the shoulders against the pelvis and keeps them level; neck and head look ahead
     for name, share in (("spine1", 0.3), ("spine2", 0.4), ("spine3", 0.3)):
-        joints[name] = _y(share * 11 * np.cos(turn - 0.2)) @ _z(-share * 1.25 * pelvis_list) @ _x(share * 2)
+        joints[name] = (
+            _y(share * 11 * np.cos(turn - 0.2)) @ _z(-share * 1.25 * pelvis_list) @ _x(share * 2)
+        )
     glance = 8 * np.sin(once + 0.6)
     for name in ("neck", "head"):
-        joints[name] = _y(0.5 * (glance - 6 * np.cos(turn - 0.2))) @ _x(-1.5 + 0.8 * np.sin(2 * turn))
+        joints[name] = _y(0.5 * (glance - 6 * np.cos(turn - 0.2))) @ _x(
+            -1.5 + 0.8 * np.sin(2 * turn)
+        )
 
     for side, mirror, own in (("left", 1, phase), ("right", -1, phase + 0.5)):
         hip, knee = _curve(HIP_FLEXION, own), _curve(KNEE_FLEXION, own)
-        joints[f"{side}_hip"] = _x(-hip) @ _z(mirror * -1.5) @ _y(mirror * 4 + mirror * 3 * np.cos(2 * np.pi * own))
+        joints[f"{side}_hip"] = (
+            _x(-hip) @ _z(mirror * -1.5) @ _y(mirror * 4 + mirror * 3 * np.cos(2 * np.pi * own))
+        )
         joints[f"{side}_knee"] = _x(knee)
         joints[f"{side}_ankle"] = _x(-_curve(ANKLE_LIFT, own)) @ _y(mirror * 3)
         joints[f"{side}_foot"] = _x(-_curve(TOE_LIFT, own))
 
-        forward = -np.cos(2 * np.pi * (own - ARM_LAG))  # 1: the arm is in front, against its own leg
+        forward = -np.cos(
+            2 * np.pi * (own - ARM_LAG)
+        )  # 1: the arm is in front, against its own leg
         swing = 17 * forward + 3
         bend = 22 + 11 * forward
         shoulder = _x(-swing) @ _z(-mirror * (ARM_DOWN + 1.5 * np.cos(2 * turn))) @ _x(-8)
@@ -180,7 +209,9 @@ def _waving(frame, shoulder, collar, elbow, wrist):
     wave = np.sin(2 * np.pi * (frame - WAVE_UP) / 9.0)
     # upper arm a little below the shoulder, to the side and forward
     raised = _y(24) @ _z(32) @ _x(-75), _z(-4), _y(108 + 17 * wave), _y(9 * wave)
-    blend = [_between(a, b, up) for a, b in zip((shoulder, collar, elbow, wrist), raised, strict=True)]
+    blend = [
+        _between(a, b, up) for a, b in zip((shoulder, collar, elbow, wrist), raised, strict=True)
+    ]
     return (*blend, 1 - 0.85 * up)
 
 
@@ -193,7 +224,9 @@ def _smooth(x: float) -> float:
 def _curve(keys: dict, phase: float) -> float:
     """A periodic cubic spline through {phase: degrees}."""
     times, values = list(keys), list(keys.values())
-    return float(CubicSpline([*times, times[0] + 1], [*values, values[0]], bc_type="periodic")(phase % 1.0))
+    return float(
+        CubicSpline([*times, times[0] + 1], [*values, values[0]], bc_type="periodic")(phase % 1.0)
+    )
 
 
 def _about(axis: int):

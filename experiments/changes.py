@@ -56,9 +56,13 @@ def outcome(network, capture, held_out) -> dict[str, Any]:
     height = np.ptp(rest[:, 1])
     reach = float(np.linalg.norm(np.asarray(gaussians.means) - own, axis=-1).max() / height)
     warnings = list(likely_mistakes(capture))
-    assert np.isfinite(np.asarray(drawn.images)).all() and np.isfinite(np.asarray(drawn.alpha)).all()
+    assert (
+        np.isfinite(np.asarray(drawn.images)).all() and np.isfinite(np.asarray(drawn.alpha)).all()
+    )
     scores = score_tasks(drawn.images, held_out, alpha=drawn.alpha)["novel"]
-    return {"warnings": warnings, "reach": reach} | {name: scores[name] for name in ("psnr", "psnr_fg")}
+    return {"warnings": warnings, "reach": reach} | {
+        name: scores[name] for name in ("psnr", "psnr_fg")
+    }
 
 
 def change(function: Callable[..., Any]) -> Callable[..., Change]:
@@ -70,14 +74,18 @@ def change(function: Callable[..., Any]) -> Callable[..., Change]:
 def photos(capture, changed: Callable[[np.ndarray], np.ndarray]):
     """The colors of the person changed, on white."""
     masks = capture.masks[..., None]
-    return dataclasses.replace(capture, images=masks * np.clip(changed(capture.images), 0, 1) + (1 - masks))
+    return dataclasses.replace(
+        capture, images=masks * np.clip(changed(capture.images), 0, 1) + (1 - masks)
+    )
 
 
 @change
 def masks(capture, changed: Callable[[np.ndarray], np.ndarray]):
     """Other masks, white where they are 0."""
     found = changed(capture.masks)
-    return dataclasses.replace(capture, masks=found, images=found[..., None] * capture.images + (1 - found[..., None]))
+    return dataclasses.replace(
+        capture, masks=found, images=found[..., None] * capture.images + (1 - found[..., None])
+    )
 
 
 @change
@@ -85,7 +93,9 @@ def cameras(capture, K: Callable = lambda K: K, matrix: Callable = lambda m: m):
     old = capture.cameras
     intrinsics = np.stack([K(np.array(x)) for x in old.K]).astype(np.float32)
     extrinsics = np.stack([matrix(np.array(x)) for x in old.cam_from_world]).astype(np.float32)
-    return dataclasses.replace(capture, cameras=dataclasses.replace(old, K=intrinsics, cam_from_world=extrinsics))
+    return dataclasses.replace(
+        capture, cameras=dataclasses.replace(old, K=intrinsics, cam_from_world=extrinsics)
+    )
 
 
 def focal(factor: float) -> Callable:
@@ -117,14 +127,18 @@ def zoom(capture, factor: float):
 
     images = np.stack([zoomed(image, 1.0) for image in capture.images])
     shapes = np.stack([zoomed(mask, 0.0) for mask in capture.masks])
-    about = np.array([[factor, 0, side / 2 * (1 - factor)], [0, factor, side / 2 * (1 - factor)], [0, 0, 1]])
+    about = np.array(
+        [[factor, 0, side / 2 * (1 - factor)], [0, factor, side / 2 * (1 - factor)], [0, 0, 1]]
+    )
     return dataclasses.replace(cameras(lambda K: about @ K)(capture), images=images, masks=shapes)
 
 
 @change
 def poses(capture, changed: Callable[[np.ndarray], np.ndarray]):
     rotations = np.asarray(changed(np.array(capture.poses.rotations)), np.float32)
-    return dataclasses.replace(capture, poses=dataclasses.replace(capture.poses, rotations=rotations))
+    return dataclasses.replace(
+        capture, poses=dataclasses.replace(capture.poses, rotations=rotations)
+    )
 
 
 def _placed(place: Callable[[np.ndarray], np.ndarray]) -> Change:
@@ -135,7 +149,9 @@ def _placed(place: Callable[[np.ndarray], np.ndarray]) -> Change:
 @change
 def tall(capture, factor: float):
     """A body, and a world, of another size."""
-    scaled = {name: getattr(capture.body, name) * factor for name in ("template", "shape_directions")}
+    scaled = {
+        name: getattr(capture.body, name) * factor for name in ("template", "shape_directions")
+    }
     moved = dataclasses.replace(capture.poses, translation=capture.poses.translation * factor)
     away = _placed(lambda m: factor * m[:3, 3])(capture)
     return dataclasses.replace(away, body=dataclasses.replace(capture.body, **scaled), poses=moved)
@@ -199,14 +215,23 @@ def turned_by(capture, degrees: float):
 def moved_by(capture, centimeters: float):
     """The body moved, in one direction."""
     step = noise(3, (3,))
-    translation = np.asarray(capture.poses.translation) + (centimeters / 100 * step / np.linalg.norm(step))
-    return dataclasses.replace(capture, poses=dataclasses.replace(capture.poses, translation=translation.astype(np.float32)))
+    translation = np.asarray(capture.poses.translation) + (
+        centimeters / 100 * step / np.linalg.norm(step)
+    )
+    return dataclasses.replace(
+        capture,
+        poses=dataclasses.replace(capture.poses, translation=translation.astype(np.float32)),
+    )
 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     """The mask dilated, or eroded below 0."""
     side = 2 * abs(pixels) + 1
-    return mask if pixels == 0 else (ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion)(mask, (side, side))
+    return (
+        mask
+        if pixels == 0
+        else (ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion)(mask, (side, side))
+    )
 
 
 @change
@@ -214,7 +239,9 @@ def masks_grown(capture, pixels: int):
     """Masks dilated (or eroded, below 0); what they show of the background is grey."""
     found = np.stack([grown(mask, pixels) for mask in capture.masks])
     inside = np.minimum(found, capture.masks)[..., None]
-    true = (capture.images - (1 - capture.masks[..., None])) / np.maximum(capture.masks[..., None], 1e-6)
+    true = (capture.images - (1 - capture.masks[..., None])) / np.maximum(
+        capture.masks[..., None], 1e-6
+    )
     around = (found[..., None] - inside) * 0.5
     images = np.clip(inside * true + around + (1 - found[..., None]), 0, 1).astype(np.float32)
     return dataclasses.replace(capture, images=images, masks=found)

@@ -45,7 +45,9 @@ def missing() -> str | None:
 class Chromium:
     """A browser with one page; a context manager."""
 
-    def __init__(self, width: int = 1280, height: int = 800, pixel_ratio: float = 1.0, mobile: bool = False):
+    def __init__(
+        self, width: int = 1280, height: int = 800, pixel_ratio: float = 1.0, mobile: bool = False
+    ):
         from selenium import webdriver
         from selenium.webdriver.chrome.service import Service
 
@@ -54,7 +56,9 @@ class Chromium:
         for flag in FLAGS:
             options.add_argument(flag)
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-        self.driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
+        self.driver = webdriver.Chrome(
+            options=options, service=Service(shutil.which("chromedriver"))
+        )
         self.driver.set_script_timeout(PATIENCE)
         client = self.driver.command_executor
         assert not isinstance(client, str)  # Chrome's is an object
@@ -67,9 +71,16 @@ class Chromium:
     def __exit__(self, *_: object) -> None:
         self.driver.quit()
 
-    def resize(self, width: int, height: int, pixel_ratio: float = 1.0, mobile: bool = False) -> None:
+    def resize(
+        self, width: int, height: int, pixel_ratio: float = 1.0, mobile: bool = False
+    ) -> None:
         """The size of the page in CSS pixels."""
-        metrics = {"width": width, "height": height, "deviceScaleFactor": pixel_ratio, "mobile": mobile}
+        metrics = {
+            "width": width,
+            "height": height,
+            "deviceScaleFactor": pixel_ratio,
+            "mobile": mobile,
+        }
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
 
     def open(self, page: Path | str) -> None:
@@ -98,4 +109,8 @@ class Chromium:
     def problems(self) -> list[str]:
         """Errors and warnings on the console since the last call, but for notes on speed (tests read pixels back)."""
         entries = self.driver.get_log("browser")
-        return [entry["message"] for entry in entries if "GPU stall due to ReadPixels" not in entry["message"]]
+        return [
+            entry["message"]
+            for entry in entries
+            if "GPU stall due to ReadPixels" not in entry["message"]
+        ]

@@ -14,7 +14,15 @@ import math
 from collections import Counter
 from typing import Any
 
-PASSES = {"all_gather": 1, "reduce_scatter": 1, "psum": 2, "psum_invariant": 2, "pmax": 2, "pmin": 2, "all_to_all": 1}
+PASSES = {
+    "all_gather": 1,
+    "reduce_scatter": 1,
+    "psum": 2,
+    "psum_invariant": 2,
+    "pmax": 2,
+    "pmin": 2,
+    "all_to_all": 1,
+}
 """Of each message, how often the whole array passes a device, but for its own share of it."""
 MEBI = 1 / 2**20
 
@@ -35,12 +43,20 @@ class Costs:
         return self.dots + self.convolutions
 
     def __add__(self, other: "Costs") -> "Costs":
-        return Costs(*(getattr(self, f.name) + getattr(other, f.name) for f in dataclasses.fields(self)))
+        return Costs(
+            *(getattr(self, f.name) + getattr(other, f.name) for f in dataclasses.fields(self))
+        )
 
     def times(self, count: int) -> "Costs":
         """That often."""
         often = lambda counter: Counter({key: count * number for key, number in counter.items()})
-        return Costs(count * self.dots, count * self.convolutions, self.unknown_trips, often(self.messages), often(self.sent))
+        return Costs(
+            count * self.dots,
+            count * self.convolutions,
+            self.unknown_trips,
+            often(self.messages),
+            often(self.sent),
+        )
 
 
 def costs_of(traced: Any) -> Costs:
@@ -57,7 +73,10 @@ def temporary_mb(compiled: Any) -> float:
 
 
 def _of_jaxpr(jaxpr, devices) -> Costs:
-    return sum((_of_equation(equation, devices) for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns), Costs())
+    return sum(
+        (_of_equation(equation, devices) for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns),
+        Costs(),
+    )
 
 
 def _of_equation(equation, devices) -> Costs:
@@ -70,7 +89,13 @@ def _of_equation(equation, devices) -> Costs:
     if name == "conv_general_dilated":
         kernel, spec = equation.invars[1].aval.shape, given["dimension_numbers"].rhs_spec
         taps = kernel[spec[1]] * math.prod(kernel[axis] for axis in spec[2:])
-        count = 2 * results[0].aval.size * taps // math.prod(given["lhs_dilation"]) // given["batch_group_count"]
+        count = (
+            2
+            * results[0].aval.size
+            * taps
+            // math.prod(given["lhs_dilation"])
+            // given["batch_group_count"]
+        )
         return Costs(convolutions=count)
     if name in PASSES or name == "ppermute":
         return _message(equation, devices)
@@ -80,7 +105,10 @@ def _of_equation(equation, devices) -> Costs:
         parts = _of_jaxpr(given["cond_jaxpr"], devices) + _of_jaxpr(given["body_jaxpr"], devices)
         return parts + Costs(unknown_trips=1)
     if name == "cond":
-        return max((_of_jaxpr(branch, devices) for branch in given["branches"]), key=lambda costs: costs.flops)
+        return max(
+            (_of_jaxpr(branch, devices) for branch in given["branches"]),
+            key=lambda costs: costs.flops,
+        )
     if name == "shard_map":
         devices = devices | dict(given["mesh"].shape)
     return sum((_of_jaxpr(inner, devices) for inner in _inner(given)), Costs())
@@ -97,11 +125,15 @@ def _inner(given):
 def _message(equation, devices) -> Costs:
     name, given = equation.primitive.name, equation.params
     axes = given.get("axes", given.get("axis_name"))
-    named = [axis for axis in (axes if isinstance(axes, tuple) else (axes,)) if not isinstance(axis, int)]
+    named = [
+        axis for axis in (axes if isinstance(axes, tuple) else (axes,)) if not isinstance(axis, int)
+    ]
     if not named:  # vmap has made it a sum over an axis of the array
         return Costs()
     size = math.prod(devices[axis] for axis in named)
-    whole = sum(x.aval.size * x.aval.dtype.itemsize for x in equation.invars) * (size if name == "all_gather" else 1)
+    whole = sum(x.aval.size * x.aval.dtype.itemsize for x in equation.invars) * (
+        size if name == "all_gather" else 1
+    )
     share = 1 if name == "ppermute" else PASSES[name] * (size - 1) / size
     kind = name.removesuffix("_invariant")
     return Costs(messages=Counter({kind: 1}), sent=Counter({kind: math.ceil(whole * share)}))

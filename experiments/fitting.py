@@ -65,41 +65,74 @@ def make_case(seed, body, model, frames, views) -> FitCase:
         translations.append(shift)
         extrinsics.append(np.asarray(cameras.cam_from_world))
         intrinsics.append(np.asarray(cameras.K))
-    rotations, translations = np.asarray(rotations, np.float32), np.asarray(translations, np.float32)
+    rotations, translations = (
+        np.asarray(rotations, np.float32),
+        np.asarray(translations, np.float32),
+    )
     landmarks, joints = _posed(model, subject.betas, rotations, translations)
-    return FitCase(subject.betas, rotations, translations, joints, landmarks, np.stack(intrinsics), np.stack(extrinsics))
+    return FitCase(
+        subject.betas,
+        rotations,
+        translations,
+        joints,
+        landmarks,
+        np.stack(intrinsics),
+        np.stack(extrinsics),
+    )
 
 
 def walking(model, seed) -> FitCase:
     """The person of a seed in the first frames of the shipped walk; cameras stand still all around."""
     motion, rng = load_motion(), np.random.default_rng([seed, POSE_STREAM])
-    rotations, translations = (np.asarray(x)[:FRAMES] for x in (motion.rotations, motion.translations))
+    rotations, translations = (
+        np.asarray(x)[:FRAMES] for x in (motion.rotations, motion.translations)
+    )
     betas = rng.normal(0, 0.7, model.joint_directions.shape[-1]).astype(np.float32)
     landmarks, joints = _posed(model, betas, rotations, translations)
     azimuths = rng.uniform(0, 2 * np.pi) + np.arange(4) * (2 * np.pi / 4)
     K, middle = intrinsics_from_fov(1.0, SIZE, SIZE), jnp.asarray(joints.mean((0, 1)))
     cameras = orbit(middle, 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, SIZE, SIZE)
     still = lambda array: np.broadcast_to(np.asarray(array), (FRAMES, *array.shape))
-    return FitCase(betas, rotations, translations, joints, landmarks, still(cameras.K), still(cameras.cam_from_world))
+    return FitCase(
+        betas,
+        rotations,
+        translations,
+        joints,
+        landmarks,
+        still(cameras.K),
+        still(cameras.cam_from_world),
+    )
 
 
 @jax.jit
 def _pose_all(model, betas, rotations, translations):
-    return jax.vmap(lambda r, t: pose_landmarks(model, betas, BodyPose(r, t)))(rotations, translations)
+    return jax.vmap(lambda r, t: pose_landmarks(model, betas, BodyPose(r, t)))(
+        rotations, translations
+    )
 
 
 def _posed(model, betas, rotations, translations):
-    return tuple(np.asarray(x) for x in _pose_all(model, jnp.asarray(betas), rotations, translations))
+    return tuple(
+        np.asarray(x) for x in _pose_all(model, jnp.asarray(betas), rotations, translations)
+    )
 
 
 def detect(case, seed, noise_px, outliers, outlier_px=100.0):
     """Keypoints (m, c, k, 2) as a detector with errors would give them: noise everywhere, a share displaced by up to so far."""
     rng = np.random.default_rng([seed, ERROR_STREAM])
-    seen = np.einsum("mcab,mkb->mcka", case.cam_from_world[..., :3, :3], case.landmarks) + case.cam_from_world[..., None, :3, 3]
-    pixels = seen[..., :2] / seen[..., 2:] * case.K[..., None, [0, 1], [0, 1]] + case.K[..., None, :2, 2]
+    seen = (
+        np.einsum("mcab,mkb->mcka", case.cam_from_world[..., :3, :3], case.landmarks)
+        + case.cam_from_world[..., None, :3, 3]
+    )
+    pixels = (
+        seen[..., :2] / seen[..., 2:] * case.K[..., None, [0, 1], [0, 1]] + case.K[..., None, :2, 2]
+    )
     pixels = pixels + rng.normal(0, 1, pixels.shape) * noise_px
     wild = rng.random(pixels.shape[:-1]) < outliers
-    angle, radius = rng.uniform(0, 2 * np.pi, wild.shape), outlier_px * np.sqrt(rng.random(wild.shape))
+    angle, radius = (
+        rng.uniform(0, 2 * np.pi, wild.shape),
+        outlier_px * np.sqrt(rng.random(wild.shape)),
+    )
     return pixels + (wild * radius)[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
@@ -108,7 +141,9 @@ def observe(people, seed, noise_px, outliers, model):
     points = np.stack([detect(case, seed + i, noise_px, outliers) for i, case in enumerate(people)])
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])
     noise = np.stack([expected_noise(p, c) for p, c in zip(points, confidences, strict=True)])
-    K, cam_from_world = (np.stack([getattr(case, name) for case in people]) for name in ("K", "cam_from_world"))
+    K, cam_from_world = (
+        np.stack([getattr(case, name) for case in people]) for name in ("K", "cam_from_world")
+    )
     arrays = (points, confidences, K, cam_from_world, noise)
     return jax.vmap(jax.vmap(Observations))(*(jnp.asarray(x, jnp.float32) for x in arrays))
 
@@ -137,13 +172,21 @@ def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = Tr
     if curves:
         asked += [(ALL, views, 2.0, share) for views in VIEWS for share in (0.0, 0.2)]
         asked += [(ALL, 4, noise, 0.0) for noise in NOISES]
-        asked += [(kind, 4, 2.0, share) for kind in ("coco17", "openpose67") for share in (0.0, 0.2)]
-    settings = {each: f"{each[0]}, {each[1]} views, {each[2]:g} px, {each[3]:.0%}" for each in asked}
-    cases = {name: functools.partial(_errors, people, frames, each) for each, name in settings.items()}
+        asked += [
+            (kind, 4, 2.0, share) for kind in ("coco17", "openpose67") for share in (0.0, 0.2)
+        ]
+    settings = {
+        each: f"{each[0]}, {each[1]} views, {each[2]:g} px, {each[3]:.0%}" for each in asked
+    }
+    cases = {
+        name: functools.partial(_errors, people, frames, each) for each, name in settings.items()
+    }
     rows = run.rows(cases, {"people": people, "frames": frames})
     table = []
     for (kind, views, noise, share), name in settings.items():
-        shown = ["-" if rows[name].get(key) is None else f"{rows[name][key]:.1f}" for key in COLUMNS]
+        shown = [
+            "-" if rows[name].get(key) is None else f"{rows[name][key]:.1f}" for key in COLUMNS
+        ]
         table.append([kind, views, f"{noise:g}", f"{share:.0%}", *shown])
     four = rows[settings[(ALL, 4, 2.0, 0.2)]]
     said = (
@@ -177,7 +220,10 @@ def _errors(count, frames, setting):
         fit = jax.block_until_ready(fit_all(seen))
         times.append(time.perf_counter())
     truth, joints = np.stack([case.joints for case in people]), np.asarray(fit.joints)
-    errors, off = (1000 * np.linalg.norm(joints - x, axis=-1) for x in (truth, truth + joints[..., :1, :] - truth[..., :1, :]))
+    errors, off = (
+        1000 * np.linalg.norm(joints - x, axis=-1)
+        for x in (truth, truth + joints[..., :1, :] - truth[..., :1, :])
+    )
     found = {
         "mean_joint_error_mm": float(errors.mean()),
         "p95_joint_error_mm": float(np.quantile(errors, 0.95)),
@@ -186,18 +232,30 @@ def _errors(count, frames, setting):
         "worst_frame_mean_mm": float(errors.mean(-1).max()),
     }
     found |= landmark_errors(model, people, seen, fit)
-    found["root_aligned_mean_joint_error_mm"] = float(off.mean())  # pelvis where the true one is: what a single view can know
-    return found | {"seconds_per_frame": (times[2] - times[1]) / (count * frames), "first_call_s": times[1] - times[0]}
+    found["root_aligned_mean_joint_error_mm"] = float(
+        off.mean()
+    )  # pelvis where the true one is: what a single view can know
+    return found | {
+        "seconds_per_frame": (times[2] - times[1]) / (count * frames),
+        "first_call_s": times[1] - times[0],
+    }
 
 
 def landmark_errors(model, people, seen, fit) -> dict:
     """Millimetres between true landmarks and fitted or triangulated ones; None of triangulation from one view."""
     truth, known = np.stack([case.landmarks for case in people]), np.asarray(model.known)
-    off = lambda points: float(1000 * np.linalg.norm(np.asarray(points) - truth, axis=-1)[..., known].mean())
+    off = lambda points: float(
+        1000 * np.linalg.norm(np.asarray(points) - truth, axis=-1)[..., known].mean()
+    )
     found = {"mean_landmark_error_mm": off(fit.landmarks)}
     if seen.points.shape[2] > 1:
-        plain, robust = (jax.jit(jax.vmap(jax.vmap(f))) for f in (triangulate, triangulate_robustly))
-        found |= {"triangulated_mm": off(plain(seen)[0]), "robustly_triangulated_mm": off(robust(seen)[0])}
+        plain, robust = (
+            jax.jit(jax.vmap(jax.vmap(f))) for f in (triangulate, triangulate_robustly)
+        )
+        found |= {
+            "triangulated_mm": off(plain(seen)[0]),
+            "robustly_triangulated_mm": off(robust(seen)[0]),
+        }
     return found
 
 
@@ -230,7 +288,12 @@ CASES = {
 
 
 @entry
-def fit_sequences(run: Run, smoothness: tuple[float, ...] = (0.005, 0.02), people: int = 3, cases: tuple[str, ...] = ()) -> None:
+def fit_sequences(
+    run: Run,
+    smoothness: tuple[float, ...] = (0.005, 0.02),
+    people: int = 3,
+    cases: tuple[str, ...] = (),
+) -> None:
     """What `humangs fit --smoothness` makes of sequences with frames that are badly seen: the shipped walk with known keypoints.
 
     Mean error over all 55 joints of the frames that the case leaves alone and of those that it spoils, and of the joints'
@@ -245,11 +308,20 @@ def fit_sequences(run: Run, smoothness: tuple[float, ...] = (0.005, 0.02), peopl
     model, made = _model(ALL), [walking(_model(ALL), seed) for seed in range(FIRST, FIRST + people)]
     ways = {"alone": 0.0} | {f"smooth {s:g}": s for s in smoothness}
     names = cases or tuple(CASES)
-    each = {f"{name}: {way}": functools.partial(measure, model, made, name, s) for name in names for way, s in ways.items()}
+    each = {
+        f"{name}: {way}": functools.partial(measure, model, made, name, s)
+        for name in names
+        for way, s in ways.items()
+    }
     rows = run.rows(each, {"people": people, "kind": ALL})
-    show = lambda value: "-" if value is None else f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
+    show = lambda value: (
+        "-" if value is None else f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
+    )
     keys = {"others_mm": "frames left alone", "spoilt_mm": "spoilt", "tremble_mm": "acceleration"}
-    table = [[name, *(show(rows[f"{name}: {way}"][key]) for key in keys for way in ways)] for name in names]
+    table = [
+        [name, *(show(rows[f"{name}: {way}"][key]) for key in keys for way in ways)]
+        for name in names
+    ]
     header = ["case"]
     for what in keys.values():
         header += [f"{what}: one by one", *(f"{s:g}" for s in smoothness)]
@@ -289,12 +361,26 @@ def spoiled(model, people, name: str):
     elif "one view" in name:
         confidences[:, rows, 1:] = 0
     elif "somebody else" in name:
-        others = observe([moved(case, OTHER) for case in people[1:] + people[:1]], FIRST + 1, noise, 0.0, model)
-        points[:, rows] = np.asarray(others.points)[:, [(row + FRAMES // 2) % FRAMES for row in rows]]
+        others = observe(
+            [moved(case, OTHER) for case in people[1:] + people[:1]], FIRST + 1, noise, 0.0, model
+        )
+        points[:, rows] = np.asarray(others.points)[
+            :, [(row + FRAMES // 2) % FRAMES for row in rows]
+        ]
     elif "px off" in name:
         points[:, rows] = np.asarray(observe(people, FIRST, noise, 0.2, model).points)[:, rows]
-    noises = np.stack([expected_noise(p, c) for p, c in zip(points[:, :, :views], confidences[:, :, :views], strict=True)])
-    each = {"points": points, "confidences": confidences, "K": seen.K, "cam_from_world": seen.cam_from_world}
+    noises = np.stack(
+        [
+            expected_noise(p, c)
+            for p, c in zip(points[:, :, :views], confidences[:, :, :views], strict=True)
+        ]
+    )
+    each = {
+        "points": points,
+        "confidences": confidences,
+        "K": seen.K,
+        "cam_from_world": seen.cam_from_world,
+    }
     return replace(seen, **{key: value[:, :, :views] for key, value in each.items()}, noise=noises)
 
 
@@ -321,17 +407,24 @@ def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
     captures: capture folders, or folders of them
     """
     networks, seen = Networks(), {place.name: [] for place in MEDIAPIPE_33.places}
-    for folder in (file.parent for each in captures for file in sorted(each.glob("**/capture.json"))):
+    for folder in (
+        file.parent for each in captures for file in sorted(each.glob("**/capture.json"))
+    ):
         for name, row in landmark_rows(networks, folder):
             seen[name].append(row)
     places, rows = {}, []
     for name, own in seen.items():
         if (other := mirrored_name(name)) in places:
             continue
-        mirrored = [(change * [-1, 1, 1], error) for change, error in seen[other]] if name != other else []
+        mirrored = (
+            [(change * [-1, 1, 1], error) for change, error in seen[other]] if name != other else []
+        )
         if own or mirrored:
             offset, scatter = solved_offset(own + mirrored)
-            places[name] = {"millimetres": np.round(offset, 1).tolist(), "scatter": round(scatter, 1)}
+            places[name] = {
+                "millimetres": np.round(offset, 1).tolist(),
+                "scatter": round(scatter, 1),
+            }
             rows.append([name, *(f"{x:.0f}" for x in offset), f"{scatter:.0f}"])
     header = ["landmark, left or middle", "to the left", "up", "forwards", "scatter, mm"]
     run.show(markdown_table(header, rows), {"places": places})
@@ -342,7 +435,10 @@ def landmark_rows(networks, folder):
     capture, kind = load_capture(folder), MEDIAPIPE_33
     plain = tuple(place._replace(offset=(0.0, 0.0, 0.0)) for place in kind.places)
     model = landmark_model(capture.body, kind.names, plain)
-    moved = [replace(model, points=replace(model.points, rest=model.points.rest + STEP * row)) for row in jnp.eye(3)]
+    moved = [
+        replace(model, points=replace(model.points, rest=model.points.rest + STEP * row))
+        for row in jnp.eye(3)
+    ]
     for view in range(capture.view_count):
         people = detect_people(networks, np.asarray(capture.images[view], np.float32))
         if not people:
@@ -350,7 +446,10 @@ def landmark_rows(networks, folder):
         pose, camera = capture.pose(int(capture.frames[view])), capture.cameras[view]
         betas = jnp.asarray(capture.betas)
         points = [pose_landmarks(each, betas, pose)[0] for each in (model, *moved)]
-        pixels, depths = (np.asarray(x, float) for x in jax.vmap(functools.partial(project, camera))(jnp.stack(points)))
+        pixels, depths = (
+            np.asarray(x, float)
+            for x in jax.vmap(functools.partial(project, camera))(jnp.stack(points))
+        )
         changes = np.moveaxis(pixels[1:] - pixels[0], 0, -1) / STEP
         errors = people[0].pixels - pixels[0]
         if np.median(np.linalg.norm(errors, axis=-1)) > WRONG * np.ptp(pixels[0], axis=0).max():

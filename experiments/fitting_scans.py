@@ -53,17 +53,28 @@ def fit_scans(
     if subjects < 1:
         raise ValueError("--subjects: expected at least 1")
     body, each = load_body(), itertools.product(seeds_of("fitting", 0, subjects), kinds)
-    cases = {f"{kind} {seed}": functools.partial(fit_one, seed, kind, body, without_joints) for seed, kind in each}
+    cases = {
+        f"{kind} {seed}": functools.partial(fit_one, seed, kind, body, without_joints)
+        for seed, kind in each
+    }
     settings = {"noise_mm": NOISE_MM, "joints": not without_joints}
     rows = run.rows(cases, settings)
-    numbers: dict[str, Any] = {kind: summary([row for name, row in rows.items() if name.startswith(kind)]) for kind in kinds}
+    numbers: dict[str, Any] = {
+        kind: summary([row for name, row in rows.items() if name.startswith(kind)])
+        for kind in kinds
+    }
     run.show(scans_table(numbers, without_joints), numbers | {"settings": settings})
 
 
 def scans_table(numbers: dict[str, Any], without_joints: bool) -> str:
     """One row for each kind: of all scans if joints were given, else of those whose pose was found."""
     if without_joints:
-        header = ["scans, no joints", f"found (vertices within {SUCCESS:g} mm)", "of these: vertices, mean", "surface, mean"]
+        header = [
+            "scans, no joints",
+            f"found (vertices within {SUCCESS:g} mm)",
+            "of these: vertices, mean",
+            "surface, mean",
+        ]
         shown = lambda value: "-" if value is None else f"{value:.1f} mm"
         rows = [
             [kind, f"{round(row['success'] * row['scans'])} of {row['scans']}"]
@@ -74,7 +85,10 @@ def scans_table(numbers: dict[str, Any], without_joints: bool) -> str:
     header = [f"scans, {len(JOINTS)} joints given with {NOISE_MM:g} mm of noise", "vertices, mean"]
     header += ["surface, mean", "surface, worst person", "seconds a scan"]
     names = ("mean_vertex_mm", "mean_surface_mm", "worst_surface_mm")
-    cells = lambda row: [*(f"{significant(row[name])} mm" for name in names), f"{row['seconds_per_scan']:.1f}"]
+    cells = lambda row: [
+        *(f"{significant(row[name])} mm" for name in names),
+        f"{row['seconds_per_scan']:.1f}",
+    ]
     return markdown_table(header, [[kind, *cells(row)] for kind, row in numbers.items()])
 
 
@@ -90,7 +104,12 @@ def fit_one(seed, kind, body, without_joints):
     fitted = place.inverse()(body_in_scan(fit))
     vertex = 1000 * np.linalg.norm(fitted - true, axis=1)
     surface = 1000 * distances_to_surface(fitted, true, np.asarray(body.faces))
-    row = {"seed": seed, "kind": kind, "vertex_mm": float(vertex.mean()), "surface_mm": float(surface.mean())}
+    row = {
+        "seed": seed,
+        "kind": kind,
+        "vertex_mm": float(vertex.mean()),
+        "surface_mm": float(surface.mean()),
+    }
     row |= {"surface_p95_mm": float(np.quantile(surface, 0.95)), "seconds": seconds}
     row["scale_ratio"] = fit.world_from_scan.scale * place.scale
     return row
@@ -99,14 +118,26 @@ def fit_one(seed, kind, body, without_joints):
 def person(seed, kind, body):
     """True vertices (n, 3) of the body and landmarks (k, 3), and the scan's vertices and faces, metres."""
     subject = make_subject(seed, body)
-    rotations = sample_rotations(np.random.default_rng([seed, POSE_STREAM]), subject.build).astype(np.float32)
+    rotations = sample_rotations(np.random.default_rng([seed, POSE_STREAM]), subject.build).astype(
+        np.float32
+    )
     pose, betas = BodyPose(jnp.asarray(rotations), jnp.zeros(3)), jnp.asarray(subject.betas)
-    posed = jax.jit(lambda b, p: (pose_body(body, shape_body(body, b), p).vertices, pose_landmarks(model, b, p)[0]))
+    posed = jax.jit(
+        lambda b, p: (
+            pose_body(body, shape_body(body, b), p).vertices,
+            pose_landmarks(model, b, p)[0],
+        )
+    )
     model = landmark_model(body, JOINTS)
     true, landmarks = (np.asarray(x, np.float64) for x in posed(betas, pose))
     if kind == "bare":
         return true, landmarks, true, np.asarray(body.faces)
-    return true, landmarks, subject.posed_vertices(rotations, np.zeros(3)).astype(np.float64), subject.surface.faces
+    return (
+        true,
+        landmarks,
+        subject.posed_vertices(rotations, np.zeros(3)).astype(np.float64),
+        subject.surface.faces,
+    )
 
 
 def random_place(seed):

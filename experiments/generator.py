@@ -49,9 +49,15 @@ def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
     numbers, table, pixels = {}, [], np.asarray([row["pixels"] for row in rows.values()])
     for name, definition in FAULTS.items():
         each = np.asarray([row[name] for row in rows.values()])
-        mean, most, above = float((each * pixels).sum() / pixels.sum()), float(each.max()), float((each > 1e-3).mean())
+        mean, most, above = (
+            float((each * pixels).sum() / pixels.sum()),
+            float(each.max()),
+            float((each > 1e-3).mean()),
+        )
         numbers[name] = {"mean": mean, "worst": most, "above_0.1_percent": above}
-        table.append([name.replace("_", ", "), definition, f"{mean:.4%}", f"{most:.2%}", f"{above:.1%}"])
+        table.append(
+            [name.replace("_", ", "), definition, f"{mean:.4%}", f"{most:.2%}", f"{above:.1%}"]
+        )
     header = ["fault", "definition", "mean", "worst person", f"of {subjects} people above 0.1 %"]
     run.show(markdown_table(header, table, "lllll"), {"people": subjects} | numbers)
 
@@ -59,9 +65,13 @@ def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
 def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
     posed = sample_pose(make_subject(seed, body), 0)
     rng = np.random.default_rng([seed, 77, 0])
-    camera = surroundings.cameras_around(rng, posed.vertices, surroundings.spread_azimuths(rng, 1), size)[0]
+    camera = surroundings.cameras_around(
+        rng, posed.vertices, surroundings.spread_azimuths(rng, 1), size
+    )[0]
     pixels, *counts = count_faults(body, posed, camera)
-    return {"pixels": float(pixels)} | {name: float(x / pixels) for name, x in zip(FAULTS, counts, strict=True)}
+    return {"pixels": float(pixels)} | {
+        name: float(x / pixels) for name, x in zip(FAULTS, counts, strict=True)
+    }
 
 
 def count_faults(body, posed, camera):
@@ -166,9 +176,14 @@ def motions(body, seeds):
         subject = make_subject(seed, body)
         motion = sample_motion(subject, MOTION_FRAMES)
         rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
-        pelvis = anatomy.joint_positions(subject.build, rotations[0].astype(float))[0][anatomy.PELVIS]
+        pelvis = anatomy.joint_positions(subject.build, rotations[0].astype(float))[0][
+            anatomy.PELVIS
+        ]
         facing = _azimuth(pelvis @ [0, 0, 1])
-        posed = [pose_subject(subject, rotations[i], translations[i]) for i in np.linspace(0, len(rotations) - 1, 8).astype(int)]
+        posed = [
+            pose_subject(subject, rotations[i], translations[i])
+            for i in np.linspace(0, len(rotations) - 1, 8).astype(int)
+        ]
         rows.append([_whole(p, facing + 0.7, MOTION_SIZE) for p in posed])
     half = len(rows) // 2
     return _grid([a + b for a, b in zip(rows[:half], rows[half:], strict=True)])
@@ -180,7 +195,9 @@ def _azimuth(direction):
 
 def _seen(posed, target, distance, azimuth, elevation, fov, size):
     K, azimuths = intrinsics_from_fov(fov, *size), jnp.asarray([azimuth], jnp.float32)
-    camera = orbit(jnp.asarray(target, jnp.float32), float(distance), azimuths, float(elevation), K, *size)[0]
+    camera = orbit(
+        jnp.asarray(target, jnp.float32), float(distance), azimuths, float(elevation), K, *size
+    )[0]
     return render_view(posed, camera)[0]
 
 
@@ -201,4 +218,6 @@ def _grid(rows):
     """(h, w, 3) image of rows of images of one size; short rows are filled with white."""
     columns = max(len(row) for row in rows)
     blank = np.ones_like(rows[0][0])
-    return np.concatenate([np.concatenate(row + [blank] * (columns - len(row)), axis=1) for row in rows], axis=0)
+    return np.concatenate(
+        [np.concatenate(row + [blank] * (columns - len(row)), axis=1) for row in rows], axis=0
+    )

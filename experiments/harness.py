@@ -42,7 +42,9 @@ def listed() -> dict[str, tuple[str, str]]:
     found = {}
     for path in sorted(FOLDER.rglob("*.py")):
         for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.FunctionDef) and any(ast.unparse(d) == "entry" for d in node.decorator_list):
+            if isinstance(node, ast.FunctionDef) and any(
+                ast.unparse(d) == "entry" for d in node.decorator_list
+            ):
                 module = ".".join(("experiments", *path.relative_to(FOLDER).with_suffix("").parts))
                 found[node.name] = module, (ast.get_docstring(node) or "").split("\n")[0]
     return found
@@ -51,7 +53,9 @@ def listed() -> dict[str, tuple[str, str]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; the exit status."""
     known = listed()
-    parser = argparse.ArgumentParser(prog="python -m experiments", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments", description=__doc__.split("\n")[0]
+    )
     parser.add_argument("name", nargs="?", help="without one, all are listed")
     parser.add_argument("options", nargs=argparse.REMAINDER)
     asked = parser.parse_args(arguments)
@@ -84,7 +88,9 @@ def call(function: FunctionType, options: Sequence[str]) -> int:
         parser.error(str(error))
 
 
-def parser_of(function: FunctionType) -> tuple[argparse.ArgumentParser, dict[str, Callable[[Any], Any]]]:
+def parser_of(
+    function: FunctionType,
+) -> tuple[argparse.ArgumentParser, dict[str, Callable[[Any], Any]]]:
     """The options of an experiment, and for each parameter what makes its value of them."""
     text = inspect.getdoc(function) or ""
     parser = argparse.ArgumentParser(
@@ -93,7 +99,9 @@ def parser_of(function: FunctionType) -> tuple[argparse.ArgumentParser, dict[str
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     given = _add_parameters(parser, function)
-    parser.add_argument("--json", type=Path, metavar="OUT", help="rows and numbers; rows already there are kept")
+    parser.add_argument(
+        "--json", type=Path, metavar="OUT", help="rows and numbers; rows already there are kept"
+    )
     parser.add_argument("--publish", action="store_true", help="write docs/results and the page")
     parser.add_argument("--table", default=function.__name__, help="name of the table on the page")
     return parser, given
@@ -108,8 +116,12 @@ def _add_parameters(parser, function):
             fields = [field.name for field in dataclasses.fields(default)]
             kinds_of, texts_of = typing.get_type_hints(type(default)), _helps(type(default))
             for field in fields:
-                _add_option(parser, field, kinds_of[field], getattr(default, field), texts_of.get(field, ""))
-            given[name] = lambda asked, d=default, f=fields: dataclasses.replace(d, **{n: getattr(asked, n) for n in f})
+                _add_option(
+                    parser, field, kinds_of[field], getattr(default, field), texts_of.get(field, "")
+                )
+            given[name] = lambda asked, d=default, f=fields: dataclasses.replace(
+                d, **{n: getattr(asked, n) for n in f}
+            )
         else:
             _add_option(parser, name, kinds[name], default, texts.get(name, ""))
             given[name] = lambda asked, name=name: getattr(asked, name)
@@ -131,7 +143,9 @@ def _add_option(parser, name, kind, default, text):
     else:
         options["type"] = kind
     shown = "" if required or default in (None, (), False) else " (default: %(default)s)"
-    parser.add_argument(name if required else f"--{name.replace('_', '-')}", help=text + shown, **options)
+    parser.add_argument(
+        name if required else f"--{name.replace('_', '-')}", help=text + shown, **options
+    )
 
 
 class _Tuple(argparse.Action):
@@ -162,7 +176,10 @@ class Run:
     _written: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def rows(
-        self, cases: Mapping[str, Callable[[], Row]], settings: Mapping[str, Any] | None = None, again: bool = False
+        self,
+        cases: Mapping[str, Callable[[], Row]],
+        settings: Mapping[str, Any] | None = None,
+        again: bool = False,
     ) -> dict[str, Row]:
         """Rows of all cases. Those that --json OUT has with the same settings are not measured again; it is written after each.
 
@@ -177,7 +194,9 @@ class Run:
         for name in bar(list(cases), desc=self.name, unit="case"):
             if name not in kept or again:
                 found = cases[name]()
-                kept[name], self.pictures[name] = found if isinstance(found, tuple) else (found, None)
+                kept[name], self.pictures[name] = (
+                    found if isinstance(found, tuple) else (found, None)
+                )
                 self._write()
         return {name: kept[name] for name in cases}
 
@@ -188,11 +207,17 @@ class Run:
             stored = json.loads(self.json.read_text())
             old, rows = stored["settings"], stored["rows"]
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{self.json}: expected the JSON of an earlier run, or no file: {error}") from error
+            raise ValueError(
+                f"{self.json}: expected the JSON of an earlier run, or no file: {error}"
+            ) from error
         if old != settings:
             print(f"{self.json}: made with other settings, so it is replaced")
             return {}
-        return {name: row for name, row in rows.items() if not (isinstance(row, dict) and "failed" in row)}
+        return {
+            name: row
+            for name, row in rows.items()
+            if not (isinstance(row, dict) and "failed" in row)
+        }
 
     def _write(self):
         if self.json:
@@ -220,7 +245,9 @@ def means(rows: Sequence[Row]) -> Row:
 
 
 @contextlib.contextmanager
-def figure(path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0) -> Generator[Any]:
+def figure(
+    path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0
+) -> Generator[Any]:
     """Axes of plots side by side, written when the block ends. legend: share of the height for one legend below all."""
     import matplotlib
 

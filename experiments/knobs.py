@@ -54,7 +54,16 @@ PRESETS_HEAD = """
 
 
 def page() -> str:
-    classes = Runtime, Conventions, PatchTransformer, VertexDecoder, SplatConfig, RasterConfig, RefineConfig, TrainConfig
+    classes = (
+        Runtime,
+        Conventions,
+        PatchTransformer,
+        VertexDecoder,
+        SplatConfig,
+        RasterConfig,
+        RefineConfig,
+        TrainConfig,
+    )
     rows = [row for cls in (*classes, OnTheFlyConfig, Settings) for row in knob_rows(cls)]
     sections = {HEAD: rows, PRESETS_HEAD: preset_rows(), FIELDS_HEAD: field_rows()}
     return "".join(head + "\n".join(rows) + "\n" for head, rows in sections.items())
@@ -65,12 +74,19 @@ def preset_rows() -> list[str]:
 
     def changes(value: Any, usual: Any) -> list[str]:
         names = [field.name for field in dataclasses.fields(value) if field.name != "runtime"]
-        return [f"{name} {getattr(value, name)}" for name in names if getattr(value, name) != getattr(usual, name)]
+        return [
+            f"{name} {getattr(value, name)}"
+            for name in names
+            if getattr(value, name) != getattr(usual, name)
+        ]
 
     plain = Settings(), Runtime()
     rows = []
     for name, preset in PRESETS.items():
-        own, network = ", ".join(changes(preset, plain[0])), ", ".join(changes(preset.runtime, plain[1]))
+        own, network = (
+            ", ".join(changes(preset, plain[0])),
+            ", ".join(changes(preset.runtime, plain[1])),
+        )
         rows.append(f"| `{name}` | {own} | {network or 'as trained'} |")
     return rows
 
@@ -88,7 +104,9 @@ def field_rows() -> list[str]:
         ranges = "; ".join(dict.fromkeys(map(str, marks_in(hint, Range))))
         allowed = in_words(typing.get_type_hints(cls)[name]) + (f", {ranges}" if ranges else "")
         cells = (f"`{path}`", allowed, f"`{value}`", docstrings(cls).get(name, ""))
-        rows.append(f"| {' | '.join(' '.join(cell.split()).replace('|', 'or') for cell in cells)} |")
+        rows.append(
+            f"| {' | '.join(' '.join(cell.split()).replace('|', 'or') for cell in cells)} |"
+        )
     return rows
 
 
@@ -102,7 +120,11 @@ def docstrings(cls: type) -> dict[str, str]:
         (written,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
         assert isinstance(written, ast.ClassDef)
         for field, text in itertools.pairwise(written.body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(text, ast.Expr)
+                and isinstance(text.value, ast.Constant)
+            ):
                 found[ast.unparse(field.target)] = str(text.value.value)
     return found
 

@@ -65,7 +65,10 @@ def page(run: Run, size: int = 512, frames: int = 20) -> None:
         raise ValueError(reason)
     avatars = {"avatar": shipped_person(), "finer": shipped_person(FINE_EDGE)}
     with tempfile.TemporaryDirectory() as folder:
-        rows = [_measured(each, Path(folder) / f"{name}.html", size, frames) for name, each in avatars.items()]
+        rows = [
+            _measured(each, Path(folder) / f"{name}.html", size, frames)
+            for name, each in avatars.items()
+        ]
     header = ["", *(f"{row['gaussians']:,} Gaussians" for row in rows)]
     show = lambda row, key: f"{row[key] / 1e6:.2f}" if key == "bytes" else f"{row[key]:.1f}"
     lines = [[label.format(size=size), *(show(row, key) for row in rows)] for label, key in SHOWN]
@@ -73,7 +76,10 @@ def page(run: Run, size: int = 512, frames: int = 20) -> None:
 
 
 def _measured(avatar, file, size, frames):
-    row: dict[str, Any] = {"gaussians": len(avatar.gaussians.means), "bytes": write_page(file, avatar)}
+    row: dict[str, Any] = {
+        "gaussians": len(avatar.gaussians.means),
+        "bytes": write_page(file, avatar),
+    }
     with Chromium() as browser:
         browser.open(file)
         row["first_image_seconds"] = browser.run("return humangs.firstImage") / 1000
@@ -83,7 +89,11 @@ def _measured(avatar, file, size, frames):
         row["motion_whole"], row["motion_person"] = motion_scores(browser, avatar, 100)
         asked = {"frames": frames, "width": size, "height": size}
         timed = browser.run("return humangs.benchmark(given[0])", asked)
-        return row | {"fps": timed["fps"], "sort_ms": timed["sort_ms"], "console": browser.problems()}
+        return row | {
+            "fps": timed["fps"],
+            "sort_ms": timed["sort_ms"],
+            "console": browser.problems(),
+        }
 
 
 def test_views(avatar: Avatar, size: int) -> tuple[list[Camera], dict[str, BodyPose]]:
@@ -93,11 +103,19 @@ def test_views(avatar: Avatar, size: int) -> tuple[list[Camera], dict[str, BodyP
         "walk": load_motion().pose(WALK_FRAME).rotations,
         "held out": load_capture(f"{DEMO_CAPTURE}/held_out").pose(0).rotations,
     }
-    height, middle = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1])), jnp.asarray(avatar.rest_vertices.mean(0))
-    distance, K = 1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV), intrinsics_from_fov(VERTICAL_FOV, size, size)
+    height, middle = (
+        float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1])),
+        jnp.asarray(avatar.rest_vertices.mean(0)),
+    )
+    distance, K = (
+        1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV),
+        intrinsics_from_fov(VERTICAL_FOV, size, size),
+    )
     cameras = orbit(middle, distance, jnp.asarray(AZIMUTHS), jnp.asarray(ELEVATIONS), K, size, size)
     # the root moves from pose to pose: the cameras look at the T-pose's middle, so it is taken back there
-    return [cameras[i] for i in range(len(AZIMUTHS))], {name: BodyPose(x, jnp.zeros(3)) for name, x in rotations.items()}
+    return [cameras[i] for i in range(len(AZIMUTHS))], {
+        name: BodyPose(x, jnp.zeros(3)) for name, x in rotations.items()
+    }
 
 
 def view_scores(browser: Chromium, avatar: Avatar, size: int) -> dict[str, tuple[float, float]]:
@@ -116,7 +134,9 @@ def view_scores(browser: Chromium, avatar: Avatar, size: int) -> dict[str, tuple
 
 def exact_image(browser: Chromium, camera: Camera, pose: BodyPose) -> Any:
     """The screenshot of one camera and pose on white, (h, w, 3)."""
-    view = {name: np.asarray(getattr(camera, name), float).tolist() for name in ("K", "cam_from_world")}
+    view = {
+        name: np.asarray(getattr(camera, name), float).tolist() for name in ("K", "cam_from_world")
+    }
     view |= {"width": camera.width, "height": camera.height}
     view |= {"rotations": np.asarray(pose.rotations, float).tolist()}
     view |= {"translation": np.asarray(pose.translation, float).tolist()}
@@ -144,10 +164,16 @@ def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float
     browser.run("await humangs.settle()")
     view = browser.run("return humangs.view()")
     image = browser.screenshot()
-    browser.run("document.body.classList.remove('hidden'); document.getElementById('ground').click();")
+    browser.run(
+        "document.body.classList.remove('hidden'); document.getElementById('ground').click();"
+    )
     browser.resize(1280, 800)
-    pose = BodyPose(jnp.asarray(view["rotations"], jnp.float32), jnp.asarray(view["translation"], jnp.float32))
-    camera = Camera.from_opencv(np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"])
+    pose = BodyPose(
+        jnp.asarray(view["rotations"], jnp.float32), jnp.asarray(view["translation"], jnp.float32)
+    )
+    camera = Camera.from_opencv(
+        np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"]
+    )
     return compare(image, avatar, camera, pose)
 
 

@@ -50,7 +50,9 @@ def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
     joints = pose_body(body, shape_body(body, jnp.asarray(capture.betas)), pose).joints
     squares = []
     for names, side in DETAILS.values():
-        (x, y), depth = project(camera, joints[np.asarray([body.joint_names.index(name) for name in names])].mean(0))
+        (x, y), depth = project(
+            camera, joints[np.asarray([body.joint_names.index(name) for name in names])].mean(0)
+        )
         half = max(2, round(0.5 * side * float(camera.K[0, 0]) / float(depth)))
         padded = np.pad(image, ((half, half), (half, half), (0, 0)), constant_values=1.0)
         top, left = (int(np.clip(round(float(value)), 0, image.shape[0])) for value in (y, x))
@@ -82,7 +84,9 @@ POSES: dict[str, dict[str, tuple[float, float, float]]] = {
 
 
 @entry
-def readme_pictures(run: Run, avatar: Path, out: Path = Path("docs/images"), size: int = 512) -> None:
+def readme_pictures(
+    run: Run, avatar: Path, out: Path = Path("docs/images"), size: int = 512
+) -> None:
     """README's row of pictures and its animation: the demo's photos, its avatar from two sides, in new poses, and its face.
 
     Options:
@@ -101,20 +105,31 @@ def readme_pictures(run: Run, avatar: Path, out: Path = Path("docs/images"), siz
             rotations[person.joint_names.index(name)] = np.radians(turn)
         return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
 
-    half = [np.asarray(Image.fromarray(to_uint8(x)).resize((size // 2, size // 2), 1)) / 255 for x in photos.images[:4]]
-    pictures = [np.concatenate([np.concatenate(half[:2], axis=1), np.concatenate(half[2:], axis=1)])]
+    half = [
+        np.asarray(Image.fromarray(to_uint8(x)).resize((size // 2, size // 2), 1)) / 255
+        for x in photos.images[:4]
+    ]
+    pictures = [
+        np.concatenate([np.concatenate(half[:2], axis=1), np.concatenate(half[2:], axis=1)])
+    ]
     rest = a_pose_of(person)
     pictures += [drawn(rest, shot), drawn(rest, dataclasses.replace(shot, azimuth=130.0))]
-    pictures += [drawn(posed(turns), dataclasses.replace(shot, azimuth=30.0)) for turns in POSES.values()]
+    pictures += [
+        drawn(posed(turns), dataclasses.replace(shot, azimuth=30.0)) for turns in POSES.values()
+    ]
     head = person.rest_joints[person.joint_names.index("head")]
     K = jnp.asarray([[2.6 * size, 0, size / 2], [0, 2.6 * size, size / 2], [0, 0, 1]])
     target = head + jnp.asarray([0, 0.06, 0.0])
-    face = look_at(target + jnp.asarray([0.35, 0.05, 1.5]), target, jnp.asarray([0.0, 1, 0]), K, size, size)
+    face = look_at(
+        target + jnp.asarray([0.35, 0.05, 1.5]), target, jnp.asarray([0.0, 1, 0]), K, size, size
+    )
     pictures.append(np.clip(np.asarray(render(animate(person, posed({})), face).rgb), 0, 1))
     strip = np.concatenate([_framed(x, size) for x in pictures], axis=1)
     Image.fromarray(to_uint8(strip)).save(out / "readme.jpg", quality=88)
     motion = load_motion()
-    frames = images(person, *motion_views(person, motion, dataclasses.replace(shot, azimuth=25.0), 40.0), shot)
+    frames = images(
+        person, *motion_views(person, motion, dataclasses.replace(shot, azimuth=25.0), 40.0), shot
+    )
     write_video(out / "animation.gif", frames, motion.fps)
     run.show(f"{out / 'readme.jpg'}: {strip.shape[1]} x {strip.shape[0]}")
 

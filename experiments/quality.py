@@ -28,7 +28,10 @@ COLUMNS = {  # heading and digits
 
 @entry
 def evaluation_views(
-    run: Run, people: People = People(32), views: tuple[int, ...] = (1, 2, 4, 6), plot: Path | None = None
+    run: Run,
+    people: People = People(32),
+    views: tuple[int, ...] = (1, 2, 4, 6),
+    plot: Path | None = None,
 ) -> None:
     """Unseen people from 1 to 6 photos against held-out views, in the pose of the photos and in others.
 
@@ -47,12 +50,20 @@ def evaluation_views(
     def measure(seed, count):
         truth, inputs = subject(seed).held_out, subject(seed).inputs(count)
         drawn = draw_views(reconstruct(start.variables, start.config, inputs), truth).images
-        ours, baseline = (score_tasks(x, truth, start.lpips) for x in (drawn, draw_painted_body(painted_body(inputs), truth)))
-        compared = lambda task: {f"baseline_{name}": baseline[task][name] for name in ("psnr", "ssim", "psnr_fg", "lpips")}
+        ours, baseline = (
+            score_tasks(x, truth, start.lpips)
+            for x in (drawn, draw_painted_body(painted_body(inputs), truth))
+        )
+        compared = lambda task: {
+            f"baseline_{name}": baseline[task][name]
+            for name in ("psnr", "ssim", "psnr_fg", "lpips")
+        }
         return {task: ours[task] | compared(task) for task in ours}
 
     chosen = 4 if 4 in views else max(views)
-    cases = {f"{s}, {n} photos": functools.partial(measure, s, n) for s in start.seeds for n in views}
+    cases = {
+        f"{s}, {n} photos": functools.partial(measure, s, n) for s in start.seeds for n in views
+    }
     rows = run.rows(cases, start.settings)
     by_views = {n: {seed: rows[f"{seed}, {n} photos"] for seed in start.seeds} for n in views}
     section = views_section(by_views, chosen, start.about())
@@ -61,7 +72,15 @@ def evaluation_views(
         link = Path(os.path.relpath(plot, page_of(run.table).parent)).as_posix()
         section += f"\n\n![PSNR against the number of photos]({link})"
     numbers = {n: means(list(row.values())) for n, row in by_views.items()}
-    run.show(section, {"views": chosen, "by_views": numbers, "settings": start.settings, "people": len(start.seeds)})
+    run.show(
+        section,
+        {
+            "views": chosen,
+            "by_views": numbers,
+            "settings": start.settings,
+            "people": len(start.seeds),
+        },
+    )
 
 
 def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) -> str:
@@ -71,7 +90,11 @@ def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) 
     """
     mean = {n: means(list(rows.values())) for n, rows in by_views.items()}
     tasks = [task for task in TASKS if task in mean[chosen]]
-    columns = {key: column for key, column in COLUMNS.items() if mean[chosen][tasks[0]].get(key) is not None}
+    columns = {
+        key: column
+        for key, column in COLUMNS.items()
+        if mean[chosen][tasks[0]].get(key) is not None
+    }
     rows = [[TASKS[task], n, *cells(mean[n][task], columns)] for task in tasks for n in mean]
     return "\n\n".join(
         (
@@ -84,11 +107,24 @@ def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) 
 
 def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
     """Whether more photos are ever worse, and how many people beat their vertex-color baseline."""
-    mean = [(n, float(np.mean([row[task]["psnr"] for row in rows.values()]))) for n, rows in by_views.items()]
-    worse = [f"by {x - y:.2f} dB from {few} to {many} photos" for (few, x), (many, y) in itertools.pairwise(mean) if y < x]
-    said = "on average, PSNR falls " + ", ".join(worse) if worse else "more photos are never worse on average"
+    mean = [
+        (n, float(np.mean([row[task]["psnr"] for row in rows.values()])))
+        for n, rows in by_views.items()
+    ]
+    worse = [
+        f"by {x - y:.2f} dB from {few} to {many} photos"
+        for (few, x), (many, y) in itertools.pairwise(mean)
+        if y < x
+    ]
+    said = (
+        "on average, PSNR falls " + ", ".join(worse)
+        if worse
+        else "more photos are never worse on average"
+    )
     rows = [row[task] for row in by_views[chosen].values()]
-    whole, person = (sum(row[key] > row[f"baseline_{key}"] for row in rows) for key in ("psnr", "psnr_fg"))
+    whole, person = (
+        sum(row[key] > row[f"baseline_{key}"] for row in rows) for key in ("psnr", "psnr_fg")
+    )
     return (
         f"{TASKS[task].capitalize()}: {said}; with {chosen}, {whole} of {len(rows)} people have a higher PSNR than "
         f"their vertex-color baseline, {person} in the foreground alone."
@@ -98,10 +134,22 @@ def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
 def plot_views(path: Path, mean: dict[int, Any]) -> None:
     """PSNR of the whole image and of the foreground against the number of photos, ours and the vertex-color baseline."""
     with figure(path, 2, legend=0.15) as axes:
-        for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole picture", "foreground PSNR"), strict=True):
+        for axis, key, title in zip(
+            axes, ("psnr", "psnr_fg"), ("whole picture", "foreground PSNR"), strict=True
+        ):
             for color, task in enumerate(TASKS):
-                for prefix, style, name in (("", "o-", "ours"), ("baseline_", "s--", "vertex-color baseline")):
+                for prefix, style, name in (
+                    ("", "o-", "ours"),
+                    ("baseline_", "s--", "vertex-color baseline"),
+                ):
                     values = [tasks[task][prefix + key] for tasks in mean.values() if task in tasks]
                     label = f"{name}: {TASKS[task]}"
-                    axis.plot(list(mean)[: len(values)], values, style, ms=4, color=f"C{color}", label=label)
+                    axis.plot(
+                        list(mean)[: len(values)],
+                        values,
+                        style,
+                        ms=4,
+                        color=f"C{color}",
+                        label=label,
+                    )
             axis.set(xlabel="photos", ylabel="PSNR, dB", title=title, xticks=list(mean))

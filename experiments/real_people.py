@@ -15,7 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from experiments.real_capture import CAMERAS, DEMO, SIZE, RealFrame, body_ious, largest_person, prepare, read_frames
+from experiments.real_capture import (
+    CAMERAS,
+    DEMO,
+    SIZE,
+    RealFrame,
+    body_ious,
+    largest_person,
+    prepare,
+    read_frames,
+)
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import images, motion_views, turntable_views
@@ -57,20 +66,37 @@ def without_calibration(
     points = frame.keypoints.points * back[:, None, [0, 1], [0, 1]] + back[:, None, :2, 2]
     focal = np.full(len(points), np.nan) if focal is None else focal
     found = cameras_from_person(
-        PersonViews(points, frame.keypoints.confidences, frame.world, MEDIAPIPE_33.names, tuple(sizes), focal, frame.names)
+        PersonViews(
+            points,
+            frame.keypoints.confidences,
+            frame.world,
+            MEDIAPIPE_33.names,
+            tuple(sizes),
+            focal,
+            frame.names,
+        )
     )
     cameras = [
         Camera.from_opencv(crop @ np.asarray(own.K, float), own.cam_from_world, SIZE, SIZE)
         for crop, own in zip(frame.crop, found.cameras, strict=True)
     ]
     keypoints = frame.keypoints
-    order = np.where(found.mirrored[:, None], MEDIAPIPE_33.mirror, np.arange(len(MEDIAPIPE_33.names)))
-    pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
+    order = np.where(
+        found.mirrored[:, None], MEDIAPIPE_33.mirror, np.arange(len(MEDIAPIPE_33.names))
+    )
+    pick = lambda values: np.take_along_axis(
+        values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1
+    )
     world = pick(frame.world)
     keypoints = dataclasses.replace(
-        keypoints, points=pick(keypoints.points), confidences=pick(keypoints.confidences), world=world.astype(np.float32)
+        keypoints,
+        points=pick(keypoints.points),
+        confidences=pick(keypoints.confidences),
+        world=world.astype(np.float32),
     )
-    return frame._replace(cameras=stack_cameras(cameras), keypoints=keypoints, world=world, moments=found.moments > 1)
+    return frame._replace(
+        cameras=stack_cameras(cameras), keypoints=keypoints, world=world, moments=found.moments > 1
+    )
 
 
 def one_view_each(frames: Sequence[RealFrame]) -> RealFrame:
@@ -78,12 +104,15 @@ def one_view_each(frames: Sequence[RealFrame]) -> RealFrame:
     stack = lambda name: np.stack([getattr(frame, name)[view] for view, frame in enumerate(frames)])
     images, detected, careful = (stack(name) for name in ("images", "detected", "careful"))
     points, confidences = (
-        np.stack([getattr(f.keypoints, n)[v] for v, f in enumerate(frames)]) for n in ("points", "confidences")
+        np.stack([getattr(f.keypoints, n)[v] for v, f in enumerate(frames)])
+        for n in ("points", "confidences")
     )
     cameras = stack_cameras([frame.cameras[view] for view, frame in enumerate(frames)])
     keypoints = dataclasses.replace(frames[0].keypoints, points=points, confidences=confidences)
     names = tuple(frame.names[view] for view, frame in enumerate(frames))
-    return RealFrame(images, detected, careful, cameras, keypoints, stack("world"), stack("crop"), names)
+    return RealFrame(
+        images, detected, careful, cameras, keypoints, stack("world"), stack("crop"), names
+    )
 
 
 def video_sizes(data: Path) -> list[tuple[int, int]]:
@@ -108,10 +137,21 @@ def person_in_rooms(seed: int, data: Path) -> tuple[RealFrame, Capture, Capture]
         images.append((np.round(255 * photo) / 255).astype(np.float32))
         people.append(largest_person(networks, images[-1]))
     stack = lambda name: np.stack([getattr(person, name) for person in people])
-    keypoints = Keypoints(stack("pixels").astype(np.float32), stack("visibility").astype(np.float32), MEDIAPIPE_33)
+    keypoints = Keypoints(
+        stack("pixels").astype(np.float32), stack("visibility").astype(np.float32), MEDIAPIPE_33
+    )
     same = np.broadcast_to(np.eye(3), (PHOTOS, 3, 3))
     names = tuple(f"person_{seed}_{name}" for name in CAMERAS)
-    found = RealFrame(np.stack(images), stack("mask"), true.masks, true.cameras, keypoints, stack("world"), same, names)
+    found = RealFrame(
+        np.stack(images),
+        stack("mask"),
+        true.masks,
+        true.cameras,
+        keypoints,
+        stack("world"),
+        same,
+        names,
+    )
     return found, true, subject.held_out
 
 
@@ -121,14 +161,22 @@ def as_fitted(held_out: Capture, true: Capture, body: Capture, same_world: bool)
     """
     cameras = held_out.cameras
     if not same_world:
-        own, there = (posed_vertices(each.body, jnp.asarray(each.betas), each.poses)[0] for each in (body, true))
-        move, moved = align_points(np.asarray(own, float), np.asarray(there, float), np.ones(len(own))), []
+        own, there = (
+            posed_vertices(each.body, jnp.asarray(each.betas), each.poses)[0]
+            for each in (body, true)
+        )
+        move, moved = (
+            align_points(np.asarray(own, float), np.asarray(there, float), np.ones(len(own))),
+            [],
+        )
         for K, matrix in zip(cameras.K, cameras.cam_from_world, strict=True):
             matrix = np.asarray(matrix, float) @ move.matrix()
             matrix[:3] /= move.scale
             moved.append(Camera.from_opencv(K, matrix, SIZE, SIZE))
         cameras = stack_cameras(moved)
-    return dataclasses.replace(held_out, cameras=cameras, betas=body.betas, poses=body.poses, body=body.body)
+    return dataclasses.replace(
+        held_out, cameras=cameras, betas=body.betas, poses=body.poses, body=body.body
+    )
 
 
 # The command ---------------------------------------------------------------------------------------------------------
@@ -146,16 +194,30 @@ def started(data: Path, frame: int) -> dict[str, float]:
             height, width = image.shape[:2]
             larger = np.sqrt(PIXELS / (height * width))
             size = round(width * larger), round(height * larger)
-            Image.fromarray(image).resize(size, Image.Resampling.BICUBIC).save(photos / f"{name}.jpg", quality=95)
+            Image.fromarray(image).resize(size, Image.Resampling.BICUBIC).save(
+                photos / f"{name}.jpg", quality=95
+            )
         environment = os.environ | {"HUMANGS_COMPILE_CACHE": str(Path(place) / "cache")}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         seconds = {}
         for when in ("first", "compiled"):
             out = Path(place) / when
             begun, used = time.perf_counter(), _processor_time()
-            command = [sys.executable, "-m", "humangs_jax.cli", "start", photos, "--out", out, "--no-browser"]
+            command = [
+                sys.executable,
+                "-m",
+                "humangs_jax.cli",
+                "start",
+                photos,
+                "--out",
+                out,
+                "--no-browser",
+            ]
             subprocess.run([str(word) for word in command], check=True, env=environment)
-            seconds[when], seconds[f"{when}_processor"] = time.perf_counter() - begun, _processor_time() - used
+            seconds[when], seconds[f"{when}_processor"] = (
+                time.perf_counter() - begun,
+                _processor_time() - used,
+            )
         return seconds | {"load": os.getloadavg()[0]}
 
 
@@ -179,7 +241,15 @@ def draw_sheet(avatar: Avatar, body: Capture, path: Path) -> None:
     Image.fromarray(sheet).save(path, quality=90)
 
 
-STD = StateStd(focal=0.005, camera_rotation=1.5, camera_center=0.03, body_pose=10.0, global_orient=6.0, betas=1.0, clothing=0.001)
+STD = StateStd(
+    focal=0.005,
+    camera_rotation=1.5,
+    camera_center=0.03,
+    body_pose=10.0,
+    global_orient=6.0,
+    betas=1.0,
+    clothing=0.001,
+)
 CONFIG = CaptureRefineConfig(std=STD, coefficients=22, robust_scales=(1.0, 1.0), independent=100.0)
 """A body that fills the masks: for cameras, not for avatars."""
 TIMES = 4
@@ -231,21 +301,36 @@ def _found(frames):
         points=np.asarray(points, np.float32),
         confidences=np.concatenate([frame.keypoints.confidences for frame in frames]),
     )
-    names, white = tuple(name for frame in frames for name in frame.names), np.ones((SIZE, SIZE, 3), np.float32)
+    names, white = (
+        tuple(name for frame in frames for name in frame.names),
+        np.ones((SIZE, SIZE, 3), np.float32),
+    )
     images = np.broadcast_to(white, (len(masks), *white.shape))
-    photos = Photos(images, np.stack(masks), stack_cameras(cameras), np.asarray(numbers, np.int32), names)
+    photos = Photos(
+        images, np.stack(masks), stack_cameras(cameras), np.asarray(numbers, np.int32), names
+    )
     found = fit_photos(photos, keypoints, load_body()).capture
     for _ in range(TIMES):
         scene = Scene(found, keypoints, CONFIG)
         found = moved_capture(found, scene.origin, scene.run()[0])
-    print("silhouettes with the cameras of all frames:", np.round(body_ious(found, np.stack(masks)), 3))
-    first = [np.asarray(each[: len(CAMERAS)], float) for each in (found.cameras.K, found.cameras.cam_from_world)]
+    print(
+        "silhouettes with the cameras of all frames:",
+        np.round(body_ious(found, np.stack(masks)), 3),
+    )
+    first = [
+        np.asarray(each[: len(CAMERAS)], float)
+        for each in (found.cameras.K, found.cameras.cam_from_world)
+    ]
     return Reference(np.linalg.inv(common) @ first[0], first[1])
 
 
 def _square(least, most):
     side = float((most - least).max())
-    return np.diag([SIZE / side, SIZE / side, 1.0]) @ [[1, 0, -least[0]], [0, 1, -least[1]], [0, 0, 1]]
+    return np.diag([SIZE / side, SIZE / side, 1.0]) @ [
+        [1, 0, -least[0]],
+        [0, 1, -least[1]],
+        [0, 0, 1],
+    ]
 
 
 def to_reference(own: Camera, reference: Camera) -> Similarity:
@@ -258,13 +343,17 @@ def to_reference(own: Camera, reference: Camera) -> Similarity:
     return Similarity(scale, rotation, places.mean(0) - scale * rotation @ centers.mean(0))
 
 
-def camera_errors(own: Camera, reference: Camera) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
+def camera_errors(
+    own: Camera, reference: Camera
+) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
     """Degrees, and centimetres of the reference's world, after one similarity."""
     move = to_reference(own, reference)
     (rotations, centers), (targets, places) = (_axes(each) for each in (own, reference))
     turns = targets @ move.rotation @ np.swapaxes(rotations, 1, 2)
     cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
-    return np.degrees(np.arccos(np.clip(cosines, -1, 1))), 100 * np.linalg.norm(move(centers) - places, axis=1)
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1))), 100 * np.linalg.norm(
+        move(centers) - places, axis=1
+    )
 
 
 def seen_from(own: Camera, used: Sequence[int], reference: Camera, view: int) -> Camera:

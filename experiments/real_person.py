@@ -54,7 +54,11 @@ from humangs_jax.refinement.refine import refine
 PSNRS = {"psnr": ("held out", 1), "psnr_fg": ("foreground", 2), "alex": ("LPIPS alex", 3)}
 CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
 SECONDS = {"first": ("first time, s", 0), "compiled": ("compiled, s", 0)}
-SECONDS |= {"first_processor": ("processor: first, s", 0), "compiled_processor": ("compiled, s", 0), "load": ("load", 0)}
+SECONDS |= {
+    "first_processor": ("processor: first, s", 0),
+    "compiled_processor": ("compiled, s", 0),
+    "load": ("load", 0),
+}
 IOUS = {"iou": ("IoU", 3), "iou_unseen": ("IoU, unseen", 3)}
 TABLES = (
     (("calibrated", "uncalibrated", "poses", "moments"), IOUS | PSNRS | CAMERAS),
@@ -84,7 +88,9 @@ class Man:
         self.data, self.numbers = data, list(frames)
         self.frames: dict[int | str, RealFrame] = dict(prepare(data, frames))
         self.reference = reference_cameras(data)
-        self.photos, self.fits, self.body = map(functools.cache, (self._photos, self._fits, self._body))
+        self.photos, self.fits, self.body = map(
+            functools.cache, (self._photos, self._fits, self._body)
+        )
 
     def _photos(self, name: int | str, masks: str) -> Photos:
         frame, place = self.frames[name], self.data / "captures" / f"{name}_{masks}"
@@ -92,16 +98,24 @@ class Man:
         return load_photos(place, fit_masks=True)
 
     def _fits(self, name: int | str, masks: str, views: tuple[int, ...]) -> FittedCapture:
-        photos, keypoints, at = self.photos(name, masks), self.frames[name].keypoints, np.asarray(views)
+        photos, keypoints, at = (
+            self.photos(name, masks),
+            self.frames[name].keypoints,
+            np.asarray(views),
+        )
         assert photos.masks is not None
         confidences = keypoints.confidences[at]
-        keypoints = dataclasses.replace(keypoints, points=keypoints.points[at], confidences=confidences)
+        keypoints = dataclasses.replace(
+            keypoints, points=keypoints.points[at], confidences=confidences
+        )
         cameras = jax.tree.map(lambda leaf: leaf[at], photos.cameras)
         names = tuple(photos.names[view] for view in views)
         chosen = Photos(photos.images[at], photos.masks[at], cameras, photos.frames[at], names)
         return fit_photos(chosen, keypoints, load_body())
 
-    def _body(self, name: int | str, masks: str, way: str = "refine", views: tuple[int, ...] = ALL) -> Capture:
+    def _body(
+        self, name: int | str, masks: str, way: str = "refine", views: tuple[int, ...] = ALL
+    ) -> Capture:
         """A capture of some views with its body, as `humangs start` finds it."""
         if way == "fit":
             return self.fits(name, masks, views).capture
@@ -109,14 +123,21 @@ class Man:
         fixed = not fitted.camera_errors if moments is None else moments
         known = {"fixed_cameras": fixed, "calibrated": moments is None}
         configs = [usual_config(fitted=True, tight=tight, **known) for tight in (False, True)]
-        refined = [refine_capture(fitted.capture, keypoints=fitted.record.keypoints, config=config) for config in configs]
+        refined = [
+            refine_capture(fitted.capture, keypoints=fitted.record.keypoints, config=config)
+            for config in configs
+        ]
         loose, tight = (each.capture for each in refined)
-        return better_body(*load_weights(), loose, tight, RefineConfig(iterations=ITERATIONS, steps=0))[0]
+        return better_body(
+            *load_weights(), loose, tight, RefineConfig(iterations=ITERATIONS, steps=0)
+        )[0]
 
 
 def avatar_of(capture: Capture) -> Avatar:
     """By the network, and iterations of the learned update."""
-    return refine(reconstruct(*load_weights(), capture), capture, RefineConfig(iterations=ITERATIONS, steps=0))
+    return refine(
+        reconstruct(*load_weights(), capture), capture, RefineConfig(iterations=ITERATIONS, steps=0)
+    )
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -125,7 +146,11 @@ def avatar_of(capture: Capture) -> Avatar:
 def calibrated(man: Man) -> Cases:
     """The published calibration and nothing else."""
     for masks, way, number in itertools.product(MASKS, ("refine", "fit"), man.numbers):
-        yield f"calibrated, {way}, {masks}", str(number), functools.partial(_calibrated, man, number, masks, way)
+        yield (
+            f"calibrated, {way}, {masks}",
+            str(number),
+            functools.partial(_calibrated, man, number, masks, way),
+        )
 
 
 def _calibrated(man, number, masks, way):
@@ -135,9 +160,13 @@ def _calibrated(man, number, masks, way):
         used = tuple(other for other in ALL if other != view)
         blind = man.body(number, masks, way, used)
         camera = seen_from(blind.cameras, used, man.reference.of(frame), view)
-        unseen += body_ious(dataclasses.replace(blind.select([0]), cameras=camera), frame.careful[[view]])
+        unseen += body_ious(
+            dataclasses.replace(blind.select([0]), cameras=camera), frame.careful[[view]]
+        )
     scores = mean_scores(known) | {"iou": float(np.mean(body_ious(body, frame.careful)))}
-    scores |= {"iou_unseen": float(np.mean(unseen))} | _errors(body.cameras, man.reference.of(frame))
+    scores |= {"iou_unseen": float(np.mean(unseen))} | _errors(
+        body.cameras, man.reference.of(frame)
+    )
     return scores | {"each_psnr_fg": [row["psnr_fg"] for row in known], "each_iou_unseen": unseen}
 
 
@@ -145,7 +174,11 @@ def poses(man: Man) -> Cases:
     """The avatar of one frame in the poses of the others."""
     first, *others = man.numbers
     for number in others:
-        yield f"poses, avatar of frame {first}", str(number), functools.partial(_posed, man, first, number)
+        yield (
+            f"poses, avatar of frame {first}",
+            str(number),
+            functools.partial(_posed, man, first, number),
+        )
 
 
 def _posed(man, first, number):
@@ -158,14 +191,20 @@ def uncalibrated(man: Man) -> Cases:
     """Nothing is given: cameras from the person, in photos with the lenses' distortion."""
     bent = prepare(man.data, man.numbers, straight=False)
     for masks, number in itertools.product(MASKS, man.numbers):
-        yield f"uncalibrated, {masks}", str(number), functools.partial(_uncalibrated, man, number, bent[number], masks)
+        yield (
+            f"uncalibrated, {masks}",
+            str(number),
+            functools.partial(_uncalibrated, man, number, bent[number], masks),
+        )
 
 
 def _uncalibrated(man, number, frame, masks):
     name = f"{number}_bent"
     man.frames[name] = frame = without_calibration(frame, video_sizes(man.data))
     body, reference = man.body(name, masks), man.reference.of(frame)
-    scores = mean_scores(held_out(body, frame, avatar_of)) | {"iou": float(np.mean(body_ious(body, frame.careful)))}
+    scores = mean_scores(held_out(body, frame, avatar_of)) | {
+        "iou": float(np.mean(body_ious(body, frame.careful)))
+    }
     return scores | _errors(frame.cameras, reference, "_start") | _errors(body.cameras, reference)
 
 
@@ -193,7 +232,11 @@ def _moments(man, frames, first):
     frame = without_calibration(one_view_each(frames), video_sizes(man.data))
     man.frames[f"moments_{first}"] = frame
     ious = body_ious(man.body(f"moments_{first}", "detected"), frame.careful)
-    return {"iou": float(np.mean(ious)), "each_iou": ious, "taken_for_moments": float(frame.moments is True)}
+    return {
+        "iou": float(np.mean(ious)),
+        "each_iou": ious,
+        "taken_for_moments": float(frame.moments is True),
+    }
 
 
 def rooms(man: Man) -> Cases:
@@ -215,7 +258,11 @@ def _in_room(man, seed, person, way):
     man.frames[name] = frame
     body = man.body(name, "detected")
     scores = drawn_psnrs(avatar_of(body), as_fitted(held, true, body, way == "true cameras"))
-    return scores | {"iou": float(np.mean(body_ious(body, true.masks)))} | _errors(body.cameras, true.cameras)
+    return (
+        scores
+        | {"iou": float(np.mean(body_ious(body, true.masks)))}
+        | _errors(body.cameras, true.cameras)
+    )
 
 
 def start(man: Man) -> Cases:
@@ -234,9 +281,15 @@ def _table(rows, kinds, columns):
     lines = []
     for row, cases in rows.items():
         if row.split(",")[0] in kinds:
-            means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
+            means = mean_scores(
+                {k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values()
+            )
             lines.append([row, len(cases), *cells(means, columns)])
-    return markdown_table(["row", "cases", *(heading for heading, _ in columns.values())], lines) if lines else ""
+    return (
+        markdown_table(["row", "cases", *(heading for heading, _ in columns.values())], lines)
+        if lines
+        else ""
+    )
 
 
 @entry
@@ -263,13 +316,21 @@ def real_person(
     """
     if not all(0 <= frame < 100 for frame in frames):
         raise ValueError("--frames: expected 0 to 99")
-    if unknown := [row for row in rows if not row.startswith(names := tuple(each.__name__ for each in ROWS))]:
+    if unknown := [
+        row for row in rows if not row.startswith(names := tuple(each.__name__ for each in ROWS))
+    ]:
         raise ValueError(f"--rows {unknown[0]}: expected beginnings of rows: {', '.join(names)}")
     enable_compile_cache()
     man = Man(data, frames)
-    wanted = itertools.chain(*(each(man) for each in ROWS if any(row.startswith(each.__name__) for row in rows)))
+    wanted = itertools.chain(
+        *(each(man) for each in ROWS if any(row.startswith(each.__name__) for row in rows))
+    )
     cases = {f"{row}: {case}": scores for row, case, scores in wanted if row.startswith(rows)}
-    settings = {"capture": f"{PACKAGE} {VERSION}", "iterations": ITERATIONS, "weights": shipped_digest(SHIPPED)}
+    settings = {
+        "capture": f"{PACKAGE} {VERSION}",
+        "iterations": ITERATIONS,
+        "weights": shipped_digest(SHIPPED),
+    }
     results: dict[str, dict[str, Any]] = {}
     for name, scores in run.rows(cases, settings).items():
         row, _, case = name.partition(": ")

@@ -130,24 +130,53 @@ def reconstruction_benchmark(
     memory_size: side of the photos there
     """
     config, large = configured(preset, size), configured(preset, memory_size)
-    settings = {"preset": preset, "views": views, "size": size, "dtype": config.runtime.dtype, "repeats": repeats}
+    settings = {
+        "preset": preset,
+        "views": views,
+        "size": size,
+        "dtype": config.runtime.dtype,
+        "repeats": repeats,
+    }
     cases = {"time": functools.partial(benchmark, config, views, size, repeats)}
     for name, count in itertools.product(TOKENS, memory):
-        cases[f"{name}, {count}"] = functools.partial(_memory, large.with_runtime(tokens=name), count, memory_size)
+        cases[f"{name}, {count}"] = functools.partial(
+            _memory, large.with_runtime(tokens=name), count, memory_size
+        )
     rows, table = run.rows(cases, settings | {"memory_size": memory_size}), []
     for name in TOKENS:
         case = rows["time"][name]
-        cells = [f"{case['ms'] / 1e3:.1f}, {case['cpu_ms'] / 1e3:.1f}", f"{case['flops'] / 1e9:.0f}"]
-        cells += [f"{case['over_products']:.2f}", f"{case['temporary_mb']:.0f}", f"{case['compile_s']:.1f}"]
+        cells = [
+            f"{case['ms'] / 1e3:.1f}, {case['cpu_ms'] / 1e3:.1f}",
+            f"{case['flops'] / 1e9:.0f}",
+        ]
+        cells += [
+            f"{case['over_products']:.2f}",
+            f"{case['temporary_mb']:.0f}",
+            f"{case['compile_s']:.1f}",
+        ]
         table.append([name, case["tokens"], *cells])
-    header = ["tokens", "slots", "wall, CPU s", "GFLOP", "over plain products (CPU)", "MiB", "compile s"]
+    header = [
+        "tokens",
+        "slots",
+        "wall, CPU s",
+        "GFLOP",
+        "over plain products (CPU)",
+        "MiB",
+        "compile s",
+    ]
     title = f"{preset}, {views} views of {size}, {config.runtime.dtype}, {rows['time']['device']}."
     run.show(f"{title}\n\n{markdown_table(header, table)}", rows["time"] | settings)
     if memory:
         table = [
-            [f"{name} tokens, {unit}", *(f"{scale * rows[f'{name}, {n}'][key]:.{digits}f}" for n in memory)]
+            [
+                f"{name} tokens, {unit}",
+                *(f"{scale * rows[f'{name}, {n}'][key]:.{digits}f}" for n in memory),
+            ]
             for name in TOKENS
-            for unit, key, scale, digits in (("MiB", "temporary_mb", 1, 0), ("TFLOP", "flops", 1e-12, 2))
+            for unit, key, scale, digits in (
+                ("MiB", "temporary_mb", 1, 0),
+                ("TFLOP", "flops", 1e-12, 2),
+            )
         ]
         header = [f"{preset} at {memory_size}", *(f"{count} views" for count in memory)]
         rows.pop("time")
@@ -164,14 +193,27 @@ def benchmark(config: HumanGSConfig, views: int, size: int, repeats: int) -> dic
     for name, case in zip(TOKENS, (config.with_runtime(tokens="all"), packed), strict=True):
         program, seconds, flops = whole(variables, inputs, case)
         tokens = round(touched / share) if name == "all" else case.runtime.token_capacity
-        facts[name] = {"compile_s": seconds, "flops": flops, "temporary_mb": temporary_mb(program), "tokens": tokens}
+        facts[name] = {
+            "compile_s": seconds,
+            "flops": flops,
+            "temporary_mb": temporary_mb(program),
+            "tokens": tokens,
+        }
         runs[name] = lambda program=program: jax.block_until_ready(program(variables, inputs))
     times = {name: list(map(float, pair)) for name, pair in medians(runs, repeats).items()}
     for name, fact in facts.items():
         wall, cpu = times[name]
-        fact |= {"ms": wall, "cpu_ms": cpu, "over_products": cpu / times["matmul"][1] * product_flops / fact["flops"]}
+        fact |= {
+            "ms": wall,
+            "cpu_ms": cpu,
+            "over_products": cpu / times["matmul"][1] * product_flops / fact["flops"],
+        }
     gflops = product_flops / times["matmul"][0] / 1e6
-    return facts | {"matmul_gflops": gflops, "foreground_share": share, "device": jax.devices()[0].device_kind}
+    return facts | {
+        "matmul_gflops": gflops,
+        "foreground_share": share,
+        "device": jax.devices()[0].device_kind,
+    }
 
 
 def _memory(config: HumanGSConfig, views: int, size: int) -> dict[str, float]:
@@ -185,7 +227,9 @@ def _memory(config: HumanGSConfig, views: int, size: int) -> dict[str, float]:
 
 
 @entry
-def reconstruction_batches(run: Run, sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 32), runs: int = 3) -> None:
+def reconstruction_batches(
+    run: Run, sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 32), runs: int = 3
+) -> None:
     """Subjects a second of `hg.reconstruct_views` under `vmap`, by the size of the batch: four photos, shipped weights.
 
     Options:
@@ -200,9 +244,19 @@ def reconstruction_batches(run: Run, sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 3
         program = batched.lower(variables, own, body, views).compile()
         memory[str(size)] = temporary_mb(program)
         arguments = variables, own, body, views
-        calls[str(size)] = lambda program=program, arguments=arguments: jax.block_until_ready(program(*arguments))
+        calls[str(size)] = lambda program=program, arguments=arguments: jax.block_until_ready(
+            program(*arguments)
+        )
     each = {size: float(ms[0]) / int(size) for size, ms in medians(calls, runs).items()}
     first = each[str(sizes[0])]
-    rows = [[size, f"{1000 / ms:.2f}", f"{first / ms:.2f}", f"{memory[size]:,.0f}"] for size, ms in each.items()]
-    header = ["subjects in a batch", "subjects a second", f"relative to {sizes[0]}", "working memory, MB"]
+    rows = [
+        [size, f"{1000 / ms:.2f}", f"{first / ms:.2f}", f"{memory[size]:,.0f}"]
+        for size, ms in each.items()
+    ]
+    header = [
+        "subjects in a batch",
+        "subjects a second",
+        f"relative to {sizes[0]}",
+        "working memory, MB",
+    ]
     run.show(markdown_table(header, rows, "rrrr"), {"ms": each, "memory_mb": memory})

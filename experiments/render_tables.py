@@ -20,8 +20,12 @@ FORMATS = re.compile(r"(?<=<!-- formats: )(?P<name>\w+)( -->\n).*?(?=<!-- end --
 
 def main() -> int:
     """Command line; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="report what differs instead of writing it")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="report what differs instead of writing it"
+    )
     arguments = parser.parse_args()
     faults = render_pages(REPOSITORY, write=not arguments.check)
     print("\n".join(faults) or "All tables are those of docs/results.")
@@ -35,16 +39,27 @@ def render_pages(repository: Path, write: bool) -> list[str]:
     for page in pages(repository):
         old = page.read_text()
         names = [match["name"] for match in SECTION.finditer(old)]
-        faults += [f"{page.name}: no docs/results/{name}.json for its table" for name in names if name not in known]
-        faults += [f"{page.name}: a table marker without its end" for _ in range(old.count("<!-- table: ") - len(names))]
+        faults += [
+            f"{page.name}: no docs/results/{name}.json for its table"
+            for name in names
+            if name not in known
+        ]
+        faults += [
+            f"{page.name}: a table marker without its end"
+            for _ in range(old.count("<!-- table: ") - len(names))
+        ]
         shown.update(names)
         new = rendered(old, results, [name for name in names if name in known])
         new = FORMATS.sub(lambda match: match["name"] + match[2] + format_table(match["name"]), new)
         if new != old and write:
             write_text(page, new)
         elif new != old:
-            faults.append(f"{page.name}: differs from docs/results; run experiments/render_tables.py")
-    return faults + [f"docs/results/{name}.json: shown on no page" for name in sorted(known - shown)]
+            faults.append(
+                f"{page.name}: differs from docs/results; run experiments/render_tables.py"
+            )
+    return faults + [
+        f"docs/results/{name}.json: shown on no page" for name in sorted(known - shown)
+    ]
 
 
 def format_table(name: str) -> str:
@@ -73,7 +88,9 @@ def format_table(name: str) -> str:
             (
                 about,
                 quoted(each.keys),
-                each.up if each.fixed or not each.also else f"{each.up}, or {', '.join(each.also)} where people stand so",
+                each.up
+                if each.fixed or not each.also
+                else f"{each.up}, or {', '.join(each.also)} where people stand so",
                 "must be given" if each.fps is None else f"{each.fps:g}",
             )
             for about, each in arrays

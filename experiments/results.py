@@ -25,7 +25,9 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SECTION = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(?=<!-- end -->)", re.DOTALL)
+SECTION = re.compile(
+    r"(<!-- table: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(?=<!-- end -->)", re.DOTALL
+)
 PACKAGES = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
 ALIGNMENTS = {"l": "---", "r": "---:"}
 
@@ -49,22 +51,37 @@ def json_text(value: Any, indent: str = "") -> str:
     if isinstance(value, dict) and value:
         # a key that is no string becomes one as json.dumps makes it
         keys = [next(iter(json.loads(json.dumps({key: None})))) for key in value]
-        items = [f"{json.dumps(key)}: {json_text(item, inner)}" for key, item in zip(keys, value.values(), strict=True)]
+        items = [
+            f"{json.dumps(key)}: {json_text(item, inner)}"
+            for key, item in zip(keys, value.values(), strict=True)
+        ]
         brackets = "{}"
-    elif isinstance(value, list | tuple) and any(isinstance(item, dict | list | tuple) for item in value):
+    elif isinstance(value, list | tuple) and any(
+        isinstance(item, dict | list | tuple) for item in value
+    ):
         items, brackets = [json_text(item, inner) for item in value], "[]"
     else:
-        return json.dumps(value, ensure_ascii=False, default=lambda array: array.tolist())  # of numpy
-    return f"{brackets[0]}\n" + ",\n".join(inner + item for item in items) + f"\n{indent}{brackets[1]}"
+        return json.dumps(
+            value, ensure_ascii=False, default=lambda array: array.tolist()
+        )  # of numpy
+    return (
+        f"{brackets[0]}\n" + ",\n".join(inner + item for item in items) + f"\n{indent}{brackets[1]}"
+    )
 
 
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]], align: str | None = None) -> str:
+def markdown_table(
+    header: Sequence[str], rows: Sequence[Sequence[object]], align: str | None = None
+) -> str:
     """A table. align holds "l" or "r" for each column; by default the first is aligned to the left, others to the right."""
     rule = [ALIGNMENTS[side] for side in align or default_alignment(header)]
-    return "\n".join("| " + " | ".join(str(cell) for cell in row) + " |" for row in (header, rule, *rows))
+    return "\n".join(
+        "| " + " | ".join(str(cell) for cell in row) + " |" for row in (header, rule, *rows)
+    )
 
 
-def cells(numbers: Mapping[str, float | None], columns: Mapping[str, tuple[str, int]], missing: str = "-") -> list[str]:
+def cells(
+    numbers: Mapping[str, float | None], columns: Mapping[str, tuple[str, int]], missing: str = "-"
+) -> list[str]:
     """Numbers of a row, by columns: key -> heading and digits."""
     values = ((numbers.get(key), digits) for key, (_, digits) in columns.items())
     return [missing if value is None else f"{value:,.{digits}f}" for value, digits in values]
@@ -85,7 +102,9 @@ def blocks_of(text: str) -> list[str | dict[str, Any]]:
     blocks: list[str | dict[str, Any]] = []
     for paragraph in re.split(r"\n\s*\n", text.strip()):
         if paragraph.startswith("|"):
-            header, rule, *rows = [[c.strip() for c in line.strip()[1:-1].split("|")] for line in paragraph.split("\n")]
+            header, rule, *rows = [
+                [c.strip() for c in line.strip()[1:-1].split("|")] for line in paragraph.split("\n")
+            ]
             align = "".join("r" if side.endswith(":") else "l" for side in rule)
             blocks.append({"header": header, "rows": rows})
             if align != default_alignment(header):
@@ -96,13 +115,19 @@ def blocks_of(text: str) -> list[str | dict[str, Any]]:
 
 
 def text_of(blocks: Sequence[str | dict[str, Any]]) -> str:
-    return "\n\n".join(block if isinstance(block, str) else markdown_table(**block) for block in blocks)
+    return "\n\n".join(
+        block if isinstance(block, str) else markdown_table(**block) for block in blocks
+    )
 
 
 def pages(repository: Path | None = None) -> list[Path]:
     """README.md, all pages of the docs, and that of the experiments."""
     repository = repository or REPOSITORY
-    found = [repository / "README.md", repository / "experiments" / "README.md", *sorted((repository / "docs").rglob("*.md"))]
+    found = [
+        repository / "README.md",
+        repository / "experiments" / "README.md",
+        *sorted((repository / "docs").rglob("*.md")),
+    ]
     return [page for page in found if page.is_file()]
 
 
@@ -111,7 +136,12 @@ def page_of(name: str) -> Path:
 
     Raises: ValueError unless one page does, once.
     """
-    found = [page for page in pages() for match in SECTION.finditer(page.read_text()) if match["name"] == name]
+    found = [
+        page
+        for page in pages()
+        for match in SECTION.finditer(page.read_text())
+        if match["name"] == name
+    ]
     if len(found) != 1:
         raise ValueError(
             f"needs <!-- table: {name} --> and <!-- end --> once in README.md, experiments/README.md or docs/, found {len(found)}"
@@ -119,7 +149,9 @@ def page_of(name: str) -> Path:
     return found[0]
 
 
-def publish(page: Path, name: str, text: str, numbers: object = None, record: dict[str, Any] | None = None) -> None:
+def publish(
+    page: Path, name: str, text: str, numbers: object = None, record: dict[str, Any] | None = None
+) -> None:
     """Writes docs/results/NAME.json, and the page's section of that name.
 
     record: what made it, by default this process (`run_record`).
@@ -140,7 +172,11 @@ def rendered(page: str, results: Path, names: Sequence[str] | None = None) -> st
     def section(match: re.Match[str]) -> str:
         if names is not None and match["name"] not in names:
             return match[0]
-        return match[1] + text_of(json.loads((results / f"{match['name']}.json").read_text())["blocks"]) + "\n"
+        return (
+            match[1]
+            + text_of(json.loads((results / f"{match['name']}.json").read_text())["blocks"])
+            + "\n"
+        )
 
     return SECTION.sub(section, page)
 
@@ -150,14 +186,19 @@ def run_record(name: str | None = None, options: Sequence[str] | None = None) ->
     also after NAME=), date, machine, versions.
     """
     script = Path(sys.argv[0]).resolve()
-    made_by = script.relative_to(REPOSITORY).as_posix() if script.is_relative_to(REPOSITORY) else script.name
+    made_by = (
+        script.relative_to(REPOSITORY).as_posix()
+        if script.is_relative_to(REPOSITORY)
+        else script.name
+    )
     given = sys.argv[1:] if options is None else options
     return {
         "script": f"python -m experiments {name}" if name else made_by,
         "arguments": shlex.join(re.sub(r"(^|=)/.*/", r"\1", each) for each in given),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": {"cpu": cpu_model(), "cores": cores()},
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in PACKAGES},
+        "versions": {"python": platform.python_version()}
+        | {name: version(name) for name in PACKAGES},
     }
 
 
@@ -168,7 +209,9 @@ def cores() -> int | None:
 
 def cpu_model() -> str:
     information = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", information.read_text()) if information.exists() else []
+    names = (
+        re.findall(r"model name\s*: (.*)", information.read_text()) if information.exists() else []
+    )
     return names[0] if names else platform.processor() or platform.machine()
 
 

@@ -66,7 +66,9 @@ CASES: dict[str, Case] = {
     "4 stops under": Case(changes.photos(lambda x: x / 16)),
     "black": Case(changes.photos(np.zeros_like)),
     "white": Case(changes.photos(np.ones_like)),
-    "noise": Case(changes.photos(lambda x: np.random.default_rng(0).random(x.shape).astype(np.float32))),
+    "noise": Case(
+        changes.photos(lambda x: np.random.default_rng(0).random(x.shape).astype(np.float32))
+    ),
     "focal length x 2": Case(changes.cameras(changes.focal(2.0))),
     "focal length / 2": Case(changes.cameras(changes.focal(0.5))),
     "focal length x 10": Case(changes.cameras(changes.focal(10.0))),
@@ -142,7 +144,9 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
             rows.append([name, "error", "", "", "", row["error"]])
             continue
         shown = [f"{row['reach']:.2f}", f"{row['psnr']:.1f}", f"{row['psnr_fg']:.1f}"]
-        rows.append([name, "warned" if row["warnings"] else "avatar", *shown, (row["warnings"] or [""])[0]])
+        rows.append(
+            [name, "warned" if row["warnings"] else "avatar", *shown, (row["warnings"] or [""])[0]]
+        )
     header = ["case", "result", "reach", "PSNR", "foreground PSNR", "first line"]
     run.show(markdown_table(header, rows, "llrrrl"), numbers)
 
@@ -154,28 +158,59 @@ BOUND = 1.0
 RENDERED = "distance of the cameras"
 """The quantity with new photos from the cameras as they are changed."""
 LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
-    "photos": ("", 4, {n: lambda c, n=n: c.select(list(range(0, changes.VIEWS, changes.VIEWS // n))) for n in (1, 2)}),
+    "photos": (
+        "",
+        4,
+        {
+            n: lambda c, n=n: c.select(list(range(0, changes.VIEWS, changes.VIEWS // n)))
+            for n in (1, 2)
+        },
+    ),
     "noise": (
         "standard deviation",
         0,
-        {x: changes.photos(lambda i, x=x: i + x * noise(4, i.shape)) for x in (0.05, 0.1, 0.2, 0.4)},
+        {
+            x: changes.photos(lambda i, x=x: i + x * noise(4, i.shape))
+            for x in (0.05, 0.1, 0.2, 0.4)
+        },
     ),
-    "distance of the cameras": ("m", None, {x: changes.far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)}),
-    "height of the person": ("pixels of 256", None, {x: changes.person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)}),
-    "masks too large or small": ("pixels of 256", 0, {x: changes.masks_grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
-    "focal length": ("%", 0, {x: changes.cameras(changes.focal(1 + x / 100)) for x in (-10, -5, -2, 2, 5, 10)}),
+    "distance of the cameras": (
+        "m",
+        None,
+        {x: changes.far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)},
+    ),
+    "height of the person": (
+        "pixels of 256",
+        None,
+        {x: changes.person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)},
+    ),
+    "masks too large or small": (
+        "pixels of 256",
+        0,
+        {x: changes.masks_grown(x) for x in (-6, -3, -1, 1, 3, 6)},
+    ),
+    "focal length": (
+        "%",
+        0,
+        {x: changes.cameras(changes.focal(1 + x / 100)) for x in (-10, -5, -2, 2, 5, 10)},
+    ),
     "cameras turned": ("degrees", 0, {x: changes.turned_by(x) for x in (0.25, 0.5, 1, 2, 4)}),
     "joints turned": (
         "degrees",
         0,
-        {x: changes.poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * noise(5, r.shape)) for x in (1, 2, 4, 8, 16)},
+        {
+            x: changes.poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * noise(5, r.shape))
+            for x in (1, 2, 4, 8, 16)
+        },
     ),
     "body moved": ("cm", 0, {x: changes.moved_by(x) for x in (0.5, 1, 2, 4, 8)}),
     "shape coefficients": (
         "standard deviations",
         0,
         {
-            x: lambda c, x=x: dataclasses.replace(c, betas=np.asarray(c.betas) + np.float32(x * noise(6, c.betas.shape)))
+            x: lambda c, x=x: dataclasses.replace(
+                c, betas=np.asarray(c.betas) + np.float32(x * noise(6, c.betas.shape))
+            )
             for x in (0.25, 0.5, 1, 2)
         },
     ),
@@ -202,15 +237,27 @@ def limits(run: Run, people: int = 2) -> None:
             scores.append(changes.outcome(network, capture, subject.held_out)["psnr"])
         return float(np.mean(scores))
 
-    tried = {(name, value): change for name, (_, _, each) in LIMITS.items() for value, change in each.items()}
-    cases = {f"{name} {value:g}": functools.partial(score, name, change) for (name, value), change in tried.items()}
-    scores = run.rows({"plain": lambda: score("", lambda capture: capture)} | cases, {"people": people})
+    tried = {
+        (name, value): change
+        for name, (_, _, each) in LIMITS.items()
+        for value, change in each.items()
+    }
+    cases = {
+        f"{name} {value:g}": functools.partial(score, name, change)
+        for (name, value), change in tried.items()
+    }
+    scores = run.rows(
+        {"plain": lambda: score("", lambda capture: capture)} | cases, {"people": people}
+    )
     losses: dict[str, Any] = {}
     for name, value in tried:
         losses.setdefault(name, {})[value] = scores["plain"] - scores[f"{name} {value:g}"]
     ranges, rows = {name: interval(name, losses[name]) for name in LIMITS}, []
     for name, lost in losses.items():
-        ends = ["-" if ranges[name][end] is None else f"{ranges[name][end]:.3g}" for end in ("low", "high")]
+        ends = [
+            "-" if ranges[name][end] is None else f"{ranges[name][end]:.3g}"
+            for end in ("low", "high")
+        ]
         values = ", ".join(f"{value:g}: {loss:.1f}" for value, loss in sorted(lost.items()))
         rows.append([f"{name}, {ranges[name]['unit']}".rstrip(", "), *ends, values])
     header = ["quantity", "from", "to", "dB lost at each value tried"]
@@ -242,12 +289,18 @@ def interval(name: str, losses: dict[float, float]) -> dict[str, Any]:
 # Number types --------------------------------------------------------------------------------------------------------
 
 Types = Literal["float32", "tf32", "bfloat16", "float16"]
-COLUMNS = {"values": "value", "cotangents": "gradient sent back", "gradients": "gradient of parameters"}
+COLUMNS = {
+    "values": "value",
+    "cotangents": "gradient sent back",
+    "gradients": "gradient of parameters",
+}
 TARGETS = 2
 
 
 @entry
-def stability(run: Run, types: tuple[Types, ...] = ("float32", "tf32", "bfloat16", "float16"), seeds: int = 3) -> None:
+def stability(
+    run: Run, types: tuple[Types, ...] = ("float32", "tf32", "bfloat16", "float16"), seeds: int = 3
+) -> None:
     """Error of every stage, from photos to images and back to gradients, by number type, against float64 from the same numbers.
 
     The shipped weights on people of the validation seeds. An error is a relative L2 norm, the largest over the arrays of a stage
@@ -260,9 +313,19 @@ def stability(run: Run, types: tuple[Types, ...] = ("float32", "tf32", "bfloat16
     types: number types to compare
     seeds: people
     """
-    worst = _worst(shipped_cases(seeds), [name for name in types if name != "tf32" or jax.default_backend() == "gpu"])
-    columns = [(n, c) for n in next(iter(worst.values())) for c in COLUMNS if n != "float16" or c == "values"]
-    show = lambda stage, name, column: f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
+    worst = _worst(
+        shipped_cases(seeds),
+        [name for name in types if name != "tf32" or jax.default_backend() == "gpu"],
+    )
+    columns = [
+        (n, c)
+        for n in next(iter(worst.values()))
+        for c in COLUMNS
+        if n != "float16" or c == "values"
+    ]
+    show = lambda stage, name, column: (
+        f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
+    )
     rows = [[title, *(show(stage, *pair) for pair in columns)] for title, stage in worst.items()]
     header = ["stage", *(f"{name}: {COLUMNS[column]}" for name, column in columns)]
     run.show(markdown_table(header, rows), {"seeds": seeds} | worst, "stability_shipped")
@@ -279,7 +342,9 @@ def _worst(cases, types):
                     for leaf, array in arrays.items():
                         truth = np.asarray(reference[stage][column][leaf], np.float64)
                         norm = np.linalg.norm(truth)
-                        error = float(np.linalg.norm(np.asarray(array, np.float64) - truth) / (norm or 1.0))
+                        error = float(
+                            np.linalg.norm(np.asarray(array, np.float64) - truth) / (norm or 1.0)
+                        )
                         cell = worst.setdefault(stage, {}).setdefault(name, {})
                         known = cell.get(column, {}).get("error", -1.0)
                         if np.isnan(error) or known < error:  # NaN is the worst
@@ -293,7 +358,11 @@ def shipped_cases(count):
     body, size, examples = gaussian_body(whole, config), config.conventions.image_size, []
     for seed in seeds_of("validation", 0, count):
         person = make_evaluation_subject(seed, whole, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0))
-        examples.append(Example(standardize(person.inputs(changes.VIEWS), size), standardize(person.held_out, size)))
+        examples.append(
+            Example(
+                standardize(person.inputs(changes.VIEWS), size), standardize(person.held_out, size)
+            )
+        )
     inputs = [prepare_inputs(body, example.inputs, config) for example in examples]
     fitted = [fit_buffers(each.foreground, each.view_count, config) for each in inputs]
     config = max(fitted, key=lambda fit: fit.runtime.token_capacity)
@@ -303,22 +372,42 @@ def shipped_cases(count):
 def observe(case, name):
     """{stage: {column: {leaf: array}}} of one training step's forward and backward pass in a number type."""
     variables, config, body, example = case
-    run = TrainConfig(model=config, loss=LossConfig(random_background=0.0), target_size=config.conventions.image_size)
+    run = TrainConfig(
+        model=config,
+        loss=LossConfig(random_background=0.0),
+        target_size=config.conventions.image_size,
+    )
     wide = name == "float64"
     number = np.float64 if wide else np.float32
     real = lambda x: jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)
-    cast = lambda tree: jax.tree.map(lambda x: np.asarray(x, number) if real(x) else np.asarray(x), tree)
-    with jax.enable_x64(wide), jax.default_matmul_precision("tensorfloat32" if name == "tf32" else "highest"):
+    cast = lambda tree: jax.tree.map(
+        lambda x: np.asarray(x, number) if real(x) else np.asarray(x), tree
+    )
+    with (
+        jax.enable_x64(wide),
+        jax.default_matmul_precision("tensorfloat32" if name == "tf32" else "highest"),
+    ):
         learned = cast(variables["params"]), cast(variables.get("batch_stats", {}))
         if name == "float16":
             model = config.with_runtime(dtype="float16", scan=False)
             stages = {
-                stage: {"values": values} for stage, values in observer(model, run)(*learned, cast(body), cast(example)).items()
+                stage: {"values": values}
+                for stage, values in observer(model, run)(
+                    *learned, cast(body), cast(example)
+                ).items()
             }
         else:
-            run = dataclasses.replace(run, model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32"))
-            _, found = observe_subject(*learned, cast(body), cast(example), jax.random.key(0), run, NO_NETWORKS)
-            stages = {x.name: {"values": x.values, "cotangents": x.taken, "gradients": x.gradients} for x in found}
+            run = dataclasses.replace(
+                run,
+                model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32"),
+            )
+            _, found = observe_subject(
+                *learned, cast(body), cast(example), jax.random.key(0), run, NO_NETWORKS
+            )
+            stages = {
+                x.name: {"values": x.values, "cotangents": x.taken, "gradients": x.gradients}
+                for x in found
+            }
         return jax.tree.map(lambda x: np.asarray(x, np.float64), jax.device_get(stages))
 
 
@@ -330,9 +419,13 @@ def observer(model, run):
         recorder = Recorder()
         variables = {"params": params, "batch_stats": batch_stats}
         with nn.intercept_methods(recorder):
-            outputs, _ = apply_humangs(variables, prepare_inputs(body, example.inputs, model), model, True)
+            outputs, _ = apply_humangs(
+                variables, prepare_inputs(body, example.inputs, model), model, True
+            )
             backgrounds = white_backgrounds(example.targets)
-            draw_targets(variables, outputs, body, example.inputs, example.targets, backgrounds, run)
+            draw_targets(
+                variables, outputs, body, example.inputs, example.targets, backgrounds, run
+            )
         return recorder.given
 
     return jax.jit(forward)

@@ -55,9 +55,14 @@ def demo_scene(size: int, count: int | None = None) -> Scene:
     gaussians = Gaussians(*(getattr(own, name) for name in PARAMETERS))
     if count is not None:
         rng, g = np.random.default_rng(count), len(own.means)
-        gaussians, share = jax.tree.map(lambda x: x[np.arange(count) % g], gaussians), np.sqrt(min(1.0, g / count))
+        gaussians, share = (
+            jax.tree.map(lambda x: x[np.arange(count) % g], gaussians),
+            np.sqrt(min(1.0, g / count)),
+        )
         offsets = (1 - share) * gaussians.scales * rng.standard_normal((count, 3), np.float32)
-        gaussians = replace(gaussians, means=gaussians.means + offsets, scales=share * gaussians.scales)
+        gaussians = replace(
+            gaussians, means=gaussians.means + offsets, scales=share * gaussians.scales
+        )
     return Scene(gaussians, capture.cameras[0].resized(size, size))
 
 
@@ -69,7 +74,9 @@ def compiled(scene: Scene, config: SplatConfig) -> tuple[Programs, dict[str, flo
     gaussians, camera = scene
     dtype = gaussians.means.dtype
     config, black = plan_buffers(gaussians, camera, config, 1.0), jnp.zeros(3, dtype)
-    goal = jnp.asarray(np.random.default_rng(1).random((camera.height, camera.width, 3), np.float32), dtype)
+    goal = jnp.asarray(
+        np.random.default_rng(1).random((camera.height, camera.width, 3), np.float32), dtype
+    )
 
     def forward(gaussians: Gaussians) -> Any:
         return render(gaussians, camera, config, black)
@@ -107,7 +114,9 @@ def differences(found: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> d
     """PSNR and largest error of the image, and the worst relative L2 error of a gradient."""
     error = np.abs(found["image"] - truth["image"])
     norm = np.linalg.norm
-    worst = max(float(norm(found[name] - truth[name]) / (norm(truth[name]) + 1e-300)) for name in PARAMETERS)
+    worst = max(
+        float(norm(found[name] - truth[name]) / (norm(truth[name]) + 1e-300)) for name in PARAMETERS
+    )
     psnr = float(-10 * np.log10(np.mean(error**2) + 1e-300))
     return {"psnr": psnr, "max_abs_error": float(error.max()), "gradient_relative_l2": worst}
 
@@ -128,10 +137,18 @@ def splatting(run: Run, sizes: tuple[int, ...] = (256, 512, 1024), repeats: int 
         scene = demo_scene(size)
         programs, memory = compiled(scene, DEFAULT_CONFIG)
         errors = differences(outputs(programs), exact_outputs(scene))
-        times = {name: float(np.median([timed(programs[name])[1] for _ in range(repeats)])) for name in DIRECTIONS}
+        times = {
+            name: float(np.median([timed(programs[name])[1] for _ in range(repeats)]))
+            for name in DIRECTIONS
+        }
         return errors | {name: {"mib": memory[name], "cpu_ms": times[name]} for name in DIRECTIONS}
 
-    rows, table = run.rows({str(size): lambda size=size: measure(size) for size in sizes}, {"repeats": repeats}), []
+    rows, table = (
+        run.rows(
+            {str(size): lambda size=size: measure(size) for size in sizes}, {"repeats": repeats}
+        ),
+        [],
+    )
     for size, row in rows.items():
         both = [row[name] for name in DIRECTIONS]
         cells = [f"{size} x {size}", *(f"{each['cpu_ms']:.0f}" for each in both)]
@@ -179,16 +196,22 @@ class Setting(NamedTuple):
 
 def settings_of(scene: Scene, only: Sequence[str] = ()) -> list[Setting]:
     """All points to measure but the exact one."""
-    found = [Setting("preset", name, config) for name, config in SPLAT_PRESETS.items() if name != "exact"]
+    found = [
+        Setting("preset", name, config) for name, config in SPLAT_PRESETS.items() if name != "exact"
+    ]
     for knob, values in KNOBS.items():
         found += [Setting(knob, f"{knob} {short(v)}", SplatConfig(**{knob: v})) for v in values]
     if not only or {"hidden", "combined"} & set(only):
         weights = largest_weights(scene)
         found += [Setting("hidden", f"hidden {t:g}", SplatConfig(), weights < t) for t in HIDDEN]
         for fields in COMBINED:
-            label = ", ".join(f"{name.replace('transmittance_', '')} {value:g}" for name, value in fields.items())
+            label = ", ".join(
+                f"{name.replace('transmittance_', '')} {value:g}" for name, value in fields.items()
+            )
             dropped = weights < fields["hidden"] if "hidden" in fields else None
-            config = SplatConfig(**{name: value for name, value in fields.items() if name != "hidden"})
+            config = SplatConfig(
+                **{name: value for name, value in fields.items() if name != "hidden"}
+            )
             found.append(Setting("combined", label, config, dropped))
     return [s for s in found if not only or s.knob in only]
 
@@ -198,23 +221,36 @@ def short(value: Any) -> str:
     if not isinstance(value, float):
         return str(value)
     inverse = round(1 / value)
-    return f"1/{inverse}" if 10 < inverse < 500 and inverse % 10 and inverse * value == 1 else f"{value:g}"
+    return (
+        f"1/{inverse}"
+        if 10 < inverse < 500 and inverse % 10 and inverse * value == 1
+        else f"{value:g}"
+    )
 
 
 def largest_weights(scene: Scene) -> np.ndarray:
     """(g,) the largest weight of each Gaussian on any pixel of any of the cameras around the scene, and of its own."""
     (gaussians, own), config = scene, SplatConfig(visibility=True)
     middle = jnp.median(gaussians.means, axis=0)
-    angles = jnp.linspace(0, 2 * np.pi, VIEWS, endpoint=False), jnp.tile(jnp.asarray([0.0, 0.4, -0.4]), VIEWS // 3)
+    angles = (
+        jnp.linspace(0, 2 * np.pi, VIEWS, endpoint=False),
+        jnp.tile(jnp.asarray([0.0, 0.4, -0.4]), VIEWS // 3),
+    )
     distance = float(jnp.linalg.norm(own.center - middle))
     cameras = orbit(middle, distance, *angles, own.K, own.width, own.height)
     others = render_views(gaussians, cameras, config).visibility
-    return np.maximum(np.asarray(render(gaussians, own, config).visibility), np.asarray(others).max(axis=0))
+    return np.maximum(
+        np.asarray(render(gaussians, own, config).visibility), np.asarray(others).max(axis=0)
+    )
 
 
 @entry
 def splatting_tradeoff(
-    run: Run, size: int = 512, repeats: int = 7, only: tuple[str, ...] = (), image: Path | None = None
+    run: Run,
+    size: int = 512,
+    repeats: int = 7,
+    only: tuple[str, ...] = (),
+    image: Path | None = None,
 ) -> None:
     """What each knob of the splatting renderer gains in time and costs in accuracy, on the shipped person.
 
@@ -230,26 +266,45 @@ def splatting_tradeoff(
     """
     scene = demo_scene(size)
     start = functools.cache(lambda: (exact_outputs(scene), compiled(scene, DEFAULT_CONFIG)[0]))
-    cases = {each.label: functools.partial(measure, scene, start, each, repeats) for each in settings_of(scene, only)}
-    rows = run.rows({"exact": lambda: measure_exact(*start(), repeats)} | cases, {"size": size, "repeats": repeats})
-    result = {"size": size, "gaussians": len(scene.gaussians.means), "settings": list(rows.values())}
+    cases = {
+        each.label: functools.partial(measure, scene, start, each, repeats)
+        for each in settings_of(scene, only)
+    }
+    rows = run.rows(
+        {"exact": lambda: measure_exact(*start(), repeats)} | cases,
+        {"size": size, "repeats": repeats},
+    )
+    result = {
+        "size": size,
+        "gaussians": len(scene.gaussians.means),
+        "settings": list(rows.values()),
+    }
     run.show(knobs_table(result), result)
     if image:
         plot(image, result)
 
 
 def measure_exact(truth: dict[str, np.ndarray], exact: Programs, repeats: int) -> dict[str, Any]:
-    times = {name: float(np.median([timed(exact[name])[1] for _ in range(repeats + 1)])) for name in DIRECTIONS}
+    times = {
+        name: float(np.median([timed(exact[name])[1] for _ in range(repeats + 1)]))
+        for name in DIRECTIONS
+    }
     return {"knob": "exact", "label": "exact"} | times | differences(outputs(exact), truth)
 
 
-def measure(scene: Scene, start: Callable[[], Any], setting: Setting, repeats: int) -> dict[str, Any]:
+def measure(
+    scene: Scene, start: Callable[[], Any], setting: Setting, repeats: int
+) -> dict[str, Any]:
     """Times over the exact ones, and errors."""
     (truth, exact), kept = start(), None if setting.dropped is None else ~setting.dropped
     programs = compiled(scene if kept is None else scene.chosen(kept), setting.config)[0]
-    row: dict[str, Any] = {"knob": setting.knob, "label": setting.label} | differences(outputs(programs, kept), truth)
+    row: dict[str, Any] = {"knob": setting.knob, "label": setting.label} | differences(
+        outputs(programs, kept), truth
+    )
     for name in DIRECTIONS:
-        pairs = np.asarray([(timed(exact[name])[1], timed(programs[name])[1]) for _ in range(repeats)])
+        pairs = np.asarray(
+            [(timed(exact[name])[1], timed(programs[name])[1]) for _ in range(repeats)]
+        )
         row[name] = float(np.median(pairs[:, 1] / pairs[:, 0]))
     del programs
     gc.collect()
@@ -260,11 +315,27 @@ def knobs_table(result: dict[str, Any]) -> str:
     rows = []
     for row in result["settings"]:
         label = f"**{row['label']}**" if row["knob"] == "preset" else row["label"]
-        times = (f"{row[name]:.0f} ms" if row["knob"] == "exact" else f"{row[name]:.2f}" for name in DIRECTIONS)
-        errors = f"{row['psnr']:.1f}", f"{row['max_abs_error']:.1g}", f"{row['gradient_relative_l2']:.1g}"
+        times = (
+            f"{row[name]:.0f} ms" if row["knob"] == "exact" else f"{row[name]:.2f}"
+            for name in DIRECTIONS
+        )
+        errors = (
+            f"{row['psnr']:.1f}",
+            f"{row['max_abs_error']:.1g}",
+            f"{row['gradient_relative_l2']:.1g}",
+        )
         rows.append([label, *times, *errors])
-    header = ["setting", "forward, CPU", "with gradients, CPU", "PSNR, dB", "largest error", "gradients"]
-    title = f"{result['gaussians']:,} Gaussians at {result['size']}; times relative to the exact ones."
+    header = [
+        "setting",
+        "forward, CPU",
+        "with gradients, CPU",
+        "PSNR, dB",
+        "largest error",
+        "gradients",
+    ]
+    title = (
+        f"{result['gaussians']:,} Gaussians at {result['size']}; times relative to the exact ones."
+    )
     return f"{title}\n\n{markdown_table(header, rows)}"
 
 
@@ -275,17 +346,28 @@ def plot(path: Path, result: dict[str, Any]) -> None:
     rows += [row for row in others if row["knob"] not in SCHEDULE and row["label"] != "inria"]
     with figure(path, 1, (8, 4.4)) as axis:
         steps = staircase([(row["forward"], row["psnr"]) for row in rows])
-        axis.step(*zip(*steps, strict=True), where="post", color="0.8", lw=3, label="best of all settings")
-        for i, knob in enumerate(dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")):
+        axis.step(
+            *zip(*steps, strict=True), where="post", color="0.8", lw=3, label="best of all settings"
+        )
+        for i, knob in enumerate(
+            dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")
+        ):
             points = [(row["forward"], row["psnr"]) for row in rows if row["knob"] == knob]
             style = "s" if knob == "combined" else "o-"
             axis.plot(*zip(*points, strict=True), style, ms=4, lw=0.9, color=f"C{i}", label=knob)
         for row in (row for row in rows if row["knob"] == "preset"):
             point = row["forward"], row["psnr"]
             axis.plot(*point, "*", ms=13, color="black", zorder=3)
-            axis.annotate(row["label"], point, (-8, 6), textcoords="offset points", weight="bold", ha="right")
-        axis.set(xlabel="CPU time of an image relative to exact", ylabel="PSNR to the exact image, dB")
-        axis.set_title(f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels", fontsize=9)
+            axis.annotate(
+                row["label"], point, (-8, 6), textcoords="offset points", weight="bold", ha="right"
+            )
+        axis.set(
+            xlabel="CPU time of an image relative to exact", ylabel="PSNR to the exact image, dB"
+        )
+        axis.set_title(
+            f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels",
+            fontsize=9,
+        )
         axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
@@ -325,18 +407,26 @@ def camera_differences(scene: Scene) -> dict[str, list[float]]:
     def drawn(twist: Any, gaussians: Gaussians, config: SplatConfig) -> Any:
         x, y, z = twist[:3]
         turn = jax.scipy.linalg.expm(jnp.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
-        moved = replace(camera, cam_from_world=transform.make(turn, twist[3:]) @ camera.cam_from_world)
+        moved = replace(
+            camera, cam_from_world=transform.make(turn, twist[3:]) @ camera.cam_from_world
+        )
         return render(gaussians, moved, config).rgb
 
-    target = jax.jit(drawn)(jnp.asarray(AWAY), gaussians, plan_buffers(gaussians, camera, margin=1.5))
+    target = jax.jit(drawn)(
+        jnp.asarray(AWAY), gaussians, plan_buffers(gaussians, camera, margin=1.5)
+    )
     both = jax.jit(jax.value_and_grad(lambda *given: jnp.mean(jnp.square(drawn(*given) - target))))
     results = {}
     for name, cuts in CUTS.items():
-        config = plan_buffers(gaussians, camera, dataclasses.replace(SplatConfig(), **cuts), margin=1.5)
+        config = plan_buffers(
+            gaussians, camera, dataclasses.replace(SplatConfig(), **cuts), margin=1.5
+        )
         gradient = np.asarray(both(jnp.zeros(6), gaussians, config)[1])
         value = lambda twist, config=config: float(both(jnp.asarray(twist), gaussians, config)[0])
         results[name] = []
         for step in STEPS:
             slopes = [(value(step * axis) - value(-step * axis)) / (2 * step) for axis in np.eye(6)]
-            results[name].append(float(np.linalg.norm(slopes - gradient) / np.linalg.norm(gradient)))
+            results[name].append(
+                float(np.linalg.norm(slopes - gradient) / np.linalg.norm(gradient))
+            )
     return results

@@ -77,7 +77,9 @@ class Scene:
     def arguments(self, dtype: type | None = None) -> tuple:
         """(gaussians, K, cam_from_world, background) as JAX arrays, of `dtype` if one is given."""
         leaves = (self.gaussians, self.K, self.pose, self.background)
-        gaussians, *rest = jax.tree.map(lambda a: jnp.asarray(a if dtype is None else np.asarray(a, dtype)), leaves)
+        gaussians, *rest = jax.tree.map(
+            lambda a: jnp.asarray(a if dtype is None else np.asarray(a, dtype)), leaves
+        )
         return Gaussians(*gaussians), *rest
 
 
@@ -119,7 +121,10 @@ def ordinary(seed: int = 0, count: int = COUNT, width: int = WIDTH, height: int 
     """Gaussians 2 to 4 m before a camera that is slightly turned: the scene that every extreme starts from."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 4, count)
-    means = np.stack([*(rng.uniform(-0.5, 0.5, (2, count)) * z * np.array([[width], [height]]) / FOCAL), z], axis=-1)
+    means = np.stack(
+        [*(rng.uniform(-0.5, 0.5, (2, count)) * z * np.array([[width], [height]]) / FOCAL), z],
+        axis=-1,
+    )
     arrays = (
         means,
         rng.normal(size=(count, 4)),
@@ -133,11 +138,15 @@ def ordinary(seed: int = 0, count: int = COUNT, width: int = WIDTH, height: int 
     pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     pose[:3, 3] = [0.05, -0.02, 0.1]
     gaussians = Arrays(*(np.asarray(a, np.float32) for a in arrays))
-    return Scene(gaussians, K, pose.astype(np.float32), np.array([0.2, 0.5, 0.9], np.float32), width, height)
+    return Scene(
+        gaussians, K, pose.astype(np.float32), np.array([0.2, 0.5, 0.9], np.float32), width, height
+    )
 
 
 def changed(scene: Scene, **arrays: np.ndarray) -> Scene:
-    gaussians = scene.gaussians._replace(**{name: np.asarray(a, np.float32) for name, a in arrays.items()})
+    gaussians = scene.gaussians._replace(
+        **{name: np.asarray(a, np.float32) for name, a in arrays.items()}
+    )
     return dataclasses.replace(scene, gaussians=gaussians)
 
 
@@ -192,7 +201,9 @@ def seen_through(focal: float, zoomed: bool) -> Scene:
         factor = np.array([FOCAL / focal, FOCAL / focal, 1.0])
         means, scales = scene.gaussians.means * factor, scene.gaussians.scales * FOCAL / focal
         pose = scene.pose * np.array([[1, 1, 1, FOCAL / focal]] * 2 + [[1, 1, 1, 1]] * 2)
-        scene = dataclasses.replace(changed(scene, means=means, scales=scales), pose=pose.astype(np.float32))
+        scene = dataclasses.replace(
+            changed(scene, means=means, scales=scales), pose=pose.astype(np.float32)
+        )
     return dataclasses.replace(scene, K=K)
 
 
@@ -224,7 +235,9 @@ def crowd(count: int, opacity: tuple[float, float], spread: float) -> Scene:
 def over_everything(count: int = COUNT) -> Scene:
     """One Gaussian that covers the image many times over; the others are invisible."""
     scene = ordinary(count=count)
-    means, scales, opacities = (np.array(a) for a in (scene.gaussians.means, scene.gaussians.scales, np.zeros(count)))
+    means, scales, opacities = (
+        np.array(a) for a in (scene.gaussians.means, scene.gaussians.scales, np.zeros(count))
+    )
     means[0], scales[0], opacities[0] = [0.1, 0.2, 3.0], [50.0, 80.0, 30.0], 0.7
     return changed(scene, means=means, scales=scales, opacities=opacities)
 
@@ -269,7 +282,10 @@ def _cases() -> list[Case]:
         Case("opacity", "just under 1/255", one(opaque, ALPHA_MIN * (1 - 1e-6)), drawn=False),
         Case("opacity", "1 - 1e-7", one(opaque, 1 - 1e-7)),
         Case("opacity", "1", one(opaque, 1.0)),
-        *(Case("quaternions", f"norm {n:.0e}" if n else "zero", one(turned, n)) for n in (0, 1e-30, 1e-20, 1e15, 1e30)),
+        *(
+            Case("quaternions", f"norm {n:.0e}" if n else "zero", one(turned, n))
+            for n in (0, 1e-30, 1e-20, 1e15, 1e30)
+        ),
         Case("near plane", "just behind (one ulp)", one(at_depth, ulp(0), 1.0), drawn=False),
         Case("near plane", "on it", one(at_depth, NEAR, 1.0), drawn=False),
         Case("near plane", "just before (one ulp)", one(at_depth, ulp(1), 1.0)),
@@ -278,12 +294,31 @@ def _cases() -> list[Case]:
         Case("far away", "1e6 m, sizes of pixels", one(at_depth, 1e6, 1.0, 1e3)),
         Case("far away", "1e6 m, sizes of millimetres", one(at_depth, 1e6, 1e-9, 1e3)),
         Case("far away", "camera and scene 1e3 m from the origin", one(far_from_origin, 1e3), *FAR),
-        Case("far away", "camera and scene 1e5 m from the origin", one(far_from_origin, 1e5), *FARTHER),
+        Case(
+            "far away",
+            "camera and scene 1e5 m from the origin",
+            one(far_from_origin, 1e5),
+            *FARTHER,
+        ),
         Case("crowds", "2,000 opaque on a pixel", one(crowd, 2_000, (0.5, 1.0), 0.5)),
         Case("crowds", "2,000 faint on a pixel", one(crowd, 2_000, (0.004, 0.006), 0.5)),
-        Case("crowds", "50,000 opaque on a pixel", one(crowd, 50_000, (0.5, 1.0), 0.5), IMAGE, CROWD_GRADIENT, slow=True),
-        Case("crowds", "50,000 faint on a pixel", one(crowd, 50_000, (0.004, 0.006), 0.5), slow=True),
-        Case("crowds", "50,000 at the threshold, none ends the list", one(crowd, 50_000, (0.004, 0.0042), 8.0), slow=True),
+        Case(
+            "crowds",
+            "50,000 opaque on a pixel",
+            one(crowd, 50_000, (0.5, 1.0), 0.5),
+            IMAGE,
+            CROWD_GRADIENT,
+            slow=True,
+        ),
+        Case(
+            "crowds", "50,000 faint on a pixel", one(crowd, 50_000, (0.004, 0.006), 0.5), slow=True
+        ),
+        Case(
+            "crowds",
+            "50,000 at the threshold, none ends the list",
+            one(crowd, 50_000, (0.004, 0.0042), 8.0),
+            slow=True,
+        ),
         Case("images", "one Gaussian over everything, 31 invisible", over_everything),
         Case("images", "one Gaussian over everything", one(over_everything, 1), slow=True),
         Case("images", "no Gaussians", one(ordinary, 0, 0), drawn=False),
@@ -293,11 +328,38 @@ def _cases() -> list[Case]:
         Case("images", "7 x 30", one(ordinary, 0, COUNT, 7, 30), slow=True),
         Case("order", "coincident depths", coincident),
         Case("order", "coincident depths, reversed", one(coincident, True)),
-        *(Case("focal length", f"{f:.0e} px", one(seen_through, f, False)) for f in (1, 1e2, 1e4, 1e6)),
-        *(Case("focal length", f"{f:.0e} px, zoomed", one(seen_through, f, True)) for f in (1, 1e2, 1e4, 1e6)),
-        Case("dtypes", "bfloat16 Gaussians", one(narrow, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT, slow=True),
-        Case("dtypes", "bfloat16 everything", one(narrow_everything, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT, slow=True),
-        Case("dtypes", "float16 Gaussians", one(narrow, np.float16), IMAGE, FLOAT16_GRADIENT, slow=True),
+        *(
+            Case("focal length", f"{f:.0e} px", one(seen_through, f, False))
+            for f in (1, 1e2, 1e4, 1e6)
+        ),
+        *(
+            Case("focal length", f"{f:.0e} px, zoomed", one(seen_through, f, True))
+            for f in (1, 1e2, 1e4, 1e6)
+        ),
+        Case(
+            "dtypes",
+            "bfloat16 Gaussians",
+            one(narrow, jnp.bfloat16),
+            IMAGE,
+            BFLOAT16_GRADIENT,
+            slow=True,
+        ),
+        Case(
+            "dtypes",
+            "bfloat16 everything",
+            one(narrow_everything, jnp.bfloat16),
+            IMAGE,
+            BFLOAT16_GRADIENT,
+            slow=True,
+        ),
+        Case(
+            "dtypes",
+            "float16 Gaussians",
+            one(narrow, np.float16),
+            IMAGE,
+            FLOAT16_GRADIENT,
+            slow=True,
+        ),
     ]
 
 
@@ -310,20 +372,28 @@ NAMES = ("means", "quats", "scales", "opacities", "colors", "K", "cam_from_world
 def evaluate(draw, gaussians, K, pose, background, unit, width, height):
     """Rendering, and the gradients of a random linear function of its rgb, alpha and depth with respect to everything."""
     rng = np.random.default_rng(7)
-    weights = [rng.normal(size=shape) for shape in ((height, width, 3), (height, width), (height, width))]
+    weights = [
+        rng.normal(size=shape) for shape in ((height, width, 3), (height, width), (height, width))
+    ]
 
     def loss(gaussians, K, pose, background):
         rendering = draw(gaussians, Camera(K, pose, width, height), background=background)
         images = rendering.rgb, rendering.alpha, rendering.depth / unit
-        return sum(jnp.sum(w.astype(a.dtype) * a) for w, a in zip(weights, images, strict=True)), rendering
+        return sum(
+            jnp.sum(w.astype(a.dtype) * a) for w, a in zip(weights, images, strict=True)
+        ), rendering
 
-    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(gaussians, K, pose, background)
+    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
+        gaussians, K, pose, background
+    )
     return rendering, gradients
 
 
 def tiled(scene: Scene, draw: Callable = render, dtype: type | None = None):
     """(rendering, gradients) of a renderer, from the scene's own dtypes or in another one."""
-    out = evaluate(draw, *scene.arguments(dtype), scene.unit, width=scene.width, height=scene.height)
+    out = evaluate(
+        draw, *scene.arguments(dtype), scene.unit, width=scene.width, height=scene.height
+    )
     return jax.tree.map(np.asarray, out)
 
 
@@ -372,7 +442,12 @@ def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
     worst = max(errors, key=errors.__getitem__)
     return Outcome(
         finite=all(np.isfinite(wide(leaf)).all() for leaf in jax.tree.leaves(found)),
-        image=float(max(np.abs(wide(a) - b).max() for a, b in ((image.rgb, exact.rgb), (image.alpha, exact.alpha)))),
+        image=float(
+            max(
+                np.abs(wide(a) - b).max()
+                for a, b in ((image.rgb, exact.rgb), (image.alpha, exact.alpha))
+            )
+        ),
         depth=relative_l2(image.depth, exact.depth),
         gradient=errors[worst],
         worst=worst,
@@ -384,7 +459,9 @@ def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
 def measure(case: Case, in_float64: bool = False) -> Outcome:
     """Draws one case in float32 (or float64) and by the reference in float64, and compares."""
     scene = case.build()
-    return compare(scene, tiled_in_float64(scene) if in_float64 else tiled(scene), reference_in_float64(scene))
+    return compare(
+        scene, tiled_in_float64(scene) if in_float64 else tiled(scene), reference_in_float64(scene)
+    )
 
 
 @entry
@@ -404,8 +481,25 @@ def splatting_numerics(run: Run, only: str = "") -> int:
         if only in name:
             single, double = measure(case), measure(case, in_float64=True)
             passes = single.passes(case) and max(double.image, double.gradient) <= FLOAT64
-            numbers.append({"case": name, "image_bound": case.image, "gradient_bound": case.gradient, "passes": passes})
-            numbers[-1] |= {"float32": dataclasses.asdict(single), "float64": dataclasses.asdict(double)}
-            rows.append([name + ("" if passes else " **FAILED**"), number(single.image), number(single.gradient), single.worst])
+            numbers.append(
+                {
+                    "case": name,
+                    "image_bound": case.image,
+                    "gradient_bound": case.gradient,
+                    "passes": passes,
+                }
+            )
+            numbers[-1] |= {
+                "float32": dataclasses.asdict(single),
+                "float64": dataclasses.asdict(double),
+            }
+            rows.append(
+                [
+                    name + ("" if passes else " **FAILED**"),
+                    number(single.image),
+                    number(single.gradient),
+                    single.worst,
+                ]
+            )
     run.show(markdown_table(("case", "image error", "gradient error", "of"), rows), numbers)
     return 0 if rows and all(row["passes"] for row in numbers) else 1

@@ -38,7 +38,13 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.people.subject import GENERATOR_VERSION, PosedSubject, make_subject, seeds_of
 from humangs_jax.people.surroundings import cameras_around, spread_azimuths
-from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
+from humangs_jax.people.writer import (
+    CAMERA_STREAM,
+    HELD_OUT_STREAM,
+    View,
+    capture_views,
+    sample_pose,
+)
 
 RING = 12
 """Cameras that photos are taken from; numbers of photos divide it."""
@@ -72,8 +78,13 @@ class People:
 
     def start(self) -> "Start":
         """Reads what is needed. Raises: ValueError that names the option that is out of range."""
-        if min(self.subjects, self.held_out, self.pose_views) < 1 or min(self.first, self.poses) < 0:
-            raise ValueError("--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0")
+        if (
+            min(self.subjects, self.held_out, self.pose_views) < 1
+            or min(self.first, self.poses) < 0
+        ):
+            raise ValueError(
+                "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0"
+            )
         backbone = installed_lpips().get(self.lpips_net)
         lpips = load_lpips(self.lpips_net) if backbone else None
         body, (variables, config) = load_body(), load_weights(self.weights)
@@ -107,12 +118,18 @@ class Start(NamedTuple):
     lpips: Lpips | None
     settings: dict[str, Any]
 
-    def subject(self, seed: int, counts: Sequence[int], size: int | None = None) -> "EvaluationSubject":
+    def subject(
+        self, seed: int, counts: Sequence[int], size: int | None = None
+    ) -> "EvaluationSubject":
         """The person of a seed, with photos for these numbers of views: see `make_evaluation_subject`."""
         return make_evaluation_subject(seed, self.body, counts, size or self.size, self.held_out)
 
     def rows(
-        self, run: Run, measure: Callable[[int], Any], settings: Mapping[str, Any] | None = None, again: bool = False
+        self,
+        run: Run,
+        measure: Callable[[int], Any],
+        settings: Mapping[str, Any] | None = None,
+        again: bool = False,
     ) -> list[Any]:
         """What `measure` gives of the seed of each person, see `Run.rows`."""
         cases = {str(seed): functools.partial(measure, seed) for seed in self.seeds}
@@ -123,14 +140,17 @@ class Start(NamedTuple):
         return (
             f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels, white; {s['held_out']} "
             f"held-out views in the pose of the photos, {s['poses']} x {s['pose_views']} in novel poses; "
-            f"weights {s['weights'][:12]}, tokens: {s['tokens']}" + (f"; LPIPS {s['lpips_net']}." if s["lpips_net"] else ".")
+            f"weights {s['weights'][:12]}, tokens: {s['tokens']}"
+            + (f"; LPIPS {s['lpips_net']}." if s["lpips_net"] else ".")
         )
 
 
 def shipped_person(longest_edge: float | None = None) -> Avatar:
     """The person of the demo from four photos, feed-forward."""
     variables, config = load_weights()
-    return reconstruct(variables, config.with_runtime(longest_edge=longest_edge), load_capture(DEMO_CAPTURE))
+    return reconstruct(
+        variables, config.with_runtime(longest_edge=longest_edge), load_capture(DEMO_CAPTURE)
+    )
 
 
 def shipped_digest(asset: str) -> str:
@@ -165,7 +185,9 @@ class EvaluationSubject:
         """Evenly spaced photos of the ring, the frontal one first. Raises ValueError if they were not rendered."""
         wanted = ring_positions(count)
         if missing := set(wanted) - set(self.positions):
-            raise ValueError(f"{count} photos need ring positions {sorted(missing)}, which the capture lacks")
+            raise ValueError(
+                f"{count} photos need ring positions {sorted(missing)}, which the capture lacks"
+            )
         return self.photos.select([self.positions.index(position) for position in wanted])
 
     def with_body(self, body: BodyModel) -> "EvaluationSubject":
@@ -196,7 +218,11 @@ def ring_positions(count: int) -> tuple[int, ...]:
 
 
 def make_evaluation_subject(
-    seed: int, body: BodyModel, counts: Sequence[int], image_size: int = 256, held_out: HeldOut | None = None
+    seed: int,
+    body: BodyModel,
+    counts: Sequence[int],
+    image_size: int = 256,
+    held_out: HeldOut | None = None,
 ) -> EvaluationSubject:
     """The person of a seed, rendered from every camera that one of the numbers of photos asks for."""
     held_out = held_out or HeldOut()
@@ -233,7 +259,10 @@ def frontal_camera(posed: PosedSubject, cameras: Camera) -> int:
 
 def _as_stored(capture):
     """The capture with images and masks of 8 bits."""
-    rounded = {name: to_uint8(getattr(capture, name)).astype(np.float32) / 255 for name in ("images", "masks")}
+    rounded = {
+        name: to_uint8(getattr(capture, name)).astype(np.float32) / 255
+        for name in ("images", "masks")
+    }
     return dataclasses.replace(capture, **rounded)
 
 
@@ -244,7 +273,10 @@ def task_views(held_out: Capture) -> dict[str, np.ndarray]:
 
 
 def score_tasks(
-    drawn: np.ndarray, held_out: Capture, lpips: Lpips | None = None, alpha: np.ndarray | None = None
+    drawn: np.ndarray,
+    held_out: Capture,
+    lpips: Lpips | None = None,
+    alpha: np.ndarray | None = None,
 ) -> dict[str, Scores]:
     """Mean scores of drawn held-out views (v, h, w, 3) by task, under the protocol "humangs"; tasks without views are left out.
 
@@ -252,6 +284,12 @@ def score_tasks(
     """
     net = "vgg" if lpips is None else lpips.net
     protocol = dataclasses.replace(PROTOCOLS["humangs"], lpips=(net,))
-    rows = list(score_views(drawn, held_out, protocol, alpha, {} if lpips is None else {net: lpips}))
-    means = {task: mean_scores(rows[i] for i in views) for task, views in task_views(held_out).items() if len(views)}
+    rows = list(
+        score_views(drawn, held_out, protocol, alpha, {} if lpips is None else {net: lpips})
+    )
+    means = {
+        task: mean_scores(rows[i] for i in views)
+        for task, views in task_views(held_out).items()
+        if len(views)
+    }
     return {task: scores | {"lpips": scores.pop(f"lpips_{net}")} for task, scores in means.items()}

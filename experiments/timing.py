@@ -13,7 +13,9 @@ import numpy as np
 
 def prepare_process() -> None:
     """What has to be set before JAX starts: sleeping OpenMP threads, and an allocator that keeps what it has."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning ones would be counted as CPU time
+    os.environ.setdefault(
+        "OMP_WAIT_POLICY", "passive"
+    )  # spinning ones would be counted as CPU time
 
     from humangs_jax.core.processes import keep_freed_memory
 
@@ -27,7 +29,9 @@ def timed(function: Callable[[], object]) -> tuple[float, float]:
     return 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
 
 
-def medians(runs: Mapping[str, Callable[[], object]], repeats: int, warm_up: int = 1) -> dict[str, np.ndarray]:
+def medians(
+    runs: Mapping[str, Callable[[], object]], repeats: int, warm_up: int = 1
+) -> dict[str, np.ndarray]:
     """(wall ms, CPU ms) of every run: medians over `repeats` iterations in which each has one turn."""
     for _ in range(warm_up):
         for run in runs.values():

@@ -83,7 +83,10 @@ def tradeoff(
     result = json.loads(out.read_text()) if out.exists() else {}
     if result.get("settings") != settings:
         result = {"settings": settings, "points": {}}
-    rows, wanted = result["points"], [p for p in points() if not only or p.knob in (DEFAULT.knob, *only)]
+    rows, wanted = (
+        result["points"],
+        [p for p in points() if not only or p.knob in (DEFAULT.knob, *only)],
+    )
     for each in wanted:
         if described(each) != rows.get(each.name, {}).get("what"):
             rows[each.name] = {"what": described(each), "people": []}
@@ -102,12 +105,20 @@ def tradeoff(
 
 def settings_of() -> dict[str, Any]:
     net = NET if installed_lpips() else None
-    return {"weights": shipped_digest(SHIPPED), "generator": GENERATOR_VERSION, "size": TRUE_SIZE, "lpips_net": net, **SHOTS}
+    return {
+        "weights": shipped_digest(SHIPPED),
+        "generator": GENERATOR_VERSION,
+        "size": TRUE_SIZE,
+        "lpips_net": net,
+        **SHOTS,
+    }
 
 
 def described(point) -> dict[str, Any]:
     """A point as data; what it says of weights decides whether an earlier measurement still counts."""
-    learned = {"refiner": shipped_digest(SHIPPED_REFINER)} if point.settings.refine_iterations else {}
+    learned = (
+        {"refiner": shipped_digest(SHIPPED_REFINER)} if point.settings.refine_iterations else {}
+    )
     fields = {name: getattr(point, name) for name in ("knob", "size", "start")}
     return learned | fields | {"settings": json.loads(config_to_json(point.settings))}
 
@@ -132,9 +143,15 @@ class Bench:
     """The people, the network, and the default point, with which others take turns."""
 
     def __init__(self, subjects: int):
-        (self.variables, self.config), body, seeds = load_weights(), load_body(), seeds_of("tradeoff", 0, subjects)
+        (self.variables, self.config), body, seeds = (
+            load_weights(),
+            load_body(),
+            seeds_of("tradeoff", 0, subjects),
+        )
         held_out = HeldOut(SHOTS["held_out"], SHOTS["poses"], SHOTS["pose_views"])
-        self.person = functools.cache(lambda i: make_evaluation_subject(seeds[i], body, PHOTOS, TRUE_SIZE, held_out))
+        self.person = functools.cache(
+            lambda i: make_evaluation_subject(seeds[i], body, PHOTOS, TRUE_SIZE, held_out)
+        )
         self.default = DEFAULT
         self.lpips = load_lpips(NET) if installed_lpips() else None
         self.kept: dict[Any, Any] = {}
@@ -151,7 +168,11 @@ class Bench:
                 avatar.save(Path(folder) / "avatar.npz")
                 row["file_mb"] = (Path(folder) / "avatar.npz").stat().st_size / 2**20
             drawn = self.pruned(point, avatar, self.person(0).held_out)
-            row |= self.make_times(point) | self.frame_times(point, drawn) | {"gaussians": len(drawn.gaussians.means)}
+            row |= (
+                self.make_times(point)
+                | self.frame_times(point, drawn)
+                | {"gaussians": len(drawn.gaussians.means)}
+            )
         row["people"].append({task: {key: scores[task][key] for key in QUALITY} for task in TASKS})
 
     # Avatars and their images ----------------------------------------------------------------------------------------
@@ -187,7 +208,10 @@ class Bench:
         avatar = self.pruned(point, avatar, truth)
         poses, cameras = capture_views(avatar, truth)
         cameras = cameras.resized(point.size, point.size)
-        drawn = [np.clip(np.asarray(r.rgb), 0, 1) for r in draw(avatar, poses, cameras, how=self.how(point, avatar))]
+        drawn = [
+            np.clip(np.asarray(r.rgb), 0, 1)
+            for r in draw(avatar, poses, cameras, how=self.how(point, avatar))
+        ]
         if point.size != TRUE_SIZE:
             drawn = [resized(image, TRUE_SIZE, TRUE_SIZE) for image in drawn]
         return score_tasks(np.stack(drawn), truth, self.lpips)
@@ -207,7 +231,9 @@ class Bench:
 
     def make(self, settings):
         """One reconstruction of the first person, without refinement."""
-        return reconstruct_with(settings.unrefined, self.variables, self.config, self.photos(settings))
+        return reconstruct_with(
+            settings.unrefined, self.variables, self.config, self.photos(settings)
+        )
 
     def default_make_ms(self) -> float:
         """Of the default point, now."""
@@ -221,7 +247,13 @@ class Bench:
         for _ in range(0 if same and point is not self.default else ITERATIONS):
             pairs.append((timed(lambda: self.make(settings))[1], self.default_make_ms()))
         own, default = np.median(pairs, axis=0) if pairs else (1.0, 1.0)
-        ratio = 0.0 if point.start == "random colors" else 1.0 if point is self.default else float(own / default)
+        ratio = (
+            0.0
+            if point.start == "random colors"
+            else 1.0
+            if point is self.default
+            else float(own / default)
+        )
         with peak_memory() as peak:
             self.make(settings)
         refined, memory = 0.0, peak[0]
@@ -235,7 +267,9 @@ class Bench:
         """Time of a refinement over the default's reconstruction, without compilation, and its MiB."""
         photos, avatar = self.photos(settings), self.make(settings)
         run = lambda config: refine_with_report(avatar, photos, config)
-        run(dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement)  # compiles
+        run(
+            dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement
+        )  # compiles
         default = [self.default_make_ms() for _ in range(ITERATIONS)]
         with peak_memory() as peak:
             own = timed(lambda: run(settings.refinement))[1]
@@ -245,10 +279,18 @@ class Bench:
     def frame_times(self, point, drawn) -> dict[str, Any]:
         """Time of a frame over the default's, and the default's ms."""
         ours = self.frames(drawn, point.size, self.how(point, drawn))
-        usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
-        pairs = [[timed(lambda f=f: next(f))[1] for f in (ours, usual)] for _ in range(FRAMES + 1)][1:]
+        usual = self.frames(
+            self.default_avatar, self.default.size, self.how(self.default, self.default_avatar)
+        )
+        pairs = [[timed(lambda f=f: next(f))[1] for f in (ours, usual)] for _ in range(FRAMES + 1)][
+            1:
+        ]
         own, default = np.median(pairs, axis=0)
-        return {"frame": 1.0, "frame_ms": float(default)} if point is self.default else {"frame": float(own / default)}
+        return (
+            {"frame": 1.0, "frame_ms": float(default)}
+            if point is self.default
+            else {"frame": float(own / default)}
+        )
 
     def frames(self, avatar, size, how):
         """Frames without end, in the poses of the held-out views."""
@@ -256,7 +298,9 @@ class Bench:
         cameras = views.resized(size, size)
         turns = lambda: itertools.cycle(range(len(poses.rotations)))
         pose = lambda i: jax.tree.map(lambda x: x[i], poses)
-        renderings = draw(avatar, (pose(i) for i in turns()), (cameras[i] for i in turns()), how=how)
+        renderings = draw(
+            avatar, (pose(i) for i in turns()), (cameras[i] for i in turns()), how=how
+        )
         return (jax.block_until_ready(rendering) for rendering in renderings)
 
     def painted_times(self) -> dict[str, Any]:
@@ -265,9 +309,21 @@ class Bench:
         one = held_out.select([0])
         colors = painted_body(photos)
         draw_painted_body(colors, one)
-        makes = [(timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(ITERATIONS)]
-        usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
+        makes = [
+            (timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms())
+            for _ in range(ITERATIONS)
+        ]
+        usual = self.frames(
+            self.default_avatar, self.default.size, self.how(self.default, self.default_avatar)
+        )
         next(usual)
-        frames = [(timed(lambda: draw_painted_body(colors, one))[1], timed(lambda: next(usual))[1]) for _ in range(FRAMES)]
+        frames = [
+            (timed(lambda: draw_painted_body(colors, one))[1], timed(lambda: next(usual))[1])
+            for _ in range(FRAMES)
+        ]
         make, frame = (np.median(pairs, axis=0) for pairs in (makes, frames))
-        return {"reconstruct": float(make[0] / make[1]), "refine_share": 0.0, "frame": float(frame[0] / frame[1])}
+        return {
+            "reconstruct": float(make[0] / make[1]),
+            "refine_share": 0.0,
+            "frame": float(frame[0] / frame[1]),
+        }

@@ -71,7 +71,9 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     began, body, (variables, model) = monotonic(), load_body(), load_weights(how.init_weights)
     clock = lambda: monotonic() - began
     carrier, config = gaussian_body(body, model), configured(how)
-    config = dataclasses.replace(config, model=dataclasses.replace(model, runtime=config.model.runtime))  # room for tokens
+    config = dataclasses.replace(
+        config, model=dataclasses.replace(model, runtime=config.model.runtime)
+    )  # room for tokens
     networks = load_loss_networks(lpips_net="alex", installed=True)
     state, average = (init_state(config, variables) for _ in range(2))
     average = average.params
@@ -93,26 +95,43 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     start, saved, done, end, metrics = clock(), clock(), 0, 60 * how.minutes - RESERVE, {}
     with open(out / "log.jsonl", "w", buffering=1) as log:
         while (now := clock()) < end:
-            rate = min(1.0, (done + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * (now - start) / (end - start)))
+            rate = (
+                min(1.0, (done + 1) / WARM_UP)
+                * 0.5
+                * (1 + math.cos(math.pi * (now - start) / (end - start)))
+            )
             batch = examples(bank, done)
             jax.block_until_ready(metrics)  # of the step before: the clock runs with the device
             state, average, metrics = step(state, average, batch, *given, rate)
             done += 1
             if done % LOGGED == 0:
                 numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
-                log.write(json.dumps({"step": done, "seconds": clock(), "rate": rate} | numbers) + "\n")
+                log.write(
+                    json.dumps({"step": done, "seconds": clock(), "rate": rate} | numbers) + "\n"
+                )
             if now - saved > SAVED:
                 saved = now
-                save_weights(out / "weights.safetensors", state_variables(average, state), model, "float16")
+                save_weights(
+                    out / "weights.safetensors", state_variables(average, state), model, "float16"
+                )
     if not done:
-        raise ValueError(f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left for training")
+        raise ValueError(
+            f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left for training"
+        )
     trained = state_variables(average, state)
     mean = jax.tree.map(lambda a, b: START_SHARE * a + (1 - START_SHARE) * b, variables, trained)
     for name, made in {"weights": trained, "mean": mean}.items():
         save_weights(out / f"{name}.safetensors", made, model, "float16")
-    row = {"steps": done, "step": 1e3 * (clock() - start) / done, "people a second": how.batch * done / (clock() - start)}
+    row = {
+        "steps": done,
+        "step": 1e3 * (clock() - start) / done,
+        "people a second": how.batch * done / (clock() - start),
+    }
     settings = {"device": jax.devices()[0].device_kind} | dataclasses.asdict(how)
-    record = {"settings": settings, "rows": {f"training, {how.batch} people a step": row | {"s until compiled": compiled}}}
+    record = {
+        "settings": settings,
+        "rows": {f"training, {how.batch} people a step": row | {"s until compiled": compiled}},
+    }
     (out / "run.json").write_text(json.dumps(record, default=str))
 
 
@@ -122,7 +141,9 @@ def configured(how: Clock) -> TrainConfig:
     return dataclasses.replace(
         config,
         loss=dataclasses.replace(config.loss, lpips=LPIPS),
-        optimizer=dataclasses.replace(config.optimizer, learning_rate=how.learning_rate, warmup_steps=0),
+        optimizer=dataclasses.replace(
+            config.optimizer, learning_rate=how.learning_rate, warmup_steps=0
+        ),
         steps=FOR_EVER,
         batch_size=how.batch,
         microbatch_size=how.batch,
@@ -144,7 +165,9 @@ def examples_of(config: TrainConfig, how: Clock) -> Callable[..., Any]:
         displaced_share=DISPLACED,
     )
     if jax.default_backend() != "cpu":
-        drawn = dataclasses.replace(drawn, views_at_once=drawn.input_views + drawn.target_views, pixels_per_step=1 << 30)
+        drawn = dataclasses.replace(
+            drawn, views_at_once=drawn.input_views + drawn.target_views, pixels_per_step=1 << 30
+        )
 
     def examples(bank, step):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(SEED), step), how.batch)
@@ -160,7 +183,11 @@ def stepper(config: TrainConfig) -> Any:
         new, metrics = update(state, batch, body, networks, seed, config)
         params = jax.tree.map(lambda a, b: a + rate * (b - a), state.params, new.params)
         decay = jnp.minimum(EMA, (1 + state.step) / (10 + state.step))
-        return replace(new, params=params), optax.incremental_update(params, average, 1 - decay), metrics
+        return (
+            replace(new, params=params),
+            optax.incremental_update(params, average, 1 - decay),
+            metrics,
+        )
 
     return jax.jit(step, donate_argnums=(0, 1), compiler_options=compiler_options())
 

@@ -111,13 +111,18 @@ def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
     counts = ("samples", "people", "steps", "iterations", "batch")
     if min(getattr(options, name) for name in counts) < 1:
         raise ValueError(f"expected at least 1 of {', '.join(f'--{name}' for name in counts)}")
-    path, settings = out / "settings.json", json.loads(json.dumps(dataclasses.asdict(options), default=str))
+    path, settings = (
+        out / "settings.json",
+        json.loads(json.dumps(dataclasses.asdict(options), default=str)),
+    )
     if not path.is_file():
         write_json(path, settings)
     elif (known := read_json(path)) != settings:
         raise ValueError(f"{path}: this run has other settings, {known}: give another folder")
     folders = make_samples(out / "samples", FIRST_SEED, options.people, options.samples, options)
-    validation = make_samples(out / "validation", FIRST_SEED + options.people, VALIDATED, VALIDATED, options)
+    validation = make_samples(
+        out / "validation", FIRST_SEED + options.people, VALIDATED, VALIDATED, options
+    )
     train(folders, validation, out, options)
 
 
@@ -134,9 +139,13 @@ def make_samples(out: Path, first: int, people: int, count: int, options: Refini
     if not path.is_file():
         out.mkdir(parents=True, exist_ok=True)
         seeds = seeds_of("train", first, people)
-        save_bank(path, build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True))
+        save_bank(
+            path, build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True)
+        )
     bank, make = load_bank(path), jax.jit(on_the_fly_example, static_argnames="config")
-    config = OnTheFlyConfig(input_views=PHOTOS, target_views=TARGETS, input_size=options.size, target_size=options.size)
+    config = OnTheFlyConfig(
+        input_views=PHOTOS, target_views=TARGETS, input_size=options.size, target_size=options.size
+    )
     for folder in tqdm(missing, desc="samples"):
         example = jax.device_get(make(bank, jax.random.key(int(folder.name)), config))
         photos, targets = jax.tree.map(jnp.asarray, (example.inputs, example.targets))
@@ -157,7 +166,10 @@ def make_samples(out: Path, first: int, people: int, count: int, options: Refini
         folder.mkdir(parents=True, exist_ok=True)
         without_low_pass(reconstruct(*weights, capture)).save(folder / "avatar.npz")
         arrays = {name: to_uint8(getattr(both, name)) for name in ("images", "masks")}
-        arrays |= {"rotations": np.asarray(poses.rotations), "translations": np.asarray(poses.translation)}
+        arrays |= {
+            "rotations": np.asarray(poses.rotations),
+            "translations": np.asarray(poses.translation),
+        }
         arrays |= {"K": both.cameras.K, "cam_from_world": both.cameras.cam_from_world}
         write_npz(folder / "views.npz", arrays)
     return folders
@@ -176,7 +188,9 @@ class Sample:
 def read_sample(folder: Path) -> Sample:
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
-    cameras = Camera(jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), *images.shape[1:3])
+    cameras = Camera(
+        jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), *images.shape[1:3]
+    )
     pose = jnp.asarray(arrays["rotations"]), jnp.asarray(arrays["translations"])
     views = list(jax.vmap(Photo)(images, masks, jnp.ones(masks.shape, bool), cameras, *pose))
     start = parameters_of(avatar.gaussians)
@@ -193,33 +207,46 @@ def compiled(function: Any) -> Any:
     return jax.jit(function, static_argnames=static, compiler_options=compiler_options())
 
 
-def run_iterations(variables: Any, sample: Sample, photos: int, iterations: int, splat: Any) -> tuple[list[Any], list[Any]]:
+def run_iterations(
+    variables: Any, sample: Sample, photos: int, iterations: int, splat: Any
+) -> tuple[list[Any], list[Any]]:
     """Parameters side by side after each iteration, and the signals that each iteration saw."""
     start = values = stacked(sample.start)
     hidden, after, seen = jnp.zeros((len(start), Refiner.width)), [], []
     for _ in range(iterations):
         parameters = unstacked(values, sample.start)
-        each = [compiled(photo_signals)(parameters, sample.avatar, view, splat=splat)[0] for view in sample.views[:photos]]
+        each = [
+            compiled(photo_signals)(parameters, sample.avatar, view, splat=splat)[0]
+            for view in sample.views[:photos]
+        ]
         seen.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
-        values, hidden = compiled(refiner_iteration)(variables, values, start, hidden, seen[-1], sample.graph, sample.avatar)
+        values, hidden = compiled(refiner_iteration)(
+            variables, values, start, hidden, seen[-1], sample.graph, sample.avatar
+        )
         after.append(values)
     return after, seen
 
 
-def through_iterations(variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any) -> Any:
+def through_iterations(
+    variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any
+) -> Any:
     """Gradient with respect to the variables, from those with respect to the parameters after each iteration."""
 
     def iterations(variables):
         values, hidden, after = start, jnp.zeros((len(start), Refiner.width)), []
         for signals in seen:
-            values, hidden = refiner_iteration(variables, values, start, hidden, signals, graph, avatar)
+            values, hidden = refiner_iteration(
+                variables, values, start, hidden, signals, graph, avatar
+            )
             after.append(values)
         return after
 
     return jax.vjp(iterations, variables)[1](cotangents)[0]
 
 
-def view_loss(values: Any, like: Any, avatar: Any, view: Any, perceptual: Any, splat: Any) -> tuple[Any, Any]:
+def view_loss(
+    values: Any, like: Any, avatar: Any, view: Any, perceptual: Any, splat: Any
+) -> tuple[Any, Any]:
     """Loss of one view, relative to the person's share of the image; (mean squared error, LPIPS).
 
     perceptual: weight and network of LPIPS; None: without, and 0.
@@ -247,7 +274,9 @@ def view_gradient() -> Any:
     return jax.jit(differentiated, static_argnames="splat", compiler_options=compiler_options())
 
 
-def validate(variables: Any, folders: list[Path], iterations: int, perceptual: Any, splat: Any) -> list[list[float]]:
+def validate(
+    variables: Any, folders: list[Path], iterations: int, perceptual: Any, splat: Any
+) -> list[list[float]]:
     """[PSNR, LPIPS] of views that are not among the photos, mean over samples, before and after each iteration."""
     rows = []
     for folder in folders:
@@ -259,14 +288,22 @@ def validate(variables: Any, folders: list[Path], iterations: int, perceptual: A
                 view_gradient()(values, sample.start, sample.avatar, view, perceptual, splat=splat)
                 for view in sample.views[PHOTOS:]
             ]
-            return [(-10 * np.log10(float(squared)), float(distance)) for ((_, (squared, distance)), _) in found]
+            return [
+                (-10 * np.log10(float(squared)), float(distance))
+                for ((_, (squared, distance)), _) in found
+            ]
 
         rows.append([np.mean(scored(values), axis=0) for values in (stacked(sample.start), *after)])
     return np.mean(rows, axis=0).round(4).tolist()
 
 
 def step_gradient(
-    variables: Any, folders: list[Path], iterations: int, perceptual: Any, splat: Any, seed: tuple[int, int]
+    variables: Any,
+    folders: list[Path],
+    iterations: int,
+    perceptual: Any,
+    splat: Any,
+    seed: tuple[int, int],
 ) -> Any:
     """Gradient of one sample, which the seed chooses: a new view for each iteration, two for the last one."""
     rng = np.random.default_rng(seed)
@@ -279,20 +316,31 @@ def step_gradient(
     for i, values in enumerate(after):
         count = 2 if i == iterations - 1 else 1
         chosen = [sample.views[targets[(i + j) % len(targets)]] for j in range(count)]
-        each = [view_gradient()(values, sample.start, sample.avatar, view, perceptual, splat=splat)[1] for view in chosen]
+        each = [
+            view_gradient()(values, sample.start, sample.avatar, view, perceptual, splat=splat)[1]
+            for view in chosen
+        ]
         cotangents.append(ITERATION_WEIGHT ** (iterations - 1 - i) * sum(each) / count)
-    return compiled(through_iterations)(variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents)
+    return compiled(through_iterations)(
+        variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents
+    )
 
 
 def train(folders: list[Path], validation: list[Path], out: Path, options: Refining) -> None:
     """From the first step, or from OUT/state.msgpack, to OUT/refiner.safetensors."""
     sample = read_sample(folders[0])
     splat, values = planned([read_sample(folder) for folder in validation]), stacked(sample.start)
-    nothing = Signals(jnp.zeros((1, *values.shape)), jnp.zeros((1, len(values))), jnp.zeros((1, len(values))))
+    nothing = Signals(
+        jnp.zeros((1, *values.shape)), jnp.zeros((1, len(values))), jnp.zeros((1, len(values)))
+    )
     hidden = jnp.zeros((len(values), Refiner.width))
-    variables = Refiner().init(jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3))
+    variables = Refiner().init(
+        jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3)
+    )
     if options.start:
-        given = (load_refiner() if options.start == "shipped" else read_refiner(options.start))["params"]
+        given = (load_refiner() if options.start == "shipped" else read_refiner(options.start))[
+            "params"
+        ]
         new = variables["params"]
         if any(
             layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own)
@@ -302,10 +350,18 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
         variables = {"params": new | given}
     perceptual = (options.lpips, load_lpips("alex")) if options.lpips else None
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, options.learning_rate, min(50, options.steps // 2), options.steps, 0.02 * options.learning_rate
+        0.0,
+        options.learning_rate,
+        min(50, options.steps // 2),
+        options.steps,
+        0.02 * options.learning_rate,
     )
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=1e-4))
-    state: dict[str, Any] = {"variables": variables, "optimizer": optimizer.init(variables), "step": 0}
+    state: dict[str, Any] = {
+        "variables": variables,
+        "optimizer": optimizer.init(variables),
+        "step": 0,
+    }
     path = out / "state.msgpack"
     if path.is_file():
         state = serialization.from_bytes(state, path.read_bytes())
@@ -320,9 +376,18 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
         try:
             while (step := int(state["step"])) < options.steps:
                 if step % VALIDATE_EVERY == 0:
-                    scores = validate(state["variables"], validation, options.iterations, perceptual, splat)
+                    scores = validate(
+                        state["variables"], validation, options.iterations, perceptual, splat
+                    )
                     bar.write(f"step {step}: {scores} PSNR, LPIPS before and after each iteration")
-                one = functools.partial(step_gradient, state["variables"], folders, options.iterations, perceptual, splat)
+                one = functools.partial(
+                    step_gradient,
+                    state["variables"],
+                    folders,
+                    options.iterations,
+                    perceptual,
+                    splat,
+                )
                 gradients = list(threads.map(one, [(step, i) for i in range(options.batch)]))
                 gradient = jax.tree.map(lambda *x: sum(x) / len(x), *gradients)
                 variables, opt_state = updated(gradient, state["optimizer"], state["variables"])
@@ -348,4 +413,6 @@ def planned(samples: list[Sample]) -> Any:
         for view in sample.views
     ]
     most = lambda name: max(getattr(plan, name) for plan in plans)
-    return dataclasses.replace(plans[0], max_pairs=most("max_pairs"), max_rows=most("max_rows"), visibility=True)
+    return dataclasses.replace(
+        plans[0], max_pairs=most("max_pairs"), max_rows=most("max_rows"), visibility=True
+    )

@@ -28,7 +28,12 @@ from humangs_jax.body.library import load_body
 from humangs_jax.core.processes import keep_freed_memory
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.losses.loss_networks import load_loss_networks
-from humangs_jax.network.weights import flatten_variables, load_weights, save_weights, variables_from_tensors
+from humangs_jax.network.weights import (
+    flatten_variables,
+    load_weights,
+    save_weights,
+    variables_from_tensors,
+)
 from humangs_jax.people.bank import load_bank
 from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.training.config import TrainConfig, small
@@ -44,7 +49,9 @@ def main(
     bank: Path | None = None,
     validation: Path | None = None,
     hours: float | None = None,
-    init_weights: Literal["shipped"] | Path | None = None,  # the word first: tyro takes the first type that fits
+    init_weights: Literal["shipped"]
+    | Path
+    | None = None,  # the word first: tyro takes the first type that fits
     start_share: float = 0.0,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = small(),  # noqa: B008
 ) -> None:
@@ -65,7 +72,9 @@ def main(
     Raises: ValueError for a share that is not in [0, 1), or without `init_weights`, and for weights of another network.
     """
     if not 0 <= start_share < 1 or (start_share and init_weights is None):
-        raise ValueError(f"start_share {start_share}: expected a number in [0, 1), and init_weights if it is not 0")
+        raise ValueError(
+            f"start_share {start_share}: expected a number in [0, 1), and init_weights if it is not 0"
+        )
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     if hours is not None:
         timer = threading.Timer(3600 * hours, os.kill, (os.getpid(), signal.SIGTERM))
@@ -79,10 +88,22 @@ def main(
     if validation is None:
         validation = out / "validation"
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
-    training = training_people(None, people, out, body) if bank is None else on_the_fly_people(load_bank(bank))
+    training = (
+        training_people(None, people, out, body)
+        if bank is None
+        else on_the_fly_people(load_bank(bank))
+    )
     try:
         networks = load_loss_networks(lpips_net="alex", installed=True)
-        state = train(config, body, training, out, validation=find_captures(validation), variables=variables, networks=networks)
+        state = train(
+            config,
+            body,
+            training,
+            out,
+            validation=find_captures(validation),
+            variables=variables,
+            networks=networks,
+        )
     except TrainingInterrupted as stopped:
         if hours is None or timer.is_alive():  # it was not the timer
             raise

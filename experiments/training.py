@@ -24,7 +24,15 @@ from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loade
 from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.perceptual import BACKBONES, VGG19, Convolution, Lpips, Vgg19, channels, convolutions
+from humangs_jax.losses.perceptual import (
+    BACKBONES,
+    VGG19,
+    Convolution,
+    Lpips,
+    Vgg19,
+    channels,
+    convolutions,
+)
 from humangs_jax.people.writer import Layout, write_person
 from humangs_jax.training import sharding
 from humangs_jax.training.config import PRESETS
@@ -58,7 +66,10 @@ def random_weights(key: Any, slices: Any) -> Any:
         return Convolution(scale * jax.random.normal(key, shape), jnp.zeros(layer.outputs))
 
     layers = list(convolutions(slices))
-    return {layer.name: draw(layer, key) for layer, key in zip(layers, jax.random.split(key, len(layers)), strict=True)}
+    return {
+        layer.name: draw(layer, key)
+        for layer, key in zip(layers, jax.random.split(key, len(layers)), strict=True)
+    }
 
 
 def random_networks(config: Any) -> Any:
@@ -76,7 +87,9 @@ def random_networks(config: Any) -> Any:
 def written_subject(folder: Path, config: Any, body: Any) -> Path:
     """Writes the capture of a synthetic person with as many views as an example takes; its folder in `folder`."""
     views = config.views.input_counts[0] + config.views.target_count
-    write_person(folder / "person", 0, body, Layout(config.model.conventions.image_size, views=views))
+    write_person(
+        folder / "person", 0, body, Layout(config.model.conventions.image_size, views=views)
+    )
     return folder / "person"
 
 
@@ -103,32 +116,67 @@ def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: in
     """
     if unknown := set(only) - set(CASES):
         raise ValueError(f"--only: {unknown.pop()} is none of {', '.join(CASES)}")
-    cases = {f"{n}, {CASES[n][2]} + {CASES[n][3]} views": functools.partial(step_numbers, n, repeats) for n in only}
+    cases = {
+        f"{n}, {CASES[n][2]} + {CASES[n][3]} views": functools.partial(step_numbers, n, repeats)
+        for n in only
+    }
     rows, table = run.rows(cases, {"repeats": repeats}), []
     for name, row in rows.items():
-        cells = [row["tokens"], f"{row['gaussians']:,}", f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}"]
-        cells += [f"{row['flops'] / 1e12:.2f}", f"{row['share_of_floor_cpu']:.2f}", f"{row['temporary_mb']:.0f}"]
+        cells = [
+            row["tokens"],
+            f"{row['gaussians']:,}",
+            f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}",
+        ]
+        cells += [
+            f"{row['flops'] / 1e12:.2f}",
+            f"{row['share_of_floor_cpu']:.2f}",
+            f"{row['temporary_mb']:.0f}",
+        ]
         table.append([name, *cells, f"{row['peak_rss_mb']:.0f}", f"{row['compile_cpu_s']:.0f}"])
-    header = ["one subject a step", "tokens", "Gaussians", "wall, CPU s", "TFLOP", "share of floor (CPU)"]
-    run.show(markdown_table([*header, "MiB temporaries", "peak MiB", "compile, CPU s"], table), rows)
+    header = [
+        "one subject a step",
+        "tokens",
+        "Gaussians",
+        "wall, CPU s",
+        "TFLOP",
+        "share of floor (CPU)",
+    ]
+    run.show(
+        markdown_table([*header, "MiB temporaries", "peak MiB", "compile, CPU s"], table), rows
+    )
 
 
 def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     jax.config.update("jax_enable_compilation_cache", False)
     config, body = settings(*CASES[name]), load_body()
     config = with_model(config, dtype="float32" if jax.default_backend() == "cpu" else "bfloat16")
-    networks, carrier, size = random_networks(config), gaussian_body(body, config.model), config.model.conventions.image_size
+    networks, carrier, size = (
+        random_networks(config),
+        gaussian_body(body, config.model),
+        config.model.conventions.image_size,
+    )
     with tempfile.TemporaryDirectory() as folder:
         cache = CaptureCache([written_subject(Path(folder), config, body)], body)
         source = CaptureSource(cache, config.views, size, config.target_size, config.loss.depth > 0)
         batch = jax.block_until_ready(Loader(source, config.batch_size).batch_at(0))
-    if config.model.tokens == "foreground":  # room for the person's foreground tokens, as a run would have
+    if (
+        config.model.tokens == "foreground"
+    ):  # room for the person's foreground tokens, as a run would have
         first = jax.tree.map(lambda x: x[0], batch)
-        inputs = jax.jit(prepare_inputs, static_argnames="config")(carrier, first.inputs, config.model)
-        config = with_model(config, token_capacity=foreground(inputs, config.model)[0].runtime.token_capacity)
-    state, given = init_state(config, random_variables(config.model)), (batch, carrier, networks, seed_numbers(config.seed))
+        inputs = jax.jit(prepare_inputs, static_argnames="config")(
+            carrier, first.inputs, config.model
+        )
+        config = with_model(
+            config, token_capacity=foreground(inputs, config.model)[0].runtime.token_capacity
+        )
+    state, given = (
+        init_state(config, random_variables(config.model)),
+        (batch, carrier, networks, seed_numbers(config.seed)),
+    )
     static, options = ("config", "mesh"), compiler_options()
-    step = jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
+    step = jax.jit(
+        update, static_argnames=static, donate_argnames="state", compiler_options=options
+    )
     start = time.process_time()
     traced = step.trace(state, *given, config=config, mesh=None)
     program = traced.lower().compile()
@@ -174,7 +222,10 @@ VARIANTS = {
 FOREGROUND_SHARE = 0.22
 """Room for foreground tokens: a person by the published protocol touches a fifth (docs/performance.md)."""
 XLA_TOKENS = 8192
-PEAKS = {"TPU v5e: 197 TFLOP/s, 200 GB/s to other chips": (197, 200), "H100: 989 TFLOP/s, 50 GB/s beyond 8": (989, 50)}
+PEAKS = {
+    "TPU v5e: 197 TFLOP/s, 200 GB/s to other chips": (197, 200),
+    "H100: 989 TFLOP/s, 50 GB/s beyond 8": (989, 50),
+}
 """TFLOP/s and GB/s of data sheets."""
 
 
@@ -196,30 +247,50 @@ def training_cost(
     sizes: of photos and targets, pixels
     variants: of "kept", "recomputed", "foreground", "foreground, recomputed"
     """
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={chips}"
+    os.environ["XLA_FLAGS"] = (
+        f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={chips}"
+    )
     jax.config.update("jax_platforms", "cpu")  # virtual devices to count for
 
     def measure(size: int, variant: str) -> dict[str, Any]:
         mesh = sharding.training_mesh(None, jax.devices())
         return step_cost(as_variant(settings(preset, size, 4, 4, mesh.size), variant), mesh)
 
-    cases = {f"{preset} {size} {v}": functools.partial(measure, size, v) for size in sizes for v in variants}
+    cases = {
+        f"{preset} {size} {v}": functools.partial(measure, size, v)
+        for size in sizes
+        for v in variants
+    }
     rows, table = run.rows(cases, {"chips": chips}), []
     for what, row in rows.items():
         sent = sum(row["sent_bytes"].values())
         cells = [f"{row['flops'] / 1e12:.2f}", f"{row['convolution_flops'] / row['flops']:.0%}"]
-        cells += [sum(row["messages"].values()), f"{sent / 1e6:.0f}", f"{row['state_bytes'] / row['chips'] / 1e6:.1f}"]
+        cells += [
+            sum(row["messages"].values()),
+            f"{sent / 1e6:.0f}",
+            f"{row['state_bytes'] / row['chips'] / 1e6:.1f}",
+        ]
         for flops, bandwidth in PEAKS.values():
             cells.append(f"{1e-9 * row['flops'] / flops:.1f}; {1e-6 * sent / bandwidth:.1f}")
         table.append([what, *cells])
-    header = ["one chip, one step", "TFLOP", "of them convolutions", "messages", "MB sent", "state, MB"]
+    header = [
+        "one chip, one step",
+        "TFLOP",
+        "of them convolutions",
+        "messages",
+        "MB sent",
+        "state, MB",
+    ]
     run.show(markdown_table([*header, *(f"{name}: ms; sending" for name in PEAKS)], table), rows)
 
 
 def step_cost(config: Any, mesh: Any) -> dict[str, Any]:
     body = gaussian_body(load_body(), config.model)
     shapes = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
-    state, networks = jax.eval_shape(lambda: init_state(config)), jax.eval_shape(lambda: random_networks(config))
+    state, networks = (
+        jax.eval_shape(lambda: init_state(config)),
+        jax.eval_shape(lambda: random_networks(config)),
+    )
     batch = abstract_batch(config, len(body.parents), body.shape_directions.shape[-1])
     placed = lambda tree, shardings: jax.tree.map(
         lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree, shardings
@@ -305,7 +376,14 @@ def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.
                 axis.plot(steps[count - 1 :], smooth, color=color, label="training views")
         left.set(xlabel="step", ylabel="training loss", yscale="log")
         psnr = [line["val_psnr"] for line in validated]
-        right.plot([line["step"] for line in validated], psnr, "o-", ms=4, color="C1", label="validation people")
+        right.plot(
+            [line["step"] for line in validated],
+            psnr,
+            "o-",
+            ms=4,
+            color="C1",
+            label="validation people",
+        )
         right.set(xlabel="step", ylabel="PSNR, dB")
         right.legend(loc="lower right")
         for axis in (left, right):

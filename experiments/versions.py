@@ -26,7 +26,9 @@ WORKER = "from experiments.versions import print_times; print_times({train}, {re
 
 
 @entry
-def versions(run: Run, pythons: tuple[str, ...], rounds: int = 3, repeats: int = 7, train: bool = False) -> None:
+def versions(
+    run: Run, pythons: tuple[str, ...], rounds: int = 3, repeats: int = 7, train: bool = False
+) -> None:
     """CPU time of rendering, refinement and training with each interpreter and flag, in turns.
 
     Every interpreter needs the package's dependencies. The demo's person at 512 px is drawn, with

@@ -44,16 +44,26 @@ def video(run: Run, image: Path) -> None:
     image: JPEG to write
     """
     person, motion = shipped_person(), forward_walk()
-    rows = [*(walked(person, motion, follow) for follow in (True, False)), looked_at(person, motion)]
+    rows = [
+        *(walked(person, motion, follow) for follow in (True, False)),
+        looked_at(person, motion),
+    ]
     rows += [posed_before(person), layered(person, motion)]
-    sheet = [tile(np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN) for row in rows]
+    sheet = [
+        tile(
+            np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN
+        )
+        for row in rows
+    ]
     Image.fromarray(to_uint8(np.concatenate(sheet))).save(image, quality=88)
 
 
 def forward_walk() -> Motion:
     """The shipped walk, which is on the spot, moved forward."""
     motion = load_motion()
-    path = np.asarray(motion.translations) + np.linspace([0, 0, 0], [0, 0, WALKED], len(motion.translations))
+    path = np.asarray(motion.translations) + np.linspace(
+        [0, 0, 0], [0, 0, WALKED], len(motion.translations)
+    )
     return replace(motion, translations=jnp.asarray(path, jnp.float32))
 
 
@@ -64,13 +74,22 @@ def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.n
     chosen = np.linspace(0, len(poses) - 1, SHOWN).astype(int)
     drawn = images(avatar, poses[chosen], cameras[chosen], shot)
     name = "follows" if follow else "--no-follow"
-    return [(f"{name}: {i / motion.fps:.1f} s", image) for i, image in zip(chosen, drawn, strict=True)]
+    return [
+        (f"{name}: {i / motion.fps:.1f} s", image) for i, image in zip(chosen, drawn, strict=True)
+    ]
 
 
 def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     """The walk from other sides, and drawn otherwise."""
     drawn = []
-    changes = [("azimuth", 180), ("elevation", 60), ("elevation", -30), ("fov", 90), ("distance", 1.5), ("splat", "fast")]
+    changes = [
+        ("azimuth", 180),
+        ("elevation", 60),
+        ("elevation", -30),
+        ("fov", 90),
+        ("distance", 1.5),
+        ("splat", "fast"),
+    ]
     for name, value in changes:
         shot = dataclasses.replace(Shot(size=240, azimuth=20.0), **{name: value})
         poses, cameras = motion_views(avatar, motion, shot)
@@ -108,8 +127,14 @@ def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     view = exr_view("view", avatar, pose, camera, rendering, LAYERS, how)
     seen = view.rgba[..., 3:] > 0
     assert view.depth is not None  # asked for
-    position, normal = (np.stack([view.channels[f"{name}.{axis}"] for axis in "XYZ"], -1) for name in ("position", "normal"))
-    low, high = (np.asarray([edge(position[..., i][seen[..., 0]]) for i in range(3)]) for edge in (np.min, np.max))
+    position, normal = (
+        np.stack([view.channels[f"{name}.{axis}"] for axis in "XYZ"], -1)
+        for name in ("position", "normal")
+    )
+    low, high = (
+        np.asarray([edge(position[..., i][seen[..., 0]]) for i in range(3)])
+        for edge in (np.min, np.max)
+    )
     near, far = view.depth[seen[..., 0]].min(), view.depth[seen[..., 0]].max()
     palette = np.random.default_rng(3).uniform(0.15, 1, (len(avatar.joint_names) + 1, 3))
     palette[0] = 0

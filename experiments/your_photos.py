@@ -57,11 +57,19 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
     for i, name in enumerate(f"cam{i}" for i in range(capture.view_count)):
         write_png(folder / "images" / f"{name}.png", in_a_room(capture.images[i], capture.masks[i]))
         write_png(folder / "masks" / f"{name}.png", capture.masks[i])
-        K, matrix = np.array(capture.cameras.K[i], float), np.array(capture.cameras.cam_from_world[i], float)
+        K, matrix = (
+            np.array(capture.cameras.K[i], float),
+            np.array(capture.cameras.cam_from_world[i], float),
+        )
         K[:2, 2] -= 0.5  # OpenCV counts pixels, also in keypoints
         matrix = matrix @ OPENCV_FROM_Y_UP
         size = [capture.cameras.width, capture.cameras.height]
-        calibration[name] = {"K": K.tolist(), "R": matrix[:3, :3].tolist(), "T": matrix[:3, 3].tolist(), "imgSize": size}
+        calibration[name] = {
+            "K": K.tolist(),
+            "R": matrix[:3, :3].tolist(),
+            "T": matrix[:3, 3].tolist(),
+            "imgSize": size,
+        }
         known = np.isfinite(points[i]).all(-1)
         person = {"keypoints": np.where(known[:, None], points[i] - 0.5, 0).tolist()}
         person["keypoint_scores"] = np.where(known, 0.9, 0.0).tolist()
@@ -71,13 +79,18 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
 
 def landmarks_in(capture, names: tuple[str, ...] | None = None) -> np.ndarray:
     """Where points are in each photo, (v, k, 2) pixels; NaN for those that the body does not have. Default: COCO-WholeBody's."""
-    model, betas = landmark_model(capture.body, names or COCO_WHOLEBODY_133.names), jnp.asarray(capture.betas)
+    model, betas = (
+        landmark_model(capture.body, names or COCO_WHOLEBODY_133.names),
+        jnp.asarray(capture.betas),
+    )
     points = []
     for i, frame in enumerate(capture.frames):
         landmarks = np.asarray(pose_landmarks(model, betas, capture.pose(int(frame)))[0])
         matrix, K = np.asarray(capture.cameras.cam_from_world[i]), np.asarray(capture.cameras.K[i])
         seen = (landmarks @ matrix[:3, :3].T + matrix[:3, 3]) @ K.T
-        points.append(np.where(np.asarray(model.known)[:, None] > 0, seen[:, :2] / seen[:, 2:], np.nan))
+        points.append(
+            np.where(np.asarray(model.known)[:, None] > 0, seen[:, :2] / seen[:, 2:], np.nan)
+        )
     return np.stack(points)
 
 
@@ -86,21 +99,32 @@ def in_a_room(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     height, width = mask.shape
     y = np.linspace(0, 1, height)[:, None, None]
     wall, floor = np.array([0.62, 0.66, 0.70]), np.array([0.45, 0.38, 0.32])
-    room = np.where(y < 0.78, wall * (1.05 - 0.25 * y), floor * (0.7 + 0.4 * y)) * np.ones((1, width, 1))
-    return image - (1 - mask[..., None]) * (1 - room)  # the edge's share of white becomes the room's
+    room = np.where(y < 0.78, wall * (1.05 - 0.25 * y), floor * (0.7 + 0.4 * y)) * np.ones(
+        (1, width, 1)
+    )
+    return image - (1 - mask[..., None]) * (
+        1 - room
+    )  # the edge's share of white becomes the room's
 
 
 def draw_figures(out: Path, points: np.ndarray) -> None:
     read = lambda folder, i: read_image(out / "photos" / folder / f"cam{i}.png")[0]
-    photos, masks = (np.stack([read(folder, i) for i in range(VIEWS)]) for folder in ("images", "masks"))
+    photos, masks = (
+        np.stack([read(folder, i) for i in range(VIEWS)]) for folder in ("images", "masks")
+    )
     marked = np.stack([with_points(photo, own) for photo, own in zip(photos, points, strict=True)])
     rows = np.concatenate([photos, masks, marked])
-    labels = [f"{folder}/cam{i}" for folder in ("images", "masks", "keypoints") for i in range(VIEWS)]
+    labels = [
+        f"{folder}/cam{i}" for folder in ("images", "masks", "keypoints") for i in range(VIEWS)
+    ]
     save(tile(rows, labels=labels, columns=VIEWS), IMAGES / "your_photos_material.jpg")
     save(read_image(out / "me" / "check.png")[0], IMAGES / "your_photos_check.jpg")
     avatar, shot = Avatar.load(out / "me" / "avatar.npz"), Shot(size=SIZE)
     turn = turntable_views(avatar, a_pose_of(avatar), VIEWS, shot)
-    save(tile(np.stack(list(images(avatar, *turn, shot))), columns=VIEWS), IMAGES / "your_photos_avatar.jpg")
+    save(
+        tile(np.stack(list(images(avatar, *turn, shot))), columns=VIEWS),
+        IMAGES / "your_photos_avatar.jpg",
+    )
 
 
 def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:

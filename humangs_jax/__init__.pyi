@@ -34,7 +34,10 @@ from .viewer.page import show as show
 
 # Gaussians -> image
 from .rendering.gaussians import Gaussians as Gaussians
-from .avatar.export.gaussians import load_gaussians as load_gaussians, save_gaussians as save_gaussians
+from .avatar.export.gaussians import (
+    load_gaussians as load_gaussians,
+    save_gaussians as save_gaussians,
+)
 from .geometry.camera import Camera as Camera, look_at as look_at, orbit as orbit
 from .rendering.splatting import render as render, render_views as render_views
 from .rendering.reference import render_reference as render_reference
@@ -54,6 +57,9 @@ from .evaluation.run import evaluate as evaluate
 
 # JAX
 from .core.pytree import replace as replace
-from .core.processes import compiler_options as compiler_options, enable_compile_cache as enable_compile_cache
+from .core.processes import (
+    compiler_options as compiler_options,
+    enable_compile_cache as enable_compile_cache,
+)
 
 __version__: str

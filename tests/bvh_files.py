@@ -11,8 +11,19 @@ _LIMBS = {
     **{"hip": "UpLeg", "knee": "Leg", "ankle": "Foot", "foot": "ToeBase"},
 }
 CMU = {
-    **{"pelvis": "Hips", "spine1": "LowerBack", "spine2": "Spine", "spine3": "Spine1", "neck": "Neck", "head": "Head"},
-    **{f"{s}_{ours}": s.title() + theirs for s in ("left", "right") for ours, theirs in _LIMBS.items()},
+    **{
+        "pelvis": "Hips",
+        "spine1": "LowerBack",
+        "spine2": "Spine",
+        "spine3": "Spine1",
+        "neck": "Neck",
+        "head": "Head",
+    },
+    **{
+        f"{s}_{ours}": s.title() + theirs
+        for s in ("left", "right")
+        for ours, theirs in _LIMBS.items()
+    },
 }
 _SPINE = {"spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2"}
 LAFAN = CMU | _SPINE | {f"{s}_foot": f"{s.title()}Toe" for s in ("left", "right")}
@@ -25,7 +36,13 @@ MIXAMO |= {
 }
 MIXAMO |= {"left_eye": "mixamorig:LeftEye", "right_eye": "mixamorig:RightEye"}
 BONES = [
-    *(("pelvis", "spine1"), ("spine1", "spine2"), ("spine2", "spine3"), ("spine3", "neck"), ("neck", "head")),
+    *(
+        ("pelvis", "spine1"),
+        ("spine1", "spine2"),
+        ("spine2", "spine3"),
+        ("spine3", "neck"),
+        ("neck", "head"),
+    ),
     *(
         (f"{s}_{a}", f"{s}_{b}")
         for s in ("left", "right")
@@ -56,7 +73,9 @@ def frames_along_bones(rest, seed=0):
         if name == "pelvis":  # the spine along x, the hips along z
             up = rest[INDEX["spine3"]] - rest[0]
             left = rest[INDEX["left_hip"]] - rest[INDEX["right_hip"]]
-            frames[name] = Rotation.align_vectors([[1, 0, 0], [0, 0, 1]], [up, left], weights=[1e6, 1])[0]
+            frames[name] = Rotation.align_vectors(
+                [[1, 0, 0], [0, 0, 1]], [up, left], weights=[1e6, 1]
+            )[0]
         elif child is None:
             frames[name] = frames[JOINT_NAMES[parent]]
         else:
@@ -82,7 +101,9 @@ def places_of(rest, poses, moves):
     for j, parent in enumerate(PARENTS):
         own = Rotation.from_rotvec(poses[:, j])
         world[j] = own if parent < 0 else world[parent] * own
-        places[j] = moves if parent < 0 else places[parent] + world[parent].apply(rest[j] - rest[parent])
+        places[j] = (
+            moves if parent < 0 else places[parent] + world[parent].apply(rest[j] - rest[parent])
+        )
     return np.stack([places[j] for j in range(len(PARENTS))], axis=1)
 
 
@@ -91,7 +112,9 @@ def bone_directions(places):
     return bones / np.linalg.norm(bones, axis=-1, keepdims=True)
 
 
-def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=100.0, up=None, pelvis=None):
+def write_bvh(
+    rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=100.0, up=None, pelvis=None
+):
     """The text of a BVH file of a body with the joints `rest` (55, 3) in T-pose, in centimetres.
 
     poses: (m, 55, 3). names: ours -> the file's; other joints are left out. frames_of: see above. moves: (m, 3), where the
@@ -112,14 +135,20 @@ def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=
         tab = "\t" * depth
         offset = np.zeros(3)
         if name in above:
-            offset = (up * frames_of[above[name]]).apply(rest[INDEX[name]] - rest[INDEX[above[name]]])
+            offset = (up * frames_of[above[name]]).apply(
+                rest[INDEX[name]] - rest[INDEX[above[name]]]
+            )
         move = "3" if name in above else "6 Xposition Yposition Zposition"
         yield f"{tab}{'JOINT' if name in above else 'ROOT'} {names[name]}"
         yield f"{tab}{{"
         yield f"{tab}\tOFFSET {' '.join(f'{unit * x:.8f}' for x in offset)}"
         yield f"{tab}\tCHANNELS {move} {' '.join(f'{axis}rotation' for axis in order)}"
         for child in children[name]:
-            if name not in above and pelvis is not None and np.any(rest[INDEX[child]] != rest[INDEX[name]]):
+            if (
+                name not in above
+                and pelvis is not None
+                and np.any(rest[INDEX[child]] != rest[INDEX[name]])
+            ):
                 carried.add(child)
                 written.append(None)
                 yield f"{tab}\tJOINT Carrier{len(written)}\n{tab}\t{{\n{tab}\tOFFSET 0 0 0"
@@ -132,7 +161,13 @@ def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=
             yield f"{tab}\tEnd Site\n{tab}\t{{\n{tab}\t\tOFFSET 0 1 0\n{tab}\t}}"
         yield f"{tab}}}"
 
-    text = ["HIERARCHY", *lines("pelvis", 0), "MOTION", f"Frames: {len(poses)}", "Frame Time: 0.0083333"]
+    text = [
+        "HIERARCHY",
+        *lines("pelvis", 0),
+        "MOTION",
+        f"Frames: {len(poses)}",
+        "Frame Time: 0.0083333",
+    ]
     for frame, (pose, move) in enumerate(zip(poses, moves, strict=True)):
         world, numbers = {}, list(unit * up.apply(move))
         for name in written:

@@ -35,5 +35,7 @@ def edit_pickle(path, **changes):
 
 
 def changed(values, changes):
-    new = {key: change(values[key]) if callable(change) else change for key, change in changes.items()}
+    new = {
+        key: change(values[key]) if callable(change) else change for key, change in changes.items()
+    }
     return {key: value for key, value in (values | new).items() if value is not None}

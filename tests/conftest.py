@@ -19,12 +19,18 @@ from pathlib import Path
 
 # before JAX is imported; the programs that tests start inherit it
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and importlib.metadata.version("jaxlib").startswith("0.10."):
+if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and importlib.metadata.version(
+    "jaxlib"
+).startswith("0.10."):
     # the emitters make faster programs, but took more than a third of the CPU time of a run with an empty cache. XLA aborts at
     # flags that it does not know, and other versions of jaxlib may not have this one
-    os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
+    os.environ["XLA_FLAGS"] = (
+        f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
+    )
 
-if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a shell; programs that tests interrupt inherit it
+if (
+    signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+):  # in the background of a shell; programs that tests interrupt inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax
@@ -35,7 +41,9 @@ from rounding import scaled_comparison
 
 jax.config.update("jax_platforms", "cpu")  # numbers in the tests are the CPU's
 
-settings.register_profile("humangs", deadline=None, max_examples=15, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "humangs", deadline=None, max_examples=15, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("humangs")
 
 MOST_MAPPINGS = 35_000
@@ -50,9 +58,15 @@ def cache_folder() -> Path:
     """Compiled programs of this jaxlib on this kind of processor, which JAX's own keys leave out."""
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     cpu = Path("/proc/cpuinfo")
-    flags = [line for line in cpu.read_text().splitlines() if line.startswith(("flags", "Features"))] if cpu.exists() else []
+    flags = (
+        [line for line in cpu.read_text().splitlines() if line.startswith(("flags", "Features"))]
+        if cpu.exists()
+        else []
+    )
     machine = hashlib.sha256(f"{platform.machine()} {flags[:1]}".encode()).hexdigest()[:12]
-    return root / "humangs_jax" / "tests" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{machine}"
+    return (
+        root / "humangs_jax" / "tests" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{machine}"
+    )
 
 
 def prune(folder: Path, size: int) -> None:
@@ -80,7 +94,8 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 jax.config.update(
-    "jax_persistent_cache_min_compile_time_secs", float(os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1"))
+    "jax_persistent_cache_min_compile_time_secs",
+    float(os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1")),
 )
 
 for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isclose")):
@@ -88,7 +103,9 @@ for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isc
 
 
 def pytest_addoption(parser):
-    parser.addoption("--slice", metavar="I/N", help="run only the I-th (from 0) of N slices of the tests")
+    parser.addoption(
+        "--slice", metavar="I/N", help="run only the I-th (from 0) of N slices of the tests"
+    )
 
 
 def pytest_collection_modifyitems(config, items):

@@ -14,7 +14,9 @@ def random_lpips(net) -> Lpips:
     weights = {}
     for layer in convolutions(BACKBONES[net]):
         shape = (layer.size, layer.size, layer.inputs, layer.outputs)
-        kernel = rng.standard_normal(shape, np.float32) * np.sqrt(2 / np.prod(shape[:3]), dtype=np.float32)
+        kernel = rng.standard_normal(shape, np.float32) * np.sqrt(
+            2 / np.prod(shape[:3]), dtype=np.float32
+        )
         weights[layer.name] = Convolution(jnp.asarray(kernel), jnp.zeros(layer.outputs))
     return Lpips(weights, tuple(jnp.ones(count) for count in channels(BACKBONES[net])), net)
 

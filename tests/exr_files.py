@@ -22,8 +22,12 @@ def camera_of(view):
 
 
 def _view(part):
-    images = {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()}
+    images = {
+        name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()
+    }
     rgba = np.stack([images.pop(name) for name in RGBA], axis=-1)
     matrices = [part.header[key] for key in ("K", "cam_from_world")]
-    attributes = {k: v for k, v in part.header.items() if isinstance(v, str) and k not in STANDARD_ATTRIBUTES}
+    attributes = {
+        k: v for k, v in part.header.items() if isinstance(v, str) and k not in STANDARD_ATTRIBUTES
+    }
     return ExrView(rgba, images.pop("Z", None), *matrices, part.name(), images, attributes)

@@ -9,7 +9,18 @@ from humangs_jax.io.mesh import GlbWriter
 
 
 def write_glb(
-    path, rest, poses, moves, names, bind=None, fps=24.0, above=None, interpolation="LINEAR", more=(), titles=(), **more_of_file
+    path,
+    rest,
+    poses,
+    moves,
+    names,
+    bind=None,
+    fps=24.0,
+    above=None,
+    interpolation="LINEAR",
+    more=(),
+    titles=(),
+    **more_of_file,
 ):
     """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres and z up write it."""
     writer, joints = GlbWriter(), [name for name in JOINT_NAMES if name in names]
@@ -19,16 +30,22 @@ def write_glb(
 
     def animate(node, path_, values):
         if interpolation == "CUBICSPLINE":
-            values = np.stack([np.zeros_like(values), values, np.zeros_like(values)], axis=1).reshape(-1, values.shape[1])
+            values = np.stack(
+                [np.zeros_like(values), values, np.zeros_like(values)], axis=1
+            ).reshape(-1, values.shape[1])
         kind = {3: "VEC3", 4: "VEC4"}[values.shape[1]]
-        samplers.append({"input": times, "output": writer.array(kind, values), "interpolation": interpolation})
+        samplers.append(
+            {"input": times, "output": writer.array(kind, values), "interpolation": interpolation}
+        )
         channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path_}})
 
     inverse = []
     outer = np.eye(4) if above is None else np.reshape(above["matrix"], (4, 4)).T
     for name in joints:
         j, p = INDEX[name], PARENTS[INDEX[name]]
-        nodes.append({"name": names[name], "translation": (rest[j] - (rest[p] if p >= 0 else 0)).tolist()})
+        nodes.append(
+            {"name": names[name], "translation": (rest[j] - (rest[p] if p >= 0 else 0)).tolist()}
+        )
         children = [place[other] for other in joints if PARENTS[INDEX[other]] == j]
         if children:
             nodes[-1]["children"] = children
@@ -39,7 +56,10 @@ def write_glb(
     if above is not None:
         nodes.append(above | {"children": [0]})
         roots = [len(nodes) - 1]
-    skin = {"joints": list(range(len(joints))), "inverseBindMatrices": writer.array("MAT4", np.stack(inverse))}
+    skin = {
+        "joints": list(range(len(joints))),
+        "inverseBindMatrices": writer.array("MAT4", np.stack(inverse)),
+    }
     document = {"scene": 0, "scenes": [{"nodes": roots}], "nodes": nodes, "skins": [skin]}
     animations = []
     for i, each in enumerate((poses, *more)):
@@ -47,5 +67,7 @@ def write_glb(
         for name in joints:
             animate(place[name], "rotation", Rotation.from_rotvec(each[:, INDEX[name]]).as_quat())
         animate(0, "translation", moves)
-        animations.append({"channels": channels, "samplers": samplers} | ({"name": titles[i]} if titles else {}))
+        animations.append(
+            {"channels": channels, "samplers": samplers} | ({"name": titles[i]} if titles else {})
+        )
     writer.write(path, document | {"animations": animations} | more_of_file)

@@ -13,7 +13,12 @@ class Wrapped:
     """joblib's place of an array."""
 
     def __init__(self, array, padding):
-        self.subclass, self.shape, self.order, self.dtype = np.ndarray, array.shape, "C", array.dtype
+        self.subclass, self.shape, self.order, self.dtype = (
+            np.ndarray,
+            array.shape,
+            "C",
+            array.dtype,
+        )
         self.allow_mmap, self.numpy_array_alignment_bytes = True, padding
 
 
@@ -37,9 +42,14 @@ class JoblibPickler(pickle._Pickler):
 
 def joblib(content, padding=None, protocol=4):
     module, file = types.ModuleType("joblib.numpy_pickle"), io.BytesIO()
-    Wrapped.__module__, Wrapped.__qualname__, Wrapped.__name__ = "joblib.numpy_pickle", *["NumpyArrayWrapper"] * 2
+    Wrapped.__module__, Wrapped.__qualname__, Wrapped.__name__ = (
+        "joblib.numpy_pickle",
+        *["NumpyArrayWrapper"] * 2,
+    )
     module.NumpyArrayWrapper = Wrapped
-    with mock.patch.dict(sys.modules, {"joblib": types.ModuleType("joblib"), "joblib.numpy_pickle": module}):
+    with mock.patch.dict(
+        sys.modules, {"joblib": types.ModuleType("joblib"), "joblib.numpy_pickle": module}
+    ):
         pickler = JoblibPickler(file, protocol)
         pickler.padding = padding
         pickler.dump(content)

@@ -45,7 +45,12 @@ def _about(axis, degrees):
 
 def _lying(side):
     wave = 0.3 * np.sin(4 * TIMES)[:, None] * [1.0, 0.5, 0.2]
-    return _poses(_about("x", side), left_shoulder=_about("z", -70) + wave, right_shoulder=_about("z", 70), head=0.5 * wave)
+    return _poses(
+        _about("x", side),
+        left_shoulder=_about("z", -70) + wave,
+        right_shoulder=_about("z", 70),
+        head=0.5 * wave,
+    )
 
 
 def _crawling():
@@ -56,15 +61,31 @@ def _crawling():
     ]
     legs = [_about("x", (s * swing - 90)[:, None]) for s in (1, -1)]
     knees = dict.fromkeys(("left_knee", "right_knee"), _about("x", 90))
-    return _poses(_about("x", 90), left_shoulder=arms[0], right_shoulder=arms[1], left_hip=legs[0], right_hip=legs[1], **knees)
+    return _poses(
+        _about("x", 90),
+        left_shoulder=arms[0],
+        right_shoulder=arms[1],
+        left_hip=legs[0],
+        right_hip=legs[1],
+        **knees,
+    )
 
 
 def _walking():
     swing = 25 * np.sin(2 * np.pi * TIMES)
     legs = [_about("x", (s * swing)[:, None]) for s in (1, -1)]
-    knees = [_about("x", np.maximum(s * 50 * np.cos(2 * np.pi * TIMES), 0)[:, None]) for s in (-1, 1)]
+    knees = [
+        _about("x", np.maximum(s * 50 * np.cos(2 * np.pi * TIMES), 0)[:, None]) for s in (-1, 1)
+    ]
     arms = {"left_shoulder": _about("z", -70), "right_shoulder": _about("z", 70)}
-    return _poses([0.0, 0, 0], left_hip=legs[0], right_hip=legs[1], left_knee=knees[0], right_knee=knees[1], **arms)
+    return _poses(
+        [0.0, 0, 0],
+        left_hip=legs[0],
+        right_hip=legs[1],
+        left_knee=knees[0],
+        right_knee=knees[1],
+        **arms,
+    )
 
 
 def _upside_down(turns):

@@ -21,7 +21,9 @@ def random_inputs(seed=0, views=2, vertices=20, size=32):
     azimuths = jnp.linspace(0.0, 5.0, views)
     canonical = uniform(-0.8, 0.8, vertices, 3)
     directions = np.random.default_rng([seed, 1]).normal(size=(views + 1, vertices, 3))
-    normals = jnp.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True), jnp.float32)
+    normals = jnp.asarray(
+        directions / np.linalg.norm(directions, axis=-1, keepdims=True), jnp.float32
+    )
     return HumanGSInputs(
         images=uniform(0, 1, views, size, size, 3),
         cameras=orbit(jnp.zeros(3), 3.0, azimuths, 0.1, K, size, size),
@@ -44,7 +46,9 @@ def random_like(shapes, seed=0):
         if name in ("scale", "var"):
             return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), leaf.dtype)
         width = 1 if leaf.ndim < 2 else np.prod(leaf.shape[:-1])
-        return jnp.asarray(rng.normal(size=leaf.shape) * (0.1 if leaf.ndim < 2 else width**-0.5), leaf.dtype)
+        return jnp.asarray(
+            rng.normal(size=leaf.shape) * (0.1 if leaf.ndim < 2 else width**-0.5), leaf.dtype
+        )
 
     return jax.tree_util.tree_map_with_path(draw, shapes)
 

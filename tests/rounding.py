@@ -31,7 +31,11 @@ def scaled_comparison(compare):
     """`np.testing.assert_allclose`, `np.allclose` or `np.isclose` with the switch applied where an array is float32."""
     if SCALE == 1:
         return compare
-    defaults = {"rtol": 1e-7, "atol": 0.0} if compare is np.testing.assert_allclose else {"rtol": 1e-5, "atol": 1e-8}
+    defaults = (
+        {"rtol": 1e-7, "atol": 0.0}
+        if compare is np.testing.assert_allclose
+        else {"rtol": 1e-5, "atol": 1e-8}
+    )
 
     def scaled(actual, desired, rtol=defaults["rtol"], atol=defaults["atol"], **options):
         if any(getattr(a, "dtype", None) == np.float32 for a in (actual, desired)):

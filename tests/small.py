@@ -18,9 +18,23 @@ def f32(x):
 def random_gaussians(seed=0, g=20, harmonics=0):
     """Some centimetres large, a metre apart. harmonics: functions beside the constant one."""
     rng = np.random.default_rng(seed)
-    means, quats, scales = rng.normal(size=(g, 3)), rng.normal(size=(g, 4)), np.exp(rng.normal(size=(g, 3)) - 3)
-    gaussians = Gaussians(f32(means), f32(quats), f32(scales), f32(rng.uniform(0.05, 0.95, g)), f32(rng.random((g, 3))))
-    return replace(gaussians, harmonics=f32(rng.uniform(-0.9, 0.9, (g, harmonics, 3)))) if harmonics else gaussians
+    means, quats, scales = (
+        rng.normal(size=(g, 3)),
+        rng.normal(size=(g, 4)),
+        np.exp(rng.normal(size=(g, 3)) - 3),
+    )
+    gaussians = Gaussians(
+        f32(means),
+        f32(quats),
+        f32(scales),
+        f32(rng.uniform(0.05, 0.95, g)),
+        f32(rng.random((g, 3))),
+    )
+    return (
+        replace(gaussians, harmonics=f32(rng.uniform(-0.9, 0.9, (g, harmonics, 3))))
+        if harmonics
+        else gaussians
+    )
 
 
 def small_body(n=6, j=3, s=2, seed=0):
@@ -47,7 +61,15 @@ def small_avatar(seed=0, per_vertex=4, weights=None, betas=(0.3, -1.2)):
     rest, g = shape_body(body, f32(betas)), per_vertex * len(body.template)
     weights = rng.random((g, len(body.parents))) if weights is None else weights
     weights = f32(weights / weights.sum(1, keepdims=True))
-    return Avatar(random_gaussians(seed, g), weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names)
+    return Avatar(
+        random_gaussians(seed, g),
+        weights,
+        rest.vertices,
+        rest.joints,
+        body.faces,
+        body.parents,
+        body.joint_names,
+    )
 
 
 @functools.cache

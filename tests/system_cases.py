@@ -31,7 +31,13 @@ def small_system(name: str) -> HumanGSConfig:
     shrunk = {}
     for field in ("encoder", "reader", "decoder"):
         part = getattr(parts, field)
-        own = {key: value for key, value in SMALL.items() if key in {f.name for f in dataclasses.fields(part)}}
+        own = {
+            key: value
+            for key, value in SMALL.items()
+            if key in {f.name for f in dataclasses.fields(part)}
+        }
         shrunk[field] = dataclasses.replace(part, **own)
     config = config.with_parts(**shrunk).with_runtime(token_capacity=0)
-    return config.with_conventions(image_size=32, body_vertices=None, longest_edge=None, tokens="all")
+    return config.with_conventions(
+        image_size=32, body_vertices=None, longest_edge=None, tokens="all"
+    )

@@ -26,18 +26,29 @@ PATCH = 8
 
 @functools.cache
 def small(name: str) -> HumanGSConfig:
-    config = SYSTEMS[name]("bench").with_runtime(scan=True, token_capacity=0)  # scan: compiles in less time
+    config = SYSTEMS[name]("bench").with_runtime(
+        scan=True, token_capacity=0
+    )  # scan: compiles in less time
     parts = config.architecture
     change = dataclasses.replace
     if name in PIXELS:
-        sizes = {"texture": TriplaneConfig(resolution=8, channels=2), "fusion": 8} if name == "humanram" else {}
+        sizes = (
+            {"texture": TriplaneConfig(resolution=8, channels=2), "fusion": 8}
+            if name == "humanram"
+            else {}
+        )
         sizes |= {"latents": 6} if name == "lvsm_latents" else {}
         config = config.with_parts(driver=change(parts.driver, transformer=BLOCKS, **sizes))
     elif name == "lca":
-        config = small_system("lhm_views").with_parts(driver=change(parts.driver, hidden=8, layers=1, joints=2))
+        config = small_system("lhm_views").with_parts(
+            driver=change(parts.driver, hidden=8, layers=1, joints=2)
+        )
     else:
         surface = SurfaceMap(parts.surface_map.kind, TEXELS)
-        moved = {field: change(getattr(parts, field), surface_map=surface) for field in ("reader", "decoder")[name != "giga" :]}
+        moved = {
+            field: change(getattr(parts, field), surface_map=surface)
+            for field in ("reader", "decoder")[name != "giga" :]
+        }
         sizes = {"pose_width": 8, "pose_tokens": 2, "joints": 2} if name == "giga" else {}
         config = config.with_parts(**moved, driver=change(parts.driver, widths=(4, 8), **sizes))
     return config.with_conventions(image_size=SIZE, body_vertices=None, longest_edge=None)
@@ -50,8 +61,12 @@ def mapped_tube(config: HumanGSConfig):
         return body
     rng = np.random.default_rng(0)
     faces = np.asarray(body.faces)[rng.integers(len(body.faces), size=wanted.shape)]
-    weights = rng.dirichlet([1, 1, 1], wanted.shape) * (np.arange(wanted.shape[1]) % 2 == 0)[:, None]
-    return replace(body, texels=Texels(jnp.asarray(faces, jnp.int32), jnp.asarray(weights, jnp.float32)))
+    weights = (
+        rng.dirichlet([1, 1, 1], wanted.shape) * (np.arange(wanted.shape[1]) % 2 == 0)[:, None]
+    )
+    return replace(
+        body, texels=Texels(jnp.asarray(faces, jnp.int32), jnp.asarray(weights, jnp.float32))
+    )
 
 
 def views(seed: int = 0, count: int = 2, size: int = SIZE) -> SubjectViews:
@@ -60,7 +75,13 @@ def views(seed: int = 0, count: int = 2, size: int = SIZE) -> SubjectViews:
     draw = lambda *shape: jnp.asarray(rng.random(shape), jnp.float32)
     rotations = 0.6 * (draw(POSES, 2, 3) - 0.5)
     cameras = orbit(
-        jnp.zeros(3), 2.6, 2 * jnp.pi * jnp.arange(count) / count, 0.1, intrinsics_from_fov(0.8, size, size), size, size
+        jnp.zeros(3),
+        2.6,
+        2 * jnp.pi * jnp.arange(count) / count,
+        0.1,
+        intrinsics_from_fov(0.8, size, size),
+        size,
+        size,
     )
     return SubjectViews(
         images=draw(count, size, size, 3),

@@ -35,7 +35,9 @@ def test_every_page_that_a_help_text_names_exists():
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command, humangs):
     code, out, _ = humangs(command, "--help")
-    assert code == 0 and ("--out" in out or command in ("view", "evaluate")) and "docstring" not in out
+    assert (
+        code == 0 and ("--out" in out or command in ("view", "evaluate")) and "docstring" not in out
+    )
     assert "None" not in out and "docs/" not in out
     lines = out.split("examples:\n")[1].splitlines()
     assert len(lines) == len(set(lines)) == 2
@@ -58,7 +60,9 @@ def test_the_help_of_a_switch_that_is_on_says_what_typing_it_does(command, human
         (off,) = [each.help for each in hint.__metadata__ if getattr(each, "help", None)]
         assert off.startswith("Do not ") and f"--no-{field.name.replace('_', '-')} {off}" in shown
         (about,) = re.findall(rf'^    {field.name}: .*\n    """(.*)"""', source, re.MULTILINE)
-        assert not re.match(r"(do not|no|not|without|skip|take|leave|print)\b", about, re.IGNORECASE), about
+        assert not re.match(
+            r"(do not|no|not|without|skip|take|leave|print)\b", about, re.IGNORECASE
+        ), about
 
 
 def test_the_package_runs_as_a_module():
@@ -88,7 +92,9 @@ def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatc
     model = presets.tiny().with_conventions(rendering="inria")
     monkeypatch.setattr(weights, "load_weights", lambda path: ({}, model))
     monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
-    monkeypatch.setattr(loop, "train", lambda settings, *arguments, **options: started.append(settings))
+    monkeypatch.setattr(
+        loop, "train", lambda settings, *arguments, **options: started.append(settings)
+    )
     for config in ("tiny", "published"):
         arguments = ("--config", config, "--init-weights", "w", "--out", tmp_path)
         code, _, error = humangs("train", "--on-the-fly", "1", *arguments)
@@ -103,13 +109,25 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
     from humangs_jax.training import loop, sources
 
     def interrupted(*arguments, **options):
-        stopped = loop.TrainingInterrupted.__new__(loop.TrainingInterrupted)  # a whole state is not needed
+        stopped = loop.TrainingInterrupted.__new__(
+            loop.TrainingInterrupted
+        )  # a whole state is not needed
         stopped.state = SimpleNamespace(step=done)
         raise stopped
 
     monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
     monkeypatch.setattr(loop, "train", interrupted)
-    words = ["train", "--config", "tiny", "--steps", "5", "--on-the-fly", "1", "--out", str(tmp_path)]
+    words = [
+        "train",
+        "--config",
+        "tiny",
+        "--steps",
+        "5",
+        "--on-the-fly",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
     assert cli.execute(words) == code
     out, err = capsys.readouterr()
     assert f"{tmp_path}: {done} of 5 steps" in out and ("interrupted" in err) == (code != 0)
@@ -122,8 +140,14 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("reconstruct me --refin 15s", "--refin: no option of humangs reconstruct: did you mean --refine?"),
-        ("start photos --out me --fit-masks", "--fit-masks: no option of humangs start: did you mean --no-fit-masks?"),
+        (
+            "reconstruct me --refin 15s",
+            "--refin: no option of humangs reconstruct: did you mean --refine?",
+        ),
+        (
+            "start photos --out me --fit-masks",
+            "--fit-masks: no option of humangs start: did you mean --no-fit-masks?",
+        ),
         ("synth --zzz", "--zzz: no option of humangs synth"),
     ],
 )
@@ -134,7 +158,11 @@ def test_a_wrong_option_is_one_line_with_the_nearest(words, said, humangs):
 def test_version_and_unknown_commands(humangs):
     assert humangs("--version") == (0, f"humangs_jax {__version__}\n", "")
     assert humangs("check", "--version")[0] == 0
-    assert humangs("chekc") == (cli.BAD_USAGE, "", "humangs: error: 'chekc' is no command: did you mean 'check'?\n")
+    assert humangs("chekc") == (
+        cli.BAD_USAGE,
+        "",
+        "humangs: error: 'chekc' is no command: did you mean 'check'?\n",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,14 +200,20 @@ def test_a_path_of_the_next_command_can_be_pasted(name, encoding, monkeypatch):
     text = screen.quoted(Path(name))
     assert text.isprintable() and text.encode(encoding)
     bash = ["bash", "-c", f"printf %s {text}"]
-    assert subprocess.run(bash, capture_output=True, check=True, env={"LC_ALL": "C.UTF-8"}).stdout == os.fsencode(name)
+    assert subprocess.run(
+        bash, capture_output=True, check=True, env={"LC_ALL": "C.UTF-8"}
+    ).stdout == os.fsencode(name)
 
 
 def test_a_command_ends_with_what_it_wrote_how_long_it_took_and_what_is_next(sample, capsys):
     assert cli.execute(["sample"]) == 0
     out, err = capsys.readouterr()
     report, written, took, following = out.splitlines()
-    assert (report, written, err) == ("the report", "my file.npz: 3 numbers", "humangs: warning: odd\n")
+    assert (report, written, err) == (
+        "the report",
+        "my file.npz: 3 numbers",
+        "humangs: warning: odd\n",
+    )
     assert re.fullmatch(r"took \d+\.\d s: counting \d+\.\d, writing \d+\.\d", took)
     assert following == "next: humangs view 'my file.npz'"
 
@@ -214,7 +248,9 @@ def test_quiet_and_verbose(sample, capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("fails", "code"), [("usage", 2), ("data", 1), ("option", 2), ("keys", 130)])
+@pytest.mark.parametrize(
+    ("fails", "code"), [("usage", 2), ("data", 1), ("option", 2), ("keys", 130)]
+)
 def test_exit_codes(sample, capsys, fails, code):
     """An argument of the library that is wrong is an option here."""
     assert cli.execute(["sample", "--fails", fails]) == code
@@ -232,7 +268,10 @@ def test_another_error_because_of_an_interrupt_is_an_interrupt(sample, monkeypat
         raise ImportError("while initializing the extension")
 
     monkeypatch.setattr(Sample, "run", run)
-    assert cli.execute(["sample"]) == cli.INTERRUPTED and capsys.readouterr().err == "\nhumangs: interrupted\n"
+    assert (
+        cli.execute(["sample"]) == cli.INTERRUPTED
+        and capsys.readouterr().err == "\nhumangs: interrupted\n"
+    )
     monkeypatch.setattr(Sample, "run", lambda self: 1 / 0)  # a mistake of ours is not hidden
     with pytest.raises(ZeroDivisionError):
         cli.execute(["sample"])
@@ -251,7 +290,9 @@ def test_a_stage_on_a_terminal_counts_its_seconds(monkeypatch, capsys):
     finally:
         progress.end()
     err = capsys.readouterr().err
-    assert "compiling ... 0 s" in err and "compiling: the step ... 0 s" in err and "steps: 100%" in err
+    assert (
+        "compiling ... 0 s" in err and "compiling: the step ... 0 s" in err and "steps: 100%" in err
+    )
     assert re.search(r"compiling: 0\.\d s\n$", err) and list(shown.seconds) == ["compiling"]
 
 
@@ -265,7 +306,9 @@ def test_bars_are_hidden_by_quiet(capsys):
 
 
 @pytest.mark.slow
-def test_a_check_goes_on_where_the_fit_does_not_know_a_view(capture_folder, tmp_path, monkeypatch, humangs):
+def test_a_check_goes_on_where_the_fit_does_not_know_a_view(
+    capture_folder, tmp_path, monkeypatch, humangs
+):
     from humangs_jax.cli.fit import Detections
     from humangs_jax.fitting.files import UnknownViewError
 
@@ -276,13 +319,19 @@ def test_a_check_goes_on_where_the_fit_does_not_know_a_view(capture_folder, tmp_
     monkeypatch.setattr("humangs_jax.detection.people.available", lambda: False)
     code, out, error = humangs("check", capture_folder, "--out", tmp_path / "check.png")
     assert code == 0 and "no view x: fit it again; the check does without that fit" in error
-    assert "0_00" in out and (tmp_path / "check.png").is_file() and not (tmp_path / "check_fit.png").exists()
+    assert (
+        "0_00" in out
+        and (tmp_path / "check.png").is_file()
+        and not (tmp_path / "check_fit.png").exists()
+    )
 
 
 def test_a_reader_that_has_gone_ends_a_command_quietly():
     """As `humangs check X | head -0`: through a real pipe, whose other end is closed at once."""
     program = subprocess.Popen(
-        [sys.executable, "-m", "humangs_jax.cli", "--version"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-m", "humangs_jax.cli", "--version"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     )
     program.stdout.close()
     error = program.stderr.read()
@@ -319,7 +368,9 @@ def test_help_and_checks_of_places_import_nothing_heavy(tmp_path):
         "    assert cli.execute(words) == cli.BAD_USAGE, words\n"
         "assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert len(done.stderr.splitlines()) == 13 and list(tmp_path.iterdir()) == []
     assert all(name in done.stdout for name in COMMANDS)

@@ -32,7 +32,9 @@ def things(tmp_path_factory, capture_folder):
     data = (path / "me.npz").read_bytes()
     (path / "truncated.npz").write_bytes(data[: len(data) // 2])
     middle = data.index(b"quats.npy") + 100
-    (path / "altered.npz").write_bytes(data[:middle] + bytes([data[middle] ^ 16]) + data[middle + 1 :])
+    (path / "altered.npz").write_bytes(
+        data[:middle] + bytes([data[middle] ^ 16]) + data[middle + 1 :]
+    )
     arrays = dict(np.load(path / "me.npz"))
     header = json.loads(str(arrays["header"]))
     write = lambda name, **changes: np.savez(path / name, **{**arrays, **changes})
@@ -43,12 +45,17 @@ def things(tmp_path_factory, capture_folder):
     write_png(path / "photo.png", np.ones((8, 8, 3)))
     (path / "cloud.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
     np.savez(path / "ten.npz", poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), mocap_framerate=30)
-    np.savez(path / "far.npz", poses=np.zeros((2, 165)), trans=np.full((2, 3), 1e6), mocap_framerate=30)
+    np.savez(
+        path / "far.npz", poses=np.zeros((2, 165)), trans=np.full((2, 3), 1e6), mocap_framerate=30
+    )
     np.savez(path / "pickled.npz", poses=np.array([{"a": 1}], dtype=object), trans=np.zeros((1, 3)))
     (path / "folder.npz").mkdir()
     (path / "some").mkdir()
     (path / "some" / "thesis.tex").write_text("mine")
-    edit_npz(shutil.copytree(capture_folder, path / "broken") / "body.npz", rotations=lambda x: np.nan * x)
+    edit_npz(
+        shutil.copytree(capture_folder, path / "broken") / "body.npz",
+        rotations=lambda x: np.nan * x,
+    )
     next((shutil.copytree(capture_folder, path / "lacking") / "images").iterdir()).unlink()
     small_avatar().save(path / "three.npz")
     for name, joints in (("jump", 55), ("few", 10), ("steps", 3)):
@@ -179,7 +186,15 @@ BAD_USAGE = {
     "reconstruct x --out /proc/a.npz": "--out /proc/a.npz: cannot write to /proc",
     **{
         f"{line} --out file": "--out file: is a file"
-        for line in (*("demo", "import cameras c --images i", "fit capture --keypoints k", "fit --scan s.obj", "start photos"),)
+        for line in (
+            *(
+                "demo",
+                "import cameras c --images i",
+                "fit capture --keypoints k",
+                "fit --scan s.obj",
+                "start photos",
+            ),
+        )
     },
     "fit --scan broken/me.obj --out broken --overwrite": "broken/me.obj lies in it and would be deleted",
     "fit --scan me.obj --out someone --overwrite": "the folder holds no scan_fit.json",
@@ -206,13 +221,19 @@ def contents(folder):
 
 
 @pytest.mark.parametrize(("line", "expected", "said"), REFUSED, ids=[line for line, *_ in REFUSED])
-def test_what_cannot_be_meant_is_one_line_before_the_work(line, expected, said, things, monkeypatch, humangs):
+def test_what_cannot_be_meant_is_one_line_before_the_work(
+    line, expected, said, things, monkeypatch, humangs
+):
     """Bad usage ends with 2, bad data with 1."""
     monkeypatch.chdir(things)
     before = contents(things)
     code, out, err = humangs(*line.split())
-    assert err.count("\n") == 1 and err.startswith("humangs: error: ") and said in err and out == "", (out, err)
-    assert code == expected and (expected == cli.BAD_DATA or said[:2] != "--" or f"error: {said}" in err)
+    assert (
+        err.count("\n") == 1 and err.startswith("humangs: error: ") and said in err and out == ""
+    ), (out, err)
+    assert code == expected and (
+        expected == cli.BAD_DATA or said[:2] != "--" or f"error: {said}" in err
+    )
     assert contents(things) == before
 
 
@@ -237,7 +258,12 @@ def places(command):
     """The options of a command that say where a file goes, with a suffix that it may have."""
     hints = get_type_hints(command, include_extras=True)
     found = {name: marks_in(hint, options.Place) for name, hint in hints.items()}
-    return {name: place.suffixes[0] for name, marks in found.items() for place in marks if place.suffixes}
+    return {
+        name: place.suffixes[0]
+        for name, marks in found.items()
+        for place in marks
+        if place.suffixes
+    }
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
@@ -249,7 +275,11 @@ def test_places_in_folders_that_do_not_exist_are_accepted_by_every_command(name,
 
 def test_a_capture_that_looks_wrong_is_warned_about(capture_folder, tmp_path, monkeypatch, humangs):
     """The quick part of `check`; here the command ends after it."""
-    monkeypatch.setattr(many, "reconstruct_many", lambda variables, config, captures, batch: iter([captures["turned"]()][1:]))
+    monkeypatch.setattr(
+        many,
+        "reconstruct_many",
+        lambda variables, config, captures, batch: iter([captures["turned"]()][1:]),
+    )
     turned = shutil.copytree(capture_folder, tmp_path / "turned")
     edit_npz(turned / "body.npz", rotations=np.degrees)
     _, _, err = humangs("reconstruct", turned, "--out", tmp_path / "a.npz")

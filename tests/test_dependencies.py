@@ -6,10 +6,21 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-IMPORT = re.compile(r"^\s*(?:from (\w+)[\w.]* import \w|import (\w+)(?:\.\w+)*(?: as \w+)?(?:  #.*)?$)", re.MULTILINE)
+IMPORT = re.compile(
+    r"^\s*(?:from (\w+)[\w.]* import \w|import (\w+)(?:\.\w+)*(?: as \w+)?(?:  #.*)?$)",
+    re.MULTILINE,
+)
 OURS = {"humangs_jax", "tests", "experiments"}
-NAMES = {"PIL": "pillow", "skimage": "scikit-image", "orbax": "orbax-checkpoint", "jaxlib": "jax", "yaml": "PyYAML"}
-NAMES |= dict.fromkeys(("backports", "compression"), "backports.zstd")  # Python 3.14 has it as compression.zstd
+NAMES = {
+    "PIL": "pillow",
+    "skimage": "scikit-image",
+    "orbax": "orbax-checkpoint",
+    "jaxlib": "jax",
+    "yaml": "PyYAML",
+}
+NAMES |= dict.fromkeys(
+    ("backports", "compression"), "backports.zstd"
+)  # Python 3.14 has it as compression.zstd
 """Distributions that are not called like their module."""
 UNTESTED = {"torch", "bpy"}
 """Imported by scripts that made stored references, and by those that Blender runs."""
@@ -29,9 +40,16 @@ def plain(requirement):
 
 def test_imports_are_declared_and_dependencies_imported():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    required, extras = {plain(each) for each in project["dependencies"]}, project["optional-dependencies"]
+    required, extras = (
+        {plain(each) for each in project["dependencies"]},
+        project["optional-dependencies"],
+    )
     assert imported(ROOT / "humangs_jax") == required
     groups = ("dev", "notebooks", "hdf5", "heic", "photos")
     tools = {plain(each) for name in groups for each in extras[name]}
-    own = {"data"} | {plain(path.stem) for folder in ("tests", "experiments") for path in (ROOT / folder).rglob("*.py")}
+    own = {"data"} | {
+        plain(path.stem)
+        for folder in ("tests", "experiments")
+        for path in (ROOT / folder).rglob("*.py")
+    }
     assert imported(ROOT / "tests") - own - required - tools == UNTESTED

@@ -31,7 +31,8 @@ PAGES = [
     *sorted((ROOT / "notebooks").glob("*.ipynb")),
 ]
 FENCE = re.compile(
-    r"^(?P<fence>```+|~~~+)[ \t]*(?P<kind>[\w+-]*)[^\n]*\n(?P<text>.*?)^(?P=fence)[ \t]*$", re.DOTALL | re.MULTILINE
+    r"^(?P<fence>```+|~~~+)[ \t]*(?P<kind>[\w+-]*)[^\n]*\n(?P<text>.*?)^(?P=fence)[ \t]*$",
+    re.DOTALL | re.MULTILINE,
 )
 SPAN = re.compile(r"(?<!`)`(?P<text>[^`]+)`(?!`)")
 SHELLS = ("", "sh", "bash", "shell", "console", "text", "zsh")
@@ -64,7 +65,9 @@ def commands_of(path):
         if cell["cell_type"] == "markdown":
             found += commands_in(source, path.name)
         elif cell["cell_type"] == "code":
-            lines = "\n".join(line.lstrip()[1:] for line in source.splitlines() if line.lstrip().startswith("!"))
+            lines = "\n".join(
+                line.lstrip()[1:] for line in source.splitlines() if line.lstrip().startswith("!")
+            )
             found += [Command(path.name, words, True) for words in split_shell(lines)]
     return list(dict.fromkeys(found))
 
@@ -78,7 +81,9 @@ def commands_in(text, page):
     prose = FENCE.sub("", text)
     for span in SPAN.finditer(prose):
         item = prose[: span.start()].endswith(("\n- ", "\n* "))
-        found += [Command(page, words, item) for words in split_shell(" ".join(span["text"].split()))]
+        found += [
+            Command(page, words, item) for words in split_shell(" ".join(span["text"].split()))
+        ]
     return list(dict.fromkeys(found))
 
 
@@ -155,7 +160,9 @@ def refused(command):
         if name not in cli.COMMANDS:
             return None if name.startswith("-") else f"{name} is no command"
         known = option_names(cli._command(name))
-        return [word for word in words if word.startswith("--") and word.split("=")[0] not in known] or None
+        return [
+            word for word in words if word.startswith("--") and word.split("=")[0] not in known
+        ] or None
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed):
@@ -173,18 +180,35 @@ def test_a_documented_command_is_one_that_the_parser_takes(command):
 
 
 def test_documented_scripts_and_tests_exist():
-    scripts = [words[1] for _, words, _ in COMMANDS if words[0] == "python" and words[1:2] != ("-m",)]
-    tests = [word for _, words, _ in COMMANDS if words[1:3] == ("-m", "pytest") for word in words if word.startswith("tests/")]
-    assert scripts and tests and [name for name in (*scripts, *tests) if not (ROOT / name).exists()] == []
+    scripts = [
+        words[1] for _, words, _ in COMMANDS if words[0] == "python" and words[1:2] != ("-m",)
+    ]
+    tests = [
+        word
+        for _, words, _ in COMMANDS
+        if words[1:3] == ("-m", "pytest")
+        for word in words
+        if word.startswith("tests/")
+    ]
+    assert (
+        scripts
+        and tests
+        and [name for name in (*scripts, *tests) if not (ROOT / name).exists()] == []
+    )
 
 
 def test_documented_experiments_exist_and_take_their_options():
-    known, asked = listed(), [command for command in COMMANDS if command.words[1:3] == ("-m", "experiments")]
+    known, asked = (
+        listed(),
+        [command for command in COMMANDS if command.words[1:3] == ("-m", "experiments")],
+    )
     for command in (command for command in asked if len(command.words) > 3):
         name, *options = command.words[3:]
         assert name in known, command
         if command.whole or options:
-            parser_of(getattr(importlib.import_module(known[name][0]), name))[0].parse_args(filled(options))
+            parser_of(getattr(importlib.import_module(known[name][0]), name))[0].parse_args(
+                filled(options)
+            )
 
 
 def test_every_command_is_shown_somewhere():
@@ -196,12 +220,18 @@ def test_every_command_is_shown_somewhere():
     [
         ("$ humangs check me   # look", ["humangs check me"]),
         ("humangs train a \\\n    --out b \\\n    --fsdp 8", ["humangs train a --out b --fsdp 8"]),
-        ("python3 -m venv .venv && .venv/bin/humangs demo --out o", ["python -m venv .venv", "humangs demo --out o"]),
+        (
+            "python3 -m venv .venv && .venv/bin/humangs demo --out o",
+            ["python -m venv .venv", "humangs demo --out o"],
+        ),
         ("X=1 humangs demo; humangs view a &", ["humangs demo", "humangs view a"]),
         ('ssh NAME --command "humangs train p --out o"', ["humangs train p --out o"]),
         ("srun humangs train p --background '#1' # 2", ["humangs train p --background #1"]),
         ("# humangs is not a command here\nit's humangs", []),
-        ("humangs preprocess thuman|thuman4 SRC | tee log", ["humangs preprocess thuman|thuman4 SRC"]),
+        (
+            "humangs preprocess thuman|thuman4 SRC | tee log",
+            ["humangs preprocess thuman|thuman4 SRC"],
+        ),
     ],
 )
 def test_lines_of_a_shell_are_read_as_a_shell_reads_them(text, expected):
@@ -218,11 +248,22 @@ def test_blocks_and_beginnings_of_items_are_whole_and_other_spans_are_not():
         Command("page", ("humangs", "check", "me"), True),
         Command("page", ("humangs", "tune"), False),
     ]
-    assert filled(["SOURCE", "[--up=+z]", "integer|half", "$A/x.npz", "..."]) == ["1", "--up=+z", "integer", "1/x.npz"]
+    assert filled(["SOURCE", "[--up=+z]", "integer|half", "$A/x.npz", "..."]) == [
+        "1",
+        "--up=+z",
+        "integer",
+        "1/x.npz",
+    ]
 
 
 @pytest.mark.parametrize(
-    "words", ["train DATA --out RUN --vgg-19 F", "export a.npz --out b.ply --frame", "import photos", "trian DATA"]
+    "words",
+    [
+        "train DATA --out RUN --vgg-19 F",
+        "export a.npz --out b.ply --frame",
+        "import photos",
+        "trian DATA",
+    ],
 )
 def test_a_wrong_line_is_noticed(words):
     assert refused(Command("page", ("humangs", *words.split()), True))
@@ -255,7 +296,14 @@ def run_all(lines, humangs):
 def test_documented_exports_run(workspace, humangs):
     run_all(QUICK, humangs)
     made = {path.name for path in workspace.iterdir()}
-    assert made >= {"person.ply", "person.spz", "avatar.html", "dance.html", "dance_0000.ply", "dance_0195.ply"}
+    assert made >= {
+        "person.ply",
+        "person.spz",
+        "avatar.html",
+        "dance.html",
+        "dance_0000.ply",
+        "dance_0195.ply",
+    }
 
 
 @pytest.mark.slow

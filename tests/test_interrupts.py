@@ -17,7 +17,9 @@ from humangs_jax import cli
 from humangs_jax.cli.screen import PATIENCE
 from humangs_jax.data.capture import load_capture, save_capture
 
-pytestmark = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs Linux's or macOS's signals")
+pytestmark = pytest.mark.skipif(
+    not hasattr(signal, "setitimer"), reason="needs Linux's or macOS's signals"
+)
 START = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL); "
     "from humangs_jax import cli; "
@@ -30,13 +32,17 @@ def process(code, folder=None, environment=None, arguments=()):
     """A Python process whose output is read."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     environment = ENVIRONMENT if environment is None else environment
-    return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=folder, env=environment, **pipes)
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], cwd=folder, env=environment, **pipes
+    )
 
 
 def command(work, more=""):
     """Code of a command line whose command does this work."""
     run = f"class Own:\n    def run(self):\n{textwrap.indent(textwrap.dedent(work), ' ' * 8)}\n"
-    return f"{START}\n{textwrap.dedent(more)}\n{run}cli._parsed = lambda arguments: Own()\ncli.main()"
+    return (
+        f"{START}\n{textwrap.dedent(more)}\n{run}cli._parsed = lambda arguments: Own()\ncli.main()"
+    )
 
 
 def interrupted(program, number=signal.SIGINT):
@@ -61,7 +67,10 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
             hashlib.pbkdf2_hmac("sha256", b"", b"", 200_000_000)
         write = lambda folder: atomic.replace_file("file", lambda file: work(folder, file))
     """
-    program, began = (process(command("atomic.replace_folder('new', write, mark='x')", writing), tmp_path), time.monotonic())
+    program, began = (
+        process(command("atomic.replace_folder('new', write, mark='x')", writing), tmp_path),
+        time.monotonic(),
+    )
     _, error = interrupted(program)
     assert program.returncode == cli.INTERRUPTED and error.endswith("humangs: interrupted\n")
     assert PATIENCE <= time.monotonic() - began < 50
@@ -128,7 +137,9 @@ def test_an_interrupt_after_the_work_is_done_changes_nothing(code):
                 kill(own, number)
         sys.late = Late()
     """
-    program = process(f"{START}\n{textwrap.dedent(late)}cli.execute = lambda arguments: {code}\ncli.main()")
+    program = process(
+        f"{START}\n{textwrap.dedent(late)}cli.execute = lambda arguments: {code}\ncli.main()"
+    )
     _, error = program.communicate(timeout=250)
     assert (program.returncode, error) == (code, "")
 
@@ -141,7 +152,10 @@ def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
         "print('imported', flush=True)\n"
     )
     path = os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])
-    program = process(command("import slow_to_import, time; time.sleep(300)"), environment=ENVIRONMENT | {"PYTHONPATH": path})
+    program = process(
+        command("import slow_to_import, time; time.sleep(300)"),
+        environment=ENVIRONMENT | {"PYTHONPATH": path},
+    )
     out, error = program.communicate(timeout=250)
     assert (program.returncode, out) == (cli.INTERRUPTED, "imported\n"), error
 
@@ -154,7 +168,19 @@ WORKS = {
     "refined.npz": ("refine", "me.npz", "me", "--limit", "3steps", "--image-size", "64"),
     "views": ("render", "me.npz", "--views", "3", "--size", "64", "--exr"),
     "demo": ("demo", "--size", "32", "--refine", "0"),
-    "people": ("synth", "--subjects", "1", "--size", "128", "--views", "2", "--close-views", "0", "--workers", "1"),
+    "people": (
+        "synth",
+        "--subjects",
+        "1",
+        "--size",
+        "128",
+        "--views",
+        "2",
+        "--close-views",
+        "0",
+        "--workers",
+        "1",
+    ),
 }
 """By what they write: those that compute for long."""
 
@@ -173,7 +199,9 @@ def place(tmp_path_factory):
 @pytest.mark.parametrize("seconds", [2.3, 7.5, 12.8])
 def test_a_process_that_is_interrupted_exits_with_130(out, seconds, place, tmp_path):
     """As in a shell: the whole process, with XLA's threads, which crashed at its end."""
-    program = process(START + "cli.main()", place, arguments=(*WORKS[out], "--out", str(tmp_path / out)))
+    program = process(
+        START + "cli.main()", place, arguments=(*WORKS[out], "--out", str(tmp_path / out))
+    )
     time.sleep(seconds)
     program.send_signal(signal.SIGINT)
     _, error = program.communicate(timeout=300)

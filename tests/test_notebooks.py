@@ -28,13 +28,19 @@ MOST_BYTES = 1_500_000
 
 UNITS = ("dB", "%", "MiB", "MB", "ms", "s", "mm", "m", "times")
 NUMBER = r"\d{1,3}(?:,\d{3})+|\d+(?:\.\d+)?(?:e[+-]?\d+)?"
-STATED = re.compile(rf"(?:\b(some|about) +)?(?<![\w.,/^])({NUMBER})(?![\w/]|[.,]\d)(?: ?({'|'.join(UNITS)})(?![\w^]))?", re.I)
+STATED = re.compile(
+    rf"(?:\b(some|about) +)?(?<![\w.,/^])({NUMBER})(?![\w/]|[.,]\d)(?: ?({'|'.join(UNITS)})(?![\w^]))?",
+    re.I,
+)
 IN_WORDS = re.compile(
     r"\b(halves|thirds|quarters?|fifths|sixths|eighths|tenths|twice|thrice|percent|half (?:of|as)|"
     r"a (?:half|third|fifth|tenth) of|(?:two|three|four|five|six|seven|eight|nine|ten|twenty|hundred|thousand) times)\b",
     re.IGNORECASE,
 )
-DURATIONS = {"About a minute on a CPU with two cores.": (20, 140), "A few minutes on a CPU with two cores.": (60, 600)}
+DURATIONS = {
+    "About a minute on a CPU with two cores.": (20, 140),
+    "A few minutes on a CPU with two cores.": (60, 600),
+}
 """Seconds of CPU time, between which the committed run lies: two cores take between one and half of them."""
 
 PICTURES = {
@@ -66,19 +72,31 @@ def cells(notebook, kind):
 
 def outputs(notebook):
     """All outputs, in order."""
-    return [out for cell in notebook["cells"] if cell["cell_type"] == "code" for out in cell["outputs"]]
+    return [
+        out for cell in notebook["cells"] if cell["cell_type"] == "code" for out in cell["outputs"]
+    ]
 
 
 def printed(notebook):
     """The text of all outputs."""
-    return "\n".join("".join(out["text"]) for out in outputs(notebook) if out["output_type"] == "stream")
+    return "\n".join(
+        "".join(out["text"]) for out in outputs(notebook) if out["output_type"] == "stream"
+    )
 
 
 def images(notebook):
     """Arrays (h, w, 3) of all figures, levels 0 to 255."""
     kinds = ("image/jpeg", "image/png")
-    found = [out["data"][kind] for out in outputs(notebook) for kind in kinds if kind in out.get("data", {})]
-    return [np.asarray(Image.open(io.BytesIO(base64.b64decode(x))).convert("RGB"), np.int32) for x in found]
+    found = [
+        out["data"][kind]
+        for out in outputs(notebook)
+        for kind in kinds
+        if kind in out.get("data", {})
+    ]
+    return [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(x))).convert("RGB"), np.int32)
+        for x in found
+    ]
 
 
 def prose(notebook):
@@ -100,12 +118,17 @@ def unfounded(notebook):
     """What the prose states that neither outputs nor code have."""
     text, shown, code = prose(notebook), printed(notebook), "\n".join(cells(notebook, "code"))
     numbers = lambda where, unit="": [
-        float(found.replace(",", "")) for found in re.findall(rf"(?<![\w.,])({NUMBER}){unit}", where)
+        float(found.replace(",", ""))
+        for found in re.findall(rf"(?<![\w.,])({NUMBER}){unit}", where)
     ]
     wrong = [found[0] for found in IN_WORDS.finditer(text)]
     for found in STATED.finditer(text):
         zeros, number, unit = found.groups()
-        known = numbers(shown, rf" ?{re.escape(unit)}(?!\w)") if unit else numbers(shown) + numbers(code)
+        known = (
+            numbers(shown, rf" ?{re.escape(unit)}(?!\w)")
+            if unit
+            else numbers(shown) + numbers(code)
+        )
         if not any(rounds_to(value, number, zeros) for value in known):
             wrong.append(" ".join(found[0].split()))
     return wrong
@@ -151,10 +174,16 @@ def test_cells_are_executed_in_order(committed):
     _, notebook = committed
     counts = [cell["execution_count"] for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert counts == list(range(1, len(counts) + 1))
-    assert not [out for out in outputs(notebook) if out["output_type"] == "error" or out.get("name") == "stderr"]
+    assert not [
+        out
+        for out in outputs(notebook)
+        if out["output_type"] == "error" or out.get("name") == "stderr"
+    ]
     assert images(notebook)
     assert len(json.dumps(notebook)) < MOST_BYTES
-    assert not re.search(r"/(?:tmp|home|root|work|Users)/", printed(notebook)), "a path of the machine"
+    assert not re.search(r"/(?:tmp|home|root|work|Users)/", printed(notebook)), (
+        "a path of the machine"
+    )
 
 
 def test_numbers_of_the_prose_are_in_the_outputs(committed):
@@ -165,7 +194,9 @@ def test_time_of_the_prose_is_the_time_of_the_run(committed):
     _, notebook = committed
     first = " ".join(cells(notebook, "markdown")[0].split())
     least, most = next(bounds for said, bounds in DURATIONS.items() if first.endswith(said))
-    took = re.search(r"this notebook took \d+ s, (\d+) s of CPU", "".join(outputs(notebook)[-1]["text"]))
+    took = re.search(
+        r"this notebook took \d+ s, (\d+) s of CPU", "".join(outputs(notebook)[-1]["text"])
+    )
     assert took and least <= int(took[1]) <= most
 
 
@@ -178,26 +209,43 @@ def test_people_lie_inside_of_their_pictures(committed):
 
 def test_links_lead_somewhere(committed):
     text = "\n".join(cells(committed[1], "markdown"))
-    links = [target for target in re.findall(r"\]\(([^)#]+)", text) if not target.startswith("http")]
+    links = [
+        target for target in re.findall(r"\]\(([^)#]+)", text) if not target.startswith("http")
+    ]
     pages = re.findall(r"`(docs/[\w/]+\.md)`", text)
-    gone = [x for x in links if not (ROOT / "notebooks" / x).exists()] + [x for x in pages if not (ROOT / x).exists()]
+    gone = [x for x in links if not (ROOT / "notebooks" / x).exists()] + [
+        x for x in pages if not (ROOT / x).exists()
+    ]
     assert not gone
 
 
 def test_what_notebooks_need_is_installed_with_the_package():
-    code = "\n".join(source for path in NOTEBOOKS for source in cells(json.loads(path.read_text()), "code"))
+    code = "\n".join(
+        source for path in NOTEBOOKS for source in cells(json.loads(path.read_text()), "code")
+    )
     read = {f"docs/{name}" for name in re.findall(r'docs / "([\w./]+)"', code)}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     shipped = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert read
-    assert {name: shipped.get(name) for name in read} == {name: f"humangs_jax/assets/{name}" for name in read}
+    assert {name: shipped.get(name) for name in read} == {
+        name: f"humangs_jax/assets/{name}" for name in read
+    }
     assert all((ROOT / name).is_file() for name in read)
-    assert any(name.startswith("jupyterlab") for name in project["project"]["optional-dependencies"]["notebooks"])
+    assert any(
+        name.startswith("jupyterlab")
+        for name in project["project"]["optional-dependencies"]["notebooks"]
+    )
 
 
 def test_the_helper_that_frames_people_is_the_same_everywhere():
-    sources = [source for path in NOTEBOOKS for source in cells(json.loads(path.read_text()), "code")]
-    helpers = {found for source in sources for found in re.findall(r"def pictures.*?plt\.show\(\)", source, re.DOTALL)}
+    sources = [
+        source for path in NOTEBOOKS for source in cells(json.loads(path.read_text()), "code")
+    ]
+    helpers = {
+        found
+        for source in sources
+        for found in re.findall(r"def pictures.*?plt\.show\(\)", source, re.DOTALL)
+    }
     assert len(helpers) == 1
 
 
@@ -214,7 +262,11 @@ def test_the_helper_that_frames_people_is_the_same_everywhere():
     ],
 )
 def test_stale_numbers_are_found(text, shown, wrong):
-    code = {"cell_type": "code", "source": "size = 64", "outputs": [{"output_type": "stream", "text": [shown]}]}
+    code = {
+        "cell_type": "code",
+        "source": "size = 64",
+        "outputs": [{"output_type": "stream", "text": [shown]}],
+    }
     assert unfounded({"cells": [{"cell_type": "markdown", "source": [text]}, code]}) == wrong
 
 
@@ -230,7 +282,9 @@ def test_people_who_are_cut_are_found(top, left, expected, background=178):
         picture = np.full((180, 140, 3), background)
         picture[max(first, 0) : first + 110, side : side + 30] = (120, 60, 20)
         image[10:190, shift + 10 : shift + 150] = picture
-        image[[10, 189], shift + 10 : shift + 150] = image[10:190, [shift + 10, shift + 149]] = FRAME
+        image[[10, 189], shift + 10 : shift + 150] = image[10:190, [shift + 10, shift + 149]] = (
+            FRAME
+        )
     whole, moved = map(fault, framed(image))
     assert whole is None
     assert moved is None if expected is None else expected in moved
@@ -243,11 +297,15 @@ def test_notebook_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     import nbformat
     from nbclient import NotebookClient
 
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")  # notebooks run for minutes, and some measure time
+    monkeypatch.setenv(
+        "JAX_DISABLE_MOST_OPTIMIZATIONS", "0"
+    )  # notebooks run for minutes, and some measure time
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     notebook = nbformat.read(path, as_version=4)
     before = len(images(notebook))
-    NotebookClient(notebook, timeout=TIMEOUT_SECONDS, resources={"metadata": {"path": tmp_path}}).execute()
+    NotebookClient(
+        notebook, timeout=TIMEOUT_SECONDS, resources={"metadata": {"path": tmp_path}}
+    ).execute()
     assert len(images(notebook)) == before
     pictures = [picture for image in images(notebook) for picture in framed(image)]
     assert len(pictures) == PICTURES[path.stem]

@@ -13,7 +13,9 @@ import pytest
 import humangs_jax
 
 ROOT = Path(humangs_jax.__file__).parent
-SOURCES = sorted(path for path in ROOT.rglob("*") if path.suffix in (".py", ".pyi", ".js", ".frag", ".vert"))
+SOURCES = sorted(
+    path for path in ROOT.rglob("*") if path.suffix in (".py", ".pyi", ".js", ".frag", ".vert")
+)
 OTHERS = (ROOT.parent / "tests" / "conftest.py",)
 POINTER = re.compile(r"(?<![\w./-])([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?![\w/-])")
 SUFFIXES = {
@@ -48,12 +50,18 @@ def comments(path: Path) -> list[str]:
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     found = [token.string for token in tokens if token.type == tokenize.COMMENT]
     strings = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Expr)]
-    return found + [each.value for each in strings if isinstance(each, ast.Constant) and isinstance(each.value, str)]
+    return found + [
+        each.value
+        for each in strings
+        if isinstance(each, ast.Constant) and isinstance(each.value, str)
+    ]
 
 
 def pointers(path: Path) -> list[str]:
     """Dotted names between single backticks."""
-    quoted = [each for text in comments(path) for each in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text)]
+    quoted = [
+        each for text in comments(path) for each in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text)
+    ]
     return [name for each in quoted for name in POINTER.findall(each)]
 
 
@@ -75,7 +83,9 @@ def namespaces() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 classes.setdefault(node.name, set()).update(defined(node.body), set_on_self(node))
-                bases.setdefault(node.name, set()).update(ast.unparse(base).split("[")[0] for base in node.bases)
+                bases.setdefault(node.name, set()).update(
+                    ast.unparse(base).split("[")[0] for base in node.bases
+                )
     for _ in range(4):  # of bases of bases
         for name, above in bases.items():
             for base in above:
@@ -88,7 +98,11 @@ def defined(body: list[ast.stmt]) -> list[str]:
     found: list[str] = []
     for node in body:
         match node:
-            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+            case (
+                ast.FunctionDef(name=name)
+                | ast.AsyncFunctionDef(name=name)
+                | ast.ClassDef(name=name)
+            ):
                 found.append(name)
             case ast.Import(names=names) | ast.ImportFrom(names=names):
                 found += [(each.asname or each.name).split(".")[0] for each in names]
@@ -96,12 +110,21 @@ def defined(body: list[ast.stmt]) -> list[str]:
                 found += defined(inner)
             case ast.Assign() | ast.AnnAssign() | ast.AugAssign():
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-                found += [each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)]
+                found += [
+                    each.id
+                    for target in targets
+                    for each in ast.walk(target)
+                    if isinstance(each, ast.Name)
+                ]
     return found
 
 
 def set_on_self(node: ast.ClassDef) -> list[str]:
-    return [x.attr for x in ast.walk(node) if isinstance(x, ast.Attribute) and ast.unparse(x.value) == "self"]
+    return [
+        x.attr
+        for x in ast.walk(node)
+        if isinstance(x, ast.Attribute) and ast.unparse(x.value) == "self"
+    ]
 
 
 @functools.cache
@@ -112,7 +135,9 @@ def of_others() -> set[str]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 found.update((each.asname or each.name).split(".")[0] for each in node.names)
-            elif isinstance(node, ast.ImportFrom) and not (node.module or "").startswith("humangs_jax"):
+            elif isinstance(node, ast.ImportFrom) and not (node.module or "").startswith(
+                "humangs_jax"
+            ):
                 found.update(each.asname or each.name for each in node.names)
     return found
 
@@ -124,12 +149,20 @@ def points_nowhere(name: str) -> bool:
     """
     modules, classes = namespaces()
     first, *rest = name.split(".")
-    if rest[-1] in SUFFIXES or first in VARIABLES or (first == "humangs_jax" and rest[0] in humangs_jax.__all__):
+    if (
+        rest[-1] in SUFFIXES
+        or first in VARIABLES
+        or (first == "humangs_jax" and rest[0] in humangs_jax.__all__)
+    ):
         return False
     if first in classes:
         return not {rest[0], "*"} & classes[first]
     # a word may also stand for an object of a class of that name: camera.K, capture.poses, config.max_pairs
-    if any(rest[0] in attributes for owner, attributes in classes.items() if owner.lower().endswith(first.lower())):
+    if any(
+        rest[0] in attributes
+        for owner, attributes in classes.items()
+        if owner.lower().endswith(first.lower())
+    ):
         return False
     if first not in modules:
         moved = any(rest[0] in names for module, names in modules.items() if "." not in module)
@@ -141,14 +174,20 @@ def points_nowhere(name: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    "path", [*(path for path in SOURCES if path.suffix == ".py"), *OTHERS], ids=lambda path: str(path.relative_to(ROOT.parent))
+    "path",
+    [*(path for path in SOURCES if path.suffix == ".py"), *OTHERS],
+    ids=lambda path: str(path.relative_to(ROOT.parent)),
 )
 def test_what_comments_point_at_exists(path):
     assert [name for name in pointers(path) if points_nowhere(name)] == []
 
 
 def test_files_that_comments_name_exist():
-    names = {path.name for folder in ("humangs_jax", "tests", "experiments") for path in (ROOT.parent / folder).rglob("*")}
+    names = {
+        path.name
+        for folder in ("humangs_jax", "tests", "experiments")
+        for path in (ROOT.parent / folder).rglob("*")
+    }
     missing = [
         (path.name, name)
         for path in (*SOURCES, *OTHERS)
@@ -159,8 +198,23 @@ def test_files_that_comments_name_exist():
     assert missing == []
 
 
-NOWHERE = ("splatting.default_pair", "splatting.render_view", "avatar.low_pass", "Rendering.overflows", "seeds.SPLITS")
-THERE = ("buffers.default_pairs", "data.views", "camera.K", "Rendering.overflow", "avatar.npz", "jnp.where", "jax.vmap", "a.b")
+NOWHERE = (
+    "splatting.default_pair",
+    "splatting.render_view",
+    "avatar.low_pass",
+    "Rendering.overflows",
+    "seeds.SPLITS",
+)
+THERE = (
+    "buffers.default_pairs",
+    "data.views",
+    "camera.K",
+    "Rendering.overflow",
+    "avatar.npz",
+    "jnp.where",
+    "jax.vmap",
+    "a.b",
+)
 
 
 @pytest.mark.parametrize("name", [*NOWHERE, *THERE])

@@ -22,7 +22,12 @@ def test_other_names_are_refused():
 
 def test_importing_the_package_imports_nothing_heavy():
     code = "import sys, humangs_jax; print([name for name in ('jax', 'numpy', 'flax') if name in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )
 
 
 def test_there_are_at_most_fifty():
@@ -40,14 +45,35 @@ image = hg.render(gaussians, capture.cameras[0], splat).rgb
 ablation = hg.ablate("tiny", {"no token": {"model.architecture.encoder.transformer.class_token": False}})
 gain = ablation.rows[0].difference
 """
-USED = ("load_weights", "load_capture", "reconstruct", "refine", "animate", "plan_buffers", "render")
+USED = (
+    "load_weights",
+    "load_capture",
+    "reconstruct",
+    "refine",
+    "animate",
+    "plan_buffers",
+    "render",
+)
 
 
 def test_type_checkers_know_what_everything_is(tmp_path):
-    names = [*re.findall(r"^(\w+)(?:, (\w+))? =", USER, re.MULTILINE), *((f"hg.{name}", "") for name in USED)]
+    names = [
+        *re.findall(r"^(\w+)(?:, (\w+))? =", USER, re.MULTILINE),
+        *((f"hg.{name}", "") for name in USED),
+    ]
     shown = [f"reveal_type({name})" for pair in names for name in pair if name]
     (tmp_path / "user.py").write_text("\n".join([USER, *shown, "hg.render(avatar)"]))
-    command = [sys.executable, "-m", "ty", "check", "--python", sys.prefix, "--output-format", "concise", "user.py"]
+    command = [
+        sys.executable,
+        "-m",
+        "ty",
+        "check",
+        "--python",
+        sys.prefix,
+        "--output-format",
+        "concise",
+        "user.py",
+    ]
     text = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
     # numpy 2.5 calls the shape of an `np.ndarray` _AnyShape, older versions tuple[Any, ...]
     arrays_of_numpy = r"ndarray\[(_AnyShape|tuple\[Any, \.\.\.\]), dtype\[Any\]\]"
@@ -56,4 +82,6 @@ def test_type_checkers_know_what_everything_is(tmp_path):
     assert len(types) == len(shown), text
     vague = [each for each in types if re.search(r"Unknown|Any\b|object", each)]
     assert not vague, vague
-    assert "Array" in types and "float" in types and "Expected `Gaussians`, found `Avatar`" in text, text
+    assert (
+        "Array" in types and "float" in types and "Expected `Gaussians`, found `Avatar`" in text
+    ), text

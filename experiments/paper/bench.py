@@ -33,7 +33,13 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.data.loading import ViewSampling
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.evaluation.cases import Method, Predicted, draw_painted_body, draw_views, painted_body
+from humangs_jax.evaluation.cases import (
+    Method,
+    Predicted,
+    draw_painted_body,
+    draw_views,
+    painted_body,
+)
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.evaluation.scores import EvaluationProtocol, person_means
 from humangs_jax.losses.loss_networks import LossNetworks, load_loss_networks
@@ -48,7 +54,12 @@ from humangs_jax.training.state import init_state
 from humangs_jax.training.step import seed_numbers, update
 
 PAGE = REPOSITORY / "docs" / "paper.md"
-SCORES = {"psnr": ("PSNR, dB", 2), "psnr_fg": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 3), "lpips_alex": ("LPIPS (Alex)", 3)}
+SCORES = {
+    "psnr": ("PSNR, dB", 2),
+    "psnr_fg": ("foreground PSNR, dB", 2),
+    "ssim": ("SSIM", 3),
+    "lpips_alex": ("LPIPS (Alex)", 3),
+}
 TASKS = {"reconstruction": "pose of the photos", "animation": "another pose"}
 PHOTOS = 4
 """That a network is trained with, unless it takes one."""
@@ -85,7 +96,9 @@ def variants() -> dict[str, Variant]:
     encoder, reader, decoder = paper_parts(paper.architecture)
     part = lambda about, **changes: Variant(paper.with_parts(**changes), about=about)
     found = {REFERENCE: Variant(paper)}
-    found |= {name: Variant(model, 1 if name in TAKE_ONE else PHOTOS) for name, model in models.items()}
+    found |= {
+        name: Variant(model, 1 if name in TAKE_ONE else PHOTOS) for name, model in models.items()
+    }
     tokenless = dataclasses.replace(encoder.transformer, class_token=False)
     upsampler = UpsamplerConfig(BENCH_WIDTH // 3, "final")
     normal, shells = decoder.clone(frame="normal"), paper_parts(ours.architecture)[1].shells
@@ -93,10 +106,16 @@ def variants() -> dict[str, Variant]:
         "one depth": part("features of four depths", encoder=encoder.clone(upsampler=upsampler)),
         "no global token": part("global token", encoder=encoder.clone(transformer=tokenless)),
         "1 Gaussian a vertex": part("1 + 4 Gaussians a vertex", decoder=decoder.clone(free=0)),
-        "pooling over all views": Variant(paper.with_conventions(pool="all"), about="pooling over visible views"),
-        "tightness 0": Variant(paper, about="tightness", fields={"loss": dataclasses.replace(LOSS, tightness=0.0)}),
+        "pooling over all views": Variant(
+            paper.with_conventions(pool="all"), about="pooling over visible views"
+        ),
+        "tightness 0": Variant(
+            paper, about="tightness", fields={"loss": dataclasses.replace(LOSS, tightness=0.0)}
+        ),
         "all additions": Variant(ours, about="ours"),
-        "photo colors": part("ours", reader=reader.clone(sample_rgb=True), decoder=decoder.clone(residual_color=True)),
+        "photo colors": part(
+            "ours", reader=reader.clone(sample_rgb=True), decoder=decoder.clone(residual_color=True)
+        ),
         "normal frame": part("ours", decoder=normal),
         "shells and normal frame": part("ours", reader=reader.clone(shells=shells), decoder=normal),
         "foreground tokens": Variant(paper.with_conventions(tokens="foreground"), about="ours"),
@@ -109,7 +128,9 @@ LOSS = LossConfig(structural=0.0, structural_scales=1, silhouette=0.0, random_ba
 
 def configuration(variant: Variant, seed: int, steps: int, perceptual: bool = False) -> TrainConfig:
     """Of one round. The optimizer is the paper's but for its warm-up."""
-    photos = ViewSampling((variant.photos,), target_count=1, jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0)
+    photos = ViewSampling(
+        (variant.photos,), target_count=1, jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0
+    )
     config = TrainConfig(
         model=variant.model,
         views=photos,
@@ -122,7 +143,11 @@ def configuration(variant: Variant, seed: int, steps: int, perceptual: bool = Fa
         seed=seed,
     )
     config = dataclasses.replace(config, **variant.fields)
-    return dataclasses.replace(config, loss=dataclasses.replace(config.loss, vgg16=1.0)) if perceptual else config
+    return (
+        dataclasses.replace(config, loss=dataclasses.replace(config.loss, vgg16=1.0))
+        if perceptual
+        else config
+    )
 
 
 def tests_of(name: str, variant: Variant) -> tuple[str, ...]:
@@ -130,7 +155,11 @@ def tests_of(name: str, variant: Variant) -> tuple[str, ...]:
     if variant.photos == 1:
         return ("1",)
     several = name in (REFERENCE, "no global token", *SYSTEMS) and name not in ADDED
-    near = NEAR if name in ("lvsm", "humanram", "ghg", REFERENCE, "no global token", "1 Gaussian a vertex") else ()
+    near = (
+        NEAR
+        if name in ("lvsm", "humanram", "ghg", REFERENCE, "no global token", "1 Gaussian a vertex")
+        else ()
+    )
     return *(COUNTS if several else (str(PHOTOS),)), *near
 
 
@@ -149,7 +178,13 @@ def meets(curve: list[float], painted: float) -> bool:
 
 
 def train_run(
-    variant: Variant, seed: int, out: Path, people: Path, row: dict[str, Any], painted: float, round_steps: int = ROUND
+    variant: Variant,
+    seed: int,
+    out: Path,
+    people: Path,
+    row: dict[str, Any],
+    painted: float,
+    round_steps: int = ROUND,
 ) -> dict[str, Any] | None:
     """The row of a run after one more round in the folder `out`; None if it was interrupted, and goes on there.
 
@@ -161,7 +196,9 @@ def train_run(
     if networks.vgg16 is None:
         raise ValueError("the perceptual loss needs VGG-16: pip install humangs_jax[lpips]")
     networks = networks if perceptual else LossNetworks()
-    config = configuration(variant, seed, round_steps // 4 if perceptual else round_steps, perceptual)
+    config = configuration(
+        variant, seed, round_steps // 4 if perceptual else round_steps, perceptual
+    )
     # what shows no other pose than that of the photos is not asked for one
     one_pose, folder = not animatable(variant.model), out / str(number)
     source = on_disk(people / "train", one_pose, recolored=True)
@@ -172,7 +209,9 @@ def train_run(
     # another seed also means other people at each step, and rounds do not repeat the steps before
     config = dataclasses.replace(config, seed=100 * seed + number)
     try:
-        state = train(config, body, source, folder, variables=before, networks=networks, progress=False)
+        state = train(
+            config, body, source, folder, variables=before, networks=networks, progress=False
+        )
     except TrainingInterrupted as stopped:
         state, interrupted = stopped.state, True
     spent += time.process_time() - start
@@ -180,7 +219,9 @@ def train_run(
     if interrupted and int(state.step) < config.steps:
         return None
     trained, model = jax.device_get(state.variables), variant.model
-    score = tested(network(trained, model), people / "validation", variant.photos, animatable(model))
+    score = tested(
+        network(trained, model), people / "validation", variant.photos, animatable(model)
+    )
     psnr = float(np.mean(score["reconstruction"]["psnr_fg"]))
     return {
         "curve": curve if perceptual else [*curve, psnr],
@@ -188,7 +229,8 @@ def train_run(
         "done": perceptual,
         "photos": variant.photos,
         "steps": row.get("steps", 0) + config.steps,
-        "operations": row.get("operations", 0) + operations(config, source, networks) * config.steps,
+        "operations": row.get("operations", 0)
+        + operations(config, source, networks) * config.steps,
         "parameters": sum(x.size for x in jax.tree.leaves(trained["params"])),
         "cpu_seconds": row.get("cpu_seconds", 0.0) + spent,
     }
@@ -196,7 +238,10 @@ def train_run(
 
 def operations(config: TrainConfig, source: Any, networks: Any) -> int:
     """Of a step, forwards and backwards, as its program is written."""
-    state, body = jax.eval_shape(lambda: init_state(config)), gaussian_body(load_body(), config.model)
+    state, body = (
+        jax.eval_shape(lambda: init_state(config)),
+        gaussian_body(load_body(), config.model),
+    )
     step = functools.partial(update, config=compiled_for(config))
     batch = stage_loader(source, config, 0).batch_at(0)
     return costs_of(jax.jit(step).trace(state, batch, body, networks, seed_numbers(0))).flops
@@ -219,7 +264,10 @@ def tested(method: Method, people: Path, count: int, moves: bool = True) -> dict
     for task, first in zip(TASKS, (True, False), strict=True):
         means = person_means([row for row in rows if (row.frame == 0) == first]).values()
         if first or moves:
-            found[task] = {name: [round(x, 4) for row in means if (x := row[name]) is not None] for name in SCORES}
+            found[task] = {
+                name: [round(x, 4) for row in means if (x := row[name]) is not None]
+                for name in SCORES
+            }
     return found
 
 
@@ -235,7 +283,9 @@ class Difference(NamedTuple):
     people: int
 
     def text(self, digits: int = 2) -> str:
-        return f"{self.mean:+.{digits}f}" + ("" if self.half is None else f" +-{self.half:.{digits}f}")
+        return f"{self.mean:+.{digits}f}" + (
+            "" if self.half is None else f" +-{self.half:.{digits}f}"
+        )
 
     __str__ = text
 
@@ -252,10 +302,15 @@ def difference(
     Its variance is that over people of the paired differences, and that of seeds, which is pooled over all variants with several;
     Student's t with the degrees of freedom of Welch and Satterthwaite.
     """
-    values = lambda name, photos: np.asarray([x["scores"][str(photos)][task][score] for x in finished(runs, name)])
+    values = lambda name, photos: np.asarray(
+        [x["scores"][str(photos)][task][score] for x in finished(runs, name)]
+    )
     first, second = values(*a), values(*b)
     paired = first.mean(axis=0) - second.mean(axis=0)
-    people, (seeds, freedom) = np.var(paired, ddof=1) / len(paired), seed_variance(runs, task, score)
+    people, (seeds, freedom) = (
+        np.var(paired, ddof=1) / len(paired),
+        seed_variance(runs, task, score),
+    )
     count = len(first), len(second)
     if not freedom:
         return Difference(float(paired.mean()), None, count, len(paired))
@@ -270,7 +325,9 @@ def seed_variance(runs: Mapping[str, Any], task: str, score: str) -> tuple[float
     """Variance of a run's mean by its seed, and its degrees of freedom."""
     squares, freedom = 0.0, 0
     for name in runs:
-        means = [np.mean(own[task][score]) for x in finished(runs, name) if task in (own := headline(x))]
+        means = [
+            np.mean(own[task][score]) for x in finished(runs, name) if task in (own := headline(x))
+        ]
         if len(means) > 1:
             squares, freedom = squares + np.var(means) * len(means), freedom + len(means) - 1
     return (squares / freedom if freedom else 0.0), freedom
@@ -304,7 +361,11 @@ def state_of(report: Mapping[str, Any], name: str) -> str:
 def trained_names(report: Mapping[str, Any]) -> list[str]:
     """Variants of which a run meets it and has scores."""
     painted = report["painted"]["validation"]
-    return [name for name, own in report["runs"].items() if any("scores" in x and is_trained(x, painted) for x in own.values())]
+    return [
+        name
+        for name, own in report["runs"].items()
+        if any("scores" in x and is_trained(x, painted) for x in own.values())
+    ]
 
 
 def results(name: str) -> Any:

@@ -39,7 +39,8 @@ STAGES = {
     "decoder input": ("mid_decoder_input",),
     "raw heads": ("mid_raw_geometry", "mid_raw_appearance"),
     "canonical Gaussians": tuple(
-        f"asset_{name}" for name in ("means3D", "rotations", "scales", "colors", "opacity", "lbs_weights")
+        f"asset_{name}"
+        for name in ("means3D", "rotations", "scales", "colors", "opacity", "lbs_weights")
     ),
     "skinned Gaussians": ("posed_means3D", "posed_rotations"),
 }
@@ -70,9 +71,14 @@ def load_arrays(path: Path) -> dict[str, Any]:
         if name not in arrays:
             raise ValueError(f"{path}: array {name!r} is missing")
         shape, axes = arrays[name].shape, axes.split()
-        wanted = tuple(int(a) if a.isdigit() else sizes.setdefault(a, n) for a, n in zip(axes, shape, strict=False))
+        wanted = tuple(
+            int(a) if a.isdigit() else sizes.setdefault(a, n)
+            for a, n in zip(axes, shape, strict=False)
+        )
         if len(shape) != len(axes) or shape != wanted or 0 in shape:
-            raise ValueError(f"{path}: {name} has shape {shape}, expected ({', '.join(axes)}) with {sizes}")
+            raise ValueError(
+                f"{path}: {name} has shape {shape}, expected ({', '.join(axes)}) with {sizes}"
+            )
         if not np.isfinite(arrays[name]).all():
             raise ValueError(f"{path}: {name} holds numbers that are not finite")
     if all(name.startswith("in_") for name in arrays):
@@ -89,15 +95,24 @@ def read_release_config(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("model"), dict):
         raise ValueError(f"{path}: expected an object with 'model'")
     parts = content["model"] | {"training": content.get("training")}
-    found = {f"{part}.{name}": x for part, values in parts.items() if isinstance(values, dict) for name, x in values.items()}
+    found = {
+        f"{part}.{name}": x
+        for part, values in parts.items()
+        if isinstance(values, dict)
+        for name, x in values.items()
+    }
     if found.get("training.use_canonical_maps"):
-        raise ValueError(f"{path}: training.use_canonical_maps: the variant with canonical target maps is not supported")
+        raise ValueError(
+            f"{path}: training.use_canonical_maps: the variant with canonical target maps is not supported"
+        )
     if (height := found.get("training.target_height")) not in (None, 1.8):
         raise ValueError(f"{path}: training.target_height must be 1.8, got {height!r}")
     return found
 
 
-def complete_config(config: HumanGSConfig, release: dict[str, Any], dtype: str, image_size: int) -> HumanGSConfig:
+def complete_config(
+    config: HumanGSConfig, release: dict[str, Any], dtype: str, image_size: int
+) -> HumanGSConfig:
     """A checkpoint's configuration with what the release's one adds to it. Raises: ValueError where they do not agree."""
     encoder, _, decoder = paper_parts(config.architecture)
     transformer = encoder.transformer
@@ -116,8 +131,12 @@ def complete_config(config: HumanGSConfig, release: dict[str, Any], dtype: str, 
     }
     for name, value in found.items():
         if release.get(name) not in (None, value):
-            raise ValueError(f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the checkpoint")
-    tight, free = (release.get(f"vertex_decoder.num_{kind}_gaussians") for kind in ("tight", "free"))
+            raise ValueError(
+                f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the checkpoint"
+            )
+    tight, free = (
+        release.get(f"vertex_decoder.num_{kind}_gaussians") for kind in ("tight", "free")
+    )
     if tight is not None and free is not None:
         if tight + free != decoder.gaussians_per_vertex:
             raise ValueError(
@@ -140,7 +159,9 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
     K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = fx, fy, cx, cy, 1
     one = Camera(jnp.eye(3, dtype=dtype), jnp.eye(4, dtype=dtype), width, height)
     cam_from_world = np.linalg.inv(arrays["in_c2w"][index].astype(np.float64))
-    cameras = replace(one, K=jnp.asarray(K, dtype), cam_from_world=jnp.asarray(cam_from_world, dtype))
+    cameras = replace(
+        one, K=jnp.asarray(K, dtype), cam_from_world=jnp.asarray(cam_from_world, dtype)
+    )
     inputs = HumanGSInputs(
         images=images,
         cameras=cameras,
@@ -153,7 +174,9 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
     return inputs, jnp.asarray(arrays["in_lbs_weights"], dtype), own("in_joint_transforms")
 
 
-def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: Any, joint_transforms: Any) -> dict:
+def compute_stages(
+    variables: Any, inputs: Any, config: Any, skinning_weights: Any, joint_transforms: Any
+) -> dict:
     """Every stage of one subject, by its array's name and in its layout; jittable with `config` static.
 
     And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see `nearest_candidates`.
@@ -163,15 +186,30 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     stages = intermediates(variables, inputs, config)
     features, outputs = stages["reader"], stages["decoder"]
     gaussians, maps = outputs.gaussians, stages["encoder"].maps
-    if encoder.upsampler is not None:  # vertices read the last convolution only where they need it; here it is everywhere
-        convolution = Convolution(int(reader.output_width or 0), nn.initializers.zeros, config.runtime.compute_dtype)
+    if (
+        encoder.upsampler is not None
+    ):  # vertices read the last convolution only where they need it; here it is everywhere
+        convolution = Convolution(
+            int(reader.output_width or 0), nn.initializers.zeros, config.runtime.compute_dtype
+        )
         maps = convolution.apply(part_variables(variables, "reader"), maps)
-    pixels, texture = encoder_pixels(inputs, config.run()), variables["params"]["encoder"]["tokenizer"]["texture"]
-    heads = lambda name: stages[f"decoder.{name}_out"].reshape(len(features.local), decoder.gaussians_per_vertex, -1)
+    pixels, texture = (
+        encoder_pixels(inputs, config.run()),
+        variables["params"]["encoder"]["tokenizer"]["texture"],
+    )
+    heads = lambda name: stages[f"decoder.{name}_out"].reshape(
+        len(features.local), decoder.gaussians_per_vertex, -1
+    )
     entering = [features.local]
     if features.global_token is not None:
-        entering.append(jnp.broadcast_to(features.global_token, (len(features.local), *features.global_token.shape)))
-    weights = corrected_skinning_weights(skinning_weights, outputs.skinning_offsets, decoder.gaussians_per_vertex)
+        entering.append(
+            jnp.broadcast_to(
+                features.global_token, (len(features.local), *features.global_token.shape)
+            )
+        )
+    weights = corrected_skinning_weights(
+        skinning_weights, outputs.skinning_offsets, decoder.gaussians_per_vertex
+    )
     transforms = jnp.einsum("gj,jab->gab", weights, joint_transforms)
     posed = skin_gaussians(gaussians, transforms, config.conventions.skinning)
     rotations = quaternion.to_matrix(quaternion.normalize(gaussians.quats))
@@ -179,7 +217,9 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     return {
         "out_ray_d": channels_first(pixels[..., 6:9]),
         "out_pose_feature": channels_first(sample_triplane(texture, pixels[..., 9:])),
-        "mid_tokens": stages["encoder.tokenizer"].reshape(len(inputs.images), -1, encoder.transformer.width),
+        "mid_tokens": stages["encoder.tokenizer"].reshape(
+            len(inputs.images), -1, encoder.transformer.width
+        ),
         "mid_block_0": stages["encoder.transformer.block_0"],
         "mid_encoder_out": stages["encoder.transformer.norm"],
         "mid_feature_map_stride4": channels_first(maps)[:, :, ::MAP_STRIDE, ::MAP_STRIDE],
@@ -204,7 +244,10 @@ def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> A
     ours = np.asarray(found["posed_rotations"], np.float64)
     if TIES not in found or ours.shape != reference.shape:
         return ours
-    readings, levels = np.asarray(found[TIES], np.float64), np.asarray(found[TIE_LEVELS], np.float64)
+    readings, levels = (
+        np.asarray(found[TIES], np.float64),
+        np.asarray(found[TIE_LEVELS], np.float64),
+    )
     tied = levels >= levels.max(-1, keepdims=True) - bound
     distances = [np.abs(readings - sign * reference[..., None, :]).max(-1) for sign in (1, -1)]
     best = np.argmin(np.where(tied, np.minimum(*distances), np.inf), axis=-1)
@@ -212,15 +255,22 @@ def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> A
     return np.where(tied.sum(-1, keepdims=True) > 1, nearest, ours)
 
 
-def relative_errors(found: dict[str, Any], expected: dict[str, Any], bound: float = 0.0) -> dict[str, float | None]:
+def relative_errors(
+    found: dict[str, Any], expected: dict[str, Any], bound: float = 0.0
+) -> dict[str, float | None]:
     """Largest error of each expected stage over its largest magnitude; None where none was found in its shape.
 
     bound: within which candidates of posed rotations tie.
     """
     errors: dict[str, float | None] = {}
     for name, reference in expected.items():
-        ours, reference = np.asarray(found.get(name, np.nan), np.float64), np.asarray(reference, np.float64)
-        if ours.shape != reference.shape or not (np.isfinite(ours).all() and np.isfinite(reference).all()):
+        ours, reference = (
+            np.asarray(found.get(name, np.nan), np.float64),
+            np.asarray(reference, np.float64),
+        )
+        if ours.shape != reference.shape or not (
+            np.isfinite(ours).all() and np.isfinite(reference).all()
+        ):
             errors[name] = None
             continue
         if name == "posed_rotations":
@@ -238,7 +288,9 @@ def check(checkpoint: Path, dtype: str) -> dict[str, Any]:
     """
     found, expected = run_checkpoint(checkpoint, dtype)
     bound = BOUNDS[dtype]
-    errors = relative_errors(found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound)
+    errors = relative_errors(
+        found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound
+    )
     passed = all(error is not None and error <= bound for error in errors.values())
     return {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
 
@@ -248,7 +300,11 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
     config, arrays = (checkpoint.with_suffix(suffix) for suffix in (".json", ".npz"))
     release, expected = read_release_config(config), load_arrays(arrays)
     # the width of a head is only needed where the checkpoint does not tell it
-    width = release.get("transformer.d_head") if release.get("transformer.use_qk_norm") is False else None
+    width = (
+        release.get("transformer.d_head")
+        if release.get("transformer.use_qk_norm") is False
+        else None
+    )
     converted = load_checkpoint(checkpoint, head_width=width)
     settings = complete_config(converted.config, release, dtype, expected["in_image"].shape[-2])
     if expected["in_lbs_weights"].shape != converted.skinning_weights.shape:
@@ -256,23 +312,34 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
             f"{arrays}: in_lbs_weights has shape {expected['in_lbs_weights'].shape}, the checkpoint's "
             f"{converted.skinning_weights.shape}"
         )
-    working = jnp.float64 if dtype == "float64" else jnp.float32  # bfloat16: products only, see `network.runtime`
+    working = (
+        jnp.float64 if dtype == "float64" else jnp.float32
+    )  # bfloat16: products only, see `network.runtime`
     variables = jax.tree.map(lambda x: jnp.asarray(x, working), converted.variables)
     compute = jax.jit(compute_stages, static_argnames="config")
-    with jax.default_matmul_precision("highest"):  # GPUs and TPUs multiply float32 in fewer bits otherwise
+    with jax.default_matmul_precision(
+        "highest"
+    ):  # GPUs and TPUs multiply float32 in fewer bits otherwise
         subjects = []
         for index in range(len(expected["in_image"])):
             inputs, weights, transforms = subject_inputs(expected, index, working)
-            subjects.append(jax.tree.map(np.asarray, compute(variables, inputs, settings, weights, transforms)))
+            subjects.append(
+                jax.tree.map(np.asarray, compute(variables, inputs, settings, weights, transforms))
+            )
     found = {
-        name: (np.concatenate if name in PER_VIEW else np.stack)([subject[name] for subject in subjects]) for name in subjects[0]
+        name: (np.concatenate if name in PER_VIEW else np.stack)(
+            [subject[name] for subject in subjects]
+        )
+        for name in subjects[0]
     }
     return found, expected
 
 
 @entry
 def parity(
-    run: Run, checkpoints: tuple[Path, ...], dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",)
+    run: Run,
+    checkpoints: tuple[Path, ...],
+    dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",),
 ) -> int:
     """Checkpoints of the published network on stored inputs: the largest error of every stage, relative to its largest magnitude.
 
@@ -303,7 +370,10 @@ def parity(
     found = list(dict.fromkeys(name for column in columns.values() for name in column["stages"]))
     rows = [(stage, name) for stage, names in STAGES.items() for name in names if name in found]
     rows += [("unknown stage", name) for name in found if name not in {name for _, name in rows}]
-    table = [[stage, f"`{name}`", *(_shown(each, name) for each in columns.values())] for stage, name in rows]
+    table = [
+        [stage, f"`{name}`", *(_shown(each, name) for each in columns.values())]
+        for stage, name in rows
+    ]
     text = markdown_table(["stage", "array", *columns], table, "ll" + "r" * len(columns))
     run.show(text, columns, "parity_stages")
     return int(not all(column["passed"] for column in columns.values()))
@@ -311,4 +381,8 @@ def parity(
 
 def _shown(column: dict[str, Any], name: str) -> str:
     error = column["stages"].get(name)
-    return "NOT COMPARED" if error is None else f"{error:.1e}" + ("" if error <= column["bound"] else " TOO LARGE")
+    return (
+        "NOT COMPARED"
+        if error is None
+        else f"{error:.1e}" + ("" if error <= column["bound"] else " TOO LARGE")
+    )

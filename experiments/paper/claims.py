@@ -32,7 +32,11 @@ from experiments.paper.rows import (
 )
 from experiments.results import markdown_table
 
-CONTRADICTED, REPRODUCED, NOT_TESTED = "contradicted at toy scale", "reproduced at toy scale", "not tested"
+CONTRADICTED, REPRODUCED, NOT_TESTED = (
+    "contradicted at toy scale",
+    "reproduced at toy scale",
+    "not tested",
+)
 VERDICTS = CONTRADICTED, REPRODUCED, NOT_TESTED
 """In the order of the page."""
 
@@ -65,19 +69,31 @@ def paper_claims(run: Run) -> None:
     has fewer than three seeds: "not tested".
     """
     report, cost = results("paper"), results("paper_cost")
-    rows = sorted(judged(report, [*claims(), *of_cost(cost)]), key=lambda row: VERDICTS.index(row[3]))
+    rows = sorted(
+        judged(report, [*claims(), *of_cost(cost)]), key=lambda row: VERDICTS.index(row[3])
+    )
     lines = [[*row[:3], f"{row[3]}: {row[4]}" if row[4] else row[3]] for row in rows]
     heads = ["claim", "what the paper says", "what we measured", "verdict"]
     texts = [markdown_table(heads, lines, "llll")]
     added = [[name, said(report, x) or lacking(report, [x], 1)] for name, x in additions().items()]
-    texts += ["Our own additions, each alone added to the paper's network:", markdown_table(["", "foreground PSNR"], added, "ll")]
+    texts += [
+        "Our own additions, each alone added to the paper's network:",
+        markdown_table(["", "foreground PSNR"], added, "ll"),
+    ]
     run.show("\n\n".join(texts), {"verdicts": {row[0]: row[3] for row in rows}})
 
 
-def judged(report: Mapping[str, Any], listed: Iterable[Claim]) -> list[tuple[str, str, str, str, str]]:
+def judged(
+    report: Mapping[str, Any], listed: Iterable[Claim]
+) -> list[tuple[str, str, str, str, str]]:
     """Rows: claim, the paper, ours, verdict, why."""
     return [
-        (row.claim, row.paper, "; ".join(filter(None, (said(report, x) for x in row.pairs))) or "-", *judge(report, row.pairs))
+        (
+            row.claim,
+            row.paper,
+            "; ".join(filter(None, (said(report, x) for x in row.pairs))) or "-",
+            *judge(report, row.pairs),
+        )
         if row.pairs
         else (row.claim, row.paper, row.measured or "-", *row.verdict)
         for row in listed
@@ -88,7 +104,11 @@ def said(report: Mapping[str, Any], pair: Pair) -> str:
     """A difference in words; nothing where a run is not trained."""
     names = " - ".join(f"`{name}` {test}" for name, test in pair[:2])
     unit, digits = ("", 4) if pair.score.startswith("lpips") else (" dB", 2)
-    return "" if lacking(report, [pair], 1) else f"{names}: {measured(report, pair).text(digits)}{unit}"
+    return (
+        ""
+        if lacking(report, [pair], 1)
+        else f"{names}: {measured(report, pair).text(digits)}{unit}"
+    )
 
 
 def measured(report: Mapping[str, Any], pair: Pair) -> Difference:
@@ -115,7 +135,11 @@ def judge(report: Mapping[str, Any], pairs: Iterable[Pair]) -> tuple[str, str]:
     found = [(x.mean, x.half or 0.0) for x in (measured(report, pair) for pair in pairs)]
     if any(mean + half < 0 for mean, half in found):
         return CONTRADICTED, ""
-    return (REPRODUCED, "") if all(mean > half for mean, half in found) else (NOT_TESTED, "an interval contains 0")
+    return (
+        (REPRODUCED, "")
+        if all(mean > half for mean, half in found)
+        else (NOT_TESTED, "an interval contains 0")
+    )
 
 
 def additions() -> dict[str, Pair]:
@@ -127,7 +151,9 @@ def additions() -> dict[str, Pair]:
 def claims() -> list[Claim]:
     ours = lambda count=PHOTOS: (REFERENCE, count)
     near = lambda name: tuple(Pair((REFERENCE, test), (name, test)) for test in NEAR)
-    part = lambda name, tests=(PHOTOS,), score="psnr": tuple(Pair(ours(test), (name, test), score=score) for test in tests)
+    part = lambda name, tests=(PHOTOS,), score="psnr": tuple(
+        Pair(ours(test), (name, test), score=score) for test in tests
+    )
     one, five = GAUSSIANS["THuman2.1"]
     return [
         Claim(
@@ -140,8 +166,16 @@ def claims() -> list[Claim]:
             f"{pair_of(ANIMATION[OURS], ANIMATION[HUMANRAM])}",
             (Pair(ours(), ("humanram", PHOTOS), "animation"),),
         ),
-        Claim("better than GHG with 1, 2, 4 and 6 photos", f"near: {by_photos(OURS, GHG)}", near("ghg")),
-        Claim("better than LVSM with 1, 2, 4 and 6 photos", f"near: {by_photos(OURS, LVSM)}", near("lvsm")),
+        Claim(
+            "better than GHG with 1, 2, 4 and 6 photos",
+            f"near: {by_photos(OURS, GHG)}",
+            near("ghg"),
+        ),
+        Claim(
+            "better than LVSM with 1, 2, 4 and 6 photos",
+            f"near: {by_photos(OURS, LVSM)}",
+            near("lvsm"),
+        ),
         Claim(
             "better than GST, which takes one photo",
             f"{pair_of(DOMAINS[OURS][0], DOMAINS['GST, released weights'][0])} of released weights",
@@ -163,11 +197,25 @@ def claims() -> list[Claim]:
             (Pair(("lhm_views", PHOTOS), ("lhm", 1)),),
         ),
         Claim(
-            "1 tight + 4 free Gaussians a vertex against 1", pair_of(five, one), part("1 Gaussian a vertex", (PHOTOS, NEAR[2]))
+            "1 tight + 4 free Gaussians a vertex against 1",
+            pair_of(five, one),
+            part("1 Gaussian a vertex", (PHOTOS, NEAR[2])),
         ),
-        Claim("the global token helps with 1 and 2 photos, not from 4 on", "a figure", part("no global token", NEAR[:2])),
-        Claim("features of four depths", "LPIPS of patches falls", part("one depth", score="lpips_alex")),
-        Claim("pooling over visible views", "described so; the release pools all", part("pooling over all views")),
+        Claim(
+            "the global token helps with 1 and 2 photos, not from 4 on",
+            "a figure",
+            part("no global token", NEAR[:2]),
+        ),
+        Claim(
+            "features of four depths",
+            "LPIPS of patches falls",
+            part("one depth", score="lpips_alex"),
+        ),
+        Claim(
+            "pooling over visible views",
+            "described so; the release pools all",
+            part("pooling over all views"),
+        ),
         Claim(
             "back-projection instead of attention to the photos",
             "no numbers",
@@ -233,10 +281,14 @@ def by_photos(a: str, b: str) -> str:
 def lost() -> str:
     """What systems lose on the other data set."""
     both = {name: DOMAINS[name] for name in (OURS, HUMANRAM, LVSM, GHG)}
-    return ", ".join(f"{name} {there[0] - here[0]:+.1f}" for name, (here, there) in both.items() if there)
+    return ", ".join(
+        f"{name} {there[0] - here[0]:+.1f}" for name, (here, there) in both.items() if there
+    )
 
 
 def printed(a: str, b: str) -> str:
     """What the tables of reconstruction say of two systems."""
     sets = {"THuman2.1": (DOMAINS, 0), "THuman4.0": (RECONSTRUCTION, 0), "AvatarReX": (DOMAINS, 1)}
-    return ", ".join(f"{name} {pair_of(table[a][i], table[b][i])}" for name, (table, i) in sets.items())
+    return ", ".join(
+        f"{name} {pair_of(table[a][i], table[b][i])}" for name, (table, i) in sets.items()
+    )

@@ -38,7 +38,12 @@ POINTS, TOKENS = 40000, 4096 + 1024
 
 @entry
 def paper_cost(
-    run: Run, width: int = 128, repeats: int = 3, networks: bool = False, quick: bool = False, image: Path | None = None
+    run: Run,
+    width: int = 128,
+    repeats: int = 3,
+    networks: bool = False,
+    quick: bool = False,
+    image: Path | None = None,
 ) -> None:
     """The paper's central claim: vertices that are projected into the photos against vertices that attend to all tokens.
 
@@ -63,10 +68,21 @@ def paper_cost(
         middle = {"views": 1, "vertices": 1000, "size": 64} if quick else MIDDLE
         axes = {name: AXES[name][:2] for name in ("views", "vertices")} if quick else AXES
         cases = [middle | {axis: value} for axis, values in axes.items() for value in values]
-        each = {" ".join(map(str, case.values())): functools.partial(compare, width, repeats, **case) for case in cases}
+        each = {
+            " ".join(map(str, case.values())): functools.partial(compare, width, repeats, **case)
+            for case in cases
+        }
         found = run.rows(each, {"width": width, "repeats": repeats})
-        rows = [dict(zip(middle, map(int, name.split()), strict=True)) | row for name, row in found.items()]
-        result = {"rows": rows, "middle": middle, "width": width, "networks": {} if quick else all_networks()}
+        rows = [
+            dict(zip(middle, map(int, name.split()), strict=True)) | row
+            for name, row in found.items()
+        ]
+        result = {
+            "rows": rows,
+            "middle": middle,
+            "width": width,
+            "networks": {} if quick else all_networks(),
+        }
     run.show(text_of(result), result)
     if image:
         plot(image, result)
@@ -77,14 +93,23 @@ def plot(path: Path, result: dict[str, Any]) -> None:
     with figure(path, len(AXES), (11, 3.6)) as all_axes:
         for axes, axis in zip(all_axes, AXES, strict=True):
             others = {key: value for key, value in result["middle"].items() if key != axis}
-            same = [row for row in result["rows"] if all(row[key] == value for key, value in others.items())]
+            same = [
+                row
+                for row in result["rows"]
+                if all(row[key] == value for key, value in others.items())
+            ]
             rows = sorted(same, key=lambda row: row[axis])
             values = [row[axis] for row in rows]
             for name, color in READERS.items():
-                axes.loglog(values, [row[name]["cpu_ms"] for row in rows], "o-", color=color, label=name)
+                axes.loglog(
+                    values, [row[name]["cpu_ms"] for row in rows], "o-", color=color, label=name
+                )
             axes.set_xticks(values, [str(value) for value in values])
             axes.minorticks_off()
-            title = ", ".join(f"{value} px" if key == "size" else f"{value} {key}" for key, value in others.items())
+            title = ", ".join(
+                f"{value} px" if key == "size" else f"{value} {key}"
+                for key, value in others.items()
+            )
             axes.set(xlabel={"size": "side of the photos, pixels"}.get(axis, axis))
             axes.set_title(title, fontsize=9)
         all_axes[0].set_ylabel("CPU ms")
@@ -96,19 +121,26 @@ def all_networks() -> dict[str, dict[str, float]]:
     return whole | {name: joint_flops(name, photos) for name, photos in JOINT.items()}
 
 
-def compare(width: int, repeats: int, views: int, vertices: int, size: int) -> dict[str, dict[str, float]]:
+def compare(
+    width: int, repeats: int, views: int, vertices: int, size: int
+) -> dict[str, dict[str, float]]:
     """CPU ms, operations and temporary MiB of both readers on the same maps."""
     inputs, encoding = subject(width, views, vertices, size)
     runs, found = {}, {}
     for name, config in configurations(width, size).items():
         reader, run = config.architecture.reader, config.run()
-        shapes = jax.eval_shape(lambda reader=reader, run=run: reader.init(jax.random.key(0), encoding, inputs, run))
+        shapes = jax.eval_shape(
+            lambda reader=reader, run=run: reader.init(jax.random.key(0), encoding, inputs, run)
+        )
         variables = jax.tree.map(lambda x: np.full(x.shape, 0.02, x.dtype), shapes)
         read = lambda v, e, x, reader=reader, run=run: reader.apply(v, e, x, run).local
         traced = jax.jit(read).trace(variables, encoding, inputs)
         program = traced.lower().compile()
         sums = READ_OPERATIONS * views * vertices * width if name == "back-projection" else 0
-        found[name] = {"operations": costs_of(traced).flops + sums, "temporary_mb": temporary_mb(program)}
+        found[name] = {
+            "operations": costs_of(traced).flops + sums,
+            "temporary_mb": temporary_mb(program),
+        }
         runs[name] = lambda p=program, v=variables: jax.block_until_ready(p(v, encoding, inputs))
     for name, (wall, cpu) in medians(runs, repeats).items():
         found[name] |= {"ms": float(wall), "cpu_ms": float(cpu)}
@@ -159,11 +191,16 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
     """Operations of the attention of an LHM-style system in its published size, with LHM's points and tokens."""
     config = SYSTEMS[name]("published")
     reader, grid = config.architecture.reader, jnp.zeros((photos, TOKENS, 1))
-    camera = jax.vmap(lambda K, pose: Camera(K, pose, 1, TOKENS))(jnp.zeros((photos, 3, 3)), jnp.zeros((photos, 4, 4)))
+    camera = jax.vmap(lambda K, pose: Camera(K, pose, 1, TOKENS))(
+        jnp.zeros((photos, 3, 3)), jnp.zeros((photos, 4, 4))
+    )
 
     def arguments(points: Any, tokens: Any) -> tuple[Any, ...]:
         """Photos whose pixels are the tokens."""
-        colors, posed = jnp.zeros((*grid.shape, 3)), jnp.broadcast_to(points, (photos, *points.shape))
+        colors, posed = (
+            jnp.zeros((*grid.shape, 3)),
+            jnp.broadcast_to(points, (photos, *points.shape)),
+        )
         inputs = HumanGSInputs(colors, camera, posed, points, colors, grid, grid > 0)
         return Encoding(tokens, None, jnp.zeros((), jnp.int32)), inputs, config.run()
 
@@ -175,38 +212,81 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
     return counted(photos, POINTS, forward, variables, points, tokens)
 
 
-def counted(photos: int, vertices: int, forward: Any, variables: Any, *given: Any) -> dict[str, float]:
+def counted(
+    photos: int, vertices: int, forward: Any, variables: Any, *given: Any
+) -> dict[str, float]:
     """What a program costs that is not run."""
     parameters = sum(x.size for x in jax.tree.leaves(variables["params"]))
     operations = costs_of(jax.jit(forward).trace(variables, *given)).flops
-    return {"photos": photos, "vertices": vertices, "parameters": parameters, "operations": operations}
+    return {
+        "photos": photos,
+        "vertices": vertices,
+        "parameters": parameters,
+        "operations": operations,
+    }
 
 
 def text_of(result: dict[str, Any]) -> str:
     a, b = READERS
-    header = ["views", "vertices", "photo", f"{a}, CPU ms", f"{b}, CPU ms", "ratio", f"{a}, M operations"]
+    header = [
+        "views",
+        "vertices",
+        "photo",
+        f"{a}, CPU ms",
+        f"{b}, CPU ms",
+        "ratio",
+        f"{a}, M operations",
+    ]
     header += [f"{b}, M operations", "ratio", f"{a}, MiB", f"{b}, MiB"]
     rows = []
     for row in result["rows"]:
-        times, operations, memory = ([row[name][key] for name in READERS] for key in ("cpu_ms", "operations", "temporary_mb"))
+        times, operations, memory = (
+            [row[name][key] for name in READERS] for key in ("cpu_ms", "operations", "temporary_mb")
+        )
         cells = [significant(x) for x in (*times, times[1] / times[0])]
         cells += [f"{x / 1e6:.0f}" for x in operations] + [f"{operations[1] / operations[0]:.0f}"]
         rows.append([row["views"], row["vertices"], row["size"], *cells, *map(significant, memory)])
-    texts = [f"Readers of width {result['width']}.", markdown_table(header, rows, "r" * len(header))]
+    texts = [
+        f"Readers of width {result['width']}.",
+        markdown_table(header, rows, "r" * len(header)),
+    ]
     if networks := result["networks"]:
         ours = networks["humangs"]["operations"]
         lines = []
         for name, x in networks.items():
             title = f"{name}, joint attention alone" if name in JOINT else name
-            cells = [f"{x['parameters'] / 1e6:.0f}", f"{x['operations'] / 1e12:.2f}", significant(x["operations"] / ours)]
+            cells = [
+                f"{x['parameters'] / 1e6:.0f}",
+                f"{x['operations'] / 1e12:.2f}",
+                significant(x["operations"] / ours),
+            ]
             lines.append([title, x["photos"], x["vertices"], *cells])
         printed = {name: ANIMATION[name][3] or 0.0 for name in (OURS, "LHM (single view)")}
         for name, x in printed.items():
-            lines.append([f"{name}, printed seconds", "", "", "", significant(x), significant(x / printed[OURS])])
+            lines.append(
+                [
+                    f"{name}, printed seconds",
+                    "",
+                    "",
+                    "",
+                    significant(x),
+                    significant(x / printed[OURS]),
+                ]
+            )
         texts += [
             f"Networks in published sizes, all patches tokens: operations counted, not run. LHM-style: {POINTS:,} points and "
             f"{TOKENS:,} tokens a photo, without the two networks that make the tokens. The last rows are the paper's modelling "
             f"times, its {FASTER_MODELLING} x.",
-            markdown_table(["network", "photos", "vertices or points", "M parameters", "TFLOP", "over HumanGS"], lines),
+            markdown_table(
+                [
+                    "network",
+                    "photos",
+                    "vertices or points",
+                    "M parameters",
+                    "TFLOP",
+                    "over HumanGS",
+                ],
+                lines,
+            ),
         ]
     return "\n\n".join(texts)

@@ -35,7 +35,10 @@ NEARER = 0.6
 """Distance of the cameras of near people over that of the others: parts of the person leave the frame."""
 CLOTHES = {
     "longsleeve": ({"sleeve": 0.6, "bottom": -0.33, "loose": 0.4, "depth": 0.05}, {"crew"}),
-    "chinos": ({"top": -0.26, "end": -1.16, "width": 0.01, "loose": 0.4, "waist": -0.22, "tucked": 0.0}, set()),
+    "chinos": (
+        {"top": -0.26, "end": -1.16, "width": 0.01, "loose": 0.4, "waist": -0.22, "tucked": 0.0},
+        set(),
+    ),
     "flats": ({"height": 0.07, "sole": 0.015, "over": 0.0}, set()),
 }
 """Sizes and details of the garments, see `people.outfits`."""
@@ -47,13 +50,28 @@ def plain(seed: int, body: BodyModel) -> Person:
     garments = []
     for kind, (sizes, details) in CLOTHES.items():
         color = random_color(rng)
-        garments.append(Garment(kind, Fabric("plain", color, color, int(rng.integers(1 << 31))), sizes, frozenset(details)))
+        garments.append(
+            Garment(
+                kind,
+                Fabric("plain", color, color, int(rng.integers(1 << 31))),
+                sizes,
+                frozenset(details),
+            )
+        )
     haircut = dataclasses.replace(person.haircut, cut="buzz", beard="none")
     lights = sample_lights(np.random.default_rng(LIGHT_SEED))
     return dataclasses.replace(person, garments=tuple(garments), haircut=haircut, lights=lights)
 
 
-def write_plain(out: Path, split: str, count: int, views: int, held_out: int = 0, size: int = SIZE, near: bool = False) -> Path:
+def write_plain(
+    out: Path,
+    split: str,
+    count: int,
+    views: int,
+    held_out: int = 0,
+    size: int = SIZE,
+    near: bool = False,
+) -> Path:
     """People of a split as captures of two poses, `views` photos of each; folders that are there are kept. Returns `out`.
 
     held_out: where it is not 0 the capture has the first pose alone, and held_out/ has that many views of either.
@@ -63,10 +81,15 @@ def write_plain(out: Path, split: str, count: int, views: int, held_out: int = 0
         folder = out / f"{seed:07d}"
         if (folder / "capture.json").is_file():
             continue
-        subject, rng = make_subject(seed, body, plain(seed, body)), np.random.default_rng([seed, CAMERA_STREAM])
+        subject, rng = (
+            make_subject(seed, body, plain(seed, body)),
+            np.random.default_rng([seed, CAMERA_STREAM]),
+        )
         chosen = rng.choice(POSES, 2, replace=False)
         generators = [np.random.default_rng([POSE_STREAM, int(pose)]) for pose in chosen]
-        posed = [stand(subject, sample_rotations(generator, subject.build)) for generator in generators]
+        posed = [
+            stand(subject, sample_rotations(generator, subject.build)) for generator in generators
+        ]
         seen = _views(rng, posed[:1] if held_out else posed, views, size, near)
         unseen = _views(rng, posed, held_out, size, near)
 
@@ -79,7 +102,9 @@ def write_plain(out: Path, split: str, count: int, views: int, held_out: int = 0
     return out
 
 
-def _views(rng: np.random.Generator, posed: list[PosedSubject], count: int, size: int, near: bool) -> list[View]:
+def _views(
+    rng: np.random.Generator, posed: list[PosedSubject], count: int, size: int, near: bool
+) -> list[View]:
     views = []
     for frame, one in enumerate(posed if count else ()):
         cameras = cameras_around(rng, one.vertices, spread_azimuths(rng, count), size)
@@ -103,7 +128,12 @@ class OnePose(CaptureFolder):
     def summary(self) -> StoredSubject:
         found = super().summary()
         first = found.frames == found.frames[0]
-        return found._replace(**{name: getattr(found, name)[first] for name in ("K", "cam_from_world", "frames", "azimuths")})
+        return found._replace(
+            **{
+                name: getattr(found, name)[first]
+                for name in ("K", "cam_from_world", "frames", "azimuths")
+            }
+        )
 
 
 class Recolored(CaptureSource):
@@ -118,6 +148,12 @@ class Recolored(CaptureSource):
 
 def on_disk(folder: Path, one_pose: bool = False, recolored: bool = False) -> MakeSource:
     """The people of a folder as a run's source. one_pose: of the first pose alone."""
-    body, kind, source = load_body(), OnePose if one_pose else CaptureFolder, Recolored if recolored else CaptureSource
+    body, kind, source = (
+        load_body(),
+        OnePose if one_pose else CaptureFolder,
+        Recolored if recolored else CaptureSource,
+    )
     cache = PeopleCache([kind(path, body) for path in find_captures(folder)])
-    return lambda config: source(cache, config.views, config.model.image_size, config.target_size, config.loss.depth > 0)
+    return lambda config: source(
+        cache, config.views, config.model.image_size, config.target_size, config.loss.depth > 0
+    )

@@ -7,7 +7,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.paper.bench import animatable, folder_of, last_weights, shown, takes_one, trained_names
+from experiments.paper.bench import (
+    animatable,
+    folder_of,
+    last_weights,
+    shown,
+    takes_one,
+    trained_names,
+)
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading.captures import find_captures
@@ -48,10 +55,30 @@ DOMAINS = {
 }
 """Table 3, reconstruction: in the domain of training (THuman2.1), and in another one (AvatarReX)."""
 VIEWS = {
-    HUMANRAM: ((25.44, 0.946, 0.052), (27.39, 0.950, 0.044), (29.10, 0.960, 0.039), (29.90, 0.966, 0.036)),
-    LVSM: ((17.78, 0.900, 0.101), (22.64, 0.930, 0.066), (25.96, 0.950, 0.055), (27.03, 0.950, 0.051)),
-    GHG: ((21.71, 0.920, 0.094), (22.43, 0.930, 0.089), (22.69, 0.930, 0.088), (22.72, 0.930, 0.088)),
-    OURS: ((24.07, 0.936, 0.068), (25.71, 0.946, 0.059), (27.19, 0.950, 0.054), (27.84, 0.950, 0.051)),
+    HUMANRAM: (
+        (25.44, 0.946, 0.052),
+        (27.39, 0.950, 0.044),
+        (29.10, 0.960, 0.039),
+        (29.90, 0.966, 0.036),
+    ),
+    LVSM: (
+        (17.78, 0.900, 0.101),
+        (22.64, 0.930, 0.066),
+        (25.96, 0.950, 0.055),
+        (27.03, 0.950, 0.051),
+    ),
+    GHG: (
+        (21.71, 0.920, 0.094),
+        (22.43, 0.930, 0.089),
+        (22.69, 0.930, 0.088),
+        (22.72, 0.930, 0.088),
+    ),
+    OURS: (
+        (24.07, 0.936, 0.068),
+        (25.71, 0.946, 0.059),
+        (27.19, 0.950, 0.054),
+        (27.84, 0.950, 0.051),
+    ),
 }
 """THuman2.1 near, with 1, 2, 4 and 6 photos."""
 GAUSSIANS = {
@@ -82,11 +109,16 @@ def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Vie
             return None
         given = [(x.frames, x.cameras.cam_from_world) for x in map(load_capture, folders)]
     else:
-        given = [(x.subject.frames, x.subject.cam_from_world) for x in open_people(people, FileBody.load(body))]
+        given = [
+            (x.subject.frames, x.subject.cam_from_world)
+            for x in open_people(people, FileBody.load(body))
+        ]
     for name, (frames, poses) in zip(names, given, strict=True):
         context, target = varied(np.asarray(frames), photos) if varying else ([], [])
         if not target:
-            context, target = choose_views(name, np.asarray(frames), np.asarray(poses), Choice(photos))
+            context, target = choose_views(
+                name, np.asarray(frames), np.asarray(poses), Choice(photos)
+            )
         found[name] = {"context": context, "target": target}
     return found
 
@@ -94,7 +126,11 @@ def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Vie
 def varied(frames: np.ndarray, photos: int) -> tuple[list[int], list[int]]:
     """Inputs of as many frames as there are, in turns, each by another camera; targets of all others. Nothing of one frame."""
     poses = np.unique(frames)
-    seen = poses[[i * len(poses) // photos for i in range(photos)]] if len(poses) > photos else poses[:-1]
+    seen = (
+        poses[[i * len(poses) // photos for i in range(photos)]]
+        if len(poses) > photos
+        else poses[:-1]
+    )
     if not len(seen):
         return [], []
     context: list[int] = []
@@ -114,7 +150,9 @@ def cases(people: Path, photos: int, body: Path | None, views: Views | None) -> 
             yield found.load(i)
         elif name in views:
             for start in range(0, len(views[name]["target"]), AT_ONCE):
-                chosen[name] = views[name] | {"target": views[name]["target"][start : start + AT_ONCE]}
+                chosen[name] = views[name] | {
+                    "target": views[name]["target"][start : start + AT_ONCE]
+                }
                 yield found.load(i)
 
 
@@ -133,7 +171,12 @@ def trained(runs: Path | None, given: tuple[str, ...] = ()) -> dict[str, tuple[A
 
 
 def measured(
-    weights: tuple[Any, Any], people: Path, photos: int, body: Path | None, networks: Any, views: Views | None = None
+    weights: tuple[Any, Any],
+    people: Path,
+    photos: int,
+    body: Path | None,
+    networks: Any,
+    views: Views | None = None,
 ) -> dict[str, Any] | None:
     """Scores of the views in the pose of the photos and in others, and the seconds to model and to draw a frame.
 
@@ -158,7 +201,9 @@ def measured(
         frames = lambda capture: set(np.asarray(capture.frames).tolist())
         seen = {pose_of(case.inputs, i) for i in frames(case.inputs)} if case.inputs else set()
         same = {i: pose_of(case.truth, i) in seen for i in frames(case.truth)}
-        rows += [(same[row.frame], row) for row in evaluate([case], method=method, lpips=networks).rows]
+        rows += [
+            (same[row.frame], row) for row in evaluate([case], method=method, lpips=networks).rows
+        ]
     means: dict[str, Any] = {"photos": photos}
     for task, first in (("reconstruction", True), ("animation", False)):
         own = list(person_means([row for same, row in rows if same == first]).values())
@@ -170,13 +215,22 @@ def measured(
 
 
 def pose_of(capture: Any, frame: int) -> bytes:
-    return b"".join(np.asarray(x, np.float32).round(5).tobytes() for x in jax.tree.leaves(capture.pose(frame)))
+    return b"".join(
+        np.asarray(x, np.float32).round(5).tobytes() for x in jax.tree.leaves(capture.pose(frame))
+    )
 
 
 def triple(scores: Any) -> str:
     """PSNR / SSIM / LPIPS of a measured row or of a printed one; a dash where it is missing."""
     if scores is None:
         return "-"
-    values = scores if isinstance(scores, tuple) else (scores["psnr"], scores["ssim"], scores.get("lpips_vgg"))
-    texts = [f"{value:.{digits}f}" if value is not None else "-" for value, digits in zip(values, (2, 3, 3), strict=True)]
+    values = (
+        scores
+        if isinstance(scores, tuple)
+        else (scores["psnr"], scores["ssim"], scores.get("lpips_vgg"))
+    )
+    texts = [
+        f"{value:.{digits}f}" if value is not None else "-"
+        for value, digits in zip(values, (2, 3, 3), strict=True)
+    ]
     return " / ".join(texts)

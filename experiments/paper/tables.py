@@ -90,10 +90,15 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
         raise ValueError("--data is needed: the people that the weights are measured on")
     enable_compile_cache()
     given = options.weights + (train_first(options) if options.train else ())
-    systems, lpips = trained(options.runs, given), load_loss_networks(lpips_net="vgg", installed=True).lpips
+    systems, lpips = (
+        trained(options.runs, given),
+        load_loss_networks(lpips_net="vgg", installed=True).lpips,
+    )
     settings, numbers = settings_of(options, given), {}
 
-    def measure(name: str, people: Path | None, photos: int, varying: bool = False) -> dict[str, Any] | None:
+    def measure(
+        name: str, people: Path | None, photos: int, varying: bool = False
+    ) -> dict[str, Any] | None:
         if people is None or name not in systems:
             return None
         photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
@@ -103,9 +108,13 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
             beside = people.with_name(f"evaluation_{photos}.json")
             if not fixed and not varying and people.suffix == ".json" and beside.is_file():
                 fixed = beside
-            views = read_evaluation(fixed) if fixed else views_of(people, photos, options.body, varying)
+            views = (
+                read_evaluation(fixed) if fixed else views_of(people, photos, options.body, varying)
+            )
             networks = () if lpips is None else (lpips,)
-            one = functools.partial(measured, systems[name], people, photos, options.body, networks, views)
+            one = functools.partial(
+                measured, systems[name], people, photos, options.body, networks, views
+            )
             numbers.update(run.rows({key: one}, settings))
             jax.clear_caches()  # programs map memory, and Linux ends a process with too many mappings
         return numbers[key]
@@ -113,7 +122,9 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
     left_out = {name for name, variant in variants().items() if variant.about}
     names = [name for name in systems if name not in left_out]
     texts = [f"**{name}**\n\n{TABLES[name](names, measure, options)}" for name in only or TABLES]
-    rows = {key: row and {name: shown(x) for name, x in row.items()} for key, row in numbers.items()}
+    rows = {
+        key: row and {name: shown(x) for name, x in row.items()} for key, row in numbers.items()
+    }
     run.show("\n\n".join(texts), {"settings": settings, "rows": rows})
 
 
@@ -123,9 +134,17 @@ def train_first(options: Compared) -> tuple[str, ...]:
     if people is None or out is None:
         raise ValueError("--train needs --train-on: the people that the network learns from")
     if config.loss.perceptual and options.vgg19 is None:
-        raise ValueError(f"--config {options.config} has the perceptual loss: it needs --vgg19 (docs/loss_networks.md)")
+        raise ValueError(
+            f"--config {options.config} has the perceptual loss: it needs --vgg19 (docs/loss_networks.md)"
+        )
     body = FileBody.load(options.body)
-    train(config, body.model, people_on_disk(people, body), out, networks=load_loss_networks(options.vgg19))
+    train(
+        config,
+        body.model,
+        people_on_disk(people, body),
+        out,
+        networks=load_loss_networks(options.vgg19),
+    )
     return (f"{out.name}={out / 'weights.safetensors'}",)
 
 
@@ -138,9 +157,13 @@ def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
     """What decides the numbers: the weights and the people. Raises: ValueError for people of one name, by which rows are kept."""
     names = sorted(title(path) for path in {options.data, options.near, *options.other} if path)
     if len(set(names)) < len(names):
-        raise ValueError(f"people in folders of one name: {', '.join(names)}: expected a name for each")
+        raise ValueError(
+            f"people in folders of one name: {', '.join(names)}: expected a name for each"
+        )
     return {
-        "weights": {name: file_digest(Path(file)) for name, _, file in (x.partition("=") for x in given)},
+        "weights": {
+            name: file_digest(Path(file)) for name, _, file in (x.partition("=") for x in given)
+        },
         "runs": file_digest(options.runs / "results.json") if options.runs else None,
         "indices": file_digest(options.indices) if options.indices else None,
         "people": names,
@@ -149,14 +172,21 @@ def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
 
 def shown(value: Any) -> Any:
     """Of the scores, those that the tables have."""
-    return [value[name] for name in ("psnr", "ssim", "lpips_vgg")] if isinstance(value, dict) else value
+    return (
+        [value[name] for name in ("psnr", "ssim", "lpips_vgg")]
+        if isinstance(value, dict)
+        else value
+    )
 
 
 # The tables: (names of our rows, measure, options) -> Markdown ---------------------------------------------------------
 
 
 def ours(
-    names: Sequence[str], measure: Measure, columns: Sequence[tuple[Path | None, int, str]], cameras: str = ""
+    names: Sequence[str],
+    measure: Measure,
+    columns: Sequence[tuple[Path | None, int, str]],
+    cameras: str = "",
 ) -> list[list[str]]:
     """Our rows: a name, its number of photos (or cameras), and for each column (people, photos, task) the scores.
 
@@ -164,7 +194,10 @@ def ours(
     """
     rows = []
     for name in names:
-        found = [measure(name, people, photos, varying=task == "varying") for people, photos, task in columns]
+        found = [
+            measure(name, people, photos, varying=task == "varying")
+            for people, photos, task in columns
+        ]
         if not found[0]:
             continue
         cells, count = [], found[0]["photos"]
@@ -182,21 +215,31 @@ def animation(names: list[str], measure: Measure, options: Any) -> str:
     for row in ours(names, measure, [(options.data, PHOTOS, "varying")]):
         found = measure(row[0], options.data, PHOTOS, varying=True)
         rows.append([*row, seconds(found["model_s"]), seconds(found["frame_s"])])
-    return markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
+    return markdown_table(
+        ["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr"
+    )
 
 
 def reconstruction(names: list[str], measure: Measure, options: Any) -> str:
     """Table 2."""
     rows = [[name, PAPER, *map(triple, x)] for name, x in RECONSTRUCTION.items()]
-    rows += ours(names, measure, [(options.data, PHOTOS, task) for task in ("reconstruction", "animation")])
-    return markdown_table(["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr")
+    rows += ours(
+        names, measure, [(options.data, PHOTOS, task) for task in ("reconstruction", "animation")]
+    )
+    return markdown_table(
+        ["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr"
+    )
 
 
 def domains(names: list[str], measure: Measure, options: Any) -> str:
     """Table 3."""
     others = options.other or [None]
-    rows = [[name, PAPER, *map(triple, x), *[""] * (len(others) - 1)] for name, x in DOMAINS.items()]
-    rows += ours(names, measure, [(people, PHOTOS, "reconstruction") for people in (options.data, *others)])
+    rows = [
+        [name, PAPER, *map(triple, x), *[""] * (len(others) - 1)] for name, x in DOMAINS.items()
+    ]
+    rows += ours(
+        names, measure, [(people, PHOTOS, "reconstruction") for people in (options.data, *others)]
+    )
     heads = [f"cross-domain: {title(people)}" if people else "cross-domain" for people in others]
     return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 
@@ -205,7 +248,9 @@ def views(names: list[str], measure: Measure, options: Any) -> str:
     """Numbers of photos."""
     rows = [[name, f"{PAPER}, near", *map(triple, x)] for name, x in VIEWS.items()]
     for cameras, people in (("standard", options.data), ("near", options.near)):
-        rows += ours(names, measure, [(people, count, "reconstruction") for count in COUNTS], cameras)
+        rows += ours(
+            names, measure, [(people, count, "reconstruction") for count in COUNTS], cameras
+        )
     return markdown_table(["method", "cameras", *map(str, COUNTS)], rows, "ll" + "r" * len(COUNTS))
 
 
@@ -213,9 +258,19 @@ def gaussians(names: list[str], measure: Measure, options: Any) -> str:
     """Gaussians a vertex, on as many sets as there are: those of training, near ones, others."""
     sets = [people for people in (options.data, options.near, *options.other) if people]
     kinds = enumerate(("1", "1 tight + 4 free"))
-    rows = [[f"{k}, {name}", PAPER, triple(x[i]), *[""] * (len(sets) - 1)] for i, k in kinds for name, x in GAUSSIANS.items()]
-    rows += ours(list(dict.fromkeys((*K_VARIANTS, *names))), measure, [(people, PHOTOS, "reconstruction") for people in sets])
-    return markdown_table(["Gaussians a vertex", "", *map(title, sets)], rows, "ll" + "r" * len(sets))
+    rows = [
+        [f"{k}, {name}", PAPER, triple(x[i]), *[""] * (len(sets) - 1)]
+        for i, k in kinds
+        for name, x in GAUSSIANS.items()
+    ]
+    rows += ours(
+        list(dict.fromkeys((*K_VARIANTS, *names))),
+        measure,
+        [(people, PHOTOS, "reconstruction") for people in sets],
+    )
+    return markdown_table(
+        ["Gaussians a vertex", "", *map(title, sets)], rows, "ll" + "r" * len(sets)
+    )
 
 
 TABLES: dict[str, Callable[[list[str], Measure, Any], str]] = {

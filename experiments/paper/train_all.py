@@ -50,7 +50,9 @@ VALIDATED, VIEWS, HELD_OUT_VIEWS, TRAIN_VIEWS = 8, 12, 4, 8
 
 
 @entry
-def paper(run: Run, out: Path, only: tuple[str, ...] = (), train: bool = True, quick: bool = False) -> None:
+def paper(
+    run: Run, out: Path, only: tuple[str, ...] = (), train: bool = True, quick: bool = False
+) -> None:
     """Trains the paper's systems and ablations one after the other at 32 pixels, until each meets its criterion.
 
     What the rounds of a run are, and when it counts as trained: `bench.py`. What is done stays in OUT: the same command goes on
@@ -72,10 +74,14 @@ def paper(run: Run, out: Path, only: tuple[str, ...] = (), train: bool = True, q
     report = kept(path, settings)
     if train:
         enable_compile_cache(out / "cache")
-        write_plain(place / "validation", "validation", min(VALIDATED, test_people), VIEWS, HELD_OUT_VIEWS)
+        write_plain(
+            place / "validation", "validation", min(VALIDATED, test_people), VIEWS, HELD_OUT_VIEWS
+        )
         write_plain(place / "test", "test", test_people, VIEWS, HELD_OUT_VIEWS)
         write_plain(place / "near", "test", test_people, VIEWS, HELD_OUT_VIEWS, near=True)
-        write_plain(place / "train", "train", people, TRAIN_VIEWS, size=2 * SIZE)  # the loader averages
+        write_plain(
+            place / "train", "train", people, TRAIN_VIEWS, size=2 * SIZE
+        )  # the loader averages
         if not report["painted"]:
             seen = tested(painted, place / "validation", PHOTOS)["reconstruction"]["psnr_fg"]
             test = {str(PHOTOS): tested(painted, place / "test", PHOTOS)}
@@ -83,10 +89,16 @@ def paper(run: Run, out: Path, only: tuple[str, ...] = (), train: bool = True, q
             write_json(path, report)
         for name, seed in (x for x in queue(seeds) if x[0] in (only or known)):
             if not finish(name, seed, out, report):
-                print(f"interrupted in {name!r}, seed {seed}: the same command goes on there", file=sys.stderr)
+                print(
+                    f"interrupted in {name!r}, seed {seed}: the same command goes on there",
+                    file=sys.stderr,
+                )
                 break
     if report["runs"]:
-        run.show(table(report), report | {"differences": differences(report), "ablations": ablations(report)})
+        run.show(
+            table(report),
+            report | {"differences": differences(report), "ablations": ablations(report)},
+        )
 
 
 def queue(seeds: int) -> list[tuple[str, int]]:
@@ -95,7 +107,12 @@ def queue(seeds: int) -> list[tuple[str, int]]:
     others = [name for name, variant in variants().items() if variant.about]
     more = [(REFERENCE, seed) for seed in range(1, seeds)]
     order = [(name, 0) for name in systems] + more + [(name, 0) for name in others]
-    order += [x for seed in range(1, seeds) for name in (*systems, *others) if (x := (name, seed)) not in more]
+    order += [
+        x
+        for seed in range(1, seeds)
+        for name in (*systems, *others)
+        if (x := (name, seed)) not in more
+    ]
     return sorted(order, key=lambda run: run[0] in ADDED)
 
 
@@ -109,13 +126,18 @@ def finish(name: str, seed: int, out: Path, report: dict[str, Any]) -> bool:
             row = train_run(variant, seed, place, out / "people", row, least, steps)
             if row is None:
                 return False
-            print(f"{name}, seed {seed}: {row['steps']} steps, foreground {row['validation']:.2f} dB", flush=True)
+            print(
+                f"{name}, seed {seed}: {row['steps']} steps, foreground {row['validation']:.2f} dB",
+                flush=True,
+            )
         else:
             method = network(load_weights(last_weights(place))[0], variant.model)
             scores = {}
             for test in tests_of(name, variant):
                 folder = out / "people" / ("near" if test in NEAR else "test")
-                scores[test] = tested(method, folder, int(test.split()[-1]), animatable(variant.model))
+                scores[test] = tested(
+                    method, folder, int(test.split()[-1]), animatable(variant.model)
+                )
             row = row | {"scores": scores}
         rows[str(seed)] = row
         write_json(out / "results.json", report)
@@ -129,13 +151,21 @@ def kept(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
         return {"settings": dict(settings), "painted": {}, "runs": {}}
     report = read_json(path)
     if report["settings"] != settings:
-        raise ValueError(f"{path} has runs of other settings, {report['settings']}: give another OUT")
+        raise ValueError(
+            f"{path} has runs of other settings, {report['settings']}: give another OUT"
+        )
     return report
 
 
 def table(report: Mapping[str, Any]) -> str:
     """A row a variant, with its difference to the reference; those that have not met the criterion say how far they came."""
-    runs, least, lines, counted, changes = report["runs"], report["painted"]["validation"], [], [], differences(report)
+    runs, least, lines, counted, changes = (
+        report["runs"],
+        report["painted"]["validation"],
+        [],
+        [],
+        differences(report),
+    )
     for name, own in ((name, own) for name, own in runs.items() if own):
         rows, steps = finished(runs, name), max(x["steps"] for x in own.values())
         spent = {"operations": 1e12, "cpu_seconds": 60}
@@ -143,21 +173,47 @@ def table(report: Mapping[str, Any]) -> str:
         last = next(iter(own.values()))
         if not rows or not is_trained(rows[0], least):
             said = f"{state_of(report, name)}, {last['validation']:.2f} dB in validation"
-            lines.append([name, last["photos"], 0, *["-"] * (len(SCORES) + 1), said, steps, *compute])
+            lines.append(
+                [name, last["photos"], 0, *["-"] * (len(SCORES) + 1), said, steps, *compute]
+            )
             continue
         means = {key: np.mean([headline(x)["reconstruction"][key] for x in rows]) for key in SCORES}
         moved = "-"
         if "animation" in headline(rows[0]):
             moved = f"{np.mean([headline(x)['animation']['psnr_fg'] for x in rows]):.2f}"
-        lines.append([name, last["photos"], len(rows), *cells(means, SCORES), moved, str(changes.get(name, "")), steps, *compute])
+        lines.append(
+            [
+                name,
+                last["photos"],
+                len(rows),
+                *cells(means, SCORES),
+                moved,
+                str(changes.get(name, "")),
+                steps,
+                *compute,
+            ]
+        )
         for kind in (COUNTS, NEAR):
             if set(kind) <= set(rows[0]["scores"]):
-                means = [np.mean([x["scores"][test]["reconstruction"]["psnr_fg"] for x in rows]) for test in kind]
-                counted.append([name, "near" if kind == NEAR else "standard", *(f"{x:.2f}" for x in means)])
+                means = [
+                    np.mean([x["scores"][test]["reconstruction"]["psnr_fg"] for x in rows])
+                    for test in kind
+                ]
+                counted.append(
+                    [name, "near" if kind == NEAR else "standard", *(f"{x:.2f}" for x in means)]
+                )
     base = report["painted"]["test"][str(PHOTOS)]
     means, moved = ({key: np.mean(x) for key, x in base[task].items()} for task in TASKS)
-    lines.append([PAINTED, PHOTOS, "", *cells(means, SCORES), f"{moved['psnr_fg']:.2f}", "", "", "", ""])
-    header = ["variant", "photos", "seeds", *(heading for heading, _ in SCORES.values()), "another pose, foreground"]
+    lines.append(
+        [PAINTED, PHOTOS, "", *cells(means, SCORES), f"{moved['psnr_fg']:.2f}", "", "", "", ""]
+    )
+    header = [
+        "variant",
+        "photos",
+        "seeds",
+        *(heading for heading, _ in SCORES.values()),
+        "another pose, foreground",
+    ]
     header += [f"foreground against `{REFERENCE}`, dB", "steps", "TFLOP", "CPU minutes"]
     settings = report["settings"]
     said = (
@@ -168,7 +224,11 @@ def table(report: Mapping[str, Any]) -> str:
     )
     texts = [markdown_table(header, lines), said]
     if counted:
-        texts.append(markdown_table(["foreground PSNR, dB, by photos", "cameras", *COUNTS], counted, "llrrrr"))
+        texts.append(
+            markdown_table(
+                ["foreground PSNR, dB, by photos", "cameras", *COUNTS], counted, "llrrrr"
+            )
+        )
     for part, (heads, rows) in ablations(report).items():
         texts += [f"{part}; a gain is positive:", markdown_table(heads, rows, "lllrrrr")]
     return "\n\n".join(texts)
@@ -177,8 +237,14 @@ def table(report: Mapping[str, Any]) -> str:
 def differences(report: Mapping[str, Any]) -> dict[str, Difference]:
     """To the reference, of the foreground in the pose of the photos, each trained variant with its own number of photos."""
     runs, ready = report["runs"], trained_names(report)
-    with_photos = {name: (name, finished(runs, name)[0]["photos"]) for name in ready if name != REFERENCE}
-    return {name: difference(runs, own, (REFERENCE, PHOTOS)) for name, own in with_photos.items() if REFERENCE in ready}
+    with_photos = {
+        name: (name, finished(runs, name)[0]["photos"]) for name in ready if name != REFERENCE
+    }
+    return {
+        name: difference(runs, own, (REFERENCE, PHOTOS))
+        for name, own in with_photos.items()
+        if REFERENCE in ready
+    }
 
 
 ABLATIONS = {
@@ -193,7 +259,9 @@ ABLATIONS = {
 def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
     """Heading and rows of each ablation: what a part gains, by cameras, poses and numbers of photos."""
     runs, ready, found = report["runs"], trained_names(report), {}
-    scored = lambda name, test, task: name in ready and task in finished(runs, name)[0]["scores"].get(test, {})
+    scored = lambda name, test, task: (
+        name in ready and task in finished(runs, name)[0]["scores"].get(test, {})
+    )
     for part, other in ABLATIONS.items():
         lines = []
         for kind, task, score in itertools.product((COUNTS, NEAR), TASKS, ("psnr", "lpips_alex")):
@@ -203,9 +271,13 @@ def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list
             for a, b in zip(kind, before, strict=False):
                 known = scored(REFERENCE, a, task) and scored(other, b, task)
                 gain = difference(runs, (REFERENCE, a), (other, b), task, score) if known else None
-                gains.append("-" if gain is None else gain._replace(mean=sign * gain.mean).text(digits))
+                gains.append(
+                    "-" if gain is None else gain._replace(mean=sign * gain.mean).text(digits)
+                )
             if set(gains) != {"-"}:
-                lines.append(["near" if kind == NEAR else "standard", TASKS[task], SCORES[score][0], *gains])
+                lines.append(
+                    ["near" if kind == NEAR else "standard", TASKS[task], SCORES[score][0], *gains]
+                )
         if lines:
             found[part] = (["cameras", "shown", "gain", *COUNTS], lines)
     return found

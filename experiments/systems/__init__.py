@@ -17,7 +17,12 @@ from experiments.systems.grouped import GroupDecoder, GroupReader
 from experiments.systems.pixel_queries import NoReader, PhotoDecoder, QueryDriver
 from experiments.systems.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
 from experiments.systems.stereo import NearestPairDriver, StereoDecoder
-from experiments.systems.surface_gaussians import PoseMapDriver, SurfaceDecoder, TextureDriver, TextureReader
+from experiments.systems.surface_gaussians import (
+    PoseMapDriver,
+    SurfaceDecoder,
+    TextureDriver,
+    TextureReader,
+)
 from experiments.systems.surface_map import SurfaceMap
 from experiments.systems.two_stream import TwoStreamReader
 from humangs_jax.network import presets
@@ -42,8 +47,12 @@ def humangs(size: Size = "published") -> HumanGSConfig:
     if size == "published":
         return config
     encoder, reader, decoder = paper_parts(config.architecture)
-    encoder = encoder.clone(transformer=BENCH_TRANSFORMER, upsampler=UpsamplerConfig(BENCH_WIDTH // 3))
-    parts = Architecture(encoder, reader.clone(output_width=BENCH_WIDTH), decoder.clone(hidden=BENCH_WIDTH))
+    encoder = encoder.clone(
+        transformer=BENCH_TRANSFORMER, upsampler=UpsamplerConfig(BENCH_WIDTH // 3)
+    )
+    parts = Architecture(
+        encoder, reader.clone(output_width=BENCH_WIDTH), decoder.clone(hidden=BENCH_WIDTH)
+    )
     return HumanGSConfig(parts, _scaled(config.conventions))
 
 
@@ -55,9 +64,13 @@ def ours(size: Size = "published") -> HumanGSConfig:
     if size == "published":
         return config
     encoder, reader, decoder = paper_parts(config.architecture)
-    encoder = encoder.clone(texture=TriplaneConfig(resolution=32, channels=8), transformer=BENCH_TRANSFORMER)
+    encoder = encoder.clone(
+        texture=TriplaneConfig(resolution=32, channels=8), transformer=BENCH_TRANSFORMER
+    )
     conventions = dataclasses.replace(_scaled(config.conventions), skinning_reach=None, light=False)
-    return HumanGSConfig(Architecture(encoder, reader, decoder.clone(hidden=BENCH_WIDTH)), conventions)
+    return HumanGSConfig(
+        Architecture(encoder, reader, decoder.clone(hidden=BENCH_WIDTH)), conventions
+    )
 
 
 def _scaled(conventions: Conventions) -> Conventions:
@@ -66,7 +79,9 @@ def _scaled(conventions: Conventions) -> Conventions:
 
 def _sized(size: Size, conventions: Conventions, *parts: Any) -> HumanGSConfig:
     """A system of these parts, at the bench for its photos and bodies."""
-    return HumanGSConfig(Architecture(*parts), conventions if size == "published" else _scaled(conventions))
+    return HumanGSConfig(
+        Architecture(*parts), conventions if size == "published" else _scaled(conventions)
+    )
 
 
 def lvsm(size: Size = "published") -> HumanGSConfig:
@@ -74,13 +89,19 @@ def lvsm(size: Size = "published") -> HumanGSConfig:
     parts = PlainPhotos(patch_size=8), NoReader(), PhotoDecoder()
     if size == "bench":
         return _sized(size, Conventions(image_size=256), *parts, QueryDriver(BENCH_BLOCKS))
-    return _sized(size, Conventions(image_size=256), *parts, QueryDriver()).with_runtime(dtype="bfloat16")
+    return _sized(size, Conventions(image_size=256), *parts, QueryDriver()).with_runtime(
+        dtype="bfloat16"
+    )
 
 
 def lvsm_latents(size: Size = "published") -> HumanGSConfig:
     """LVSM's encoder-decoder: photos become latents once, and a target attends to these. 12 + 12 layers, 3,072 latents."""
     config, published = lvsm(size), size == "published"
-    blocks = TransformerConfig(layers=12, class_token=False) if published else dataclasses.replace(BENCH_BLOCKS, layers=2)
+    blocks = (
+        TransformerConfig(layers=12, class_token=False)
+        if published
+        else dataclasses.replace(BENCH_BLOCKS, layers=2)
+    )
     return config.with_parts(driver=QueryDriver(blocks, latents=3072 if published else 64))
 
 
@@ -88,16 +109,31 @@ def humanram(size: Size = "published") -> HumanGSConfig:
     """HumanRAM-style (`pixel_queries`): LVSM of 12 layers with the neural texture, and a convolutional decoder, at 512 pixels."""
     config = lvsm(size)
     if size == "published":
-        driver = QueryDriver(TransformerConfig(layers=12, class_token=False), TriplaneConfig(), fusion=256)
+        driver = QueryDriver(
+            TransformerConfig(layers=12, class_token=False), TriplaneConfig(), fusion=256
+        )
         return config.with_parts(driver=driver).with_conventions(image_size=512)
-    return config.with_parts(driver=QueryDriver(BENCH_BLOCKS, TriplaneConfig(resolution=32, channels=8), fusion=32))
+    return config.with_parts(
+        driver=QueryDriver(BENCH_BLOCKS, TriplaneConfig(resolution=32, channels=8), fusion=32)
+    )
 
 
 def giga(size: Size = "published") -> HumanGSConfig:
     """GIGA-style (`surface_gaussians`): a texture of 512 texels, a U-Net for every pose, one Gaussian a texel."""
-    driver = TextureDriver() if size == "published" else TextureDriver((16, 32, 64, BENCH_WIDTH), BENCH_WIDTH, 8)
+    driver = (
+        TextureDriver()
+        if size == "published"
+        else TextureDriver((16, 32, 64, BENCH_WIDTH), BENCH_WIDTH, 8)
+    )
     surface = SurfaceMap("atlas", 512 if size == "published" else 48)
-    return _sized(size, Conventions(pixels="person"), PlainPhotos(), TextureReader(surface), SurfaceDecoder(surface), driver)
+    return _sized(
+        size,
+        Conventions(pixels="person"),
+        PlainPhotos(),
+        TextureReader(surface),
+        SurfaceDecoder(surface),
+        driver,
+    )
 
 
 def animatable(size: Size = "published") -> HumanGSConfig:
@@ -106,7 +142,14 @@ def animatable(size: Size = "published") -> HumanGSConfig:
     """
     driver = PoseMapDriver() if size == "published" else PoseMapDriver((16, 32, 64))
     surface = SurfaceMap("front_back", 1024 if size == "published" else 96)
-    return _sized(size, Conventions(pixels="person"), PlainPhotos(), NoReader(), SurfaceDecoder(surface), driver)
+    return _sized(
+        size,
+        Conventions(pixels="person"),
+        PlainPhotos(),
+        NoReader(),
+        SurfaceDecoder(surface),
+        driver,
+    )
 
 
 def lca(size: Size = "published") -> HumanGSConfig:
@@ -121,12 +164,18 @@ def back_projection(size: Size = "published") -> HumanGSConfig:
     """The paper's network without its upsampler: the partner of `cross_attention`, from which it differs in the reader alone."""
     config = humangs(size)
     encoder, reader, _ = paper_parts(config.architecture)
-    return config.with_parts(encoder=encoder.clone(upsampler=None), reader=reader.clone(output_width=None))
+    return config.with_parts(
+        encoder=encoder.clone(upsampler=None), reader=reader.clone(output_width=None)
+    )
 
 
 def cross_attention(size: Size = "published") -> HumanGSConfig:
     """The same with vertices that attend to all image tokens: what the paper's second claim is about."""
-    reader = CrossAttentionReader() if size == "published" else CrossAttentionReader(BENCH_WIDTH, 1, 4, BENCH_HEAD)
+    reader = (
+        CrossAttentionReader()
+        if size == "published"
+        else CrossAttentionReader(BENCH_WIDTH, 1, 4, BENCH_HEAD)
+    )
     return back_projection(size).with_parts(reader=reader)
 
 
@@ -138,10 +187,16 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
-        reader, decoder = (TwoStreamReader(pooling=pooling, most_views=most_views), VertexDecoder(hidden=512))
+        reader, decoder = (
+            TwoStreamReader(pooling=pooling, most_views=most_views),
+            VertexDecoder(hidden=512),
+        )
     else:
         encoder = _photo_encoder(BENCH_BLOCKS)
-        reader, decoder = TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views), VertexDecoder(hidden=BENCH_WIDTH)
+        reader, decoder = (
+            TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views),
+            VertexDecoder(hidden=BENCH_WIDTH),
+        )
     decoder = decoder.clone(tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
     conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.0128)
     return _sized(size, conventions, encoder, reader, decoder)
@@ -162,7 +217,10 @@ def lhm_plus(size: Size = "published") -> HumanGSConfig:
 def gst(size: Size = "published") -> HumanGSConfig:
     """GST-style (`grouped`): one photo of 256 pixels; HMR2's ViT-H in size (1280 wide, 32 layers, patches of 16)."""
     if size == "published":
-        encoder = _photo_encoder(TransformerConfig(width=1280, layers=32, class_token=False, head_width=80), patch_size=16)
+        encoder = _photo_encoder(
+            TransformerConfig(width=1280, layers=32, class_token=False, head_width=80),
+            patch_size=16,
+        )
         conventions = Conventions(image_size=256, body_vertices=6890)  # those of SMPL
         return HumanGSConfig(Architecture(encoder, GroupReader(), GroupDecoder()), conventions)
     config = lhm("bench")

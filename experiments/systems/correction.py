@@ -36,7 +36,9 @@ class Corrected(NamedTuple):
     offsets: Float[Array, "g 3"]
 
 
-def apply_corrections(gaussians: Gaussians, raw: Float[Array, "g 14"], offset_scale: float) -> Corrected:
+def apply_corrections(
+    gaussians: Gaussians, raw: Float[Array, "g 14"], offset_scale: float
+) -> Corrected:
     """Gaussians with corrections, `CHANNELS` numbers each: zeros change nothing (but colors closer to 0 or 1 than
     `COLOR_MARGIN`), and Gaussians of opacity 0 keep it.
 
@@ -89,18 +91,28 @@ class CorrectionMLP(GaussianDriver):
     def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
         """See `parts.Driver`. Raises: ValueError for other features or another K; see `pose_vector`."""
         if not isinstance(outputs.scene, VertexFeatures):
-            raise ValueError(f"a CorrectionMLP needs VertexFeatures, got {type(outputs.scene).__name__}")
+            raise ValueError(
+                f"a CorrectionMLP needs VertexFeatures, got {type(outputs.scene).__name__}"
+            )
         local, per_vertex = outputs.scene.local, self.gaussians_per_vertex
         if len(outputs.gaussians.opacities) != per_vertex * len(local):
-            raise ValueError(f"driver.gaussians_per_vertex {per_vertex}: the decoder gives another number")
-        vector = jnp.broadcast_to(pose_vector(target.pose, self.joints), (len(local), 3 * (self.joints - 1)))
+            raise ValueError(
+                f"driver.gaussians_per_vertex {per_vertex}: the decoder gives another number"
+            )
+        vector = jnp.broadcast_to(
+            pose_vector(target.pose, self.joints), (len(local), 3 * (self.joints - 1))
+        )
         x = jnp.concatenate([local, vector], axis=-1)
         for i in range(self.layers):
             x = jax.nn.silu(nn.Dense(self.hidden, name=f"hidden_{i}")(x))
         last = nn.initializers.normal(LAST_STD)
         raw = nn.Dense(CHANNELS * per_vertex, kernel_init=last, name="out")(x)
-        gaussians, offsets = apply_corrections(outputs.gaussians, raw.reshape(-1, CHANNELS), self.offset_scale)
-        driven = offsets.reshape(len(local), per_vertex, 3)  # of a body of 1.8 m, metres are normalised units
+        gaussians, offsets = apply_corrections(
+            outputs.gaussians, raw.reshape(-1, CHANNELS), self.offset_scale
+        )
+        driven = offsets.reshape(
+            len(local), per_vertex, 3
+        )  # of a body of 1.8 m, metres are normalised units
         if outputs.tight_offsets is not None:  # the canonical ones stay small, too
             driven = jnp.concatenate([outputs.tight_offsets, driven], axis=1)
         return replace(outputs, gaussians=gaussians, tight_offsets=driven)

@@ -14,7 +14,14 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import Layers, Ratio, Width, part
-from humangs_jax.network.parts import Encoding, HumanGSInputs, Pass, Reader, VertexFeatures, subject_unit
+from humangs_jax.network.parts import (
+    Encoding,
+    HumanGSInputs,
+    Pass,
+    Reader,
+    VertexFeatures,
+    subject_unit,
+)
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import INIT_STD, NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
@@ -45,12 +52,16 @@ class CrossAttentionReader(Reader):
         canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
         x = nn.Dense(self.width, kernel_init=INIT, name="position")(positional_encoding(canonical))
         for index in range(self.layers):
-            x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(x, tokens, count)
+            x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(
+                x, tokens, count
+            )
         local = layer_norm(None, "norm", use_bias=True)(x)
         return VertexFeatures(local, encoding.global_token, normals=inputs.canonical_normals)
 
 
-def image_tokens(encoding: Encoding, inputs: HumanGSInputs) -> tuple[Float[Array, "l d"], Int[Array, ""] | None]:
+def image_tokens(
+    encoding: Encoding, inputs: HumanGSInputs
+) -> tuple[Float[Array, "l d"], Int[Array, ""] | None]:
     """The tokens of all views, those of padding last, and the number of real ones (None: all).
 
     Raises: ValueError unless the maps have one element a patch.
@@ -82,9 +93,13 @@ class CrossBlock(nn.Module):
     runtime: Runtime
 
     @nn.compact
-    def __call__(self, x: Float[Array, "n d"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None) -> Float[Array, "n d"]:
+    def __call__(
+        self, x: Float[Array, "n d"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None
+    ) -> Float[Array, "n d"]:
         width, dtype = x.shape[-1], self.runtime.compute_dtype
-        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
+        dense = lambda features, name: nn.Dense(
+            features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name
+        )
         heads = lambda y: y.reshape(len(y), -1, self.head_width)
         rms = lambda y, name: nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=name)(y)
         q = rms(heads(dense(width, "q")(layer_norm(dtype, "norm1")(x))), "q_norm")

@@ -20,7 +20,15 @@ from experiments.systems.two_stream import check_views
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.configuration import Bias, Layers, Ratio, Spread, Vertices, Width, part
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.parts import Decoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, subject_unit
+from humangs_jax.network.parts import (
+    Decoder,
+    Encoding,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    Reader,
+    subject_unit,
+)
 from humangs_jax.network.transformer import INIT_STD, Attention, layer_norm
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
@@ -49,17 +57,25 @@ class GroupReader(Reader):
         check_heads("reader", self.width, self.head_width)
 
     @nn.compact
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Float[Array, "a r d"]:
+    def __call__(
+        self, encoding: Encoding, inputs: HumanGSInputs, run: Pass
+    ) -> Float[Array, "a r d"]:
         """Tokens of the 5 attributes of r groups. Raises ValueError for a second photo, or an encoder with an upsampler."""
         check_views(inputs, 1)
         tokens, count = image_tokens(encoding, inputs)
-        x = self.param("queries", nn.initializers.normal(1.0), (len(ATTRIBUTES) * self.groups, self.width))
+        x = self.param(
+            "queries", nn.initializers.normal(1.0), (len(ATTRIBUTES) * self.groups, self.width)
+        )
         init = nn.initializers.normal(INIT_STD)
         for index in range(self.layers):
             own = Attention(self.head_width, True, run.runtime, init, name=f"self_{index}")
             x = x + own(layer_norm(run.runtime.compute_dtype, f"self_norm_{index}")(x), None)
-            x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(x, tokens, count)
-        return layer_norm(None, "norm", use_bias=True)(x).reshape(len(ATTRIBUTES), self.groups, self.width)
+            x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(
+                x, tokens, count
+            )
+        return layer_norm(None, "norm", use_bias=True)(x).reshape(
+            len(ATTRIBUTES), self.groups, self.width
+        )
 
 
 @part
@@ -74,7 +90,9 @@ class GroupDecoder(Decoder):
     """Bias of the scales before the softplus."""
 
     @nn.compact
-    def __call__(self, features: Float[Array, "a r d"], inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, features: Float[Array, "a r d"], inputs: HumanGSInputs, run: Pass
+    ) -> HumanGSOutputs:
         """A Gaussian a vertex. Raises ValueError for a body of more vertices than the groups have."""
         vertices, groups = len(inputs.canonical_vertices), features.shape[1]
         if vertices > (room := groups * self.group_size):
@@ -88,7 +106,9 @@ class GroupDecoder(Decoder):
             raw[name] = nn.Dense(
                 self.group_size * numbers,
                 kernel_init=nn.initializers.normal(LAST_STD),
-                bias_init=lambda _, __, dtype=jnp.float32, b=bias: jnp.tile(jnp.asarray(b, dtype), self.group_size),
+                bias_init=lambda _, __, dtype=jnp.float32, b=bias: jnp.tile(
+                    jnp.asarray(b, dtype), self.group_size
+                ),
                 name=name,
             )(token).reshape(room, numbers)[:vertices]
         unit = subject_unit(inputs.canonical_vertices)

@@ -27,9 +27,23 @@ import jax.numpy as jnp
 from experiments.systems.targets import PixelDriver
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.configuration import Patch, Range, Vertices, part
-from humangs_jax.network.encoder import TEXTURE_STD, TriplaneConfig, encoder_pixels, patchify, sample_triplane
+from humangs_jax.network.encoder import (
+    TEXTURE_STD,
+    TriplaneConfig,
+    encoder_pixels,
+    patchify,
+    sample_triplane,
+)
 from humangs_jax.network.maps import Convolution
-from humangs_jax.network.parts import Decoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, Target
+from humangs_jax.network.parts import (
+    Decoder,
+    Encoding,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    Reader,
+    Target,
+)
 from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.network.upsampler import KAIMING, SLOPE, UpConvolution
 from humangs_jax.rendering.gaussians import Gaussians
@@ -58,7 +72,9 @@ class PhotoDecoder(Decoder):
     """No Gaussians: the photos, for a `QueryDriver`."""
 
     def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
-        return HumanGSOutputs(no_gaussians(), scene=Photos(encoder_pixels(inputs, run), inputs.view_count))
+        return HumanGSOutputs(
+            no_gaussians(), scene=Photos(encoder_pixels(inputs, run), inputs.view_count)
+        )
 
 
 def no_gaussians() -> Gaussians:
@@ -89,9 +105,13 @@ class QueryDriver(PixelDriver):
         """Raises ValueError for a class token, or too few layers to fuse four depths."""
         super().__post_init__()
         if self.transformer.class_token:
-            raise ValueError("driver.transformer.class_token: expected false, there is no global token here")
+            raise ValueError(
+                "driver.transformer.class_token: expected false, there is no global token here"
+            )
         if self.fusion is not None and self.transformer.layers < 4:
-            raise ValueError(f"driver.fusion needs at least 4 layers, got {self.transformer.layers}")
+            raise ValueError(
+                f"driver.fusion needs at least 4 layers, got {self.transformer.layers}"
+            )
 
     @nn.compact
     def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> Float[Array, "i j 3"]:
@@ -114,7 +134,9 @@ class QueryDriver(PixelDriver):
             patches = patchify(maps, patch)
             return linear(width, name)(patches.reshape(len(patches), -1))
 
-        seen = tokens_of(jnp.concatenate([2 * photos.pixels[..., :3] - 1, seen], axis=-1), "photo_tokens")
+        seen = tokens_of(
+            jnp.concatenate([2 * photos.pixels[..., :3] - 1, seen], axis=-1), "photo_tokens"
+        )
         asked = tokens_of(asked[None], "target_tokens")
         targets = len(asked)
         # the target comes first: photos that are padding are the last tokens
@@ -123,7 +145,10 @@ class QueryDriver(PixelDriver):
         if self.latents is not None:
             learned = self.param("latents", nn.initializers.normal(INIT_STD), (self.latents, width))
             encoder = Transformer(self.transformer, run.runtime, name="encoder")
-            encoded = encoder(jnp.concatenate([learned, seen]), None if count is None else count - targets + self.latents)[-1]
+            encoded = encoder(
+                jnp.concatenate([learned, seen]),
+                None if count is None else count - targets + self.latents,
+            )[-1]
             seen, count = encoded[: self.latents], None
         transformer = Transformer(self.transformer, run.runtime, name="transformer")
         depths = transformer(jnp.concatenate([asked, seen]), count)

@@ -23,7 +23,16 @@ from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.maps import sample_bilinear, sample_nearest, texel_indices
-from humangs_jax.network.parts import Decoder, Encoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, subject_unit
+from humangs_jax.network.parts import (
+    Decoder,
+    Encoder,
+    Encoding,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    Reader,
+    subject_unit,
+)
 from humangs_jax.network.reader import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians
@@ -68,12 +77,16 @@ class ShellTextureReader(Reader):
         """Raises ValueError unless the shells begin at the surface and ascend."""
         super().__post_init__()
         if not self.shells or self.shells[0] != 0 or list(self.shells) != sorted(set(self.shells)):
-            raise ValueError(f"reader.shells {self.shells}: expected ascending distances, the first 0")
+            raise ValueError(
+                f"reader.shells {self.shells}: expected ascending distances, the first 0"
+            )
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> ShellTextures:
         """Textures of the shells. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
         if inputs.texels is None or inputs.posed_normals is None:
-            raise ValueError("shell textures need texels and posed_normals of the inputs, see `prepare_inputs`")
+            raise ValueError(
+                "shell textures need texels and posed_normals of the inputs, see `prepare_inputs`"
+            )
         unit, texels = subject_unit(inputs.canonical_vertices), inputs.texels
         steps = jnp.asarray(self.shells, inputs.images.dtype)
         size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
@@ -86,15 +99,25 @@ class ShellTextureReader(Reader):
             shape, points = points.shape[:-1], points.reshape(-1, 3)
             pixels, depths = project_vertices(camera, points)
             indices = texel_indices(pixels, size, size, grid)
-            surface, person = sample_nearest(depth_map, indices), sample_nearest(foreground, indices) > 0
-            framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)
-            visible = framed & person & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE)) & present
+            surface, person = (
+                sample_nearest(depth_map, indices),
+                sample_nearest(foreground, indices) > 0,
+            )
+            framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (
+                depths > 0
+            )
+            visible = (
+                framed & person & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE)) & present
+            )
             towards = safe_normalize(camera.center - points, jnp.zeros(3)).reshape(*shape, 3)
             facing = jnp.sum(towards * surface_normals, axis=-1)
             facing = jnp.where(visible.reshape(shape) & covered, facing, 0.0)
             colors = sample_bilinear(image, indices).reshape(*shape, 3)
             better = facing > best[0]
-            return (jnp.where(better, facing, best[0]), jnp.where(better[..., None], colors, best[1])), None
+            return (
+                jnp.where(better, facing, best[0]),
+                jnp.where(better[..., None], colors, best[1]),
+            ), None
 
         shape = (len(self.shells), *covered.shape)
         nothing = jnp.zeros(shape), jnp.full((*shape, 3), UNSEEN_COLOR)
@@ -124,7 +147,11 @@ def _filled(sums, weights):
     _, height, width, _ = sums.shape
     if height % 2 or width % 2:
         total = jnp.sum(weights, axis=(1, 2), keepdims=True)
-        coarse = jnp.where(total > 0, jnp.sum(sums, axis=(1, 2), keepdims=True) / jnp.where(total > 0, total, 1), UNSEEN_COLOR)
+        coarse = jnp.where(
+            total > 0,
+            jnp.sum(sums, axis=(1, 2), keepdims=True) / jnp.where(total > 0, total, 1),
+            UNSEEN_COLOR,
+        )
     else:
         coarse = doubled(_filled(halved(sums), halved(weights)))
     return jnp.where(weights > 0, mean, coarse)
@@ -152,11 +179,15 @@ class ShellDecoder(Decoder):
         """
         texels, normals, weights = inputs.texels, inputs.canonical_normals, inputs.skinning_weights
         if texels is None or normals is None or weights is None:
-            raise ValueError("shell textures need texels, canonical_normals and skinning_weights of the inputs")
+            raise ValueError(
+                "shell textures need texels, canonical_normals and skinning_weights of the inputs"
+            )
         unit, shells = subject_unit(inputs.canonical_vertices), len(features.distances)
         covered = texels.covered
         surface = texels.interpolate(inputs.canonical_vertices / unit)
-        offsets = features.distances[:, None, None, None] * safe_normalize(texels.interpolate(normals), jnp.zeros(3))
+        offsets = features.distances[:, None, None, None] * safe_normalize(
+            texels.interpolate(normals), jnp.zeros(3)
+        )
         channels = jnp.concatenate([2 * features.colors - 1, offsets[1:]])
         entering = jnp.moveaxis(channels, 0, 2).reshape(1, *covered.shape, -1)
         nn.share_scope(self, network := UNet(self.widths, (sum(CHANNELS) * shells,)))
@@ -169,9 +200,13 @@ class ShellDecoder(Decoder):
             means=flat(surface + offsets) * unit,
             quats=quaternion.normalize(flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)),
             scales=flat(self.largest_scale * jax.nn.sigmoid(scales)) * unit,
-            opacities=jnp.where(shown, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0).reshape(-1),
+            opacities=jnp.where(
+                shown, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0
+            ).reshape(-1),
             colors=flat(features.colors),
         )
-        rows = texels.interpolate(weights).at[..., 0].add(1.0 - covered)  # what shows nothing stays at the root
+        rows = (
+            texels.interpolate(weights).at[..., 0].add(1.0 - covered)
+        )  # what shows nothing stays at the root
         rows = jnp.tile(rows.reshape(-1, rows.shape[-1]), (shells, 1))
         return HumanGSOutputs(gaussians, skinning_weights=rows)

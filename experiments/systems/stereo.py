@@ -27,7 +27,16 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera, pixel_rays
 from humangs_jax.network.maps import sample_bilinear, texel_indices
-from humangs_jax.network.parts import Decoder, Drawn, Driver, HumanGSInputs, HumanGSOutputs, Pass, Target, subject_unit
+from humangs_jax.network.parts import (
+    Decoder,
+    Drawn,
+    Driver,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    Target,
+    subject_unit,
+)
 from humangs_jax.network.reader import project_vertices
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians
@@ -75,15 +84,25 @@ class StereoDecoder(Decoder):
     def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
         """See `parts.Decoder`. A photo without another one is compared with itself."""
         images, cameras, vertices = inputs.images, inputs.cameras, inputs.posed_vertices
-        size, grid, unit = (cameras.width, cameras.height), run.conventions.pixel_grid, subject_unit(inputs.canonical_vertices)
+        size, grid, unit = (
+            (cameras.width, cameras.height),
+            run.conventions.pixel_grid,
+            subject_unit(inputs.canonical_vertices),
+        )
         middle = jnp.mean(vertices[0], axis=0)
         directions = safe_normalize(cameras.center - middle, jnp.zeros(3))
-        near = jnp.where(inputs.present & ~jnp.eye(len(images), dtype=bool), directions @ directions.T, ABSENT)
+        near = jnp.where(
+            inputs.present & ~jnp.eye(len(images), dtype=bool), directions @ directions.T, ABSENT
+        )
         partners = jnp.argmax(near, axis=1)
         photos = jnp.concatenate([2 * images - 1, inputs.foreground[..., None]], axis=-1)
-        maps = safe_normalize(UNet(self.widths, self.widths[:1], name="features")(photos), jnp.zeros(self.widths[0]))
+        maps = safe_normalize(
+            UNet(self.widths, self.widths[:1], name="features")(photos), jnp.zeros(self.widths[0])
+        )
 
-        def sweep(camera: Camera, points: Float[Array, "n 3"], own: Array, other: Array, partner: Camera) -> tuple[Array, ...]:
+        def sweep(
+            camera: Camera, points: Float[Array, "n 3"], own: Array, other: Array, partner: Camera
+        ) -> tuple[Array, ...]:
             origin, rays = pixel_rays(camera)
             reach = jnp.linalg.norm(points - origin, axis=-1)
             low, high = jnp.min(reach) - self.margin * unit, jnp.max(reach) + self.margin * unit
@@ -91,29 +110,52 @@ class StereoDecoder(Decoder):
 
             def common(distance: Array) -> Array:
                 pixels, _ = project_vertices(partner, (origin + distance * rays).reshape(-1, 3))
-                there = sample_bilinear(other, texel_indices(pixels, size, size, grid)).reshape(own.shape)
+                there = sample_bilinear(other, texel_indices(pixels, size, size, grid)).reshape(
+                    own.shape
+                )
                 return SHARPNESS * jnp.sum(own * there, axis=-1)
 
             return jnp.moveaxis(jax.lax.map(common, distances), 0, -1), distances, origin, rays
 
         others = jax.tree.map(lambda x: x[partners], (maps, cameras))
         costs, distances, origins, rays = jax.vmap(sweep)(cameras, vertices, maps, *others)
-        raw = UNet(self.widths, (self.planes, sum(CHANNELS)), name="gaussians")(jnp.concatenate([photos, maps, costs], axis=-1))
+        raw = UNet(self.widths, (self.planes, sum(CHANNELS)), name="gaussians")(
+            jnp.concatenate([photos, maps, costs], axis=-1)
+        )
 
-        def pixels(image: Array, seen: Array, raw: Array, cost: Array, distances: Array, *seen_from: Array) -> Gaussians:
+        def pixels(
+            image: Array, seen: Array, raw: Array, cost: Array, distances: Array, *seen_from: Array
+        ) -> Gaussians:
             origin, rays, focal = seen_from
-            scores, quats, scales, opacities = jnp.split(raw, self.planes + np.cumsum([0, *CHANNELS[:2]]), axis=-1)
+            scores, quats, scales, opacities = jnp.split(
+                raw, self.planes + np.cumsum([0, *CHANNELS[:2]]), axis=-1
+            )
             reach = (jax.nn.softmax(cost + scores) @ distances)[..., None]
             flat = lambda x: x.reshape(-1, x.shape[-1])
             return Gaussians(
                 means=flat(origin + reach * rays),
-                quats=quaternion.normalize(flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)),
-                scales=flat(COVERAGE * reach / focal * jnp.exp(SCALING * jnp.tanh(scales / SCALING))),
-                opacities=jnp.where(seen, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0).reshape(-1),
+                quats=quaternion.normalize(
+                    flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)
+                ),
+                scales=flat(
+                    COVERAGE * reach / focal * jnp.exp(SCALING * jnp.tanh(scales / SCALING))
+                ),
+                opacities=jnp.where(
+                    seen, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0
+                ).reshape(-1),
                 colors=flat(image),
             )
 
-        of_views = images, inputs.foreground, raw, costs, distances, origins, rays, cameras.K[:, 0, 0]
+        of_views = (
+            images,
+            inputs.foreground,
+            raw,
+            costs,
+            distances,
+            origins,
+            rays,
+            cameras.K[:, 0, 0],
+        )
         scene = PixelGaussians(jax.vmap(pixels)(*of_views), directions, middle, inputs.present)
         return HumanGSOutputs(no_gaussians(), scene=scene)
 
@@ -131,13 +173,22 @@ class NearestPairDriver(Driver):
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
         posed = jax.vmap(lambda center: nearest_pair(outputs.scene, center))(targets.cameras.center)
-        return draw_posed(posed, targets, backgrounds, config)._replace(opacities=posed.opacities.reshape(-1))
+        return draw_posed(posed, targets, backgrounds, config)._replace(
+            opacities=posed.opacities.reshape(-1)
+        )
 
     @nn.nowrap
-    def show(self, variables, config, inputs, targets, background) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
+    def show(
+        self, variables, config, inputs, targets, background
+    ) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
         """See `parts.Driver`. The pose of a target changes nothing; their world has to be y-up."""
         scene = reconstructed(variables, config, inputs)[0].scene
-        return drawn((nearest_pair(scene, center) for center in targets.cameras.center), targets.cameras, background, config)
+        return drawn(
+            (nearest_pair(scene, center) for center in targets.cameras.center),
+            targets.cameras,
+            background,
+            config,
+        )
 
 
 def nearest_pair(scene: PixelGaussians, center: Float[Array, "3"]) -> Gaussians:

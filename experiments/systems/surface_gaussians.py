@@ -36,7 +36,16 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.maps import sample_bilinear, texel_indices
-from humangs_jax.network.parts import Decoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, Target, subject_unit
+from humangs_jax.network.parts import (
+    Decoder,
+    Encoding,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    Reader,
+    Target,
+    subject_unit,
+)
 from humangs_jax.network.reader import UNSEEN_COLOR, project_vertices, visible_vertices
 from humangs_jax.network.vertex_decoder import normal_frames
 from humangs_jax.rendering.gaussians import Gaussians
@@ -80,7 +89,9 @@ class TextureReader(Reader):
         """The texture. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
         texels = _texels(inputs)
         if inputs.posed_normals is None:
-            raise ValueError("a TextureReader needs posed_normals of the inputs, see `prepare_inputs`")
+            raise ValueError(
+                "a TextureReader needs posed_normals of the inputs, see `prepare_inputs`"
+            )
         unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
         size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
 
@@ -89,11 +100,21 @@ class TextureReader(Reader):
             pixels, depths = project_vertices(camera, points)
             visible = visible_vertices(pixels, depths, depth_map, size, grid) & covered & present
             away = lambda x: safe_normalize(x, jnp.zeros(3))
-            cosines = jnp.sum(away(texels.interpolate(normals).reshape(-1, 3)) * away(camera.center - points), axis=-1)
-            weights = jnp.where(visible & (cosines > 0), jnp.exp(self.sharpness * (cosines - 1)), 0.0)
+            cosines = jnp.sum(
+                away(texels.interpolate(normals).reshape(-1, 3)) * away(camera.center - points),
+                axis=-1,
+            )
+            weights = jnp.where(
+                visible & (cosines > 0), jnp.exp(self.sharpness * (cosines - 1)), 0.0
+            )
             return sample_bilinear(image, texel_indices(pixels, size, size, grid)), weights
 
-        arguments = (inputs.images, inputs.depth_maps, inputs.cameras.in_units(unit), inputs.posed_vertices / unit)
+        arguments = (
+            inputs.images,
+            inputs.depth_maps,
+            inputs.cameras.in_units(unit),
+            inputs.posed_vertices / unit,
+        )
         colors, weights = jax.vmap(view)(*arguments, inputs.posed_normals, inputs.present)
         total = jnp.sum(weights, axis=0)
         mean = jnp.einsum("vtc,vt->tc", colors, safe_divide(weights, total), precision=EXACT)
@@ -115,7 +136,9 @@ class SurfaceDecoder(Decoder):
         """See `parts.Decoder`. Raises: ValueError if the inputs lack the map, the normals or the weights of the body."""
         texels = _texels(inputs)
         if inputs.canonical_normals is None or inputs.skinning_weights is None:
-            raise ValueError("a SurfaceDecoder needs canonical_normals and skinning_weights, see `prepare_inputs`")
+            raise ValueError(
+                "a SurfaceDecoder needs canonical_normals and skinning_weights, see `prepare_inputs`"
+            )
         texture = features if isinstance(features, SurfaceTexture) else None
         unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
         flat = lambda values: texels.interpolate(values).reshape(len(covered), -1)
@@ -127,16 +150,22 @@ class SurfaceDecoder(Decoder):
             quats=normal_frames(safe_normalize(flat(inputs.canonical_normals), up)),
             scales=jnp.broadcast_to(along * jnp.asarray([1.0, 1.0, THICKNESS]), (len(covered), 3)),
             opacities=jnp.where(covered, OPACITY, 0.0),
-            colors=jnp.full((len(covered), 3), UNSEEN_COLOR) if texture is None else texture.colors.reshape(-1, 3),
+            colors=jnp.full((len(covered), 3), UNSEEN_COLOR)
+            if texture is None
+            else texture.colors.reshape(-1, 3),
         )
         weights = jnp.where(covered[:, None], flat(inputs.skinning_weights), root)
         positions = texels.interpolate(inputs.canonical_vertices) / unit
-        return HumanGSOutputs(gaussians, skinning_weights=weights, scene=Surface(texture, positions, texels))
+        return HumanGSOutputs(
+            gaussians, skinning_weights=weights, scene=Surface(texture, positions, texels)
+        )
 
 
 def _texels(inputs: HumanGSInputs) -> Texels:
     if inputs.texels is None:
-        raise ValueError("this network works on a map of the surface: use `gaussian_body` and `prepare_inputs`")
+        raise ValueError(
+            "this network works on a map of the surface: use `gaussian_body` and `prepare_inputs`"
+        )
     return inputs.texels
 
 
@@ -165,10 +194,15 @@ class TextureDriver(GaussianDriver):
         surface: Surface = outputs.scene
         if surface.texture is None:
             raise ValueError("a TextureDriver needs a TextureReader")
-        texture, attention = surface.texture, PoseAttention(self.pose_width, self.pose_tokens, parent=None)
+        texture, attention = (
+            surface.texture,
+            PoseAttention(self.pose_width, self.pose_tokens, parent=None),
+        )
         seen = jnp.concatenate([2 * texture.colors - 1, texture.seen[..., None]], axis=-1)
         nn.share_scope(self, network := UNet(self.widths, tuple(NETS.values()), attention))
-        raw = network(seen[None], surface.positions[None], context=pose_vector(target.pose, self.joints))
+        raw = network(
+            seen[None], surface.positions[None], context=pose_vector(target.pose, self.joints)
+        )
         return _driven(outputs, raw[0], self.offset_scale)
 
 
@@ -191,14 +225,22 @@ class PoseMapDriver(GaussianDriver):
         surface: Surface = outputs.scene
         upright = quaternion.matrix_from_axis_angle(target.pose.rotations[0])
         middle = jnp.mean(target.vertices, axis=0)
-        relative = jnp.matmul(target.vertices - middle, upright, precision=EXACT)  # rows times R: R^T p
+        relative = jnp.matmul(
+            target.vertices - middle, upright, precision=EXACT
+        )  # rows times R: R^T p
         maps = surface.texels.interpolate(relative)[None]
-        raw = jnp.concatenate([UNet(self.widths, (n,), name=name)(maps) for name, n in NETS.items()], axis=-1)
+        raw = jnp.concatenate(
+            [UNet(self.widths, (n,), name=name)(maps) for name, n in NETS.items()], axis=-1
+        )
         return _driven(outputs, raw[0], self.offset_scale)
 
 
-def _driven(outputs: HumanGSOutputs, raw: Float[Array, "h w 14"], offset_scale: float) -> HumanGSOutputs:
-    gaussians, offsets = apply_corrections(outputs.gaussians, raw.reshape(-1, CHANNELS), offset_scale)
+def _driven(
+    outputs: HumanGSOutputs, raw: Float[Array, "h w 14"], offset_scale: float
+) -> HumanGSOutputs:
+    gaussians, offsets = apply_corrections(
+        outputs.gaussians, raw.reshape(-1, CHANNELS), offset_scale
+    )
     return replace(outputs, gaussians=gaussians, tight_offsets=offsets[:, None])
 
 
@@ -209,10 +251,14 @@ class PoseAttention(nn.Module):
     tokens: int
 
     @nn.compact
-    def __call__(self, x: Float[Array, "v h w d"], pose: Float[Array, " q"]) -> Float[Array, "v h w d"]:
+    def __call__(
+        self, x: Float[Array, "v h w d"], pose: Float[Array, " q"]
+    ) -> Float[Array, "v h w d"]:
         features = x.shape[-1]
         hidden = jax.nn.silu(nn.Dense(self.width, name="pose_0")(pose))
-        context = nn.Dense(self.tokens * features, name="pose_1")(hidden).reshape(self.tokens, features)
+        context = nn.Dense(self.tokens * features, name="pose_1")(hidden).reshape(
+            self.tokens, features
+        )
         dense = lambda name: nn.Dense(features, use_bias=False, name=name)
         queries, keys, values = dense("query")(x), dense("key")(context), dense("value")(context)
         attention = jax.nn.softmax(queries @ keys.T * features**-0.5, axis=-1)

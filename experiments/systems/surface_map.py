@@ -57,8 +57,13 @@ def _texels(template, faces, uvs, uv_faces, wanted):
 
 def _atlas(vertices, faces, uvs, uv_faces, size):
     if uvs is not None and uv_faces is not None:
-        nothing = np.zeros(0, np.int64)  # charts and vertices of an atlas are not needed for its texels
-        uvs, uv_faces = np.frombuffer(uvs, np.float32).reshape(-1, 2), np.frombuffer(uv_faces, np.int32).reshape(-1, 3)
+        nothing = np.zeros(
+            0, np.int64
+        )  # charts and vertices of an atlas are not needed for its texels
+        uvs, uv_faces = (
+            np.frombuffer(uvs, np.float32).reshape(-1, 2),
+            np.frombuffer(uv_faces, np.int32).reshape(-1, 3),
+        )
         return texels(Atlas(uvs, uv_faces, nothing, nothing, size, 1.0))
     one = np.zeros(len(faces), np.int64)
     atlas = unwrap(vertices, faces, one, -(-size // CELLS) * CELLS, one + 1.0)
@@ -72,7 +77,9 @@ def _front_and_back(vertices, faces, size):
     seen = []
     for side in (1, -1):
         depth = 2.5 - 0.5 * side * front / max(np.abs(front).max(), 1e-6)
-        points = np.stack([size * (0.5 + side * right) * depth, size * (0.5 - up) * depth, depth], axis=-1)
+        points = np.stack(
+            [size * (0.5 + side * right) * depth, size * (0.5 - up) * depth, depth], axis=-1
+        )
         camera = Camera(jnp.eye(3), jnp.eye(4), size, size)
         seen.append(rasterize_mesh(jnp.asarray(points, jnp.float32), jnp.asarray(faces), camera))
     beside = lambda name: np.concatenate([np.asarray(getattr(one, name)) for one in seen], axis=1)

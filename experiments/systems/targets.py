@@ -20,7 +20,13 @@ from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_b
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import SubjectViews, equal_exposure, gaussian_body, prepare_inputs, standardize
+from humangs_jax.data.views import (
+    SubjectViews,
+    equal_exposure,
+    gaussian_body,
+    prepare_inputs,
+    standardize,
+)
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import encoder_pixels
@@ -53,7 +59,9 @@ class GaussianDriver(Driver):
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
         def one(pose):
-            posed, driven = self.posed(variables, outputs, body, targets.betas, BodyPose(*pose), config.model)
+            posed, driven = self.posed(
+                variables, outputs, body, targets.betas, BodyPose(*pose), config.model
+            )
             return posed, driven.tight_offsets
 
         posed, offsets = jax.lax.map(one, (targets.rotations, targets.translations))
@@ -62,11 +70,15 @@ class GaussianDriver(Driver):
         return found._replace(opacities=flat(posed.opacities), tight_offsets=flat(offsets))
 
     @nn.nowrap
-    def show(self, variables, config, inputs, targets, background) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
+    def show(
+        self, variables, config, inputs, targets, background
+    ) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
         """See `parts.Driver`. Their world has to be y-up, unlike that of `reconstruct`."""
         outputs, body, views, config = reconstructed(variables, config, inputs)
         own = part_variables(variables, "driver")
-        posed = (_posed(self, own, outputs, body, views.betas, pose, config) for pose in _poses(targets))
+        posed = (
+            _posed(self, own, outputs, body, views.betas, pose, config) for pose in _poses(targets)
+        )
         return drawn(posed, targets.cameras, background, config)
 
 
@@ -80,14 +92,21 @@ class PixelDriver(Driver):
 
     @nn.nowrap
     def images(
-        self, variables: Variables, outputs: HumanGSOutputs, body: BodyModel, targets: SubjectViews, config: HumanGSConfig
+        self,
+        variables: Variables,
+        outputs: HumanGSOutputs,
+        body: BodyModel,
+        targets: SubjectViews,
+        config: HumanGSConfig,
     ) -> Float[Array, "v h w 3"]:
         """Of targets, a pass each; their photos and masks are not used. What is too much of a whole patch is cut off."""
         vertices, pixels = target_queries(body, targets, config)
 
         @jax.checkpoint
         def one(target):
-            return self.apply(variables, outputs, Target(BodyPose(*target[:2]), *target[2:]), config.run())
+            return self.apply(
+                variables, outputs, Target(BodyPose(*target[:2]), *target[2:]), config.run()
+            )
 
         arguments = (targets.rotations, targets.translations, vertices, pixels)
         return jax.lax.map(one, arguments)[:, : targets.cameras.height, : targets.cameras.width]
@@ -95,18 +114,24 @@ class PixelDriver(Driver):
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
         images = self.images(variables, outputs, body, targets, config.model)
-        full = lambda rgb: Rendering(rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32))
+        full = lambda rgb: Rendering(
+            rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32)
+        )
         return Drawn(jax.vmap(full)(images))
 
     @nn.nowrap
     def show(self, variables, config, inputs, targets, background) -> tuple[np.ndarray, None]:
         """See `parts.Driver`. Raises: ValueError for another background than white."""
         if background != 1:
-            raise ValueError(f"a network that draws pixels shows people on white; background {background:g} was asked for")
+            raise ValueError(
+                f"a network that draws pixels shows people on white; background {background:g} was asked for"
+            )
         outputs, body, views, config = reconstructed(variables, config, inputs)
         own, images = part_variables(variables, "driver"), []
         for pose, camera in zip(_poses(targets), targets.cameras, strict=True):
-            images.append(np.asarray(_image(self, own, outputs, body, _one_view(views, pose, camera), config)))
+            images.append(
+                np.asarray(_image(self, own, outputs, body, _one_view(views, pose, camera), config))
+            )
         return np.clip(np.stack(images), 0, 1), None
 
 
@@ -129,7 +154,9 @@ def drawn(
     """Images and alpha of Gaussians for each camera, as the weights were trained with."""
     how = SPLAT_PRESETS[config.conventions.rendering]
     found = list(draw_gaussians(posed, cameras, jnp.full(3, background), how))
-    return np.stack([np.clip(np.asarray(x.rgb), 0, 1) for x in found]), np.stack([np.asarray(x.alpha) for x in found])
+    return np.stack([np.clip(np.asarray(x.rgb), 0, 1) for x in found]), np.stack(
+        [np.asarray(x.alpha) for x in found]
+    )
 
 
 def reconstructed(
@@ -149,7 +176,9 @@ def _poses(targets: Capture) -> Any:
 
 def _one_view(views: SubjectViews, pose: BodyPose, camera: Camera) -> SubjectViews:
     blank = jnp.zeros((1, camera.height, camera.width, 3))
-    camera, rotations, translations = jax.tree.map(lambda x: x[None], (camera, pose.rotations, pose.translation))
+    camera, rotations, translations = jax.tree.map(
+        lambda x: x[None], (camera, pose.rotations, pose.translation)
+    )
     return SubjectViews(blank, blank[..., 0], camera, rotations, translations, views.betas)
 
 
@@ -162,12 +191,20 @@ def _outputs(variables: Variables, inputs: Any, config: HumanGSConfig) -> HumanG
 
 
 @functools.partial(jax.jit, static_argnames=("driver", "config"))
-def _image(driver: PixelDriver, variables: Variables, outputs: Any, body: Any, target: Any, config: Any) -> Array:
+def _image(
+    driver: PixelDriver, variables: Variables, outputs: Any, body: Any, target: Any, config: Any
+) -> Array:
     return driver.images(variables, outputs, body, target, config)[0]
 
 
 @functools.partial(jax.jit, static_argnames=("driver", "config"))
 def _posed(
-    driver: GaussianDriver, variables: Variables, outputs: Any, body: Any, betas: Any, pose: Any, config: Any
+    driver: GaussianDriver,
+    variables: Variables,
+    outputs: Any,
+    body: Any,
+    betas: Any,
+    pose: Any,
+    config: Any,
 ) -> Gaussians:
     return driver.posed(variables, outputs, body, betas, pose, config)[0]

@@ -19,7 +19,14 @@ from experiments.systems.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import Few, Layers, Ratio, Vertices, Width, part
 from humangs_jax.geometry.transform import along_curve
-from humangs_jax.network.parts import Encoding, HumanGSInputs, Pass, Reader, VertexFeatures, subject_unit
+from humangs_jax.network.parts import (
+    Encoding,
+    HumanGSInputs,
+    Pass,
+    Reader,
+    VertexFeatures,
+    subject_unit,
+)
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
@@ -54,14 +61,23 @@ class TwoStreamReader(Reader):
         tokens, count = image_tokens(encoding, inputs)
         positions = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
         dense = lambda name: nn.Dense(self.width, kernel_init=INIT, name=name)
-        embedded = dense("position_out")(jax.nn.silu(dense("position_in")(positional_encoding(positions))))
+        embedded = dense("position_out")(
+            jax.nn.silu(dense("position_in")(positional_encoding(positions)))
+        )
         points, cluster = embedded, None
         if self.pooling > 1:
-            cluster, clusters = along_curve(positions, CURVE_REACH) // self.pooling, -(-len(positions) // self.pooling)
+            cluster, clusters = (
+                along_curve(positions, CURVE_REACH) // self.pooling,
+                -(-len(positions) // self.pooling),
+            )
             members = jax.ops.segment_sum(jnp.ones(len(positions)), cluster, clusters)
             points = jax.ops.segment_sum(embedded, cluster, clusters) / members[:, None]
         tokens = layer_norm(None, "token_norm")(dense("tokens")(tokens))
-        present = jnp.ones(len(tokens)) if count is None else (jnp.arange(len(tokens)) < count).astype(jnp.float32)
+        present = (
+            jnp.ones(len(tokens))
+            if count is None
+            else (jnp.arange(len(tokens)) < count).astype(jnp.float32)
+        )
         pooled = jnp.sum(tokens * present[:, None], axis=0) / jnp.maximum(jnp.sum(present), 1)
         for index in range(self.blocks):
             last, sizes = index + 1 == self.blocks, (self.width, self.mlp_ratio, self.head_width)
@@ -92,13 +108,21 @@ class TwoStreamBlock(nn.Module):
 
     @nn.compact
     def __call__(
-        self, points: Float[Array, "n d"], tokens: Float[Array, "l d"], count: Int[Array, ""] | None, pooled: Float[Array, " d"]
+        self,
+        points: Float[Array, "n d"],
+        tokens: Float[Array, "l d"],
+        count: Int[Array, ""] | None,
+        pooled: Float[Array, " d"],
     ) -> tuple[Float[Array, "n d"], Float[Array, "l d"]]:
         dtype, width, vertices = self.runtime.compute_dtype, self.width, len(points)
-        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
+        dense = lambda features, name: nn.Dense(
+            features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name
+        )
 
         def modulations(name, number):
-            made = nn.Dense(number * width, kernel_init=nn.initializers.zeros, name=f"{name}_modulation")
+            made = nn.Dense(
+                number * width, kernel_init=nn.initializers.zeros, name=f"{name}_modulation"
+            )
             return jnp.split(made(jax.nn.silu(pooled)), number)
 
         def heads(x, name, modulation, ask):
@@ -106,21 +130,34 @@ class TwoStreamBlock(nn.Module):
             x = layer_norm(dtype, f"{name}_norm1")(x) * (1 + scale) + shift
             made = dense((2 + ask) * width, f"{name}_kvq")(x).reshape(len(x), -1, self.head_width)
             k, v, *q = jnp.split(made, 2 + ask, axis=1)
-            rms = lambda y, which: nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=f"{name}_{which}_norm")(y)
+            rms = lambda y, which: nn.RMSNorm(
+                epsilon=NORM_EPSILON, dtype=dtype, name=f"{name}_{which}_norm"
+            )(y)
             return [rms(k, "k"), v, *(rms(y, "q") for y in q)]
 
         def update(x, seen, name, modulation):
             gate1, shift, scale, gate2 = modulation
             x = x + gate1 * dense(width, f"{name}_out")(seen.reshape(len(x), width))
             hidden = layer_norm(dtype, f"{name}_norm2")(x) * (1 + scale) + shift
-            hidden = jax.nn.gelu(dense(self.mlp_ratio * width, f"{name}_mlp_in")(hidden), approximate=False)
+            hidden = jax.nn.gelu(
+                dense(self.mlp_ratio * width, f"{name}_mlp_in")(hidden), approximate=False
+            )
             return x + gate2 * dense(width, f"{name}_mlp_out")(hidden)
 
-        of_points, of_tokens = modulations("points", 6), modulations("tokens", 2 if self.last else 6)
+        of_points, of_tokens = (
+            modulations("points", 6),
+            modulations("tokens", 2 if self.last else 6),
+        )
         k, v, q = heads(points, "points", of_points[:2], ask=True)
         token_k, token_v, *token_q = heads(tokens, "tokens", of_tokens[:2], ask=not self.last)
-        k, v, q = jnp.concatenate([k, token_k]), jnp.concatenate([v, token_v]), jnp.concatenate([q, *token_q])
+        k, v, q = (
+            jnp.concatenate([k, token_k]),
+            jnp.concatenate([v, token_v]),
+            jnp.concatenate([q, *token_q]),
+        )
         total = None if count is None else vertices + count
         seen = attention(q, k, v, total, self.runtime.attention)
         points = update(points, seen[:vertices], "points", of_points[2:])
-        return points, tokens if self.last else update(tokens, seen[vertices:], "tokens", of_tokens[2:])
+        return points, tokens if self.last else update(
+            tokens, seen[vertices:], "tokens", of_tokens[2:]
+        )

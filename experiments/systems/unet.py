@@ -22,7 +22,9 @@ MOST_SCALES = 12
 def check_scales(name: str, widths: tuple[int, ...]) -> None:
     """Raises ValueError, naming the setting, unless there are 1 to `MOST_SCALES` positive widths."""
     if not 1 <= len(widths) <= MOST_SCALES or min(widths) < 1:
-        raise ValueError(f"{name} {widths[:MOST_SCALES]}: expected 1 to {MOST_SCALES} positive numbers, one a scale")
+        raise ValueError(
+            f"{name} {widths[:MOST_SCALES]}: expected 1 to {MOST_SCALES} positive numbers, one a scale"
+        )
 
 
 class UNet(nn.Module):
@@ -39,10 +41,14 @@ class UNet(nn.Module):
     dtype: Any = None
 
     @nn.compact
-    def __call__(self, *given: Float[Array, "v h w _"], context: Any = None) -> Float[Array, "v h w features"]:
+    def __call__(
+        self, *given: Float[Array, "v h w _"], context: Any = None
+    ) -> Float[Array, "v h w features"]:
         coarsest, (_, height, width, _) = 2 ** (len(self.widths) - 1), given[0].shape
         if height % coarsest or width % coarsest:
-            raise ValueError(f"maps of {width} x {height}: a U-Net of {len(self.widths)} scales needs multiples of {coarsest}")
+            raise ValueError(
+                f"maps of {width} x {height}: a U-Net of {len(self.widths)} scales needs multiples of {coarsest}"
+            )
 
         def convolved(x, width, name):
             for i in range(2):
@@ -58,11 +64,17 @@ class UNet(nn.Module):
 
         def decoded(x, features, mark):
             for i, skip in reversed(list(enumerate(kept))):
-                x = convolved(jnp.concatenate([doubled(x), skip], axis=-1), self.widths[i], f"{mark}up_{i}")
-            return Convolution(features, nn.initializers.normal(LAST_STD), self.dtype, name=f"{mark}out")(x)
+                x = convolved(
+                    jnp.concatenate([doubled(x), skip], axis=-1), self.widths[i], f"{mark}up_{i}"
+                )
+            return Convolution(
+                features, nn.initializers.normal(LAST_STD), self.dtype, name=f"{mark}out"
+            )(x)
 
         marks = lambda many: [""] if len(many) == 1 else [f"{i}_" for i in range(len(many))]
-        scales = zip(*(encoded(x, mark) for x, mark in zip(given, marks(given), strict=True)), strict=True)
+        scales = zip(
+            *(encoded(x, mark) for x, mark in zip(given, marks(given), strict=True)), strict=True
+        )
         kept = [jnp.concatenate(maps, axis=-1) for maps in scales]
         x = kept.pop()
         if self.bottleneck is not None:

@@ -33,7 +33,11 @@ from humangs_jax.fitting.fit_capture import Examination
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import to_uint8
-from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh, vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import (
+    interpolate_attributes,
+    rasterize_mesh,
+    vertex_normals,
+)
 
 LONGEST_SIDE = 512
 """Larger photos are shrunk to this for the check, pixels."""
@@ -96,13 +100,19 @@ class CheckReport:
         for view in self.views:
             iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
             outside = "" if view.outside is None else f"{view.outside:.1%}"
-            rows.append([view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warning))])
+            rows.append(
+                [view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warning))]
+            )
         lines = text_table(rows)
         if self.displaced:
             how = "as body.npz says" if self.registered else "to the masks"
-            lines.append(f"reconstruct will move the body {how}, by up to {100 * self.displaced:.1f} cm (yellow)")
+            lines.append(
+                f"reconstruct will move the body {how}, by up to {100 * self.displaced:.1f} cm (yellow)"
+            )
         if self.skirt:
-            lines.append("reconstruct will put a skirt around the legs, as the masks show one (yellow)")
+            lines.append(
+                "reconstruct will put a skirt around the legs, as the masks show one (yellow)"
+            )
         lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {view.warning}" for view in self.views if view.warning]
         if self.ok:
@@ -112,7 +122,9 @@ class CheckReport:
         return "\n".join(lines)
 
 
-def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None = None) -> CheckReport:
+def check_capture(
+    capture: Capture, out: str | Path, keypoints: Keypoints | None = None
+) -> CheckReport:
     """Draw the posed body over every photo, write the sheet as a PNG, and report how well they agree.
 
     Arguments: keypoints: of the views, if they are known: whether the cameras may be at fault.
@@ -130,26 +142,44 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
         worn = with_skirt(capture.body, capture, moves)
     body, moves = (capture.body, moves) if worn is None else worn
     moves = None if moves is None or not moves.any() else moves
-    displaced = None if moves is None else _posed_frames(dataclasses.replace(capture, body=body, displacement=None), moves)
+    displaced = (
+        None
+        if moves is None
+        else _posed_frames(dataclasses.replace(capture, body=body, displacement=None), moves)
+    )
     moved_tints = side_tints(body)
     overlays, views = [], []
-    for i, (name, warning, inside) in enumerate(zip(capture.names, found.views, found.inside, strict=True)):
-        drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
+    for i, (name, warning, inside) in enumerate(
+        zip(capture.names, found.views, found.inside, strict=True)
+    ):
+        drawn = _body_image(
+            vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i]
+        )
         iou = outside = None
         if capture.masks is not None:
             iou, outside = _agreement(np.asarray(drawn.covered), capture.masks[i] > MASK_THRESHOLD)
             if warning is None and outside > MOST_OUTSIDE:
                 warning = WIDER.format(outside, *(FIXED if right else FREE))
         if shown is not capture:
-            drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, shown.cameras[i])
+            drawn = _body_image(
+                vertices[int(capture.frames[i])], capture.body.faces, tints, shown.cameras[i]
+            )
         overlays.append(overlay(shown.images[i], drawn))
         if displaced is not None:
-            moved = _body_image(displaced[int(capture.frames[i])], body.faces, moved_tints, shown.cameras[i])
+            moved = _body_image(
+                displaced[int(capture.frames[i])], body.faces, moved_tints, shown.cameras[i]
+            )
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, inside, warning))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
-    farthest = 0.0 if moves is None else float(np.linalg.norm(moves[: len(capture.body.template)], axis=1).max())
-    return CheckReport(tuple(views), found.whole, farthest, capture.displacement is not None, worn is not None)
+    farthest = (
+        0.0
+        if moves is None
+        else float(np.linalg.norm(moves[: len(capture.body.template)], axis=1).max())
+    )
+    return CheckReport(
+        tuple(views), found.whole, farthest, capture.displacement is not None, worn is not None
+    )
 
 
 def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3"]]) -> Capture:
@@ -161,10 +191,16 @@ def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3
 
 
 def draw_body(
-    body: BodyModel, betas: Float[Array, " s"], pose: BodyPose, camera: Camera, photo: Float[np.ndarray, "h w 3"]
+    body: BodyModel,
+    betas: Float[Array, " s"],
+    pose: BodyPose,
+    camera: Camera,
+    photo: Float[np.ndarray, "h w 3"],
 ) -> tuple[Float[np.ndarray, "h w 3"], BodyImage]:
     """The posed body over a photo of one camera, and the body alone."""
-    drawn = _body_image(jax.jit(person_vertices)(body, betas, pose), body.faces, side_tints(body), camera)
+    drawn = _body_image(
+        jax.jit(person_vertices)(body, betas, pose), body.faces, side_tints(body), camera
+    )
     return overlay(photo, drawn), drawn
 
 
@@ -178,7 +214,10 @@ def overlay(photo: Float[np.ndarray, "h w 3"], drawn: BodyImage) -> Float[np.nda
 def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
     """Colors of the vertices: left, right, or between, by the names of the joints that move them, else by x in T-pose."""
     weights = np.asarray(body.skinning_weights)
-    left, right = (weights @ np.array([name.startswith(side) for name in body.joint_names]) for side in ("left", "right"))
+    left, right = (
+        weights @ np.array([name.startswith(side) for name in body.joint_names])
+        for side in ("left", "right")
+    )
     if not (left.any() and right.any()):
         left, right = (np.asarray(body.template)[:, 0] * sign > 0 for sign in (1, -1))
     left, right = left.astype(np.float32)[:, None], right.astype(np.float32)[:, None]
@@ -188,7 +227,12 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
 
 
 @jax.jit
-def _body_image(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], tints: Float[Array, "n 3"], camera: Camera) -> BodyImage:
+def _body_image(
+    vertices: Float[Array, "n 3"],
+    faces: Int[Array, "f 3"],
+    tints: Float[Array, "n 3"],
+    camera: Camera,
+) -> BodyImage:
     points = transform.apply(camera.cam_from_world, vertices)
     rays = points / jnp.linalg.norm(points, axis=-1, keepdims=True)
     rotation = camera.cam_from_world[:3, :3]
@@ -199,7 +243,9 @@ def _body_image(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], tints: 
     return BodyImage(shaded, fragments.face_ids >= 0)
 
 
-def _posed_frames(capture: Capture, moves: Float[np.ndarray, "n 3"] | None = None) -> dict[int, Float[Array, "n 3"]]:
+def _posed_frames(
+    capture: Capture, moves: Float[np.ndarray, "n 3"] | None = None
+) -> dict[int, Float[Array, "n 3"]]:
     """Vertices of the frames that views show, by frame. moves: of the shaped body."""
     rest = shape_body(capture.body, jnp.asarray(capture.betas))
     if moves is not None:
@@ -208,10 +254,14 @@ def _posed_frames(capture: Capture, moves: Float[np.ndarray, "n 3"] | None = Non
     return {frame: pose(capture.body, rest, capture.pose(frame)).vertices for frame in shown}
 
 
-def _agreement(covered: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
+def _agreement(
+    covered: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
+) -> tuple[float, float]:
     """Intersection over union of body and mask, and the share of the body more than one pixel off the mask."""
     union = max((covered | mask).sum(), 1)
-    return float((covered & mask).sum() / union), float((covered & ~binary_dilation(mask)).sum() / max(covered.sum(), 1))
+    return float((covered & mask).sum() / union), float(
+        (covered & ~binary_dilation(mask)).sum() / max(covered.sum(), 1)
+    )
 
 
 def _boundary(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -235,7 +285,9 @@ RADIUS, SMALL = 4, 2
 WHITE, BLACK, CROSS = (255, 255, 255), (0, 0, 0), (255, 0, 230)
 
 
-def fit_sheet(capture: Capture, keypoints: Keypoints, examination: Examination, out: str | Path) -> None:
+def fit_sheet(
+    capture: Capture, keypoints: Keypoints, examination: Examination, out: str | Path
+) -> None:
     """Write a sheet of up to 24 views, evenly chosen, as a PNG.
 
     Arguments: examination: of this capture by these keypoints. Raises: OSError if the image cannot be written.
@@ -245,14 +297,19 @@ def fit_sheet(capture: Capture, keypoints: Keypoints, examination: Examination, 
     compared = [examination.compared[view] for view in range(count)]
     marks = [keypoints.points[view][compared[view]] for view in range(count)]
     close, corners = around_person(capture, _posed_frames(capture), marks)
-    drawn = [_with_keypoints(_overlay(close, view), close, corners[view], keypoints, examination, view) for view in chosen]
+    drawn = [
+        _with_keypoints(_overlay(close, view), close, corners[view], keypoints, examination, view)
+        for view in chosen
+    ]
     contact_sheet(np.stack(drawn), out, labels=[_fit_label(examination, view) for view in chosen])
 
 
 def _overlay(capture: Capture, view: int) -> Float[np.ndarray, "h w 3"]:
     shown = capture.select([view]).resized(LONGEST_SIDE)
     pose = capture.pose(int(capture.frames[view]))
-    return draw_body(capture.body, jnp.asarray(capture.betas), pose, shown.cameras[0], shown.images[0])[0]
+    return draw_body(
+        capture.body, jnp.asarray(capture.betas), pose, shown.cameras[0], shown.images[0]
+    )[0]
 
 
 def _with_keypoints(
@@ -267,7 +324,9 @@ def _with_keypoints(
     from PIL import Image, ImageDraw
 
     height, width = image.shape[:2]
-    canvas = Image.fromarray(to_uint8(image)).resize((FINE * width, FINE * height), Image.Resampling.BILINEAR)
+    canvas = Image.fromarray(to_uint8(image)).resize(
+        (FINE * width, FINE * height), Image.Resampling.BILINEAR
+    )
     pen = ImageDraw.Draw(canvas)
     scale = FINE * np.asarray([width / capture.images.shape[2], height / capture.images.shape[1]])
     within = lambda points: np.clip((points - corner) * scale, -FINE * width, 2 * FINE * width)
@@ -284,14 +343,22 @@ def _with_keypoints(
             pen.line(line, fill=CROSS, width=FINE)
     for k in shown:
         color, outlier = _color(keypoints.set.names[k]), examination.outliers[view, k]
-        pen.circle(tuple(discs[k]), radii[k] + FINE, fill=None if outlier else color, outline=BLACK, width=FINE)
+        pen.circle(
+            tuple(discs[k]),
+            radii[k] + FINE,
+            fill=None if outlier else color,
+            outline=BLACK,
+            width=FINE,
+        )
         if outlier:
             pen.circle(tuple(discs[k]), radii[k], outline=color, width=FINE)
     return np.asarray(canvas.resize((width, height), Image.Resampling.BOX)) / 255
 
 
 def _is_small(name: str) -> bool:
-    return name.startswith("face_") or any(part in name for part in ("hand_root", *(f"_{finger}_" for finger in FINGERS)))
+    return name.startswith("face_") or any(
+        part in name for part in ("hand_root", *(f"_{finger}_" for finger in FINGERS))
+    )
 
 
 def _color(name: str) -> tuple[int, ...]:

@@ -30,7 +30,9 @@ def around_person(
     """
     height, width = capture.images.shape[1:3]
     photo, count = np.asarray([width, height]), len(capture.images)
-    boxes = [_box(capture, view, vertices[int(capture.frames[view])], marks) for view in range(count)]
+    boxes = [
+        _box(capture, view, vertices[int(capture.frames[view])], marks) for view in range(count)
+    ]
     sizes = [high - low for low, high in filter(None, boxes)]
     whole = capture, np.zeros((count, 2), int)
     if not sizes:
@@ -47,19 +49,33 @@ def around_person(
     K = jnp.asarray(np.asarray(capture.cameras.K) - shift)
     cameras = replace(capture.cameras, K=K, width=int(size[0]), height=int(size[1]))
     masks = None if capture.masks is None else _cut(capture.masks, corners, size)
-    return dataclasses.replace(capture, images=_cut(capture.images, corners, size), masks=masks, cameras=cameras), corners
+    return dataclasses.replace(
+        capture, images=_cut(capture.images, corners, size), masks=masks, cameras=cameras
+    ), corners
 
 
-def _cut(images: np.ndarray, corners: Int[np.ndarray, "v 2"], size: Int[np.ndarray, "2"]) -> np.ndarray:
+def _cut(
+    images: np.ndarray, corners: Int[np.ndarray, "v 2"], size: Int[np.ndarray, "2"]
+) -> np.ndarray:
     """Windows of one size (width, height) at the corners (x, y)."""
-    return np.stack([image[y : y + size[1], x : x + size[0]] for image, (x, y) in zip(images, corners, strict=True)])
+    return np.stack(
+        [
+            image[y : y + size[1], x : x + size[0]]
+            for image, (x, y) in zip(images, corners, strict=True)
+        ]
+    )
 
 
 def _box(
-    capture: Capture, view: int, vertices: Float[Array, "n 3"], marks: Sequence[Float[np.ndarray, "k 2"]] | None
+    capture: Capture,
+    view: int,
+    vertices: Float[Array, "n 3"],
+    marks: Sequence[Float[np.ndarray, "k 2"]] | None,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
     """The least and largest x and y of the body, the mask and the marks in a photo; None if nothing is in it."""
-    K, pose = (np.asarray(x[view], float) for x in (capture.cameras.K, capture.cameras.cam_from_world))
+    K, pose = (
+        np.asarray(x[view], float) for x in (capture.cameras.K, capture.cameras.cam_from_world)
+    )
     points = np.asarray(vertices, float) @ pose[:3, :3].T + pose[:3, 3]
     points = points[points[:, 2] > 0]
     pixels = [points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]]
@@ -69,5 +85,7 @@ def _box(
         pixels.append(np.asarray(marks[view], float))
     photo = np.asarray(capture.images.shape[2:0:-1])
     seen = np.concatenate(pixels)
-    seen = seen[np.isfinite(seen).all(axis=1) & (seen >= 0).all(axis=1) & (seen <= photo).all(axis=1)]
+    seen = seen[
+        np.isfinite(seen).all(axis=1) & (seen >= 0).all(axis=1) & (seen <= photo).all(axis=1)
+    ]
     return (seen.min(axis=0), seen.max(axis=0)) if len(seen) else None

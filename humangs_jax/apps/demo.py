@@ -37,7 +37,14 @@ from humangs_jax.refinement.refine import refine_with_report
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.viewer.page import write_page
 
-PICTURES = ("inputs.png", "novel_views.png", "refined.png", "animation.mp4", "animation.gif", "novel_views.exr")
+PICTURES = (
+    "inputs.png",
+    "novel_views.png",
+    "refined.png",
+    "animation.mp4",
+    "animation.gif",
+    "novel_views.exr",
+)
 FILES = ("report.json", *PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
 """What the demonstration writes; the first tells that a folder is of it."""
 REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
@@ -95,11 +102,17 @@ def summary(report: dict[str, Any]) -> str:
 
 
 def _write_demo(
-    folder: Path, weights: str | os.PathLike[str] | None, frame_size: int, refine: RefineConfig | None, settings: Settings
+    folder: Path,
+    weights: str | os.PathLike[str] | None,
+    frame_size: int,
+    refine: RefineConfig | None,
+    settings: Settings,
 ) -> dict[str, Any]:
     began, timings = time.perf_counter(), dict[str, Any]()
     with stage("loading"):
-        inputs = _timed(timings, "load_capture", lambda: settings.photos(load_capture(DEMO_CAPTURE)))
+        inputs = _timed(
+            timings, "load_capture", lambda: settings.photos(load_capture(DEMO_CAPTURE))
+        )
         truth, motion = load_capture(f"{DEMO_CAPTURE}/held_out"), load_motion()
         variables, config = _timed(timings, "load_weights", lambda: load_weights(weights))
         config = settings.network(config)
@@ -109,12 +122,18 @@ def _write_demo(
         return capture_renderings(avatar, truth, jnp.full(3, background), how)
 
     with stage("reconstructing"):
-        avatar = _timed(timings, "reconstruct", lambda: reconstruct(variables, config, inputs), twice=True)
+        avatar = _timed(
+            timings, "reconstruct", lambda: reconstruct(variables, config, inputs), twice=True
+        )
         _timed(timings, "animate", lambda: animate(avatar, motion.pose(0)), twice=True)
     with stage("rendering"):
         ours = _images(_timed(timings, "render_held_out", lambda: held_out(avatar), twice=True))
         baseline = score(draw_painted_body(painted_body(inputs), truth), truth)
-    contact_sheet(inputs.images, folder / "inputs.png", labels=[f"photo {i}" for i in range(inputs.view_count)])
+    contact_sheet(
+        inputs.images,
+        folder / "inputs.png",
+        labels=[f"photo {i}" for i in range(inputs.view_count)],
+    )
     side_by_side(truth.images, ours, folder / "novel_views.png")
     report = _scores(ours, truth) | {
         "baseline_psnr": round(baseline.psnr, 4),
@@ -122,7 +141,8 @@ def _write_demo(
         "gaussians": len(avatar.gaussians.means),
         "views": {"input": inputs.view_count, "held_out": truth.view_count},
         "image_size": [inputs.cameras.width, inputs.cameras.height],
-        "versions": {name: metadata.version(name) for name in VERSIONS} | {"python": platform.python_version()},
+        "versions": {name: metadata.version(name) for name in VERSIONS}
+        | {"python": platform.python_version()},
         "device": f"{jax.devices()[0].platform}: {jax.devices()[0].device_kind}",
         "timings": timings,
     }
@@ -132,8 +152,15 @@ def _write_demo(
             if run.interrupted:
                 raise KeyboardInterrupt
             avatar, refined = run.avatar, _images(held_out(run.avatar))
-        rows = np.clip(np.stack([truth.images, ours, refined], axis=1).reshape(-1, *ours.shape[1:]), 0, 1)
-        contact_sheet(rows, folder / "refined.png", headers=("truth", "feed-forward", "refined") * 2, columns=6)
+        rows = np.clip(
+            np.stack([truth.images, ours, refined], axis=1).reshape(-1, *ours.shape[1:]), 0, 1
+        )
+        contact_sheet(
+            rows,
+            folder / "refined.png",
+            headers=("truth", "feed-forward", "refined") * 2,
+            columns=6,
+        )
         counts = {name: getattr(run, name) for name in ("iterations", "steps", "head_steps")}
         times = {name: round(getattr(run, name), 1) for name in ("seconds", "compile_seconds")}
         report["refined"] = _scores(refined, truth) | counts | times
@@ -145,7 +172,9 @@ def _write_demo(
             write_video(folder / name, frames, motion.fps)
     with stage("writing"):
         avatar.save(folder / "avatar.npz")
-        export(folder / "avatar.ply", avatar)  # in the world of its viewers, as `humangs export` writes it
+        export(
+            folder / "avatar.ply", avatar
+        )  # in the world of its viewers, as `humangs export` writes it
         write_page(folder / "avatar.html", avatar, motion)
         write_renderings_exr(folder / "novel_views.exr", *held_out(avatar, background=0.0))
     report["total_seconds"] = round(time.perf_counter() - began, 3)
@@ -158,7 +187,9 @@ def _images(views: tuple[Any, list[Rendering]]) -> np.ndarray:
 
 
 def _scores(images: np.ndarray, truth: Capture) -> dict[str, Any]:
-    return {name: round(value, 4) for name, value in dataclasses.asdict(score(images, truth)).items()}
+    return {
+        name: round(value, 4) for name, value in dataclasses.asdict(score(images, truth)).items()
+    }
 
 
 def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False) -> Any:

@@ -14,7 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.apps.same_people import Found, PhotoPeople, inside_photo, is_unclear, rivals, same_people
+from humangs_jax.apps.same_people import (
+    Found,
+    PhotoPeople,
+    inside_photo,
+    is_unclear,
+    rivals,
+    same_people,
+)
 from humangs_jax.apps.start import photo_files, scan_photos
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.configuration import ArgumentError
@@ -38,7 +45,16 @@ from humangs_jax.detection.people import (
     sharpened,
 )
 from humangs_jax.io.atomic import MOVE_AWAY, add_files, check_ours
-from humangs_jax.io.images import MASK, mark_of, orientation, oriented, read_image, resized, to_uint8, write_png
+from humangs_jax.io.images import (
+    MASK,
+    mark_of,
+    orientation,
+    oriented,
+    read_image,
+    resized,
+    to_uint8,
+    write_png,
+)
 from humangs_jax.io.reading import write_json
 
 KEYPOINTS_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.png", "masks"
@@ -84,7 +100,10 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
 
 
 def person_in_capture(
-    folder: Path, photos: Photos | Capture, keypoints: Keypoints | None = None, person: int | None = None
+    folder: Path,
+    photos: Photos | Capture,
+    keypoints: Keypoints | None = None,
+    person: int | None = None,
 ) -> tuple[list[PhotoPeople], int]:
     """The people in the photos of a capture folder, and the number of the one who is meant: by keypoints, if there are any, else
     by the number asked for, else by masks, else by size.
@@ -112,24 +131,34 @@ Masks = Sequence[Float[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]]
 """Of the photos, each of its size."""
 
 
-def person_of(photos: Sequence[PhotoPeople], given: Keypoints | Masks, sheet: Path) -> tuple[list[PhotoPeople], int]:
+def person_of(
+    photos: Sequence[PhotoPeople], given: Keypoints | Masks, sheet: Path
+) -> tuple[list[PhotoPeople], int]:
     """The photos, and the number of the one whose keypoints or masks these are, which decide in each photo.
 
     Arguments: sheet: see `choose`.
     Raises: ValueError for keypoints or masks of nobody, and where it is unclear who of a photo without any is meant.
     """
     kind = "keypoints" if isinstance(given, Keypoints) else "masks"
-    scores = [[_agreement(each, given, v) for each in photo.people] for v, photo in enumerate(photos)]
+    scores = [
+        [_agreement(each, given, v) for each in photo.people] for v, photo in enumerate(photos)
+    ]
     sums = np.sum(np.asarray(scores), axis=0)
     if max(sums, default=0.0) <= 0:
-        raise _refused(f"the {kind} are of nobody who was found in the photos: see {sheet}", photos, sheet)
+        raise _refused(
+            f"the {kind} are of nobody who was found in the photos: see {sheet}", photos, sheet
+        )
     number, settled = int(np.argmax(sums)), []
     for photo, row in zip(photos, scores, strict=True):
         people, best = list(photo.people), int(np.argmax(row))
         if row[number] < PLAINLY * row[best]:
             # the matching put somebody else there, or nobody
             people[number], people[best] = people[best], people[number]
-        settled.append(dataclasses.replace(photo, people=tuple(people), unclear=photo.unclear and max(row) <= 0))
+        settled.append(
+            dataclasses.replace(
+                photo, people=tuple(people), unclear=photo.unclear and max(row) <= 0
+            )
+        )
     blank = [v for v in range(len(photos)) if not _has_any(given, v)]
     if unclear := [photos[v].name for v in blank if is_unclear(settled, v, number)]:
         told = f"{few(unclear)}: which of the people of {sheet} is meant? There are no {kind} of the person: add them"
@@ -158,7 +187,10 @@ def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
     """The keypoints of a person; of photos without the person, none."""
     nobody = np.zeros((len(MEDIAPIPE_33.names), 6))
     seen = [photo.people[person] for photo in photos]
-    found = [nobody if each is None else np.column_stack([each.person.points, each.person.world]) for each in seen]
+    found = [
+        nobody if each is None else np.column_stack([each.person.points, each.person.world])
+        for each in seen
+    ]
     points = np.asarray(found, np.float32)
     return Keypoints(points[..., :2], points[..., 2], MEDIAPIPE_33, world=points[..., 3:])
 
@@ -168,16 +200,23 @@ def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
     return oriented(read_image(file)[0], orientation(file))
 
 
-def detect_photos(names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 3"]]) -> list[PhotoPeople]:
+def detect_photos(
+    names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 3"]]
+) -> list[PhotoPeople]:
     """The people of each photo with values in [0, 1], those with the most pixels first. Raises: ValueError without LiteRT."""
     try:
         networks = Networks()
     except ImportError as error:
         raise ValueError(str(error)) from error  # one line
     found = []
-    for name, each in zip(names, bar(photos, desc="finding people", unit="photo", total=len(names)), strict=True):
+    for name, each in zip(
+        names, bar(photos, desc="finding people", unit="photo", total=len(names)), strict=True
+    ):
         photo = np.ascontiguousarray(each, np.float32)
-        people = sorted((_found(person, photo) for person in find_people(networks, photo)), key=lambda one: -one.area)
+        people = sorted(
+            (_found(person, photo) for person in find_people(networks, photo)),
+            key=lambda one: -one.area,
+        )
         height, width = photo.shape[:2]
         shrink = min(1.0, THUMBNAIL / max(height, width))
         small = resized(photo, max(1, round(width * shrink)), max(1, round(height * shrink)))
@@ -195,7 +234,12 @@ def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"]) -> Found:
     corner = (window[0].start + top, window[1].start + left)
     # the first pixel's centre is at 0 for the network, and at one half here
     points = np.column_stack([person.pixels + 0.5, person.visibility]).astype(np.float64)
-    return Found(SeenPerson(points, person.world, person.presence), cut, corner, float((cut > 255 * SEEN).sum()))
+    return Found(
+        SeenPerson(points, person.world, person.presence),
+        cut,
+        corner,
+        float((cut > 255 * SEEN).sum()),
+    )
 
 
 # Who is meant -------------------------------------------------------------------------------------------------------
@@ -217,7 +261,11 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
 def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
     """Write the sheet that an error speaks of. Raises: ValueError where a picture of others has its name."""
     sheet.parent.mkdir(parents=True, exist_ok=True)
-    check_ours([sheet], _is_ours, "several people may be meant, and their numbers belong there: move it away")
+    check_ours(
+        [sheet],
+        _is_ours,
+        "several people may be meant, and their numbers belong there: move it away",
+    )
     write_sheet(sheet, photos)
 
 
@@ -230,7 +278,9 @@ def _refused(message: str, photos: Sequence[PhotoPeople], sheet: Path) -> ValueE
 def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
     count = len(photos[0].people)
     if not count:
-        raise ValueError(f"no person in {few([photo.name for photo in photos])}: expected one who is seen as a whole")
+        raise ValueError(
+            f"no person in {few([photo.name for photo in photos])}: expected one who is seen as a whole"
+        )
     if person is not None:
         if not 0 <= person < count:
             raise ArgumentError("person", f"{person}: expected 0 to {count - 1}, as on {sheet}")
@@ -251,9 +301,16 @@ def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> i
 
 def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
     """What should be known about the photos of a person, a line each."""
-    told = [f"{photo.name}: the person was not found in it" for photo in photos if photo.people[person] is None]
+    told = [
+        f"{photo.name}: the person was not found in it"
+        for photo in photos
+        if photo.people[person] is None
+    ]
     if any(photo.colors for photo in photos):
-        told.insert(0, f"several people in a photo: number {person} is the same by the colors of upper body and legs alone")
+        told.insert(
+            0,
+            f"several people in a photo: number {person} is the same by the colors of upper body and legs alone",
+        )
     found = [(photo, each) for photo in photos if (each := photo.people[person]) is not None]
     for photo, each in found:
         points = each.person.points[:, :2]
@@ -270,7 +327,9 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
-def check_found_place(folder: Path, names: Sequence[str], advice: str = MOVE_AWAY, *, masks: bool = True) -> None:
+def check_found_place(
+    folder: Path, names: Sequence[str], advice: str = MOVE_AWAY, *, masks: bool = True
+) -> None:
     """Whether what is found in photos of these names can be written without replacing files of others.
 
     Raises: ValueError, see `io.atomic.check_ours`.
@@ -325,7 +384,10 @@ def write_found(
 
     def write(temporary: Path) -> None:
         shown = [(photo, photo.people[person]) for photo in photos]
-        images = [ImagePeople(photo.name, photo.size, (None if each is None else each.person,)) for photo, each in shown]
+        images = [
+            ImagePeople(photo.name, photo.size, (None if each is None else each.person,))
+            for photo, each in shown
+        ]
         write_people(temporary / KEYPOINTS_FILE, images)
         write_sheet(temporary / SHEET_FILE, photos, person)
         for photo, file in zip(photos, files, strict=True) if masks else ():
@@ -333,7 +395,10 @@ def write_found(
             write_png(temporary / file, person_mask(photo, person), mark=MASK)
         if masks and to_capture:
             description = read_description(folder / "capture.json")
-            views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]
+            views = [
+                view | {"mask": file}
+                for view, file in zip(description["views"], files, strict=True)
+            ]
             write_json(temporary / "capture.json", description | {"views": views})
 
     if not overwrite:
@@ -372,7 +437,9 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
         if found is None:
             continue
         color = np.asarray(COLORS[i % len(COLORS)]) / 255
-        mask = resized(person_mask(photo, i), width, height)[..., None] * (FAINT if chosen in (None, i) else FAINT / 2)
+        mask = resized(person_mask(photo, i), width, height)[..., None] * (
+            FAINT if chosen in (None, i) else FAINT / 2
+        )
         picture = picture * (1 - mask) + color * mask
         x, y = found.person.points[0, :2] * width / photo.size[0]
         heads.append((float(np.clip(x, 8, width - 24)), float(np.clip(y - 30, 2, height - 26)), i))
@@ -380,5 +447,12 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
     pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(22)
     for x, y, i in heads:
         number = f"{i}?" if photo.unclear else str(i)
-        pen.text((x, y), number, fill="white", stroke_width=3, stroke_fill=COLORS[i % len(COLORS)], font=font)
+        pen.text(
+            (x, y),
+            number,
+            fill="white",
+            stroke_width=3,
+            stroke_fill=COLORS[i % len(COLORS)],
+            font=font,
+        )
     return np.asarray(canvas) / 255

@@ -26,7 +26,14 @@ from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.photos import read_description
 from humangs_jax.fitting.person_cameras import PersonCameras, cameras_from_person
 from humangs_jax.fitting.person_moments import PersonViews
-from humangs_jax.io.images import DIAGONAL_35MM, cropped_from, focal_length, image_size, resized, write_png
+from humangs_jax.io.images import (
+    DIAGONAL_35MM,
+    cropped_from,
+    focal_length,
+    image_size,
+    resized,
+    write_png,
+)
 
 LONGEST, LEAST_PERSON = 2048, 700
 """Pixels: longest side to which photos are reduced, and size of the person there below which they stay as they are."""
@@ -77,7 +84,9 @@ def import_photos(
             if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
                 with named_after(Path(place), images):
                     return _written(found, Path(place), out, height, None, own_masks, also)
-    return _written(_look(images, files, files, choice), images, out, height, masks, own_masks, also)
+    return _written(
+        _look(images, files, files, choice), images, out, height, masks, own_masks, also
+    )
 
 
 def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
@@ -91,7 +100,9 @@ def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
         height, width = photo.shape[:2]
         factor = min(1.0, LONGEST / max(height, width))
         smaller.parent.mkdir(parents=True, exist_ok=True)
-        write_png(smaller, resized(photo, round(factor * width), round(factor * height)), compress_level=1)
+        write_png(
+            smaller, resized(photo, round(factor * width), round(factor * height)), compress_level=1
+        )
     return found
 
 
@@ -120,7 +131,10 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
     photos, number = _chosen(photos, images, files, choice)
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]
-    known = ((focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size)) for i in shown)
+    known = (
+        (focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size))
+        for i in shown
+    )
     focal = [np.nan if each is None else each * now / before for each, before, now in known]
     seen = PersonViews(
         points=np.stack([found.person.points[:, :2] for found in people]),
@@ -140,19 +154,25 @@ def _cropped(files: list[Path]) -> tuple[str, ...]:
     if not found:
         return ()
     named = [f"{file.name} ({_by(image_size(file))}, EXIF {_by(frame)})" for file, frame in found]
-    return (f"cropped, as their shape is not that of their EXIF: {few(named)}: their focal length is taken for unknown",)
+    return (
+        f"cropped, as their shape is not that of their EXIF: {few(named)}: their focal length is taken for unknown",
+    )
 
 
 def _by(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"
 
 
-def _chosen(photos: list[PhotoPeople], images: Path, files: list[Path], choice: _Choice) -> tuple[list[PhotoPeople], int]:
+def _chosen(
+    photos: list[PhotoPeople], images: Path, files: list[Path], choice: _Choice
+) -> tuple[list[PhotoPeople], int]:
     """The photos, and the number of the person. Raises: see `detect.choose`, `detect.person_of`, `read_keypoints`."""
     # beside the capture folder, which a refusal leaves as it is
     sheet = choice.out.with_name(f"{choice.out.resolve().name}_{detect.SHEET_FILE}")
     if choice.keypoints is not None:
-        width, height = np.max([photo.size for photo in photos], axis=0).tolist()  # photos are padded to these
+        width, height = np.max(
+            [photo.size for photo in photos], axis=0
+        ).tolist()  # photos are padded to these
         views = [Path(photo.name).with_suffix("").as_posix().replace("/", "_") for photo in photos]
         keypoints = read_keypoints(choice.keypoints, views, width, height, person=choice.person)
         return detect.person_of(photos, keypoints, sheet)
@@ -173,7 +193,9 @@ def _written(
 ) -> PhotosImported:
     photos, number, shown, seen, cropped = looked
     found = cameras_from_person(seen, height=height)
-    report = import_calibration(_calibration(seen, found, images), images, out, masks=masks, scale=1.0, also=also)
+    report = import_calibration(
+        _calibration(seen, found, images), images, out, masks=masks, scale=1.0, also=also
+    )
     views = read_description(out / "capture.json")["views"]
     written = []
     for view, mirrored, described in zip(found.views, found.mirrored, views, strict=True):
@@ -184,7 +206,9 @@ def _written(
         written.append(dataclasses.replace(photo, people=tuple(people), name=name, size=size))
     detect.write_found(out, written, number, masks=own_masks, to_capture=True)
     warnings = (*cropped, *found.warnings, *report.warnings)
-    return PhotosImported(_lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(written))
+    return PhotosImported(
+        _lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(written)
+    )
 
 
 def _calibration(seen: PersonViews, found: PersonCameras, images: Path) -> Calibration:
@@ -223,7 +247,10 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
     else:
         which = f"{count} photos of several moments: the person has a pose of its own in each, and one shape"
     focal = np.median(
-        [float(c.K[0, 0]) / np.hypot(*seen.sizes[view]) for view, c in zip(found.views, found.cameras, strict=True)]
+        [
+            float(c.K[0, 0]) / np.hypot(*seen.sizes[view])
+            for view, c in zip(found.views, found.cameras, strict=True)
+        ]
     )
     return (
         f"{report.out}: {which}",

@@ -14,7 +14,11 @@ from scipy import ndimage
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.body_and_masks import points_in_image, surface_points
-from humangs_jax.data.calibration.calibration import OPENGL_FROM_OPENCV, ROTATION_TO_Y_UP, pose_matrix
+from humangs_jax.data.calibration.calibration import (
+    OPENGL_FROM_OPENCV,
+    ROTATION_TO_Y_UP,
+    pose_matrix,
+)
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 
@@ -43,15 +47,21 @@ Matrix = Float[np.ndarray, "4 4"]
 Cells = Bool[np.ndarray, "rows columns"]
 _TO_Y_UP = pose_matrix(np.asarray(ROTATION_TO_Y_UP["+z"], float), np.zeros(3))
 MISTAKES: dict[str, Callable[[Matrix, Float[np.ndarray, "3"]], Matrix]] = {
-    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(m),
+    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(
+        m
+    ),
     "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": (
         lambda m, t: OPENGL_FROM_OPENCV @ m
     ),
     "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate rows 2 and 3": (
         lambda m, t: OPENGL_FROM_OPENCV @ np.linalg.inv(m)
     ),
-    "the camera's translation is in millimetres": lambda m, t: pose_matrix(m[:3, :3], m[:3, 3] / 1000),
-    "the body's translation is in millimetres": lambda m, t: m @ pose_matrix(np.eye(3), t / 1000 - t),
+    "the camera's translation is in millimetres": lambda m, t: pose_matrix(
+        m[:3, :3], m[:3, 3] / 1000
+    ),
+    "the body's translation is in millimetres": lambda m, t: (
+        m @ pose_matrix(np.eye(3), t / 1000 - t)
+    ),
     "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y) from the right": (
         lambda m, t: m @ _TO_Y_UP.T
     ),
@@ -78,12 +88,17 @@ class Faults(NamedTuple):
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:
     """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it first."""
-    some = np.unique(np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int))
+    some = np.unique(
+        np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int)
+    )
     found, by_problem = faults(capture.select(some)), {}
     for i, problem in enumerate(found.views):
         if problem is not None and i not in found.explained:
             by_problem.setdefault(problem, []).append(capture.names[some[i]])
-    return (*found.whole, *(f"{problem}: view {few(names)}" for problem, names in by_problem.items()))
+    return (
+        *found.whole,
+        *(f"{problem}: view {few(names)}" for problem, names in by_problem.items()),
+    )
 
 
 def faults(capture: Capture) -> Faults:
@@ -92,11 +107,18 @@ def faults(capture: Capture) -> Faults:
     problems, inside = zip(*map(_fault, views), strict=True)
     largest = float(np.linalg.norm(np.asarray(capture.poses.rotations, float), axis=-1).max())
     if largest > LONGEST_TURN:
-        degrees = f"the poses seem to be in degrees: rotations up to {largest:.0f}, expected radians"
+        degrees = (
+            f"the poses seem to be in degrees: rotations up to {largest:.0f}, expected radians"
+        )
         return Faults((degrees,), problems, inside, set(range(len(views))))
     if exchanged := _exchanged_cameras(views):
         pairs = [f"{views[i].name} by the camera of {views[j].name}" for i, j in exchanged.items()]
-        return Faults((f"cameras are exchanged: the body would fit {few(pairs)}",), problems, inside, set(exchanged))
+        return Faults(
+            (f"cameras are exchanged: the body would fit {few(pairs)}",),
+            problems,
+            inside,
+            set(exchanged),
+        )
     return Faults((), problems, inside, set())
 
 
@@ -116,12 +138,24 @@ class _View(NamedTuple):
 def _coarse_views(capture: Capture) -> list[_View]:
     points = surface_points(capture.body, capture.betas, capture.poses, capture.frames, POINTS)
     translations = np.asarray(capture.poses.translation, float)
-    K, matrices = np.asarray(capture.cameras.K, float), np.asarray(capture.cameras.cam_from_world, float)
+    K, matrices = (
+        np.asarray(capture.cameras.K, float),
+        np.asarray(capture.cameras.cam_from_world, float),
+    )
     views = []
     for i, frame in enumerate(capture.frames.tolist()):
         mask = None if capture.masks is None else capture.masks[i]
         cells = None if mask is None else _mask_cells(mask)
-        view = _View(capture.names[i], capture.images[i], mask, cells, points[frame], K[i], matrices[i], translations[frame])
+        view = _View(
+            capture.names[i],
+            capture.images[i],
+            mask,
+            cells,
+            points[frame],
+            K[i],
+            matrices[i],
+            translations[frame],
+        )
         views.append(view)
     return views
 
@@ -145,7 +179,9 @@ def _fault(view: _View) -> tuple[str | None, float]:
 
 def _wrong_exposure(view: _View) -> str | None:
     """A person who is nearly black or burnt out shows nothing."""
-    person = view.image if view.mask is None else view.image[view.mask > 0.99]  # without its blended edge
+    person = (
+        view.image if view.mask is None else view.image[view.mask > 0.99]
+    )  # without its blended edge
     if person.size and np.quantile(person, 0.98) < DARKEST:
         return "the person is nearly black; is the photo underexposed, or were its values divided by 255 twice"
     if person.size and view.mask is not None and np.quantile(person, 0.4) > BURNT:
@@ -157,9 +193,14 @@ def _cause(view: _View, body: Cells) -> str | None:
     """The mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in the frame."""
     tried = {}
     if view.cells is not None:
-        tried = {mistake: _overlap(*undo(body, view.cells)) for mistake, undo in MISTAKES_OF_IMAGES.items()}
+        tried = {
+            mistake: _overlap(*undo(body, view.cells))
+            for mistake, undo in MISTAKES_OF_IMAGES.items()
+        }
     for mistake, undo in MISTAKES.items():
-        drawn, inside, height = _silhouette(view._replace(matrix=undo(view.matrix, view.translation)))
+        drawn, inside, height = _silhouette(
+            view._replace(matrix=undo(view.matrix, view.translation))
+        )
         if inside > SURELY_INSIDE and height > LEAST_HEIGHT:
             tried[mistake] = 1.0 if view.cells is None else _overlap(drawn, view.cells)
     best = max(tried, key=lambda mistake: tried[mistake], default=None)
@@ -176,11 +217,17 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
     off = [i for i, overlap in own.items() if overlap < SURELY_IOU]
     if len(off) < 2:
         return {}
-    from scipy.optimize import linear_sum_assignment  # takes longer to import than all else here to compute
+    from scipy.optimize import (
+        linear_sum_assignment,
+    )  # takes longer to import than all else here to compute
 
     overlaps = np.array([[_overlap(drawn(i, j), masks[i]) for j in off] for i in off])
     chosen = linear_sum_assignment(-overlaps)[1].tolist()
-    found = {off[row]: (off[column], overlaps[row, column]) for row, column in enumerate(chosen) if row != column}
+    found = {
+        off[row]: (off[column], overlaps[row, column])
+        for row, column in enumerate(chosen)
+        if row != column
+    }
     explains = all(overlap > max(SURELY_IOU, own[i] + BETTER) for i, (_, overlap) in found.items())
     # a mirrored photo explains views around a person as well
     mirrored = sum(_overlap(drawn(i, i)[:, ::-1], masks[i]) for i in found)
@@ -200,7 +247,9 @@ def _silhouette(view: _View) -> tuple[Cells, float, float]:
     covered = np.zeros((rows, columns), bool)
     column, row = np.minimum((pixels / cell).astype(int), (columns - 1, rows - 1)).T
     covered[row, column] = True
-    closed = ndimage.binary_closing(np.pad(covered, 2), np.ones((3, 3)))[2:-2, 2:-2]  # gaps between the points
+    closed = ndimage.binary_closing(np.pad(covered, 2), np.ones((3, 3)))[
+        2:-2, 2:-2
+    ]  # gaps between the points
     tall = float(np.ptp(pixels[:, 1])) / height if len(pixels) else 0.0
     return closed, len(pixels) / len(view.points), tall
 

@@ -15,7 +15,13 @@ import numpy as np
 from humangs_jax.core.array_types import Bool, Float, Int, UInt
 from humangs_jax.data.keypoints.formats import SeenPerson
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
-from humangs_jax.fitting.triangulation import Seen, comparable, in_order_of_time, match_colors, match_people
+from humangs_jax.fitting.triangulation import (
+    Seen,
+    comparable,
+    in_order_of_time,
+    match_colors,
+    match_people,
+)
 from humangs_jax.geometry.camera import Camera
 
 RIVAL = 0.35
@@ -54,13 +60,17 @@ class PhotoPeople:
     unclear: bool = False
 
 
-def inside_photo(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], width: int, height: int) -> Bool[np.ndarray, " n"]:
+def inside_photo(
+    x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], width: int, height: int
+) -> Bool[np.ndarray, " n"]:
     """Tells which pixels are in a photo of this size."""
     return (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def same_people(
-    photos: Sequence[PhotoPeople], cameras: Camera | None = None, frames: Sequence[int] | None = None
+    photos: Sequence[PhotoPeople],
+    cameras: Camera | None = None,
+    frames: Sequence[int] | None = None,
 ) -> list[PhotoPeople]:
     """The photos with people in such an order that the i-th of each is the same person.
 
@@ -75,17 +85,23 @@ def same_people(
         rows = [list(photo.people) for photo in photos]
     most = max((len(row) for row in rows), default=0)
     ordered = [
-        dataclasses.replace(photo, people=(*row, *[None] * (most - len(row)))) for photo, row in zip(photos, rows, strict=True)
+        dataclasses.replace(photo, people=(*row, *[None] * (most - len(row))))
+        for photo, row in zip(photos, rows, strict=True)
     ]
     order = np.argsort([-area for area in _areas(ordered)], kind="stable")
     order = [i for i in order if any(photo.people[i] is not None for photo in ordered)]
-    return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
+    return [
+        dataclasses.replace(photo, people=tuple(photo.people[i] for i in order))
+        for photo in ordered
+    ]
 
 
 def _large(people: Sequence[Found | None]) -> list[int]:
     """The people of a photo who may be meant as well as its largest."""
     areas = [0.0 if each is None else each.area for each in people]
-    return [i for i, each in enumerate(people) if each is not None and areas[i] > RIVAL * max(areas)]
+    return [
+        i for i, each in enumerate(people) if each is not None and areas[i] > RIVAL * max(areas)
+    ]
 
 
 def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
@@ -95,7 +111,9 @@ def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
 
 def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
     """The photos, each with its large people in the order of those in the photo that has the most of them; see `unclear`."""
-    found = [[each for each in photo.people if each is not None] for photo in photos]  # the largest first
+    found = [
+        [each for each in photo.people if each is not None] for photo in photos
+    ]  # the largest first
     large = [[people[i] for i in _large(people)][:LARGE_PEOPLE] for people in found]
     most = max(range(len(photos)), key=lambda v: len(large[v]))
     if len(large[most]) < 2:
@@ -110,19 +128,26 @@ def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
         row: list[Found | None] = [None] * len(first)
         for i, each in zip(order, people, strict=True):
             row[i] = each
-        ordered.append(dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colors=True))
+        ordered.append(
+            dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colors=True)
+        )
     return ordered
 
 
 def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n parts 3"]:
     """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in the photo."""
     height, width = photo.thumbnail.shape[:2]
-    u, v = (each.reshape(-1, 1) for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9)))
+    u, v = (
+        each.reshape(-1, 1)
+        for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9))
+    )
     found = np.full((len(people), len(PARTS), 3), np.nan)
     for i, each in enumerate(people):
         for k, part in enumerate(PARTS):
             a, b, c, d = each.person.points[list(part), :2] * width / photo.size[0]
-            x, y = np.floor((a * (1 - u) + b * u) * (1 - v) + (d * (1 - u) + c * u) * v).astype(int).T
+            x, y = (
+                np.floor((a * (1 - u) + b * u) * (1 - v) + (d * (1 - u) + c * u) * v).astype(int).T
+            )
             inside = inside_photo(x, y, width, height)
             if inside.any():
                 found[i, k] = np.median(photo.thumbnail[y[inside], x[inside]], axis=0)
@@ -133,10 +158,14 @@ Row = list[Found | None]
 """The people of a photo, each at the number of the person."""
 
 
-def _matched(photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]) -> list[Row]:
+def _matched(
+    photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]
+) -> list[Row]:
     """The people of each photo by number, as far as cameras and time tell who is who."""
     K, transforms = (np.asarray(x, np.float64) for x in (cameras.K, cameras.cam_from_world))
-    points = [tuple(each.person.points for each in photo.people if each is not None) for photo in photos]
+    points = [
+        tuple(each.person.points for each in photo.people if each is not None) for photo in photos
+    ]
     times = [np.flatnonzero(frames == frame) for frame in np.unique(frames)]
     shown = [[Seen(K[v], transforms[v], points[v]) for v in own] for own in times]
     matches = [match_people(views, MEDIAPIPE_33.mirror) for views in shown]
@@ -144,7 +173,11 @@ def _matched(photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndar
     for own, people in zip(times, in_order_of_time(matches, shown), strict=True):
         for match in people:
             for i, v in enumerate(own):
-                found = None if match is None or (member := match.members[i]) is None else photos[v].people[member]
+                found = (
+                    None
+                    if match is None or (member := match.members[i]) is None
+                    else photos[v].people[member]
+                )
                 mirrored = found is not None and match is not None and match.mirrored[i]
                 rows[v].append(exchanged(found) if mirrored else found)
     return rows
@@ -159,7 +192,9 @@ def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]
     alone = {large[0] for large in map(_large, rows) if len(large) == 1}
     if not alone:
         return rows
-    totals = [sum(each.area for each in person if each is not None) for person in zip(*rows, strict=True)]
+    totals = [
+        sum(each.area for each in person if each is not None) for person in zip(*rows, strict=True)
+    ]
     first, *others = sorted(alone, key=lambda i: -totals[i])
     joined, source = [list(row) for row in rows], [first] * len(rows)
     for i in others:
@@ -174,7 +209,9 @@ def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]
     return _with_those_apart(joined, first, np.asarray(source), frames)
 
 
-def _with_those_apart(rows: list[Row], person: int, source: Int[np.ndarray, " v"], frames: Int[np.ndarray, " v"]) -> list[Row]:
+def _with_those_apart(
+    rows: list[Row], person: int, source: Int[np.ndarray, " v"], frames: Int[np.ndarray, " v"]
+) -> list[Row]:
     """The same where photos of the person that do not meet the others of their moment are marked, see `Found.apart`.
 
     Arguments: source: the number that each photo had by its match.
@@ -188,7 +225,9 @@ def _with_those_apart(rows: list[Row], person: int, source: Int[np.ndarray, " v"
             points = [each.person.points for each in others if each is not None]
             mine = rows[v][person]
             assert mine is not None
-            if (len(most) > 1 or source[v] != most[0]) and any(comparable(mine.person.points, each) for each in points):
+            if (len(most) > 1 or source[v] != most[0]) and any(
+                comparable(mine.person.points, each) for each in points
+            ):
                 rows[v][person] = mine._replace(apart=True)
     return rows
 
@@ -196,7 +235,9 @@ def _with_those_apart(rows: list[Row], person: int, source: Int[np.ndarray, " v"
 def exchanged(found: Found) -> Found:
     """The person with left and right exchanged."""
     order = np.asarray(MEDIAPIPE_33.mirror)
-    person = dataclasses.replace(found.person, points=found.person.points[order], world=found.person.world[order])
+    person = dataclasses.replace(
+        found.person, points=found.person.points[order], world=found.person.world[order]
+    )
     return found._replace(person=person, mirrored=True)
 
 
@@ -214,5 +255,11 @@ def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
     people = photos[photo].people
     if photos[photo].unclear or people[person] is not None:
         return photos[photo].unclear
-    shown_with = [i for each in photos if each.people[person] is not None for i, one in enumerate(each.people) if one is not None]
+    shown_with = [
+        i
+        for each in photos
+        if each.people[person] is not None
+        for i, one in enumerate(each.people)
+        if one is not None
+    ]
     return any(i not in shown_with for i in _large(people))

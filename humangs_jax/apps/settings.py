@@ -63,16 +63,31 @@ class Settings:
     is larger are reduced to it for refinement, pixels. splat: as `Shot.splat`. prune: as `Shot.prune`.
     """
 
-    views: Few | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
+    views: Few | None = knob(
+        None, cost="what the other photos show", gain="time in proportion", measured=MEASURED
+    )
     runtime: Runtime = dataclasses.field(default_factory=Runtime)
-    refine_iterations: Iterations = knob(0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED)
-    refine_steps: RefineSteps = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
-    head_steps: RefineSteps = knob(0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md")
-    refine_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
+    refine_iterations: Iterations = knob(
+        0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED
+    )
+    refine_steps: RefineSteps = knob(
+        0, cost="time in proportion", gain="detail of the photos", measured=MEASURED
+    )
+    head_steps: RefineSteps = knob(
+        0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
+    )
+    refine_size: PhotoSide | None = knob(
+        None, cost="detail of the photos", gain="time of a step", measured=MEASURED
+    )
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
     )
-    prune: bool = knob(False, cost="less than 0.001 dB", gain="time of frames that are drawn often", measured=MEASURED)
+    prune: bool = knob(
+        False,
+        cost="less than 0.001 dB",
+        gain="time of frames that are drawn often",
+        measured=MEASURED,
+    )
 
     @property
     def refinement(self) -> RefineConfig | None:
@@ -113,10 +128,22 @@ PRESETS: Presets[Settings] = Presets(
     {
         "realtime": Settings(views=4, runtime=Runtime(crop=True, body_vertices=1000), splat="fast"),
         "balanced": Settings(
-            views=4, runtime=Runtime(crop=True, body_vertices=2000), refine_iterations=4, refine_size=256, splat="near_exact"
+            views=4,
+            runtime=Runtime(crop=True, body_vertices=2000),
+            refine_iterations=4,
+            refine_size=256,
+            splat="near_exact",
         ),
-        "quality": Settings(views=4, runtime=Runtime(crop=True), refine_iterations=4, refine_size=512, splat="near_exact"),
-        "best": Settings(runtime=Runtime(crop=True), refine_iterations=4, refine_steps=100, refine_size=512),
+        "quality": Settings(
+            views=4,
+            runtime=Runtime(crop=True),
+            refine_iterations=4,
+            refine_size=512,
+            splat="near_exact",
+        ),
+        "best": Settings(
+            runtime=Runtime(crop=True), refine_iterations=4, refine_steps=100, refine_size=512
+        ),
     },
     "; those of training are in humangs_jax.training.config",
 )
@@ -125,7 +152,11 @@ PRESETS: Presets[Settings] = Presets(
 
 @checked_arguments
 def reconstruct_with(
-    settings: Settings | str, variables: Variables, config: HumanGSConfig, capture: Capture, progress: bool = False
+    settings: Settings | str,
+    variables: Variables,
+    config: HumanGSConfig,
+    capture: Capture,
+    progress: bool = False,
 ) -> Avatar:
     """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.
 
@@ -147,12 +178,16 @@ def reconstruct_with(
     """
     if isinstance(settings, str):
         if settings not in PRESETS:
-            raise ValueError(f"settings {settings!r}: expected Settings or one of {', '.join(PRESETS)}")
+            raise ValueError(
+                f"settings {settings!r}: expected Settings or one of {', '.join(PRESETS)}"
+            )
         settings = PRESETS[settings]
     photos = settings.photos(capture)
     avatar = reconstruct(variables, settings.network(config), photos)
     if settings.refinement is not None:
-        avatar = _uninterrupted(refine_with_report(avatar, photos, settings.refinement, progress=progress)).avatar
+        avatar = _uninterrupted(
+            refine_with_report(avatar, photos, settings.refinement, progress=progress)
+        ).avatar
     return jax.block_until_ready(avatar)
 
 
@@ -260,7 +295,10 @@ class Tuned:
         if self.point.name == self.best.name:
             gives = "is the best of all settings"
         else:
-            lost, in_poses = self.best.psnr - self.point.psnr, self.best.psnr_poses - self.point.psnr_poses
+            lost, in_poses = (
+                self.best.psnr - self.point.psnr,
+                self.best.psnr_poses - self.point.psnr_poses,
+            )
             gives = f"gives up {lost:.1f} dB in the pose of the photos and {in_poses:.1f} dB in novel poses"
             gives += f" against {self.best.name!r}"
         return f"{self.point.name}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
@@ -269,7 +307,9 @@ class Tuned:
 def load_front() -> list[FrontPoint]:
     """The front that comes with the package, cheapest reconstruction first."""
     text = resources.files("humangs_jax").joinpath("assets/front.json").read_text()
-    points = [config_from_json(FrontPoint, json.dumps(point)) for point in parse_json(text)["points"]]
+    points = [
+        config_from_json(FrontPoint, json.dumps(point)) for point in parse_json(text)["points"]
+    ]
     return sorted(points, key=lambda point: point.make + point.refine)
 
 
@@ -282,16 +322,27 @@ def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[st
 
     def part(name: str, of_cost: str) -> Any:
         wanted = getattr(point, name)
-        pairs = [(getattr(other, name), getattr(cost, of_cost)) for other, cost in known if getattr(other, name) > 0]
+        pairs = [
+            (getattr(other, name), getattr(cost, of_cost))
+            for other, cost in known
+            if getattr(other, name) > 0
+        ]
         if wanted == 0 or not pairs:
             return 0.0  # refinement that nothing measured has: tried, and then measured
         ratio, found = min(pairs, key=lambda pair: abs(math.log(pair[0] / wanted)))
         return None if found is None else found * wanted / ratio
 
-    return Cost(part("make", "make_ms"), part("refine", "refine_ms"), part("frame", "frame_ms"), part("memory_mb", "memory_mb"))
+    return Cost(
+        part("make", "make_ms"),
+        part("refine", "refine_ms"),
+        part("frame", "frame_ms"),
+        part("memory_mb", "memory_mb"),
+    )
 
 
-def choose(front: Sequence[FrontPoint], measured: Mapping[str, Cost], budget: Budget) -> FrontPoint | None:
+def choose(
+    front: Sequence[FrontPoint], measured: Mapping[str, Cost], budget: Budget
+) -> FrontPoint | None:
     """The point to go on with: the best whose cost, measured or predicted, the budget allows. It is the answer if it has been
     measured, and is to be measured next if not. None: no point is within the budget. Pure.
     """
@@ -341,13 +392,17 @@ def tune(
     """
     budget = Budget(reconstruct_ms, frame_ms, memory_mb)
     front = load_front() if front is None else front
-    front = [point for point in front if capture.masks is not None or point.settings.refinement is None]
+    front = [
+        point for point in front if capture.masks is not None or point.settings.refinement is None
+    ]
     measured: dict[str, Cost] = {}
     confirmed = set()
     with bar(total=len(front), desc="tune", unit="setting", shown=progress) as shown:
         while (point := choose(front, measured, budget)) is not None:
             if point.name in confirmed:
-                return Tuned(point, measured[point.name], max(front, key=lambda each: each.quality), measured)
+                return Tuned(
+                    point, measured[point.name], max(front, key=lambda each: each.quality), measured
+                )
             shown.set_postfix_str(point.name)
             cost = measure(point.settings, variables, config, capture, size)
             if point.name in measured:
@@ -355,9 +410,14 @@ def tune(
                 confirmed.add(point.name)
             measured[point.name] = cost
             if budget.memory_mb is not None and measured[point.name].memory_mb is None:
-                raise ValueError("memory_mb: how much memory is used cannot be measured on this system")
+                raise ValueError(
+                    "memory_mb: how much memory is used cannot be measured on this system"
+                )
             shown.update()
-    least = {name: min(getattr(cost, name) for cost in measured.values()) for name in ("reconstruct_ms", "frame_ms")}
+    least = {
+        name: min(getattr(cost, name) for cost in measured.values())
+        for name in ("reconstruct_ms", "frame_ms")
+    }
     memory = [cost.memory_mb for cost in measured.values() if cost.memory_mb is not None]
     needs = f"{least['reconstruct_ms']:.0f} ms a reconstruction, {least['frame_ms']:.1f} ms a frame of {size} pixels"
     needs += f", {min(memory):.0f} MiB" if memory else ""
@@ -367,7 +427,13 @@ def tune(
     )
 
 
-def measure(settings: Settings, variables: Variables, config: HumanGSConfig, capture: Capture, size: int = 512) -> Cost:
+def measure(
+    settings: Settings,
+    variables: Variables,
+    config: HumanGSConfig,
+    capture: Capture,
+    size: int = 512,
+) -> Cost:
     """What settings cost here: an avatar of this capture, and frames of it from all around.
 
     Compiling and choosing photos, which happen once for a set of cameras, do not count.
@@ -388,7 +454,9 @@ def measure(settings: Settings, variables: Variables, config: HumanGSConfig, cap
         for how, _ in parts:
             refine(how)
         next(frames)
-    on_host = jax.default_backend() == "cpu"  # what the process takes is known, what a device takes is not
+    on_host = (
+        jax.default_backend() == "cpu"
+    )  # what the process takes is known, what a device takes is not
     return Cost(make_ms, refine_ms, frame_ms, peak[0] if on_host else None)
 
 
@@ -396,10 +464,18 @@ def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
     """Short runs of refinement, and how often each has to be counted: the iterations, and a few steps for all."""
     few = min(settings.refine_steps, STEPS)
     iterations = dataclasses.replace(settings, refine_steps=0).refinement
-    steps = dataclasses.replace(settings, refine_iterations=0, refine_steps=few, head_steps=0).refinement
+    steps = dataclasses.replace(
+        settings, refine_iterations=0, refine_steps=few, head_steps=0
+    ).refinement
     if steps is not None:
-        steps = dataclasses.replace(steps, held_out=0.0)  # a trial may find that no more steps are worth it
-    return [(c, times) for c, times in ((iterations, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None]
+        steps = dataclasses.replace(
+            steps, held_out=0.0
+        )  # a trial may find that no more steps are worth it
+    return [
+        (c, times)
+        for c, times in ((iterations, 1.0), (steps, settings.refine_steps / max(few, 1)))
+        if c is not None
+    ]
 
 
 def frames_of(avatar: Avatar, settings: Settings, size: int) -> Iterator[Rendering]:
@@ -408,7 +484,9 @@ def frames_of(avatar: Avatar, settings: Settings, size: int) -> Iterator[Renderi
     poses, cameras = turntable_views(avatar, rest_pose_of(avatar), 8, shot)
     turns = [itertools.cycle(range(8)) for _ in range(2)]
     pose = lambda i: jax.tree.map(lambda x: x[i], poses)
-    drawn = draw(avatar, map(pose, turns[0]), (cameras[i] for i in turns[1]), how=splatting_of(shot, avatar))
+    drawn = draw(
+        avatar, map(pose, turns[0]), (cameras[i] for i in turns[1]), how=splatting_of(shot, avatar)
+    )
     return (jax.block_until_ready(rendering) for rendering in drawn)
 
 

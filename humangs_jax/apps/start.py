@@ -52,7 +52,9 @@ PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
 CAMERA_PLACES = (".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0")
 """Names that are looked for in the folder of photos, in this order; those of files: `data.formats`."""
 KEYPOINT_FOLDER = "keypoints"
-OWN_DETECTOR = "pip install 'humangs_jax[photos]', and the same command finds them; or with another program:"
+OWN_DETECTOR = (
+    "pip install 'humangs_jax[photos]', and the same command finds them; or with another program:"
+)
 """For masks and keypoints: said where LiteRT is not installed."""
 
 
@@ -84,7 +86,10 @@ class Material:
             "masks": masks,
             "keypoints": self.keypoints,
         }
-        lines = [f"{name + ':':<11}{'missing' if found is None else found}" for name, found in rows.items()]
+        lines = [
+            f"{name + ':':<11}{'missing' if found is None else found}"
+            for name, found in rows.items()
+        ]
         left_out = unused_line(self.unused)
         return "\n".join([*lines, *([] if left_out is None else [left_out])])
 
@@ -102,7 +107,13 @@ class Missing:
         return "\n".join([f"{self.name}: {self.why}", *(f"    {line}" for line in self.how)])
 
 
-def look(folder: Path, *, cameras: Path | None = None, masks: Path | None = None, keypoints: Path | None = None) -> Material:
+def look(
+    folder: Path,
+    *,
+    cameras: Path | None = None,
+    masks: Path | None = None,
+    keypoints: Path | None = None,
+) -> Material:
     """What a folder has; what the arguments name is taken from there.
 
     Raises: CaptureError, one line, if there is no photo, the folder is a capture already, or a named file does not exist.
@@ -118,13 +129,16 @@ def look(folder: Path, *, cameras: Path | None = None, masks: Path | None = None
     mask_folders = [folder / name for name in MASK_FOLDERS if has_photos(folder / name)]
     named = [folder / KEYPOINT_FOLDER] if (folder / KEYPOINT_FOLDER).exists() else []
     named += [found[1]] if (found := KEYPOINTS.found(folder)) else []
-    others = sorted(path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz"))
+    others = sorted(
+        path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
+    )
     return Material(
         folder=folder,
         images=images,
         photos=len(photos),
         size=image_size(photos[0]),
-        cameras=cameras or next((place for name in CAMERA_PLACES if CAMERAS.found(place := folder / name)), None),
+        cameras=cameras
+        or next((place for name in CAMERA_PLACES if CAMERAS.found(place := folder / name)), None),
         masks=masks or next(iter([*mask_folders, *([images] if scan.masks else [])]), None),
         alpha=is_transparent(photos[0]),
         keypoints=keypoints or next(iter([*named, *others]), None),
@@ -150,20 +164,28 @@ def scan_photos(folder: Path) -> FolderScan:
         scan = whole
     else:
         scan = _scan(images)
-        others = [Unused(photo, ELSEWHERE) for photo in whole.photos if not photo.is_relative_to(images)]
+        others = [
+            Unused(photo, ELSEWHERE) for photo in whole.photos if not photo.is_relative_to(images)
+        ]
         others += [each for each in whole.unused if not each.path.is_relative_to(images)]
         scan = dataclasses.replace(scan, unused=(*scan.unused, *others))
     if not scan.photos:
         expected = f"expected {', '.join(PHOTO_SUFFIXES)} files in it or in {folder / 'images'}"
         left_out = unused_line(scan.unused)
-        raise CaptureError(folder, "", f"no photo: {expected}" + ("" if left_out is None else f" ({left_out})"))
+        raise CaptureError(
+            folder, "", f"no photo: {expected}" + ("" if left_out is None else f" ({left_out})")
+        )
     return scan
 
 
 def _expect_folder(folder: Path) -> None:
     if not folder.is_dir():
         wrong = "is a file" if folder.exists() else "no such folder"
-        raise CaptureError(folder, "", f"{wrong}: expected a folder of photos, or a video ({', '.join(VIDEO_SUFFIXES)})")
+        raise CaptureError(
+            folder,
+            "",
+            f"{wrong}: expected a folder of photos, or a video ({', '.join(VIDEO_SUFFIXES)})",
+        )
 
 
 def missing(material: Material, images: Path | None = None) -> tuple[Missing, ...]:
@@ -203,7 +225,9 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
             "or OpenPose (https://github.com/CMU-Perceptual-Computing-Lab/openpose):",
             f"  openpose.bin --image_dir {source} --write_json {target} --hand --display 0 --render_pose 0",
         )
-        found.append(Missing("keypoints", "where shoulders, knees and fingers are, for `humangs fit`", how))
+        found.append(
+            Missing("keypoints", "where shoulders, knees and fingers are, for `humangs fit`", how)
+        )
     return tuple(found)
 
 
@@ -214,7 +238,12 @@ def has_photos(folder: Path) -> bool:
 
 def _scan(folder: Path) -> FolderScan:
     """Without masks, and without what other programs have made of photos."""
-    others = (*MASK_FOLDERS, KEYPOINT_FOLDER, *(name for each in KEYPOINTS.values() for name in each.files), "colmap")
+    others = (
+        *MASK_FOLDERS,
+        KEYPOINT_FOLDER,
+        *(name for each in KEYPOINTS.values() for name in each.files),
+        "colmap",
+    )
     return scan_folder(folder, lambda place: place.name in others)
 
 
@@ -238,7 +267,9 @@ def video_of(place: Path) -> Path | None:
     if not videos:
         return None
     if len(videos) > 1:
-        problem = "expected photos or one video (videos of several cameras: `humangs import cameras`)"
+        problem = (
+            "expected photos or one video (videos of several cameras: `humangs import cameras`)"
+        )
         raise CaptureError(place, "", f"{len(videos)} videos and no photo: {problem}")
     return next(iter(videos.values()))
 
@@ -297,7 +328,9 @@ class HeldOut(NamedTuple):
         return f"a photo that was held out ({self.name}) is reproduced with {self.psnr:.1f} dB in the foreground"
 
 
-def held_out_psnr(variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None) -> HeldOut | None:
+def held_out_psnr(
+    variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None
+) -> HeldOut | None:
     """How well the photo that has the nearest other one is reproduced by an avatar of the others, over the person, in a crop of
     `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos. In its place is a
     second copy of the nearest photo: the programs for that number of photos are compiled already.
@@ -314,13 +347,21 @@ def held_out_psnr(variables: PyTree, config: HumanGSConfig, capture: Capture, re
     others = capture.select(np.where(views == view, int(apart[view].argmin()), views))
     avatar = reconstruct(variables, config, others)
     if refinement is not None:
-        avatar = refine(avatar, others, dataclasses.replace(refinement, head_steps=0))  # heads hardly change the number
+        avatar = refine(
+            avatar, others, dataclasses.replace(refinement, head_steps=0)
+        )  # heads hardly change the number
     photo = cropped(capture.select([view]), SIZE)
-    return HeldOut(capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_fg))
+    return HeldOut(
+        capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_fg)
+    )
 
 
 def better_body(
-    variables: PyTree, config: HumanGSConfig, first: Capture, second: Capture, refinement: RefineConfig | None
+    variables: PyTree,
+    config: HumanGSConfig,
+    first: Capture,
+    second: Capture,
+    refinement: RefineConfig | None,
 ) -> tuple[Capture, HeldOut | None]:
     """The capture whose body makes the better avatar, judged by a photo that is held out of it, and what that photo says.
 
@@ -328,7 +369,11 @@ def better_body(
     """
     one = held_out_psnr(variables, config, first, refinement)
     two = None if one is None else held_out_psnr(variables, config, second, refinement)
-    return (second, two) if one is not None and two is not None and two.psnr > one.psnr + CLEARLY else (first, one)
+    return (
+        (second, two)
+        if one is not None and two is not None and two.psnr > one.psnr + CLEARLY
+        else (first, one)
+    )
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
@@ -338,7 +383,10 @@ def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
     frames = np.asarray(capture.frames)
     pelvis = capture.poses.rotations[:, 0]
     world_from_pelvis = np.asarray(quaternion.matrix_from_axis_angle(pelvis), np.float64)[frames]
-    towards = np.asarray(capture.cameras.center, np.float64) - np.asarray(capture.poses.translation, np.float64)[frames]
+    towards = (
+        np.asarray(capture.cameras.center, np.float64)
+        - np.asarray(capture.poses.translation, np.float64)[frames]
+    )
     towards = np.einsum("vba,vb->va", world_from_pelvis, towards)
     towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
     return np.linalg.norm(towards[:, None] - towards, axis=-1) + 9 * np.eye(len(towards))

@@ -17,7 +17,13 @@ from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import project
-from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, skin_gaussians, widened
+from humangs_jax.rendering.gaussians import (
+    Gaussians,
+    factored,
+    gaussian_values,
+    skin_gaussians,
+    widened,
+)
 
 
 @checked_arguments
@@ -38,7 +44,9 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)
     if avatar.light is not None:
-        gaussians = replace(gaussians, colors=relit(gaussians.colors, avatar.light, transforms[:, :3, :3]))
+        gaussians = replace(
+            gaussians, colors=relit(gaussians.colors, avatar.light, transforms[:, :3, :3])
+        )
     return skin_gaussians(gaussians, transforms, avatar.skinning)
 
 
@@ -66,7 +74,9 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     joints = len(avatar.parents)
     if pose.rotations.shape != (joints, 3) or pose.translation.shape != (3,):
         found = f"rotations {pose.rotations.shape}, translation {pose.translation.shape}"
-        raise ValueError(f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch of poses")
+        raise ValueError(
+            f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch of poses"
+        )
     moves = {
         "pose.rotations": (pose.rotations, FINITE),
         "pose.translation": (pose.translation, FINITE),
@@ -92,8 +102,13 @@ def with_low_pass(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
     gaussians = avatar.gaussians
     if avatar.rendering != "exact" or gaussians.low_pass is not None:
         return avatar
-    low_pass = jnp.broadcast_to(jnp.asarray(pixel, gaussians.scales.dtype), gaussians.opacities.shape)
-    return replace(avatar, gaussians=replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass))
+    low_pass = jnp.broadcast_to(
+        jnp.asarray(pixel, gaussians.scales.dtype), gaussians.opacities.shape
+    )
+    return replace(
+        avatar,
+        gaussians=replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass),
+    )
 
 
 def without_low_pass(avatar: Avatar) -> Avatar:
@@ -111,7 +126,9 @@ def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
     gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
     if gaussians.low_pass is None:
         return with_low_pass(avatar, sizes)
-    return replace(avatar, gaussians=replace(gaussians, low_pass=jnp.minimum(gaussians.low_pass, sizes)))
+    return replace(
+        avatar, gaussians=replace(gaussians, low_pass=jnp.minimum(gaussians.low_pass, sizes))
+    )
 
 
 @jax.jit
@@ -127,6 +144,8 @@ def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
         inside = (pixels >= 0) & (pixels <= jnp.asarray([camera.width, camera.height]))
         return jnp.where(jnp.all(inside, axis=-1) & (depths > 0), depths / camera.K[0, 0], jnp.inf)
 
-    smallest = jnp.min(jax.lax.map(in_photo, (views.rotations, views.translations, views.cameras)), axis=0)
+    smallest = jnp.min(
+        jax.lax.map(in_photo, (views.rotations, views.translations, views.cameras)), axis=0
+    )
     found = jnp.isfinite(smallest)
     return jnp.where(found, smallest, jnp.max(jnp.where(found, smallest, 0.0)))

@@ -70,7 +70,10 @@ class Light:
 
 def light_values(light: Light | None) -> dict[str, tuple[Array | None, Values]]:
     """What `core.checks.check_values` needs to check the light of an avatar."""
-    return {f"light.{name}": (getattr(light, name, None), FINITE) for name in ("coefficients", "normals", "shading")}
+    return {
+        f"light.{name}": (getattr(light, name, None), FINITE)
+        for name in ("coefficients", "normals", "shading")
+    }
 
 
 def light_terms(normals: Float[Array, "g 3"]) -> Float[Array, "g 8"]:
@@ -79,12 +82,16 @@ def light_terms(normals: Float[Array, "g 3"]) -> Float[Array, "g 8"]:
     return jnp.stack([x, y, z, x * y, y * z, z * x, z**2 - x**2, 3 * y**2 - 1], axis=-1)
 
 
-def log_brightness(terms: Float[Array, "*n 8"], coefficients: Float[Array, "8"]) -> Float[Array, "*n"]:
+def log_brightness(
+    terms: Float[Array, "*n 8"], coefficients: Float[Array, "8"]
+) -> Float[Array, "*n"]:
     """Log of the brightness that a light gives."""
     return jnp.sum(terms * coefficients, axis=-1)
 
 
-def turned_normals(normals: Float[Array, "g 3"], linear: Float[Array, "g 3 3"]) -> Float[Array, "g 3"]:
+def turned_normals(
+    normals: Float[Array, "g 3"], linear: Float[Array, "g 3 3"]
+) -> Float[Array, "g 3"]:
     """Unit normals of surfaces that linear maps deform; 0 where a map has rank 1."""
     # the inverse transpose, up to a positive factor: rows of cofactors
     rows = [jnp.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)]
@@ -92,7 +99,9 @@ def turned_normals(normals: Float[Array, "g 3"], linear: Float[Array, "g 3 3"]) 
     return turned * jax.lax.rsqrt(jnp.maximum(jnp.sum(turned**2, axis=-1, keepdims=True), TINY))
 
 
-def relit(colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3"]) -> Float[Array, "g 3"]:
+def relit(
+    colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3"]
+) -> Float[Array, "g 3"]:
     """Colors where `linear` has turned the surface. They do not exceed 1, except where they do in the photos."""
     terms = light_terms(turned_normals(light.normals, linear))
     change = jnp.clip(log_brightness(terms, light.coefficients) - light.shading, -LIMIT, LIMIT)
@@ -100,7 +109,10 @@ def relit(colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3
 
 
 def light_coefficients(
-    vertices: Float[Array, "n 3"], colors: Float[Array, "n 3"], weights: Float[Array, " n"], terms: Float[Array, "n 8"]
+    vertices: Float[Array, "n 3"],
+    colors: Float[Array, "n 3"],
+    weights: Float[Array, " n"],
+    terms: Float[Array, "n 8"],
 ) -> Float[Array, "8"]:
     """The light that explains the colors of vertices.
 
@@ -111,7 +123,9 @@ def light_coefficients(
     middle = (jnp.min(vertices, axis=0) + jnp.max(vertices, axis=0)) / 2
     order = jnp.argsort(along_curve(vertices - middle, CURVE_REACH))
     brightness = jnp.mean(jnp.log(jnp.maximum(colors, DARKEST)), axis=-1)
-    numbers = jnp.concatenate([vertices, brightness[:, None], weights[:, None], terms], axis=-1)[order]
+    numbers = jnp.concatenate([vertices, brightness[:, None], weights[:, None], terms], axis=-1)[
+        order
+    ]
     others = jnp.stack([jnp.roll(numbers, step, axis=0) for step in STEPS])
     apart = jnp.broadcast_to(numbers, others.shape) - others
     near = jnp.sum(apart[..., :3] ** 2, axis=-1) < REACH**2
@@ -121,24 +135,40 @@ def light_coefficients(
     def step(_, coefficients):
         weight = counted / jnp.maximum(jnp.abs(change - log_brightness(turn, coefficients)), ROBUST)
         weighted = (turn * (weight / jnp.maximum(jnp.sum(counted), 1e-6))[:, None]).T
-        squares, target = (jnp.matmul(weighted, values, precision=EXACT) for values in (turn, change))
+        squares, target = (
+            jnp.matmul(weighted, values, precision=EXACT) for values in (turn, change)
+        )
         return jnp.linalg.solve(squares + RIDGE * jnp.eye(TERMS), target)
 
     return jax.lax.fori_loop(0, ITERATIONS, step, jnp.zeros(TERMS))
 
 
-def surface_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], points: Float[Array, "g 3"]) -> Float[Array, "g 3"]:
+def surface_normals(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], points: Float[Array, "g 3"]
+) -> Float[Array, "g 3"]:
     """Unit normals of a mesh at the vertex nearest to each point. On the host."""
     from scipy.spatial import KDTree
 
-    return vertex_normals(vertices, faces)[KDTree(np.asarray(vertices)).query(np.asarray(points))[1]]
+    return vertex_normals(vertices, faces)[
+        KDTree(np.asarray(vertices)).query(np.asarray(points))[1]
+    ]
 
 
 # The avatar -----------------------------------------------------------------------------------------------------------
 
 FORMAT = "humangs-avatar"
 VERSION = 1
-_ARRAYS = ("means", "quats", "scales", "opacities", "colors", "skinning_weights", "rest_vertices", "rest_joints", "faces")
+_ARRAYS = (
+    "means",
+    "quats",
+    "scales",
+    "opacities",
+    "colors",
+    "skinning_weights",
+    "rest_vertices",
+    "rest_joints",
+    "faces",
+)
 ALIKE = 1e-3
 """Skinning weights that differ by less are those of one vertex."""
 _LIGHT = ("coefficients", "normals", "shading")
@@ -202,7 +232,9 @@ class Avatar(Batchable):
         if light is not None:
             light = replace(light, normals=light.normals[index], shading=light.shading[index])
         gaussians = jax.tree.map(lambda x: x[index], self.gaussians)
-        return replace(self, gaussians=gaussians, skinning_weights=self.skinning_weights[index], light=light)
+        return replace(
+            self, gaussians=gaussians, skinning_weights=self.skinning_weights[index], light=light
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one compressed `.npz` (no pickle); it appears whole or not at all.
@@ -213,11 +245,15 @@ class Avatar(Batchable):
         """
         require_concrete("Avatar.save", "writes a file", self)
         if self.batch_shape:
-            raise ValueError(f"expected one avatar, got a batch {self.batch_shape}: save each, avatars[0].save(path)")
+            raise ValueError(
+                f"expected one avatar, got a batch {self.batch_shape}: save each, avatars[0].save(path)"
+            )
         if fault := shape_fault(self):
             raise ValueError(f"avatar{fault}")
         if self.gaussians.deformations is not None:
-            raise ValueError("gaussians.deformations: expected an avatar in the T-pose, which has none")
+            raise ValueError(
+                "gaussians.deformations: expected an avatar in the T-pose, which has none"
+            )
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -230,8 +266,13 @@ class Avatar(Batchable):
         values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
         if self.light is not None:
             values |= {f"light_{name}": getattr(self.light, name) for name in _LIGHT}
-        values |= {name: x for name in _OPTIONAL if (x := getattr(self.gaussians, name)) is not None}
-        values = {name: np.asarray(x if name == "faces" else at_least_float32(x)) for name, x in values.items()}
+        values |= {
+            name: x for name in _OPTIONAL if (x := getattr(self.gaussians, name)) is not None
+        }
+        values = {
+            name: np.asarray(x if name == "faces" else at_least_float32(x))
+            for name, x in values.items()
+        }
         with reading(path, "avatar"):
             _check_arrays(values, len(self.parents))
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
@@ -256,24 +297,38 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
         if is_unread(error):
             raise
         raise FileError(path, "", f"not an avatar file written by humangs ({error})") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != VERSION:
+    if (
+        not isinstance(header, dict)
+        or header.get("format") != FORMAT
+        or header.get("version") != VERSION
+    ):
         found = header if isinstance(header, dict) else {}
-        raise Refused(f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}")
+        raise Refused(
+            f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}"
+        )
     with_light = any(f"light_{name}" in arrays for name in _LIGHT)
     wanted = _ARRAYS + tuple(f"light_{name}" for name in _LIGHT if with_light)
     wanted += tuple(name for name in _OPTIONAL if name in arrays)
     if missing := [name for name in wanted if name not in arrays]:
         raise Refused(f"missing keys {missing}")
     check_joints(header["parents"], header["joint_names"])
-    skinning, rendering = header["skinning"], header.get("rendering", "exact")  # the first files do not say
+    skinning, rendering = (
+        header["skinning"],
+        header.get("rendering", "exact"),
+    )  # the first files do not say
     if skinning not in ("affine", "rotation") or rendering not in ("exact", "inria"):
-        raise Refused(f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'")
+        raise Refused(
+            f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'"
+        )
     arrays = {name: arrays[name] for name in wanted}
     _check_arrays(arrays, len(header["parents"]))
     check_checksum(header.get("checksum"), checksum(arrays))
     loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
     return cls(
-        Gaussians(*(loaded[name] for name in _ARRAYS[:5]), **{name: loaded.get(name) for name in _OPTIONAL}),
+        Gaussians(
+            *(loaded[name] for name in _ARRAYS[:5]),
+            **{name: loaded.get(name) for name in _OPTIONAL},
+        ),
         *(loaded[name] for name in _ARRAYS[5:]),
         parents=tuple(header["parents"]),
         joint_names=tuple(header["joint_names"]),
@@ -287,7 +342,9 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
     """Of an avatar of j joints, as its file holds them. Raises: Refused."""
     g, n = (len(arrays[name]) for name in ("means", "rest_vertices"))
     if not g or not n:
-        raise Refused(f"{'rest_vertices' if g else 'means'}: expected at least one {'vertex' if g else 'Gaussian'}")
+        raise Refused(
+            f"{'rest_vertices' if g else 'means'}: expected at least one {'vertex' if g else 'Gaussian'}"
+        )
     unit, lengths = (-ROUNDING, 1 + ROUNDING), (0.0, LARGEST)
     ranges = {"scales": lengths, "low_pass": lengths, "opacities": unit, "skinning_weights": unit}
     ranges["light_normals"] = (-1 - ROUNDING, 1 + ROUNDING)
@@ -301,7 +358,12 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
         "rest_vertices": (n, 3),
         "rest_joints": (j, 3),
     }
-    shapes |= {"light_coefficients": (TERMS,), "light_normals": (g, 3), "light_shading": (g,), "low_pass": (g,)}
+    shapes |= {
+        "light_coefficients": (TERMS,),
+        "light_normals": (g, 3),
+        "light_shading": (g,),
+        "low_pass": (g,),
+    }
     if "harmonics" in arrays:
         check_array("harmonics", arrays["harmonics"], (g, None, 3), -LARGEST, LARGEST)
         check_count(arrays["harmonics"].shape[1])

@@ -36,7 +36,9 @@ def file_cameras(path: Path, shot: Shot, upright: bool = False) -> dict[str, Cam
     with reading(path, "calibration"):
         found = read_calibration(path, lambda name: shot.resolution)
         check_limit("views", len(found.cameras), "cameras")
-        found = in_capture_convention(found, 1.0, found.up if upright else "+y", found.pixel_centers)
+        found = in_capture_convention(
+            found, 1.0, found.up if upright else "+y", found.pixel_centers
+        )
     if any(camera.distortion is not None and np.any(camera.distortion) for camera in found.cameras):
         logger.warning("%s: images are drawn without the distortion of lenses", path)
     cameras: dict[str, Camera] = {}
@@ -56,8 +58,12 @@ def one_size(path: Path, cameras: Mapping[str, Camera]) -> Camera:
     """A batch of the cameras of a file. Raises: ValueError if their images differ in size."""
     sizes = {(camera.width, camera.height): name for name, camera in cameras.items()}
     if len(sizes) > 1:
-        shown = ", ".join(f"{name} has {width} x {height}" for (width, height), name in sorted(sizes.items())[:2])
-        raise ValueError(f"{path}: images of several sizes, {shown}: expected one size, or a width and a height")
+        shown = ", ".join(
+            f"{name} has {width} x {height}" for (width, height), name in sorted(sizes.items())[:2]
+        )
+        raise ValueError(
+            f"{path}: images of several sizes, {shown}: expected one size, or a width and a height"
+        )
     return stack_cameras(list(cameras.values()))
 
 
@@ -89,7 +95,9 @@ def standing(avatar: Avatar, pose: BodyPose | None = None) -> BodyPose:
     """A pose (default: the T-pose) moved so that the person stands on the floor, at x = z = 0."""
     pose = rest_pose_of(avatar) if pose is None else pose
     moment = Motion(pose.rotations[None], pose.translation[None], 1.0)
-    return grounded(moment, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents).pose(0)
+    return grounded(
+        moment, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents
+    ).pose(0)
 
 
 def repeated(pose: BodyPose, views: int) -> BodyPose:

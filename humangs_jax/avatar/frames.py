@@ -30,7 +30,13 @@ from humangs_jax.io.images import DRAWN, is_own_output, write_png
 from humangs_jax.io.reading import check_limit
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SPLAT_PRESETS, SplatConfig, drawn_as
+from humangs_jax.rendering.splat_config import (
+    ALPHA_MIN,
+    DEFAULT_CONFIG,
+    SPLAT_PRESETS,
+    SplatConfig,
+    drawn_as,
+)
 from humangs_jax.rendering.splatting import Background, Rendering, render
 
 MARGIN = 1.12
@@ -64,7 +70,9 @@ def draw(
     how = SPLAT_PRESETS[avatar.rendering] if how is None else how
     gaussians = (posed(avatar, pose) for pose in poses)
     if exposures is not None:
-        lit = lambda g, e: replace(g, **jax.tree.map(lambda x: x * e, {"colors": g.colors, "harmonics": g.harmonics}))
+        lit = lambda g, e: replace(
+            g, **jax.tree.map(lambda x: x * e, {"colors": g.colors, "harmonics": g.harmonics})
+        )
         gaussians = (lit(g, e) for g, e in zip(gaussians, exposures, strict=True))
     return draw_gaussians(gaussians, cameras, background, how)
 
@@ -140,7 +148,10 @@ def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"
 
 
 def shot_cameras(
-    shot: Shot, points: Float[np.ndarray, "m p 3"], azimuths: Float[np.ndarray, " v"], smoothing: float | None
+    shot: Shot,
+    points: Float[np.ndarray, "m p 3"],
+    azimuths: Float[np.ndarray, " v"],
+    smoothing: float | None,
 ) -> Camera:
     """A batch of cameras, one per azimuth, that show all points of their frame, all from the same distance.
 
@@ -162,14 +173,20 @@ def shot_cameras(
     right = np.stack([np.cos(turns), 0 * turns, -np.sin(turns)], axis=-1)
     back = np.cos(lift) * np.stack([np.sin(turns), 0 * turns, np.cos(turns)], axis=-1)
     back[:, 1] = np.sin(lift)
-    axes = np.stack([right, np.cross(right, back), -back], axis=1)  # of the cameras in the world: right, down, forward
+    axes = np.stack(
+        [right, np.cross(right, back), -back], axis=1
+    )  # of the cameras in the world: right, down, forward
     targets = np.broadcast_to(targets, back.shape)
-    distance = _fitting_distance(shot, points, targets, axes) if shot.distance is None else shot.distance
+    distance = (
+        _fitting_distance(shot, points, targets, axes) if shot.distance is None else shot.distance
+    )
     width, height = shot.resolution
     views = np.zeros((len(turns), 4, 4), np.float32)
     views[:, :3, :3], views[:, 3, 3] = axes, 1
     views[:, :3, 3] = -np.einsum("vij,vj->vi", axes, targets + distance * back)
-    K = jnp.broadcast_to(intrinsics_from_fov(np.radians(shot.fov), width, height), (len(turns), 3, 3))
+    K = jnp.broadcast_to(
+        intrinsics_from_fov(np.radians(shot.fov), width, height), (len(turns), 3, 3)
+    )
     return replace(Camera(K[0], jnp.eye(4), width, height), K=K, cam_from_world=jnp.asarray(views))
 
 
@@ -181,10 +198,14 @@ def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.nda
         return path
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
     longer = np.pad(path, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
-    return np.stack([np.convolve(column, kernel / kernel.sum(), mode="valid") for column in longer.T], axis=-1)
+    return np.stack(
+        [np.convolve(column, kernel / kernel.sum(), mode="valid") for column in longer.T], axis=-1
+    )
 
 
-def _fitting_distance(shot: Shot, points: np.ndarray, targets: np.ndarray, axes: np.ndarray) -> float:
+def _fitting_distance(
+    shot: Shot, points: np.ndarray, targets: np.ndarray, axes: np.ndarray
+) -> float:
     """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z behind the target."""
     needed = 0.0
     for i, target in enumerate(targets):
@@ -195,7 +216,9 @@ def _fitting_distance(shot: Shot, points: np.ndarray, targets: np.ndarray, axes:
 
 
 @functools.partial(jax.jit, static_argnames="parents")
-def _paths(means: Array, weights: Array, rest_joints: Array, parents: tuple[int, ...], poses: BodyPose) -> Array:
+def _paths(
+    means: Array, weights: Array, rest_joints: Array, parents: tuple[int, ...], poses: BodyPose
+) -> Array:
     """(m, p, 3) places of Gaussians in each pose, one pose at a time."""
 
     def one(pose):
@@ -208,7 +231,13 @@ def _paths(means: Array, weights: Array, rest_joints: Array, parents: tuple[int,
 # Sequences ---------------------------------------------------------------------------------------------------------------
 
 
-def excerpt(motion: Motion, start: float = 0.0, stop: float | None = None, fps: float | None = None, loop: int = 1) -> Motion:
+def excerpt(
+    motion: Motion,
+    start: float = 0.0,
+    stop: float | None = None,
+    fps: float | None = None,
+    loop: int = 1,
+) -> Motion:
     """A motion from `start` to `stop` (seconds), at another frame rate, `loop` times.
 
     Every repetition starts where the one before has ended, at the same height. Raises: ValueError naming what is out of range.
@@ -217,14 +246,21 @@ def excerpt(motion: Motion, start: float = 0.0, stop: float | None = None, fps: 
     length = count / motion.fps
     stop = length if stop is None else stop
     if not 0 <= start < stop <= length + 0.5 / motion.fps:
-        raise ArgumentError("start", f"{start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds")
+        raise ArgumentError(
+            "start",
+            f"{start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds",
+        )
     if loop < 1:
         raise ArgumentError("loop", f"{loop}: expected at least 1")
     rate = motion.fps if fps is None else fps
-    check_limit("frames", loop * (stop - start) * rate, f"frames in {loop * (stop - start):g} seconds")
+    check_limit(
+        "frames", loop * (stop - start) * rate, f"frames in {loop * (stop - start):g} seconds"
+    )
     first = min(int(start * motion.fps), count - 1)
     last = max(first + 1, min(round(stop * motion.fps), count))
-    part = replace(motion, rotations=motion.rotations[first:last], translations=motion.translations[first:last])
+    part = replace(
+        motion, rotations=motion.rotations[first:last], translations=motion.translations[first:last]
+    )
     part = part if fps is None else part.at_rate(fps)
     if loop == 1:
         return part
@@ -245,7 +281,9 @@ def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
     return jax.vmap(BodyPose)(motion.rotations, motion.translations)
 
 
-def motion_views(avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, follow: bool = True) -> tuple[BodyPose, Camera]:
+def motion_views(
+    avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, follow: bool = True
+) -> tuple[BodyPose, Camera]:
     """A pose and a camera for each frame of a motion, which is put on the floor.
 
     Arguments: turn: degrees that the camera travels around the person. follow: the camera goes along with the person; else it
@@ -255,10 +293,14 @@ def motion_views(avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, 
     """
     poses, count = motion_poses(avatar, motion), len(motion.translations)
     azimuths = turn * np.arange(count) / count
-    return poses, shot_cameras(shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None)
+    return poses, shot_cameras(
+        shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None
+    )
 
 
-def turntable_views(avatar: Avatar, pose: BodyPose, views: int, shot: Shot) -> tuple[BodyPose, Camera]:
+def turntable_views(
+    avatar: Avatar, pose: BodyPose, views: int, shot: Shot
+) -> tuple[BodyPose, Camera]:
     """One pose, and cameras on a circle that starts at the azimuth of the shot. Raises: ValueError for no view."""
     if views < 1:
         raise ValueError(f"views {views}: expected at least 1")
@@ -275,9 +317,13 @@ def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
     """
     joints = capture.poses.rotations.shape[1]
     if joints != len(avatar.parents):
-        raise ValueError(f"the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
+        raise ValueError(
+            f"the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}"
+        )
     poses = jax.tree.map(lambda x: x[np.asarray(capture.frames)], capture.poses)
-    return upright_world(poses, capture.cameras, lambda: np.asarray(avatar.rest_joints)[avatar.parents.index(-1)])
+    return upright_world(
+        poses, capture.cameras, lambda: np.asarray(avatar.rest_joints)[avatar.parents.index(-1)]
+    )
 
 
 def capture_renderings(
@@ -296,13 +342,25 @@ def images(
     progress: what a progress bar says; None: no bar.
     """
     drawn = draw(avatar, poses, cameras, jnp.zeros(3), splatting_of(shot, avatar))
-    shown = bar(drawn, total=len(poses), desc=progress, unit="frame", first=COMPILING, shown=progress is not None)
+    shown = bar(
+        drawn,
+        total=len(poses),
+        desc=progress,
+        unit="frame",
+        first=COMPILING,
+        shown=progress is not None,
+    )
     return (image_of(rendering, shot.color()) for rendering in shown)
 
 
 @checked_arguments
 def motion_frames(
-    avatar: Avatar, motion: Motion, shot: Shot | None = None, *, turn: float = 0.0, progress: bool = True
+    avatar: Avatar,
+    motion: Motion,
+    shot: Shot | None = None,
+    *,
+    turn: float = 0.0,
+    progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Frames of a moving avatar, drawn when asked for; see `motion_views` and `images`."""
     shot = Shot() if shot is None else shot
@@ -310,14 +368,23 @@ def motion_frames(
     return images(avatar, poses, cameras, shot, "animate" if progress else None)
 
 
-def without_unseen(avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatConfig, progress: str | None = None) -> Avatar:
+def without_unseen(
+    avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatConfig, progress: str | None = None
+) -> Avatar:
     """The avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of every one of these images.
 
     Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has the error and the time.
     """
     most = np.zeros(len(avatar.gaussians.means), np.float32)
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))
-    for rendering in bar(drawn, total=len(poses), desc=progress, unit="frame", first=COMPILING, shown=progress is not None):
+    for rendering in bar(
+        drawn,
+        total=len(poses),
+        desc=progress,
+        unit="frame",
+        first=COMPILING,
+        shown=progress is not None,
+    ):
         most = np.maximum(most, rendering.visibility)
     return avatar.select(np.flatnonzero(most >= ALPHA_MIN))
 
@@ -336,7 +403,9 @@ PAIRS = 4_000_000
 
 def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict[str, Camera]:
     """Cameras around the middle of the Gaussians, by name. up: of their world. Without a distance all of them fit."""
-    means = np.asarray(gaussians.means)[np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)]
+    means = np.asarray(gaussians.means)[
+        np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
+    ]
     middle = np.median(means, axis=0) if len(means) else np.zeros(3)
     radius = np.quantile(np.linalg.norm(means - middle, axis=1), SHOWN) if len(means) else 1.0
     if len(means):
@@ -360,15 +429,21 @@ def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict
     return {f"view_{i:03d}": camera for i, camera in enumerate(each)}
 
 
-def splat_images(gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot) -> Iterator[Float[np.ndarray, "h w c"]]:
+def splat_images(
+    gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot
+) -> Iterator[Float[np.ndarray, "h w c"]]:
     """One image for each camera, in bounded memory; with alpha where the shot's background is transparent."""
     config = SPLAT_PRESETS["exact" if shot.splat == "as_trained" else shot.splat]
-    drawn = (render_in_bands(gaussians, camera, config, jnp.zeros(3)) for camera in cameras.values())
+    drawn = (
+        render_in_bands(gaussians, camera, config, jnp.zeros(3)) for camera in cameras.values()
+    )
     for rendering in bar(drawn, total=len(cameras), desc="render", unit="view", first=COMPILING):
         yield image_of(rendering, shot.color())
 
 
-def write_splat_views(out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot) -> int:
+def write_splat_views(
+    out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot
+) -> int:
     """Images NAME.png in a folder, which appear together; other files stay. Returns how many. Raises: OSError."""
 
     def write(folder: Path) -> None:
@@ -406,9 +481,12 @@ def render_in_bands(
         planned = plan_buffers(gaussians, cameras, config, margin=1.0)
     if bands == 1:
         return jax.tree.map(np.asarray, render(gaussians, camera, planned, background))
-    drawn = [jax.tree.map(np.asarray, render(gaussians, each, planned, background)) for each in cameras]
+    drawn = [
+        jax.tree.map(np.asarray, render(gaussians, each, planned, background)) for each in cameras
+    ]
     joined = {
-        name: np.concatenate([getattr(each, name) for each in drawn])[: camera.height] for name in ("rgb", "alpha", "depth")
+        name: np.concatenate([getattr(each, name) for each in drawn])[: camera.height]
+        for name in ("rgb", "alpha", "depth")
     }
     return replace(drawn[0], **joined)
 
@@ -416,6 +494,8 @@ def render_in_bands(
 def banded(camera: Camera, height: int) -> Camera:
     """A camera for each band of `height` rows, from the top; the last band may reach beyond the image."""
     tops = np.arange(0, camera.height, height)
-    shift = jnp.zeros((len(tops), 3, 3), camera.K.dtype).at[:, 1, 2].set(tops.astype(camera.K.dtype))
+    shift = (
+        jnp.zeros((len(tops), 3, 3), camera.K.dtype).at[:, 1, 2].set(tops.astype(camera.K.dtype))
+    )
     poses = jnp.broadcast_to(camera.cam_from_world, (len(tops), 4, 4))
     return replace(camera, K=camera.K - shift, cam_from_world=poses, height=height)

@@ -125,10 +125,14 @@ def write_views(
     def write(folder: Path):
         drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposures)
         views = []
-        for i, rendering in enumerate(bar(drawn, total=count, desc="render", unit="view", first=COMPILING, shown=progress)):
+        for i, rendering in enumerate(
+            bar(drawn, total=count, desc="render", unit="view", first=COMPILING, shown=progress)
+        ):
             write_png(folder / f"{names[i]}.png", image_of(rendering, shot.color()), mark=DRAWN)
             if exr is not None:
-                views.append(exr_view(names[i], avatar, poses[i], cameras[i], rendering, exr.layers, how))
+                views.append(
+                    exr_view(names[i], avatar, poses[i], cameras[i], rendering, exr.layers, how)
+                )
         if exr is not None:
             write_exr(folder / EXR_NAME, views, half=exr.half)
 
@@ -138,13 +142,21 @@ def write_views(
 
 
 def exr_view(
-    name: str, avatar: Avatar, pose: BodyPose, camera: Camera, rendering: Rendering, layers: Iterable[str], how: SplatConfig
+    name: str,
+    avatar: Avatar,
+    pose: BodyPose,
+    camera: Camera,
+    rendering: Rendering,
+    layers: Iterable[str],
+    how: SplatConfig,
 ) -> ExrView:
     """A view with its layers. rendering: of this avatar, pose and camera onto black."""
     layers, alpha = set(layers), np.asarray(rendering.alpha)
     channels, attributes = {}, {}
     if "position" in layers:
-        positions = np.where(alpha[..., None] > 0, unprojected(camera, np.asarray(rendering.depth)), 0)
+        positions = np.where(
+            alpha[..., None] > 0, unprojected(camera, np.asarray(rendering.depth)), 0
+        )
         channels |= {f"position.{axis}": positions[..., i] for i, axis in enumerate("XYZ")}
     values = {}
     if "normal" in layers:
@@ -157,20 +169,29 @@ def exr_view(
     if "normal" in layers:
         sums = drawn["normal"]
         length = np.linalg.norm(sums, axis=-1, keepdims=True)
-        normals = np.divide(sums, length, out=np.zeros_like(sums), where=(length > 0) & (alpha[..., None] > 0))
+        normals = np.divide(
+            sums, length, out=np.zeros_like(sums), where=(length > 0) & (alpha[..., None] > 0)
+        )
         channels |= {f"normal.{axis}": normals[..., i] for i, axis in enumerate("XYZ")}
     if "part" in layers:
-        channels["part"] = np.where(alpha >= COVERED, 1 + present[drawn["part"].argmax(axis=-1)], 0).astype(np.float32)
+        channels["part"] = np.where(
+            alpha >= COVERED, 1 + present[drawn["part"].argmax(axis=-1)], 0
+        ).astype(np.float32)
         attributes["parts"] = ",".join(avatar.joint_names)
     plain = _plain_view(name, camera, rendering)
     depth = plain.depth if "z" in layers else None
     return dataclasses.replace(plain, depth=depth, channels=channels, attributes=attributes)
 
 
-def write_renderings_exr(path: str | os.PathLike[str], cameras: Camera, renderings: Iterable[Rendering]) -> None:
+def write_renderings_exr(
+    path: str | os.PathLike[str], cameras: Camera, renderings: Iterable[Rendering]
+) -> None:
     """Renderings onto black as an EXR file of premultiplied RGBA in 32 bits, Z in metres and the camera, one part per view."""
     each = enumerate(zip(cameras, renderings, strict=True))
-    write_exr(Path(path), [_plain_view(f"view_{i:03d}", camera, rendering) for i, (camera, rendering) in each])
+    write_exr(
+        Path(path),
+        [_plain_view(f"view_{i:03d}", camera, rendering) for i, (camera, rendering) in each],
+    )
 
 
 def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
@@ -186,7 +207,10 @@ def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
 
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     """The points of the world on the rays of the pixels (centres at +0.5), at these depths along the camera's axis, metres."""
-    K, world_from_cam = np.asarray(camera.K, np.float64), np.linalg.inv(np.asarray(camera.cam_from_world, np.float64))
+    K, world_from_cam = (
+        np.asarray(camera.K, np.float64),
+        np.linalg.inv(np.asarray(camera.cam_from_world, np.float64)),
+    )
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     points = (depth[..., None] * rays) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
@@ -194,7 +218,10 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
 
 
 def splatted(
-    gaussians: Gaussians, camera: Camera, how: SplatConfig, values: Mapping[str, Float[Array, "g c"]]
+    gaussians: Gaussians,
+    camera: Camera,
+    how: SplatConfig,
+    values: Mapping[str, Float[Array, "g c"]],
 ) -> dict[str, Float[np.ndarray, "h w c"]]:
     """Any numbers of Gaussians, by name, summed by the weights of their colors; all of them in one image."""
     planned = plan_buffers(gaussians, camera, how)
@@ -216,8 +243,12 @@ def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
 
 
 @jax.jit
-def _posed_normals(normals: Float[Array, "g 3"], avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
-    transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
+def _posed_normals(
+    normals: Float[Array, "g 3"], avatar: Avatar, pose: BodyPose
+) -> Float[Array, "g 3"]:
+    transforms = joint_transforms(
+        avatar.rest_joints, avatar.parents, pose.rotations, pose.translation
+    )
     return turned_normals(normals, blend_transforms(avatar.skinning_weights, transforms)[:, :3, :3])
 
 
@@ -252,9 +283,21 @@ def _to_part(view: ExrView, half: bool) -> Any:
     if view.depth is not None:
         channels[DEPTH] = view.depth
     # OpenEXR writes strided arrays wrongly in silence and refuses every type but its own
-    kinds = {name: np.float16 if half and not name.startswith(WIDE) else np.float32 for name in channels}
+    kinds = {
+        name: np.float16 if half and not name.startswith(WIDE) else np.float32 for name in channels
+    }
     with np.errstate(over="ignore"):
-        channels = {name: np.ascontiguousarray(image, kinds[name]) for name, image in channels.items()}
-    camera = {name: np.ascontiguousarray(getattr(view, name), np.float32) for name in ("K", "cam_from_world")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **view.attributes, **camera}
+        channels = {
+            name: np.ascontiguousarray(image, kinds[name]) for name, image in channels.items()
+        }
+    camera = {
+        name: np.ascontiguousarray(getattr(view, name), np.float32)
+        for name in ("K", "cam_from_world")
+    }
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        **view.attributes,
+        **camera,
+    }
     return OpenEXR.Part(header, channels, view.name)

@@ -15,8 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.animate import with_low_pass
-from humangs_jax.avatar.avatar import Avatar, Light, light_coefficients, light_terms, log_brightness, turned_normals
-from humangs_jax.body.model import BodyModel, BodyPose, RestBody, blend_transforms, joint_transforms, spread_weights
+from humangs_jax.avatar.avatar import (
+    Avatar,
+    Light,
+    light_coefficients,
+    light_terms,
+    log_brightness,
+    turned_normals,
+)
+from humangs_jax.body.model import (
+    BodyModel,
+    BodyPose,
+    RestBody,
+    blend_transforms,
+    joint_transforms,
+    spread_weights,
+)
 from humangs_jax.core.array_types import Array, Bool, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
@@ -45,7 +59,10 @@ from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
-LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
+LEGS = tuple(
+    tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot"))
+    for side in ("left", "right")
+)
 SMALLEST_VOLUME = 0.2
 """Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
 POSED = "the posed vertices, which all arrays of the body move"
@@ -84,19 +101,26 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     body = gaussian_body(capture.body, config)
     views, turned = _views(capture, body, config)
     displaced = views.displacement is not None
-    if displaced and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
+    if (
+        displaced
+        and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None
+    ):
         body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
     count = len(views.images)
     if (bucket := round_up(count, smallest=1)) > count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
     check_values("reconstruct: capture", {POSED: (inputs.posed_vertices, FINITE)})
-    avatar, _ = _reconstruct(variables, fit_buffers(inputs.foreground, inputs.view_count, config), body, views, inputs)
+    avatar, _ = _reconstruct(
+        variables, fit_buffers(inputs.foreground, inputs.view_count, config), body, views, inputs
+    )
     return replace(avatar, light=None) if turned else avatar
 
 
 @checked_arguments
-def reconstruct_batch(variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
+def reconstruct_batch(
+    variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]
+) -> list[Avatar]:
     """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of views.
 
     A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the number of people. People in
@@ -123,14 +147,22 @@ def reconstruct_batch(variables: Variables, config: HumanGSConfig, captures: Seq
     together = [capture for capture, apart in zip(captures, alone, strict=True) if not apart]
     batch = iter(_together(variables, config, together) if together else ())
     return [
-        reconstruct(variables, config, capture) if apart else next(batch) for capture, apart in zip(captures, alone, strict=True)
+        reconstruct(variables, config, capture) if apart else next(batch)
+        for capture, apart in zip(captures, alone, strict=True)
     ]
 
 
-def _together(variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
+def _together(
+    variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]
+) -> list[Avatar]:
     body, views, config, turned = _stacked(config, captures)
-    avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
-    return [replace(avatar, light=None) if moved else avatar for avatar, moved in zip(avatars, turned, strict=True)]
+    avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(
+        variables, config, body, views
+    )
+    return [
+        replace(avatar, light=None) if moved else avatar
+        for avatar, moved in zip(avatars, turned, strict=True)
+    ]
 
 
 class Reconstructed(NamedTuple):
@@ -143,7 +175,10 @@ class Reconstructed(NamedTuple):
 
 
 def reconstruct_many(
-    variables: Variables, config: HumanGSConfig, captures: Mapping[str, Callable[[], Capture]], batch: int | None = None
+    variables: Variables,
+    config: HumanGSConfig,
+    captures: Mapping[str, Callable[[], Capture]],
+    batch: int | None = None,
 ) -> Iterator[Reconstructed]:
     """Yields the avatar of each capture, in their order; `batch` captures at a time are read and reconstructed by one `vmap`. A
     capture that cannot be used does not stop the others.
@@ -153,7 +188,10 @@ def reconstruct_many(
     """
     names, batch = list(captures), batch or BATCH
     for start in range(0, len(names), batch):
-        done = [_tried(Reconstructed(name), "capture", captures[name], OSError) for name in names[start : start + batch]]
+        done = [
+            _tried(Reconstructed(name), "capture", captures[name], OSError)
+            for name in names[start : start + batch]
+        ]
         good = [each.capture for each in done if each.capture is not None]
         avatars: Iterator[Avatar] = iter(())
         if len(good) > 1:
@@ -165,10 +203,16 @@ def reconstruct_many(
             else:
                 alone = functools.partial(reconstruct, variables, config, each.capture)
                 avatar = next(avatars, None)
-                yield each._replace(avatar=avatar) if avatar is not None else _tried(each, "avatar", alone)
+                yield (
+                    each._replace(avatar=avatar)
+                    if avatar is not None
+                    else _tried(each, "avatar", alone)
+                )
 
 
-def _tried(each: Reconstructed, field: str, make: Callable[[], Any], *faults: type[Exception]) -> Reconstructed:
+def _tried(
+    each: Reconstructed, field: str, make: Callable[[], Any], *faults: type[Exception]
+) -> Reconstructed:
     """`each` with the result of `make`, or with its error if that is a ValueError or one of `faults`."""
     try:
         return each._replace(**{field: make()})
@@ -177,7 +221,9 @@ def _tried(each: Reconstructed, field: str, make: Callable[[], Any], *faults: ty
 
 
 @checked_arguments
-def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
+def stack_captures(
+    config: HumanGSConfig, captures: Sequence[Capture]
+) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
     """What several people are reconstructed from in one program of your own, without the skirts of `reconstruct`.
 
     Args:
@@ -209,7 +255,9 @@ def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[
     return body, views, config
 
 
-def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, SubjectViews, HumanGSConfig, list[bool]]:
+def _stacked(
+    config: HumanGSConfig, captures: Sequence
+) -> tuple[BodyModel, SubjectViews, HumanGSConfig, list[bool]]:
     """Body, views, configuration; and whether each world has been turned."""
     body = gaussian_body(captures[0].body, config)
     bucket = round_up(max(capture.view_count for capture in captures), smallest=1)
@@ -220,7 +268,9 @@ def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, Subj
         turned.append(moved)
         views = pad_views(views, bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
-        still = jnp.zeros_like(body.template) if displaces(config) else None  # of photos without masks
+        still = (
+            jnp.zeros_like(body.template) if displaces(config) else None
+        )  # of photos without masks
         displaced = still if views.displacement is None else views.displacement
         subjects.append(replace(views, betas=betas, displacement=displaced))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
@@ -238,7 +288,9 @@ def _check_all(captures: Sequence) -> None:
             raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")
         _check(capture, f"captures[{index}]")
         if capture.body is not captures[0].body and not _equal(capture.body, captures[0].body):
-            raise ValueError(f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model")
+            raise ValueError(
+                f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model"
+            )
 
 
 def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[SubjectViews, bool]:
@@ -246,7 +298,9 @@ def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[Su
     photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
     views = photos.upright(capture.body)
     if displaces(config) and capture.displacement is not None:
-        views = replace(views, displacement=on_gaussian_body(capture.displacement, capture.body, config))
+        views = replace(
+            views, displacement=on_gaussian_body(capture.displacement, capture.body, config)
+        )
     elif displaces(config) and capture.masks is not None:
         moved = displacement(body, capture, always=config.runtime.displacement is True)
         views = replace(views, displacement=jnp.asarray(moved))
@@ -258,7 +312,9 @@ def displaces(config: HumanGSConfig) -> bool:
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
 
 
-def fit_buffers(foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, config: HumanGSConfig) -> HumanGSConfig:
+def fit_buffers(
+    foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, config: HumanGSConfig
+) -> HumanGSConfig:
     """The configuration with room for the foreground of some inputs, those of one subject or of a batch."""
     patch, capacity = config.architecture.encoder.patch_size, 0
     if config.tokens != "all":
@@ -293,7 +349,9 @@ def reconstruct_views(
     made = "body, views, config = stack_captures(config, captures) makes what it wants"
     (height, width), side = views.images.shape[1:3], config.image_size
     if {height, width, views.cameras.height, views.cameras.width} != {side}:
-        raise ValueError(f"reconstruct_views: photos of {width} x {height}, config wants {side} x {side}; {made}")
+        raise ValueError(
+            f"reconstruct_views: photos of {width} x {height}, config wants {side} x {side}; {made}"
+        )
     if not fits(body, config):
         raise ValueError(
             f"reconstruct_views: a body of {len(body.template)} vertices that gaussian_body(body, config) has not made; {made}"
@@ -303,21 +361,34 @@ def reconstruct_views(
 
 @jax.jit
 def _reconstruct(
-    variables: Variables, config: HumanGSConfig, body: BodyModel, views: SubjectViews, inputs: HumanGSInputs | None = None
+    variables: Variables,
+    config: HumanGSConfig,
+    body: BodyModel,
+    views: SubjectViews,
+    inputs: HumanGSInputs | None = None,
 ) -> tuple[Avatar, Int[Array, ""]]:
     inputs = prepare_inputs(body, views, config) if inputs is None else inputs
     outputs, _ = apply_humangs(variables, inputs, config)
     return completed_avatar(outputs, body, views, config), outputs.dropped_tokens
 
 
-def make_avatar(outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config: HumanGSConfig) -> Avatar:
+def make_avatar(
+    outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config: HumanGSConfig
+) -> Avatar:
     """Canonical Gaussians on the body of a person, shaped to `rest`: what can be posed. Raises: ValueError if there are none."""
     if outputs.is_empty:
         name = type(config.architecture.decoder).__name__
-        raise ValueError(f"{name} draws images without Gaussians: there is no avatar to make or animate")
-    weights, per_vertex = outputs.skinning_weights, outputs.gaussians.means.shape[0] // body.template.shape[0]
+        raise ValueError(
+            f"{name} draws images without Gaussians: there is no avatar to make or animate"
+        )
+    weights, per_vertex = (
+        outputs.skinning_weights,
+        outputs.gaussians.means.shape[0] // body.template.shape[0],
+    )
     if weights is None:
-        weights = corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex)
+        weights = corrected_skinning_weights(
+            body.skinning_weights, outputs.skinning_offsets, per_vertex
+        )
     return Avatar(
         gaussians=outputs.gaussians,
         skinning_weights=weights,
@@ -331,12 +402,16 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config
     )
 
 
-def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> Avatar:
+def completed_avatar(
+    outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig
+) -> Avatar:
     """`make_avatar`, and what the conventions take from the photos: the skinning between the legs, the light, the low-pass."""
     conventions = config.conventions
     avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)
     if conventions.skinning_reach is not None and outputs.skinning_weights is None:
-        avatar = with_spread_weights(avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach)
+        avatar = with_spread_weights(
+            avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach
+        )
     if conventions.light and outputs.skinning_weights is None:
         avatar = with_light(avatar, views)
     if conventions.low_pass is not None:
@@ -353,11 +428,15 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
 
     def terms_in(rotations, translation):
         joints = joint_transforms(fixed.rest_joints, fixed.parents, rotations, translation)
-        return light_terms(turned_normals(normals, blend_transforms(fixed.skinning_weights, joints)[:, :3, :3]))
+        return light_terms(
+            turned_normals(normals, blend_transforms(fixed.skinning_weights, joints)[:, :3, :3])
+        )
 
     count = len(views.images) if views.view_count is None else views.view_count
     share = (jnp.arange(len(views.images)) < count) / count
-    terms = jnp.sum(share[:, None, None] * jax.vmap(terms_in)(views.rotations, views.translations), axis=0)
+    terms = jnp.sum(
+        share[:, None, None] * jax.vmap(terms_in)(views.rotations, views.translations), axis=0
+    )
     pooled = lambda values: jnp.sum(values.reshape(len(vertices), per_vertex, -1), axis=1)
     weights = pooled(gaussians.opacities)
     mean = lambda values: pooled(values * gaussians.opacities[:, None]) / jnp.maximum(weights, 1e-6)
@@ -376,14 +455,21 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     distances = jnp.linalg.norm(points - jnp.repeat(vertices, per_vertex, axis=0), axis=-1)
     legs = jnp.asarray([[name in names for name in avatar.joint_names] for names in LEGS])
     spread = spread_weights(points, distances, own, vertices, own[::per_vertex], legs, reach)
-    transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
+    transforms = joint_transforms(
+        avatar.rest_joints, avatar.parents, pose.rotations, pose.translation
+    )
     before, after = blend_transforms(own, transforms), blend_transforms(spread, transforms)
     columns = jnp.moveaxis(after[:, :3, :3], -1, 0)
     crossed = jnp.stack([jnp.cross(columns[i - 2], columns[i - 1]) for i in range(3)], axis=1)
     volumes = jnp.sum(columns[0] * crossed[:, 0], axis=-1)
     safe = volumes > SMALLEST_VOLUME
     moved = transform.apply(before, gaussians.means) - after[:, :3, 3]
-    held = jnp.einsum("gab,gb->ga", crossed / jnp.where(safe, volumes, 1)[:, None, None], moved, precision=transform.EXACT)
+    held = jnp.einsum(
+        "gab,gb->ga",
+        crossed / jnp.where(safe, volumes, 1)[:, None, None],
+        moved,
+        precision=transform.EXACT,
+    )
     means = jnp.where(safe[:, None], held, gaussians.means)
     weights = jnp.where(safe[:, None], spread, own)
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
@@ -408,7 +494,9 @@ def _check(capture: Capture, name: str) -> None:
         if shape is not None and (found := np.shape(operator.attrgetter(field)(capture))) != shape:
             raise ValueError(f"reconstruct: {name}: {field}: expected shape {shape}, got {found}")
     if not 0 <= np.min(capture.frames) <= np.max(capture.frames) < capture.frame_count:
-        raise ValueError(f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got {capture.frames}")
+        raise ValueError(
+            f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got {capture.frames}"
+        )
     arrays = {
         "body.template": (capture.body.template, FINITE),
         "body.skinning_weights": (capture.body.skinning_weights, FINITE),
@@ -423,8 +511,14 @@ def _check(capture: Capture, name: str) -> None:
 
 
 def _equal(body: BodyModel, other: BodyModel) -> bool:
-    return jax.tree.structure(body) == jax.tree.structure(other) and jax.tree.all(jax.tree.map(np.array_equal, body, other))
+    return jax.tree.structure(body) == jax.tree.structure(other) and jax.tree.all(
+        jax.tree.map(np.array_equal, body, other)
+    )
 
 
 _prepare = jax.jit(prepare_inputs)
-_prepare_batch = jax.jit(lambda body, batch, config: jax.lax.map(lambda views: prepare_inputs(body, views, config), batch))
+_prepare_batch = jax.jit(
+    lambda body, batch, config: jax.lax.map(
+        lambda views: prepare_inputs(body, views, config), batch
+    )
+)

@@ -68,4 +68,6 @@ class Shot:
         try:
             return named_color(self.background)
         except ValueError as error:
-            raise ArgumentError("background", f"{str(error).removeprefix('background ')}, or transparent") from None
+            raise ArgumentError(
+                "background", f"{str(error).removeprefix('background ')}, or transparent"
+            ) from None

@@ -36,7 +36,9 @@ PALETTE_FRAMES = 16
 """The palette of a GIF is chosen from this number of frames, evenly spaced."""
 
 
-def check_video(path: str | Path, frames: int, width: int, height: int, transparent: bool = False) -> VideoFormat:
+def check_video(
+    path: str | Path, frames: int, width: int, height: int, transparent: bool = False
+) -> VideoFormat:
     """Check that such a video can be written; call it before its frames are drawn. Returns its format.
 
     Raises: ValueError for a suffix that is no video (none is a folder of PNG files), transparency that the
@@ -46,12 +48,21 @@ def check_video(path: str | Path, frames: int, width: int, height: int, transpar
     suffix = path.suffix.lower()
     form = next((each for each in VIDEOS.values() if suffix in each.suffixes), None)
     if form is None:
-        raise ArgumentError("path", f"{path}: expected a name ending in {alternatives(VIDEOS.suffixes)} for PNG files")
+        raise ArgumentError(
+            "path",
+            f"{path}: expected a name ending in {alternatives(VIDEOS.suffixes)} for PNG files",
+        )
     if transparent and not form.transparent:
         others = alternatives(VIDEOS.where(lambda each: each.transparent).suffixes)
-        raise ArgumentError("path", f"{path}: {suffix} has no transparency: expected {others} for PNG files, or a color")
+        raise ArgumentError(
+            "path",
+            f"{path}: {suffix} has no transparency: expected {others} for PNG files, or a color",
+        )
     if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
-        raise ArgumentError("path", f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm")
+        raise ArgumentError(
+            "path",
+            f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm",
+        )
     if suffix and path.is_dir():
         raise ArgumentError("path", f"{path}: is a folder: expected a file name")
     if not suffix and path.is_file():
@@ -119,7 +130,9 @@ def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
     return (width + width % 2, height + height % 2) if even else (width, height)
 
 
-def write_images(folder: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
+def write_images(
+    folder: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]
+) -> None:
     """PNG files of all frames."""
     for i, frame in enumerate(frames):
         write_png(folder / f"frame_{i:05d}.png", frame, mark=DRAWN)
@@ -131,12 +144,18 @@ def _checked(path: Path, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
     for i, given in enumerate(frames):
         frame = np.asarray(given)
         if frame.ndim != 3 or frame.shape[-1] not in CHANNELS:
-            raise ValueError(f"{path}: frame {i}: expected shape (h, w, 3) or (h, w, 4), got {frame.shape}")
+            raise ValueError(
+                f"{path}: frame {i}: expected shape (h, w, 3) or (h, w, 4), got {frame.shape}"
+            )
         shape = frame.shape if shape is None else shape
         if 0 in frame.shape:
-            raise ValueError(f"{path}: expected at least one frame of at least one pixel, got {frame.shape[:2]}")
+            raise ValueError(
+                f"{path}: expected at least one frame of at least one pixel, got {frame.shape[:2]}"
+            )
         if frame.shape != shape:
-            raise ValueError(f"{path}: frame {i} has shape {frame.shape}, expected that of the first, {shape}")
+            raise ValueError(
+                f"{path}: frame {i} has shape {frame.shape}, expected that of the first, {shape}"
+            )
         _check_numbers(f"{path}: frame {i}", frame)
         yield frame
 
@@ -146,7 +165,9 @@ def _check_numbers(name: str, frame: np.ndarray) -> None:
     if frame.dtype == np.uint8:
         return
     if not jnp.issubdtype(frame.dtype, jnp.floating):  # numpy's own does not know bfloat16
-        raise ValueError(f"{name}: expected floating-point numbers in [0, 1], or uint8, got {frame.dtype}")
+        raise ValueError(
+            f"{name}: expected floating-point numbers in [0, 1], or uint8, got {frame.dtype}"
+        )
     low, high = float(frame.min()), float(frame.max())  # NaN if any number is
     if not np.isfinite([low, high]).all():
         raise ValueError(f"{name} has numbers that are not finite")
@@ -159,22 +180,48 @@ def _check_numbers(name: str, frame: np.ndarray) -> None:
 
 def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
     """H.264."""
-    quality = ["-c:v", "libx264", "-crf", str(CONSTANT_RATE_FACTOR), "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    quality = [
+        "-c:v",
+        "libx264",
+        "-crf",
+        str(CONSTANT_RATE_FACTOR),
+        "-pix_fmt",
+        "yuv420p",
+        "-movflags",
+        "+faststart",
+    ]
     _write_by_ffmpeg(path, frames, fps, shape, quality)
 
 
-def write_webm(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
+def write_webm(
+    path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]
+) -> None:
     """VP9."""
-    quality = ["-c:v", "libvpx-vp9", "-crf", str(VP9_QUALITY), "-b:v", "0", "-deadline", "good", "-cpu-used", "4"]
+    quality = [
+        "-c:v",
+        "libvpx-vp9",
+        "-crf",
+        str(VP9_QUALITY),
+        "-b:v",
+        "0",
+        "-deadline",
+        "good",
+        "-cpu-used",
+        "4",
+    ]
     quality += ["-fflags", "+bitexact"]  # no random number in the file
-    if shape[-1] == 4:  # a second stream beside the colors; alternate reference frames would separate the two
+    if (
+        shape[-1] == 4
+    ):  # a second stream beside the colors; alternate reference frames would separate the two
         quality += ["-pix_fmt", "yuva420p", "-auto-alt-ref", "0"]
     else:
         quality += ["-pix_fmt", "yuv420p"]
     _write_by_ffmpeg(path, frames, fps, shape, quality)
 
 
-def _write_by_ffmpeg(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...], quality: list[str]) -> None:
+def _write_by_ffmpeg(
+    path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...], quality: list[str]
+) -> None:
     """Through ffmpeg itself: imageio's writer does not tell when ffmpeg fails."""
     import imageio_ffmpeg
 
@@ -186,7 +233,15 @@ def _write_by_ffmpeg(path: Path, frames: Iterable[np.ndarray], fps: float, shape
     command += ["-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "-", "-an", *quality]
     # said and done in BT.709: players guess the matrix of an untagged file by its size
     command += ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
-    command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", f"file:{path}"]
+    command += [
+        "-colorspace",
+        "bt709",
+        "-color_primaries",
+        "bt709",
+        "-color_trc",
+        "bt709",
+        f"file:{path}",
+    ]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None and ffmpeg.stderr is not None  # pipes, as asked for
         try:
@@ -247,7 +302,15 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
     times = np.rint(np.arange(len(images) + 1) * 100 / fps).astype(int)
     durations = [10 * int(x) for x in np.diff(times)]
     first, *rest = images
-    first.save(path, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=False)
+    first.save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=rest,
+        duration=durations,
+        loop=0,
+        optimize=False,
+    )
 
 
 # Sheets ----------------------------------------------------------------------------------------------------------------
@@ -314,16 +377,23 @@ def tile(
     top = 0 if headers is None else text + 2 * GAP
     rows = -(-count // columns)
     sheet = np.ones((top + rows * (strip + height + GAP) + GAP, columns * (width + GAP) + GAP, 3))
-    corners = [(top + GAP + (i // columns) * (strip + height + GAP), GAP + (i % columns) * (width + GAP)) for i in range(count)]
+    corners = [
+        (top + GAP + (i // columns) * (strip + height + GAP), GAP + (i % columns) * (width + GAP))
+        for i in range(count)
+    ]
     for image, (y, x) in zip(images, corners, strict=True):
         sheet[y + strip : y + strip + height, x : x + width] = image
     texts = [(label, x, y, width) for label, (y, x) in zip(labels or (), corners, strict=False)]
-    texts += [(header, GAP + i * (width + GAP), GAP, width) for i, header in enumerate(headers or ())]
+    texts += [
+        (header, GAP + i * (width + GAP), GAP, width) for i, header in enumerate(headers or ())
+    ]
     return write_texts(sheet, texts, text)
 
 
 def write_texts(
-    sheet: Float[np.ndarray, "height width 3"], texts: Sequence[tuple[str, int, int, int]], text_height: int
+    sheet: Float[np.ndarray, "height width 3"],
+    texts: Sequence[tuple[str, int, int, int]],
+    text_height: int,
 ) -> Float[np.ndarray, "height width 3"]:
     """The sheet with black texts; each is (text, left, top, width in pixels that it may take)."""
     from PIL import Image, ImageDraw, ImageFont
@@ -341,10 +411,14 @@ def write_texts(
     return np.where(np.asarray(canvas) == to_uint8(sheet), sheet, np.asarray(canvas) / 255)
 
 
-def error_colors(errors: Float[np.ndarray, "*shape"], largest: float | int) -> Float[np.ndarray, "*shape 3"]:
+def error_colors(
+    errors: Float[np.ndarray, "*shape"], largest: float | int
+) -> Float[np.ndarray, "*shape 3"]:
     """Colors of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get the last."""
     stops = np.linspace(0, largest, len(ERROR_COLORS))
-    return np.stack([np.interp(errors, stops, channel) for channel in zip(*ERROR_COLORS, strict=True)], axis=-1)
+    return np.stack(
+        [np.interp(errors, stops, channel) for channel in zip(*ERROR_COLORS, strict=True)], axis=-1
+    )
 
 
 def error_legend(width: int, text_height: int) -> Float[np.ndarray, "height width 3"]:

@@ -1,8 +1,27 @@
 """Names and parents of SMPL-X's 55 joints, which the shipped body shares."""
 
 BODY_NAMES = (
-    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle"),
-    *("spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder"),
+    *(
+        "pelvis",
+        "left_hip",
+        "right_hip",
+        "spine1",
+        "left_knee",
+        "right_knee",
+        "spine2",
+        "left_ankle",
+        "right_ankle",
+    ),
+    *(
+        "spine3",
+        "left_foot",
+        "right_foot",
+        "neck",
+        "left_collar",
+        "right_collar",
+        "head",
+        "left_shoulder",
+    ),
     *("right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
 )
 FACE_NAMES = ("jaw", "left_eye", "right_eye")
@@ -11,10 +30,21 @@ FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 JOINT_NAMES = (
     *BODY_NAMES,
     *FACE_NAMES,
-    *(f"{side}_{finger}{knuckle}" for side in ("left", "right") for finger in FINGERS for knuckle in (1, 2, 3)),
+    *(
+        f"{side}_{finger}{knuckle}"
+        for side in ("left", "right")
+        for finger in FINGERS
+        for knuckle in (1, 2, 3)
+    ),
 )
 """22 of the body, jaw and eyes, then 15 per hand from the palm outwards."""
 
 _BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
-PARENTS = (*_BODY_PARENTS, 15, 15, 15, *(j - 1 if (j - 25) % 3 else (20 if j < 40 else 21) for j in range(25, 55)))
+PARENTS = (
+    *_BODY_PARENTS,
+    15,
+    15,
+    15,
+    *(j - 1 if (j - 25) % 3 else (20 if j < 40 else 21) for j in range(25, 55)),
+)
 """Parent of each joint, -1 for the pelvis; every finger starts at its wrist."""

@@ -119,7 +119,12 @@ def place(name: str, base: str, joints: tuple[str, ...], millimetres: Millimetre
 
 CARRIERS = {
     **dict.fromkeys(("nose", "ear", "heel", "big_toe", "small_toe"), ()),
-    **{"eye": ("head",), "shoulder": ("{side}_collar",), "elbow": ("{side}_shoulder",), "wrist": ("{side}_elbow",)},
+    **{
+        "eye": ("head",),
+        "shoulder": ("{side}_collar",),
+        "elbow": ("{side}_shoulder",),
+        "wrist": ("{side}_elbow",),
+    },
     **{"hip": ("pelvis",), "knee": ("{side}_hip",), "ankle": ("{side}_knee",)},
 }
 """The joints whose turning carries what lies beside a landmark; none: what carries its vertex."""
@@ -127,19 +132,35 @@ CARRIERS = {
 
 def plain_places(names: tuple[str, ...]) -> tuple[Place, ...]:
     """Landmarks that lie where this module has them, as far as fits may find them elsewhere."""
-    sides = [name.split("_", 1) if name.startswith(("left_", "right_")) else ("", name) for name in names]
-    known = [(name, side, part) for name, (side, part) in zip(names, sides, strict=True) if part in CARRIERS]
-    return tuple(Place(n, n, (0.0, 0.0, 0.0), tuple(j.format(side=side) for j in CARRIERS[part])) for n, side, part in known)
+    sides = [
+        name.split("_", 1) if name.startswith(("left_", "right_")) else ("", name) for name in names
+    ]
+    known = [
+        (name, side, part)
+        for name, (side, part) in zip(names, sides, strict=True)
+        if part in CARRIERS
+    ]
+    return tuple(
+        Place(n, n, (0.0, 0.0, 0.0), tuple(j.format(side=side) for j in CARRIERS[part]))
+        for n, side, part in known
+    )
 
 
-def both_sides(names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres) -> tuple[Place, Place]:
+def both_sides(
+    names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres
+) -> tuple[Place, Place]:
     """A landmark of the left side and its mirror image.
 
     Arguments: names: of the left and the right one. base, joints: with {side} for the side. millimetres: the left one's.
     """
     x, y, z = millimetres
     left, right = (
-        place(name, base.format(side=side), tuple(joint.format(side=side) for joint in joints), (sign * x, y, z))
+        place(
+            name,
+            base.format(side=side),
+            tuple(joint.format(side=side) for joint in joints),
+            (sign * x, y, z),
+        )
         for name, side, sign in zip(names, ("left", "right"), (1, -1), strict=True)
     )
     return left, right
@@ -156,7 +177,12 @@ CARRIES = 0.1
 """A joint moves a point that has at least this share of its weight from it."""
 MIDLINE = 0.006
 """Half-width of the middle of the face, metres."""
-FOOT = {"foot_index": (0.0, 1.0), "big_toe": (-0.3, 1.0), "small_toe": (1.0, 1.0), "heel": (0.0, -1.0)}
+FOOT = {
+    "foot_index": (0.0, 1.0),
+    "big_toe": (-0.3, 1.0),
+    "small_toe": (1.0, 1.0),
+    "heel": (0.0, -1.0),
+}
 """The direction in which landmarks of the foot are farthest: outwards and forwards."""
 
 
@@ -217,7 +243,10 @@ def kind_of(name: str) -> str:
 
 @checked_arguments
 def landmark_model(
-    body: BodyModel, names: tuple[str, ...], places: tuple[Place, ...] = (), certainty: tuple[float, ...] = ()
+    body: BodyModel,
+    names: tuple[str, ...],
+    places: tuple[Place, ...] = (),
+    certainty: tuple[float, ...] = (),
 ) -> LandmarkModel:
     """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the joints alone.
 
@@ -226,7 +255,11 @@ def landmark_model(
     Raises: ValueError if it has none of them, which is so when its joints have other names than SMPL-X's.
     """
     finder = _Finder(body)
-    moved = {place.name: place for place in places if finder.find(place.base) and finder.has(place.joints)}
+    moved = {
+        place.name: place
+        for place in places
+        if finder.find(place.base) and finder.has(place.joints)
+    }
     sources = [[] if name in moved else finder.find(name) for name in names]
     known = tuple(bool(found) or name in moved for name, found in zip(names, sources, strict=True))
     if names and not any(known):
@@ -236,7 +269,9 @@ def landmark_model(
         )
     vertices = sorted({source for found in sources for source in found if source >= 0})
     joints, placed = len(body.parents), [moved[name] for name in names if name in moved]
-    pairs = [place.name if side_of(place.name) > 0 else mirrored_name(place.name) for place in placed]
+    pairs = [
+        place.name if side_of(place.name) > 0 else mirrored_name(place.name) for place in placed
+    ]
     numbers = sorted(set(pairs))
     regressor = np.zeros((len(names), joints + len(vertices) + len(placed)), np.float32)
     for row, name, found in zip(regressor, names, sources, strict=True):
@@ -244,7 +279,9 @@ def landmark_model(
             row[joints + vertices.index(source) if source >= 0 else -1 - source] += 1 / len(found)
         if name in moved:
             row[joints + len(vertices) + placed.index(moved[name])] = 1.0
-    points = _concatenated([_rows(surface_points(body), vertices), *(_placed(body, finder, place) for place in placed)])
+    points = _concatenated(
+        [_rows(surface_points(body), vertices), *(_placed(body, finder, place) for place in placed)]
+    )
     return LandmarkModel(
         joints=_regressed(body, body.template),
         joint_directions=_regressed(body, body.shape_directions),
@@ -255,9 +292,14 @@ def landmark_model(
         known=known,
         parents=body.parents,
         joint_names=body.joint_names,
-        movers=_movers(body.parents, np.any(regressor[:, :joints], axis=0), np.asarray(points.weights)),
+        movers=_movers(
+            body.parents, np.any(regressor[:, :joints], axis=0), np.asarray(points.weights)
+        ),
         placed=tuple(names.index(place.name) for place in placed),
-        groups=tuple((numbers.index(pair), side_of(each.name)) for pair, each in zip(pairs, placed, strict=True)),
+        groups=tuple(
+            (numbers.index(pair), side_of(each.name))
+            for pair, each in zip(pairs, placed, strict=True)
+        ),
     )
 
 
@@ -285,7 +327,10 @@ def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
 def _placed(body: BodyModel, finder: "_Finder", place: Place) -> SurfacePoints:
     """One point beside the sources of a landmark: it grows with them, and turns with the joints of the place."""
     every, sources = surface_points(body), finder.find(place.base)
-    points = [_rows(every, [source]) if source >= 0 else _joint_point(body, -1 - source) for source in sources]
+    points = [
+        _rows(every, [source]) if source >= 0 else _joint_point(body, -1 - source)
+        for source in sources
+    ]
     mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), _concatenated(points))
     weights = mean.weights
     if place.joints:
@@ -316,13 +361,17 @@ def pose_joints(
     return transforms, transform.apply(transforms, rest)
 
 
-def landmarks_from(model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]) -> Float[Array, "k 3"]:
+def landmarks_from(
+    model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]
+) -> Float[Array, "k 3"]:
     """Landmarks from posed joints and points."""
     return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=EXACT)
 
 
 def _movers(
-    parents: tuple[int, ...], joints_used: Bool[np.ndarray, " j"], point_weights: Float[np.ndarray, "p j"]
+    parents: tuple[int, ...],
+    joints_used: Bool[np.ndarray, " j"],
+    point_weights: Float[np.ndarray, "p j"],
 ) -> tuple[int, ...]:
     """Joints above the used joints, and those that move a used point (p, j): turning a joint does not move itself."""
     moving = point_weights.max(axis=0, initial=0.0) > CARRIES
@@ -367,25 +416,40 @@ class _Finder:
                 low, high = self.joints[self.index["jaw"], 1], self._eyes()[1]
                 return [self._best(self._head(low, high), lambda p: p[:, 2])]
             case ["face", "8"]:
-                return [self._on_midline(lambda p: -p[:, 1], highest=self.joints[self.index["jaw"], 1])]
+                return [
+                    self._on_midline(lambda p: -p[:, 1], highest=self.joints[self.index["jaw"], 1])
+                ]
             case ["face", "27"]:
                 height = self._eyes()[1]
                 return [self._on_midline(lambda p: -np.abs(p[:, 1] - height) + p[:, 2])]
-            case ["jaw"] | ["left" | "right", "shoulder" | "elbow" | "wrist" | "hip" | "knee" | "ankle" | "eye"]:
+            case ["jaw"] | [
+                "left" | "right",
+                "shoulder" | "elbow" | "wrist" | "hip" | "knee" | "ankle" | "eye",
+            ]:
                 return [joint(name)]
             case ["left" | "right" as side, "hand", "root"]:
                 return [joint(f"{side}_wrist")]
             case ["left" | "right" as side, "ear"]:
                 eyes = self._eyes()[1]
-                return [self._best(self._head(eyes - 0.06, eyes + 0.03), lambda p: SIDES[side] * p[:, 0])]
+                return [
+                    self._best(
+                        self._head(eyes - 0.06, eyes + 0.03), lambda p: SIDES[side] * p[:, 0]
+                    )
+                ]
             case ["left" | "right" as side, *part] if "_".join(part) in FOOT:
                 outward, forward = FOOT["_".join(part)]
                 foot = self._segment(f"{side}_ankle", f"{side}_foot")
-                return [self._best(foot, lambda p: outward * SIDES[side] * p[:, 0] + forward * p[:, 2])]
+                return [
+                    self._best(foot, lambda p: outward * SIDES[side] * p[:, 0] + forward * p[:, 2])
+                ]
             case ["left" | "right" as side, finger, "tip"] if finger in FINGERS:
                 middle, last = (self.joints[self.index[f"{side}_{finger}{k}"]] for k in (2, 3))
-                return [self._best(self._segment(f"{side}_{finger}3"), lambda p: p @ (last - middle))]
-            case ["left" | "right" as side, finger, "1" | "2" | "3" as knuckle] if finger in FINGERS:
+                return [
+                    self._best(self._segment(f"{side}_{finger}3"), lambda p: p @ (last - middle))
+                ]
+            case ["left" | "right" as side, finger, "1" | "2" | "3" as knuckle] if (
+                finger in FINGERS
+            ):
                 return [joint(f"{side}_{finger}{knuckle}")]
         raise KeyError(name)
 

@@ -17,7 +17,15 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import LARGEST, checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.io.arrays import ArrayFile, check_array, check_indices, check_joints, check_row_sums, read_npz, write_npz
+from humangs_jax.io.arrays import (
+    ArrayFile,
+    check_array,
+    check_indices,
+    check_joints,
+    check_row_sums,
+    read_npz,
+    write_npz,
+)
 from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, reading
 
 FORMAT = "humangs-body-1"
@@ -26,7 +34,16 @@ DIRECTION_STEP = 1e-5
 WEIGHT_STEPS = 65535
 UV_STEPS = 65535
 KEYS = {
-    *("format", "name", "template", "shape_directions", "faces", "parents", "joint_names", "shape_names"),
+    *(
+        "format",
+        "name",
+        "template",
+        "shape_directions",
+        "faces",
+        "parents",
+        "joint_names",
+        "shape_names",
+    ),
     *("regressor_vertices", "regressor_values", "weight_joints", "weight_values"),
 }
 """What every file has; some have texture coordinates and an order of collapses, too."""
@@ -55,12 +72,17 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
     with resources.as_file(resources.files("humangs_jax") / "assets" / "makehuman.npz") as shipped:
         file = shipped if path is None else Path(path)
         with reading(file, "body model file"), open_file(file) as content:
-            own = content.read(2) == b"PK" and "format" in read_npz(file, lambda name: name == "format")[0]
+            own = (
+                content.read(2) == b"PK"
+                and "format" in read_npz(file, lambda name: name == "format")[0]
+            )
         if not own:
             return load_smplx(file, **smplx_options)
         if smplx_options:
             which = "the shipped body" if path is None else f"the file {path}"
-            raise TypeError(f"options of SMPL-X files do not apply to {which}: {sorted(smplx_options)}")
+            raise TypeError(
+                f"options of SMPL-X files do not apply to {which}: {sorted(smplx_options)}"
+            )
         return read_body(file)
 
 
@@ -76,12 +98,20 @@ def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return columns, np.take_along_axis(matrix, columns, axis=1)
 
 
-def _dense_rows(arrays: dict[str, np.ndarray], rows: str, columns: str, count: int, width: int) -> np.ndarray:
+def _dense_rows(
+    arrays: dict[str, np.ndarray], rows: str, columns: str, count: int, width: int
+) -> np.ndarray:
     check_limit("plain_bytes", 8 * count * width, "bytes of a matrix")
     check_indices(columns, arrays[columns], (count, None), width)
-    check_array(f"{rows}_values", arrays[f"{rows}_values"], arrays[columns].shape, -LARGEST, LARGEST)
+    check_array(
+        f"{rows}_values", arrays[f"{rows}_values"], arrays[columns].shape, -LARGEST, LARGEST
+    )
     matrix = np.zeros((count, width), np.float64)
-    np.add.at(matrix, (np.arange(count)[:, None], arrays[columns].astype(np.int64)), arrays[f"{rows}_values"])
+    np.add.at(
+        matrix,
+        (np.arange(count)[:, None], arrays[columns].astype(np.int64)),
+        arrays[f"{rows}_values"],
+    )
     sums = matrix.sum(1, keepdims=True)
     if not (sums > 0).all():
         raise Refused(f"{rows}_values: expected rows with a sum above 0")
@@ -91,7 +121,9 @@ def _dense_rows(arrays: dict[str, np.ndarray], rows: str, columns: str, count: i
 def save_body(path: str | Path, body: BodyModel) -> None:
     """Write a body model. Raises: ValueError for one with pose correctives, which this format does not hold."""
     if body.pose_directions is not None:
-        raise ValueError(f"body '{body.name}' has pose directions: this format is for bodies without them")
+        raise ValueError(
+            f"body '{body.name}' has pose directions: this format is for bodies without them"
+        )
     directions = np.asarray(body.shape_directions, np.float64)
     if np.abs(directions).max(initial=0) < DIRECTION_STEP * 32767:
         directions = np.rint(directions / DIRECTION_STEP).astype(np.int16)
@@ -101,7 +133,9 @@ def save_body(path: str | Path, body: BodyModel) -> None:
         "format": np.asarray(FORMAT),
         "name": np.asarray(body.name),
         "template": np.asarray(body.template, np.float32),
-        "shape_directions": np.ascontiguousarray(np.moveaxis(directions, -1, 0)),  # compresses better by direction
+        "shape_directions": np.ascontiguousarray(
+            np.moveaxis(directions, -1, 0)
+        ),  # compresses better by direction
         "regressor_vertices": _indices(regressor_columns),
         "regressor_values": regressor_values.astype(np.float32),
         "weight_joints": _indices(weight_columns),
@@ -114,7 +148,9 @@ def save_body(path: str | Path, body: BodyModel) -> None:
     if body.uvs is not None:
         uvs = np.asarray(body.uvs, np.float64)
         inside = uvs.min() >= 0 and uvs.max() <= 1
-        arrays["uvs"] = np.rint(uvs * UV_STEPS).astype(np.uint16) if inside else uvs.astype(np.float32)
+        arrays["uvs"] = (
+            np.rint(uvs * UV_STEPS).astype(np.uint16) if inside else uvs.astype(np.float32)
+        )
         arrays["uv_faces"] = _indices(np.asarray(body.uv_faces))
     if body.collapse_order is not None:
         arrays["collapse_order"] = _indices(np.asarray(body.collapse_order))
@@ -132,11 +168,16 @@ def read_body(path: str | Path) -> BodyModel:
             raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
         if missing := sorted(KEYS - set(arrays)):
             raise Refused(f"key '{missing[0]}' is missing")
-        parents, joint_names = arrays["parents"].tolist(), [str(name) for name in arrays["joint_names"]]
+        parents, joint_names = (
+            arrays["parents"].tolist(),
+            [str(name) for name in arrays["joint_names"]],
+        )
         check_joints(parents, joint_names)
         joints, vertices, shapes = len(parents), len(arrays["template"]), len(arrays["shape_names"])
         check_array("template", arrays["template"], (vertices, 3), -LARGEST, LARGEST)
-        check_array("shape_directions", arrays["shape_directions"], (shapes, vertices, 3), -LARGEST, LARGEST)
+        check_array(
+            "shape_directions", arrays["shape_directions"], (shapes, vertices, 3), -LARGEST, LARGEST
+        )
         check_indices("faces", arrays["faces"], (None, 3), vertices)
         directions = np.moveaxis(arrays["shape_directions"], 0, -1)
         if directions.dtype == np.int16:
@@ -153,8 +194,12 @@ def read_body(path: str | Path) -> BodyModel:
             template=jnp.asarray(arrays["template"], jnp.float32),
             shape_directions=jnp.asarray(directions, jnp.float32),
             pose_directions=None,
-            joint_regressor=jnp.asarray(_dense_rows(arrays, "regressor", "regressor_vertices", joints, vertices)),
-            skinning_weights=jnp.asarray(_dense_rows(arrays, "weight", "weight_joints", vertices, joints)),
+            joint_regressor=jnp.asarray(
+                _dense_rows(arrays, "regressor", "regressor_vertices", joints, vertices)
+            ),
+            skinning_weights=jnp.asarray(
+                _dense_rows(arrays, "weight", "weight_joints", vertices, joints)
+            ),
             faces=jnp.asarray(arrays["faces"], jnp.int32),
             uvs=None if uvs is None else jnp.asarray(uvs, jnp.float32),
             uv_faces=index("uv_faces"),
@@ -230,12 +275,24 @@ def _shape_directions(
     elif columns >= 2 * OLD_COLUMNS:
         available = OLD_COLUMNS, OLD_COLUMNS
     else:
-        raise FileError(file.path, "shapedirs", f"expected 20 or 400 columns (shape, expression), got {columns}")
-    for asked, limit, kind in zip((shape_count, expression_count), available, ("shape", "expression"), strict=True):
+        raise FileError(
+            file.path, "shapedirs", f"expected 20 or 400 columns (shape, expression), got {columns}"
+        )
+    for asked, limit, kind in zip(
+        (shape_count, expression_count), available, ("shape", "expression"), strict=True
+    ):
         if not 0 <= asked <= limit:
-            raise FileError(file.path, "shapedirs", f"has {limit} {kind} directions, asked for {asked}")
-    shape, expression = stored[..., :shape_count], stored[..., available[0] : available[0] + expression_count]
-    names = (*(f"shape_{i}" for i in range(shape_count)), *(f"expression_{i}" for i in range(expression_count)))
+            raise FileError(
+                file.path, "shapedirs", f"has {limit} {kind} directions, asked for {asked}"
+            )
+    shape, expression = (
+        stored[..., :shape_count],
+        stored[..., available[0] : available[0] + expression_count],
+    )
+    names = (
+        *(f"shape_{i}" for i in range(shape_count)),
+        *(f"expression_{i}" for i in range(expression_count)),
+    )
     return np.concatenate([shape, expression], axis=-1), names
 
 

@@ -43,7 +43,9 @@ def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
     Raises: ValueError unless all joints descend from one root (-1).
     """
     count, found = len(parents), []
-    wrong = ValueError(f"parents {parents}: expected joints that all descend from one root, whose parent is -1")
+    wrong = ValueError(
+        f"parents {parents}: expected joints that all descend from one root, whose parent is -1"
+    )
     if list(parents).count(-1) != 1 or not set(parents) <= set(range(-1, count)):
         raise wrong
     up = np.asarray([*(count if parent == -1 else parent for parent in parents), count])
@@ -56,7 +58,10 @@ def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def joint_transforms(
-    rest_joints: Float[Array, "j 3"], parents: tuple[int, ...], rotations: Float[Array, "j 3"], translation: Float[Array, "3"]
+    rest_joints: Float[Array, "j 3"],
+    parents: tuple[int, ...],
+    rotations: Float[Array, "j 3"],
+    translation: Float[Array, "3"],
 ) -> Float[Array, "j 4 4"]:
     """G_j of every joint.
 
@@ -89,7 +94,9 @@ def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Arra
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
-def blend_transforms(weights: Float[Array, "n j"], transforms: Float[Array, "j 4 4"]) -> Float[Array, "n 4 4"]:
+def blend_transforms(
+    weights: Float[Array, "n j"], transforms: Float[Array, "j 4 4"]
+) -> Float[Array, "n 4 4"]:
     """T_n = sum_j w_nj G_j. Its linear part is in general no rotation."""
     return jnp.einsum("nj,jab->nab", weights, transforms, precision=EXACT)
 
@@ -124,7 +131,9 @@ def spread_weights(
         return jnp.einsum("n,nj->j", jax.nn.softmax(exponents), near_weights, precision=EXACT)
 
     spread = jax.lax.map(around, (points[far], distances), batch_size=BLOCK)
-    between = jnp.min(jnp.einsum("gj,lj->gl", spread, legs.astype(spread.dtype), precision=EXACT), axis=-1)
+    between = jnp.min(
+        jnp.einsum("gj,lj->gl", spread, legs.astype(spread.dtype), precision=EXACT), axis=-1
+    )
     share = jnp.clip(2 * distances / reach - 1.5, 0, 1) * jnp.clip(between / BETWEEN, 0, 1)
     return weights.at[far].add(share[:, None] * (spread - weights[far]))
 
@@ -148,16 +157,23 @@ class SurfacePoints:
 
 def surface_points(body: "BodyModel") -> SurfacePoints:
     """All vertices."""
-    return SurfacePoints(body.template, body.shape_directions, body.pose_directions, body.skinning_weights)
+    return SurfacePoints(
+        body.template, body.shape_directions, body.pose_directions, body.skinning_weights
+    )
 
 
-def shaped(mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]) -> Float[Array, "p 3"]:
+def shaped(
+    mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]
+) -> Float[Array, "p 3"]:
     """Points or joints of a person in T-pose, metres; missing coefficients are 0."""
     return mean + jnp.einsum("pas,s->pa", directions[..., : betas.shape[0]], betas, precision=EXACT)
 
 
 def pose_points(
-    points: SurfacePoints, betas: Float[Array, " s_used"], features: Float[Array, " q"] | None, transforms: Float[Array, "j 4 4"]
+    points: SurfacePoints,
+    betas: Float[Array, " s_used"],
+    features: Float[Array, " q"] | None,
+    transforms: Float[Array, "j 4 4"],
 ) -> Float[Array, "p 3"]:
     """Where the points of a person are, metres. features: of the pose; ignored by bodies without correctives."""
     rest = shaped(points.rest, points.directions, betas)
@@ -274,7 +290,9 @@ def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
     """
     used, available = betas.shape[0], body.shape_directions.shape[-1]
     if used > available:
-        raise ValueError(f"{used} shape coefficients, but body '{body.name}' has {available} shape directions")
+        raise ValueError(
+            f"{used} shape coefficients, but body '{body.name}' has {available} shape directions"
+        )
     vertices = shaped(body.template, body.shape_directions, betas)
     return RestBody(vertices, jnp.matmul(body.joint_regressor, vertices, precision=EXACT))
 
@@ -284,7 +302,11 @@ def without_expression(body: BodyModel) -> BodyModel:
     count = sum(not name.startswith("expression_") for name in body.shape_names)
     if not body.shape_names or count == len(body.shape_names):
         return body
-    return replace(body, shape_directions=body.shape_directions[..., :count], shape_names=body.shape_names[:count])
+    return replace(
+        body,
+        shape_directions=body.shape_directions[..., :count],
+        shape_names=body.shape_names[:count],
+    )
 
 
 def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
@@ -293,7 +315,9 @@ def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
     return (matrices - jnp.eye(3, dtype=matrices.dtype)).reshape(-1)
 
 
-def person_vertices(body: BodyModel, betas: Float[Array, " s_used"], pose: BodyPose) -> Float[Array, "n 3"]:
+def person_vertices(
+    body: BodyModel, betas: Float[Array, " s_used"], pose: BodyPose
+) -> Float[Array, "n 3"]:
     """Vertices of a person in a pose, metres."""
     return pose_body(body, shape_body(body, betas), pose).vertices
 
@@ -304,7 +328,11 @@ def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
     vertices = rest.vertices
     if body.pose_directions is not None:
         features = pose_features(pose.rotations)
-        vertices = vertices + jnp.einsum("naq,q->na", body.pose_directions, features, precision=EXACT)
+        vertices = vertices + jnp.einsum(
+            "naq,q->na", body.pose_directions, features, precision=EXACT
+        )
     transforms = joint_transforms(rest.joints, body.parents, pose.rotations, pose.translation)
     blended = blend_transforms(body.skinning_weights, transforms)
-    return PosedBody(transform.apply(blended, vertices), transforms, transform.apply(transforms, rest.joints))
+    return PosedBody(
+        transform.apply(blended, vertices), transforms, transform.apply(transforms, rest.joints)
+    )

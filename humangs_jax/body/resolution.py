@@ -25,7 +25,13 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
-from humangs_jax.geometry.mesh import directions_around, face_crosses, in_front, mesh_edges, vertex_areas
+from humangs_jax.geometry.mesh import (
+    directions_around,
+    face_crosses,
+    in_front,
+    mesh_edges,
+    vertex_areas,
+)
 
 # Finer ----------------------------------------------------------------------------------------------------------------
 
@@ -48,25 +54,37 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     if not longest > 0:
         raise ValueError(f"longest edge: expected a positive length in metres, got {longest}")
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
-    linear = {name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None}
+    linear = {
+        name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None
+    }
     faces = np.asarray(body.faces)
     linear["area"] = vertex_areas(linear["template"], faces)
     while True:
         edges, edge_of_side = mesh_edges(faces)
-        lengths = np.linalg.norm(linear["template"][edges[:, 0]] - linear["template"][edges[:, 1]], axis=-1)
+        lengths = np.linalg.norm(
+            linear["template"][edges[:, 0]] - linear["template"][edges[:, 1]], axis=-1
+        )
         if lengths.max() > FINEST * longest:
-            raise ValueError(f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m")
+            raise ValueError(
+                f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m"
+            )
         long = np.flatnonzero(lengths > longest)
         if len(long) == 0:
             break
         midpoint = np.full(len(edges), -1)
         midpoint[long] = len(linear["template"]) + np.arange(len(long))
         middle = {name: 0.5 * (x[edges[long, 0]] + x[edges[long, 1]]) for name, x in linear.items()}
-        linear = {name: np.concatenate([x, middle[name].astype(x.dtype)]) for name, x in linear.items()}
+        linear = {
+            name: np.concatenate([x, middle[name].astype(x.dtype)]) for name, x in linear.items()
+        }
         faces = _cut(faces, midpoint[edge_of_side])
-    spacing = np.sqrt(vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA))
+    spacing = np.sqrt(
+        vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA)
+    )
     added = len(linear["template"]) - len(body.template)
-    regressor = jnp.pad(body.joint_regressor, ((0, 0), (0, added)))  # joints follow the original vertices
+    regressor = jnp.pad(
+        body.joint_regressor, ((0, 0), (0, added))
+    )  # joints follow the original vertices
     return replace(
         body,
         **{name: jnp.asarray(x) for name, x in linear.items()},
@@ -81,12 +99,18 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     )
 
 
-def _cut(faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "finer 3"]:
+def _cut(
+    faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]
+) -> Int[np.ndarray, "finer 3"]:
     """Faces cut at the midpoints of their sides; middles (f, 3): the vertex on side i to i + 1, -1 for none."""
     count = (middles >= 0).sum(1)
     parts = [faces[count == 0]]
     # turn each face until the pattern of its midpoints is the one that is written out below
-    for sides, first in ((1, lambda m: m[:, 0] >= 0), (2, lambda m: m[:, 2] < 0), (3, lambda m: m[:, 0] >= 0)):
+    for sides, first in (
+        (1, lambda m: m[:, 0] >= 0),
+        (2, lambda m: m[:, 2] < 0),
+        (3, lambda m: m[:, 0] >= 0),
+    ):
         for turn in range(3):
             chosen = count == sides
             m = np.roll(middles[chosen], -turn, axis=1)
@@ -97,7 +121,9 @@ def _cut(faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]) -> Int[
             elif sides == 2:
                 parts += [np.stack([p, b, q], 1), np.stack([a, p, q], 1), np.stack([a, q, c], 1)]
             elif turn == 0:
-                parts += [np.stack(corners, 1) for corners in ((a, p, r), (p, b, q), (r, q, c), (p, q, r))]
+                parts += [
+                    np.stack(corners, 1) for corners in ((a, p, r), (p, b, q), (r, q, c), (p, q, r))
+                ]
     return np.concatenate(parts)
 
 
@@ -143,7 +169,9 @@ def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
     points = _surface_points(vertices, faces, cell)
     directions = directions_around(VIEWS, turned=0.0)
-    return np.mean([in_front(vertices, points, forward, cell, 2 * cell) for forward in directions], axis=0)
+    return np.mean(
+        [in_front(vertices, points, forward, cell, 2 * cell) for forward in directions], axis=0
+    )
 
 
 class _Mesh:
@@ -191,7 +219,9 @@ class _Mesh:
         common = self.beside[u] & self.beside[v]
         if len(common) != len(shared) or not 1 <= len(shared) <= 2:
             return False
-        if len(self.around[u]) != len(self.beside[u]) and len(shared) != 1:  # u on a rim moves along it only
+        if (
+            len(self.around[u]) != len(self.beside[u]) and len(shared) != 1
+        ):  # u on a rim moves along it only
             return False
         if self.uv_moves(u, shared, v) is None:
             return False
@@ -235,7 +265,9 @@ class _Mesh:
         self.stamp[v] += 1
 
 
-def _normal(a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> tuple[float, float, float]:
+def _normal(
+    a: Sequence[float], b: Sequence[float], c: Sequence[float]
+) -> tuple[float, float, float]:
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     return (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
@@ -245,17 +277,23 @@ def _squared(x: Sequence[float]) -> float:
     return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
 
 
-def _quality(normal: Sequence[float], a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> float:
+def _quality(
+    normal: Sequence[float], a: Sequence[float], b: Sequence[float], c: Sequence[float]
+) -> float:
     lengths = sum((p[i] - q[i]) ** 2 for p, q in ((a, b), (b, c), (c, a)) for i in range(3))
     return 2 * 3**0.5 * _squared(normal) ** 0.5 / max(lengths, 1e-30)
 
 
-def _vertex_quadrics(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 11"]:
+def _vertex_quadrics(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "n 11"]:
     """Per vertex: area-weighted sums over its faces of the outer product of (normal, d), and of the area: (n, 11)."""
     normal = face_crosses(vertices, faces)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.maximum(area, 1e-30)
-    plane = np.concatenate([normal, -np.sum(normal * vertices[faces[:, 0]], axis=1, keepdims=True)], axis=1)
+    plane = np.concatenate(
+        [normal, -np.sum(normal * vertices[faces[:, 0]], axis=1, keepdims=True)], axis=1
+    )
     rows, columns = np.triu_indices(4)
     terms = np.concatenate([plane[:, rows] * plane[:, columns], np.ones_like(area)], axis=1) * area
     quadrics = np.zeros((len(vertices), 11))
@@ -277,7 +315,12 @@ def collapse_sequence(
     hidden = exposure(vertices, faces) == 0
     for _ in range(RIM):
         hidden[faces[~hidden[faces].all(axis=1)]] = False
-    mesh = _Mesh(vertices, faces, None if uv_faces is None else np.asarray(uv_faces), np.where(hidden, HIDDEN, 1.0))
+    mesh = _Mesh(
+        vertices,
+        faces,
+        None if uv_faces is None else np.asarray(uv_faces),
+        np.where(hidden, HIDDEN, 1.0),
+    )
     heap = [(mesh.cost(u, v), u, v, 0) for u, ring in enumerate(mesh.beside) for v in ring]
     heapq.heapify(heap)
     removed, into = [], np.arange(len(vertices))
@@ -322,14 +365,21 @@ def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> n
     moved = np.zeros_like(regressor)
     np.add.at(moved.T, target, regressor.T)
     moved = moved[:, kept]
-    template, directions = np.asarray(body.template, np.float64), np.asarray(body.shape_directions, np.float64)
+    template, directions = (
+        np.asarray(body.template, np.float64),
+        np.asarray(body.shape_directions, np.float64),
+    )
     # What a row of the regressor must reproduce: the template, every direction, and 1.
-    full = np.concatenate([template, directions.reshape(len(template), -1), np.ones((len(template), 1))], axis=1)
+    full = np.concatenate(
+        [template, directions.reshape(len(template), -1), np.ones((len(template), 1))], axis=1
+    )
     error = regressor @ full - moved @ full[kept]
     joints = regressor @ template
     local = min(max(LOCAL, 3 * full.shape[1]), len(kept))
     for j in range(len(moved)):
-        near = np.argpartition(np.linalg.norm(template[kept] - joints[j], axis=1), local - 1)[:local]
+        near = np.argpartition(np.linalg.norm(template[kept] - joints[j], axis=1), local - 1)[
+            :local
+        ]
         rows = full[kept[near]]
         gram = rows.T @ rows
         gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram)
@@ -338,11 +388,16 @@ def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> n
 
 
 def _carry_uvs(
-    body: BodyModel, faces: Int[np.ndarray, "f 3"], target: Int[np.ndarray, " n"], kept_faces: Bool[np.ndarray, " f"]
+    body: BodyModel,
+    faces: Int[np.ndarray, "f 3"],
+    target: Int[np.ndarray, " n"],
+    kept_faces: Bool[np.ndarray, " f"],
 ) -> tuple[Float[Array, "u 2"], Int[Array, "kept 3"]]:
     """Texture vertices of the remaining corners: of the vertex a corner moved onto, the one nearest in the texture."""
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
-    pairs = np.unique(faces.ravel().astype(np.int64) * len(uvs) + uv_faces.ravel())  # (vertex, texture vertex)
+    pairs = np.unique(
+        faces.ravel().astype(np.int64) * len(uvs) + uv_faces.ravel()
+    )  # (vertex, texture vertex)
     start = np.searchsorted(pairs, np.arange(len(target) + 1) * len(uvs))
     corners, corner_uvs = faces[kept_faces].ravel(), uv_faces[kept_faces].ravel()
     ends = target[corners]
@@ -370,13 +425,17 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
         raise ValueError(f"vertex_count {vertex_count}: body '{body.name}' has {total} vertices")
     if body.collapse_order is None or body.collapse_into is None:
         order, into = collapse_sequence(
-            np.asarray(body.template), np.asarray(body.faces), None if body.uvs is None else np.asarray(body.uv_faces)
+            np.asarray(body.template),
+            np.asarray(body.faces),
+            None if body.uvs is None else np.asarray(body.uv_faces),
         )
     else:
         order, into = np.asarray(body.collapse_order), np.asarray(body.collapse_into)
     smallest = int(np.sum(into == np.arange(total)))
     if vertex_count < smallest:
-        raise ValueError(f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices at most")
+        raise ValueError(
+            f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices at most"
+        )
     kept = np.flatnonzero(order < vertex_count)
     target = _follow(into, order < vertex_count)
     renumber = np.full(total, -1)
@@ -386,7 +445,9 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     solid = (ends != np.roll(ends, 1, axis=1)).all(axis=1)
     uvs, uv_faces = (None, None) if body.uvs is None else _carry_uvs(body, faces, target, solid)
     dtype = body.template.dtype
-    rows = lambda array: jnp.asarray(np.asarray(array)[kept])  # by numpy: no compilation for each size
+    rows = lambda array: jnp.asarray(
+        np.asarray(array)[kept]
+    )  # by numpy: no compilation for each size
     return replace(
         body,
         template=rows(body.template),

@@ -40,9 +40,18 @@ GROUPS = {
         "tune": "avatars.Tune",
         "demo": "avatars.Demo",
     },
-    "Look at it": {"animate": "animate.Animate", "render": "animate.Render", "view": "animate.View"},
+    "Look at it": {
+        "animate": "animate.Animate",
+        "render": "animate.Render",
+        "view": "animate.View",
+    },
     "Take it along": {"export": "avatars.Export"},
-    "Prepare photos": {"detect": "captures.Detect", "import": "captures.ImportCameras", "fit": "fit.Fit", "check": "fit.Check"},
+    "Prepare photos": {
+        "detect": "captures.Detect",
+        "import": "captures.ImportCameras",
+        "fit": "fit.Fit",
+        "check": "fit.Check",
+    },
     "Research": {
         "evaluate": "training.Evaluate",
         "synth": "captures.Synth",
@@ -84,7 +93,10 @@ def execute(arguments: Sequence[str]) -> int:
 
     screen.heard.clear()
     everywhere = {"--quiet", "--verbose", "--version"}
-    given, arguments = everywhere & set(arguments), [word for word in arguments if word not in everywhere]
+    given, arguments = (
+        everywhere & set(arguments),
+        [word for word in arguments if word not in everywhere],
+    )
     verbose = "--verbose" in given
     try:
         if "--version" in given:
@@ -98,7 +110,9 @@ def execute(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
         return 0
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # Python flushes once more at its end
         return BROKEN_PIPE
     except KeyboardInterrupt:
         return _interrupted()
@@ -107,8 +121,12 @@ def execute(arguments: Sequence[str]) -> int:
             return _interrupted()
         if isinstance(error, ValueError | OSError):
             return _failed(error, verbose)
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):  # numpy; XLA, whose text has many lines
-            return _failed(MemoryError(f"out of memory: {(str(error).splitlines() or [''])[0]}"), verbose)
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(
+            error
+        ):  # numpy; XLA, whose text has many lines
+            return _failed(
+                MemoryError(f"out of memory: {(str(error).splitlines() or [''])[0]}"), verbose
+            )
         raise
     finally:
         progress.end()
@@ -154,7 +172,9 @@ def _parsed(arguments: list[str]) -> Command:
         option = word.split("=")[0].replace("_", "-")
         if option.startswith("--") and option not in known:
             near = difflib.get_close_matches(option, known, n=1)
-            raise UsageError(f"{option}: no option of humangs {name}{f': did you mean {near[0]}?' if near else ''}")
+            raise UsageError(
+                f"{option}: no option of humangs {name}{f': did you mean {near[0]}?' if near else ''}"
+            )
     typed = " ".join(arguments[: 2 if arguments[:2] == ["import", "cameras"] else 1])
     try:
         return parsed(command, typed, options)
@@ -168,7 +188,9 @@ def overview() -> str:
     lines = ["usage: humangs COMMAND [OPTIONS]", "", ABOUT]
     for group, commands in GROUPS.items():
         lines += ["", f"{group}:"]
-        lines += [f"  {name:<12} {(_command(name).__doc__ or '').splitlines()[0]}" for name in commands]
+        lines += [
+            f"  {name:<12} {(_command(name).__doc__ or '').splitlines()[0]}" for name in commands
+        ]
     return "\n".join([*lines, "", EVERYWHERE])
 
 
@@ -186,7 +208,9 @@ def _failed(error: Exception, verbose: bool) -> int:
     if isinstance(error, UnicodeEncodeError):  # of a library that takes names in UTF-8 only
         error = ValueError(f"{error.object[:200]}: expected a name in UTF-8")
     if isinstance(error, ArgumentError):
-        error = UsageError(f"{option_of(error.argument)} {error.problem}").with_traceback(error.__traceback__)
+        error = UsageError(f"{option_of(error.argument)} {error.problem}").with_traceback(
+            error.__traceback__
+        )
     screen.fail(error, verbose)
     return BAD_USAGE if isinstance(error, UsageError) else BAD_DATA
 

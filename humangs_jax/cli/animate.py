@@ -8,7 +8,15 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.avatar.export import EXPORTS, OTHERS, VIDEOS
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.cli.options import WHOLE, PartOfMotion, Place, Preset, UsageError, chosen_settings, off
+from humangs_jax.cli.options import (
+    WHOLE,
+    PartOfMotion,
+    Place,
+    Preset,
+    UsageError,
+    chosen_settings,
+    off,
+)
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import LARGEST, Range, at_least
 from humangs_jax.core.registry import FOLDER, alternatives
@@ -46,13 +54,20 @@ class Animate:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
-    motion: Annotated[Path | None, arg(help=f"{MOTIONS.listed()}. Default: the shipped walk.")] = None
+    motion: Annotated[Path | None, arg(help=f"{MOTIONS.listed()}. Default: the shipped walk.")] = (
+        None
+    )
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
-    out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path("animation.mp4")
+    out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path(
+        "animation.mp4"
+    )
     turn: Annotated[float, FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
     camera: Annotated[Path | None, arg(help=f"{PATH} {CAMERAS.listed()}")] = None
-    follow: Annotated[bool, off("follow the person: the camera stands still and sees everywhere that the person goes")] = True
+    follow: Annotated[
+        bool,
+        off("follow the person: the camera stands still and sees everywhere that the person goes"),
+    ] = True
     """The camera goes along with the person."""
     fps: Annotated[float | None, RATE] = None
     """Frames per second of the video: the motion keeps its speed. Default: those of the motion."""
@@ -94,9 +109,16 @@ class Animate:
             check_video(self.out, frames, cameras.width, cameras.height)
         avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
-            written = write_video(self.out, images(avatar, poses, cameras, shot, "animate"), motion.fps)
-        wrote(self.out, f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {motion.fps:g} frames per second")
-        suggest("humangs export", self.avatar, "--html avatar.html", *self.part.options(self.motion))
+            written = write_video(
+                self.out, images(avatar, poses, cameras, shot, "animate"), motion.fps
+            )
+        wrote(
+            self.out,
+            f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {motion.fps:g} frames per second",
+        )
+        suggest(
+            "humangs export", self.avatar, "--html avatar.html", *self.part.options(self.motion)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +136,11 @@ class Render:
     """File written by `humangs reconstruct`; or Gaussians: .ply, .splat, .spz or .glb."""
     shot: OmitArgPrefixes[Shot]
     camera: Annotated[Path | None, arg(help=f"{OF_A_FILE} {CAMERAS.listed()}")] = None
-    out: Annotated[Path, VIDEO, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = Path("views")
+    out: Annotated[
+        Path,
+        VIDEO,
+        arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}"),
+    ] = Path("views")
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down (circle only)."""
     views: Annotated[int | None, at_least(1)] = None
@@ -146,13 +172,24 @@ class Render:
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.avatar.camera_paths import file_cameras, one_size, repeated, standing
-            from humangs_jax.avatar.frames import a_pose_of, capture_views, images, rest_pose_of, turntable_views
+            from humangs_jax.avatar.frames import (
+                a_pose_of,
+                capture_views,
+                images,
+                rest_pose_of,
+                turntable_views,
+            )
             from humangs_jax.avatar.layers import ExrLayers, write_views
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.data.capture import load_capture
             from humangs_jax.data.views import exposures
 
-            check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
+            check_video(
+                self.out,
+                views,
+                *self.shot.resolution,
+                transparent=video and self.shot.color() is None,
+            )
             layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
             layers.check()
             shot = _drawn_by(self.shot, self.preset, self.config)
@@ -162,7 +199,9 @@ class Render:
             if self.camera is not None:
                 found = file_cameras(self.camera, shot, upright=True)
                 cameras, names = one_size(self.camera, found), list(found)
-                pose = standing(avatar, rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar))
+                pose = standing(
+                    avatar, rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
+                )
                 poses = repeated(pose, len(names))
             elif self.capture is not None:
                 capture = load_capture(self.capture)
@@ -173,17 +212,26 @@ class Render:
         avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
             if video:
-                written = write_video(self.out, images(avatar, poses, cameras, shot, "render"), self.fps)
+                written = write_video(
+                    self.out, images(avatar, poses, cameras, shot, "render"), self.fps
+                )
                 what = f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {self.fps:g} frames per second"
             else:
                 exr = layers if self.exr else None
-                written = write_views(self.out, avatar, poses, cameras, shot, exr, exposures=exposed, names=names)
+                written = write_views(
+                    self.out, avatar, poses, cameras, shot, exr, exposures=exposed, names=names
+                )
                 what = f"{_counted(written, 'view')} of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
         wrote(self.out, what)
         suggest("humangs animate", self.avatar)
 
     def _render_gaussians(self, views: int) -> None:
-        said = {"pose": self.pose != "t", "capture": self.capture, "exr": self.exr, "prune": self.shot.prune}
+        said = {
+            "pose": self.pose != "t",
+            "capture": self.capture,
+            "exr": self.exr,
+            "prune": self.shot.prune,
+        }
         if wrong := [name for name, given in said.items() if given]:
             raise UsageError(f"--{wrong[0]}: {self.avatar} is no avatar, which this needs")
         if self.camera is not None and self.out.suffix:
@@ -194,7 +242,12 @@ class Render:
             from humangs_jax.avatar.frames import circle_cameras, splat_images, write_splat_views
             from humangs_jax.avatar.video import check_video, write_video
 
-            check_video(self.out, views, *self.shot.resolution, transparent=self.shot.color() is None and self.out.suffix != "")
+            check_video(
+                self.out,
+                views,
+                *self.shot.resolution,
+                transparent=self.shot.color() is None and self.out.suffix != "",
+            )
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             gaussians = load_gaussians(self.avatar)
@@ -216,10 +269,16 @@ class Render:
         said = ["views"] * (self.views is not None)
         if self.capture is not None:
             said += ["camera"] * (self.camera is not None) + ["pose"] * (self.pose != "t")
-            said += [name for name in ("size", "width", "height") if getattr(self.shot, name) != getattr(Shot(), name)]
+            said += [
+                name
+                for name in ("size", "width", "height")
+                if getattr(self.shot, name) != getattr(Shot(), name)
+            ]
             _require_no_circle("--capture", self.shot, Shot(), said)
             if self.out.suffix:
-                raise UsageError(f"--out {self.out}: expected a folder: the views of a capture are no video")
+                raise UsageError(
+                    f"--out {self.out}: expected a folder: the views of a capture are no video"
+                )
         elif self.camera is not None:
             _require_no_circle("--camera", self.shot, Shot(), said)
 
@@ -232,7 +291,10 @@ class View:
     docs: viewer.
     """
 
-    examples: ClassVar[tuple[str, ...]] = ("humangs view avatar.npz --motion dance.bvh", "humangs view runs/train --live")
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs view avatar.npz --motion dance.bvh",
+        "humangs view runs/train --live",
+    )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`. With --live: of `humangs refine --live`, or the folder of a training run."""
     motion: Path | None = None
@@ -261,7 +323,9 @@ class View:
             from humangs_jax.viewer.page import page_html, serve
 
             avatar = Avatar.load(self.avatar)
-            motion = None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
+            motion = (
+                None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
+            )
             name = None if self.motion is None else self.motion.stem
             text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)

@@ -47,7 +47,10 @@ class Demo:
     Reconstructs, refines, renders held-out views, animates, and writes the avatar; all at the end.
     """
 
-    examples: ClassVar[tuple[str, ...]] = ("humangs demo --out demo_out", "humangs demo --refine 0 --preset realtime")
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs demo --out demo_out",
+        "humangs demo --refine 0 --preset realtime",
+    )
     out: Annotated[Path, Place()] = Path("demo_out")
     """Folder for the images, the video, the avatar and report.json."""
     weights: Path | None = None
@@ -110,9 +113,13 @@ class Reconstruct:
     """Captures that the network reads at once. Default: 8."""
     shard: str = "0/1"
     """I/N: the I-th of N parts of the captures, counted from 0, for job arrays."""
-    fit_masks: Annotated[bool, off("move masks that are too large or too small to the edges in the photos")] = True
+    fit_masks: Annotated[
+        bool, off("move masks that are too large or too small to the edges in the photos")
+    ] = True
     """Move masks that are too large or too small to the edges in the photos."""
-    check: Annotated[bool, off("check first whether photos, cameras and poses belong together")] = True
+    check: Annotated[bool, off("check first whether photos, cameras and poses belong together")] = (
+        True
+    )
     """Check first whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
@@ -126,7 +133,9 @@ class Reconstruct:
         if several and out.suffix == ".npz":
             raise UsageError(f"--out {out}: expected a folder for the avatars of several captures")
         if parts > 1 and not several:
-            raise UsageError(f"--shard {self.shard}: expected several captures, or a folder of them")
+            raise UsageError(
+                f"--shard {self.shard}: expected several captures, or a folder of them"
+            )
         require_place(out, "--out", Place() if several else AVATAR)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct_many
@@ -142,9 +151,16 @@ class Reconstruct:
             done = {name for name in captures if (out / f"{name}.npz").exists()}
             if done:
                 tell(f"{out}: {len(done)} of {len(captures)} avatars are there")
-            captures = {name: folder for name, folder in list(captures.items())[part::parts] if name not in done}
+            captures = {
+                name: folder
+                for name, folder in list(captures.items())[part::parts]
+                if name not in done
+            }
         views = settings.views if settings is not None and self.views is None else self.views
-        load = {name: functools.partial(self._photos, folder, views) for name, folder in captures.items()}
+        load = {
+            name: functools.partial(self._photos, folder, views)
+            for name, folder in captures.items()
+        }
         if not several:  # what is wrong with it is said before the network is read
             (name, read), *_ = load.items()
             photos = read()
@@ -153,11 +169,15 @@ class Reconstruct:
             variables, config = load_weights(self.weights)
         config = config if settings is None else settings.network(config)
         said = {"tokens": self.tokens, "dtype": self.dtype}
-        config = config.with_runtime(**{name: value for name, value in said.items() if value != "as_trained"})
+        config = config.with_runtime(
+            **{name: value for name, value in said.items() if value != "as_trained"}
+        )
         failed = []
         with stage("reconstructing"):
             made = reconstruct_many(variables, config, load, self.batch)
-            for name, photos, avatar, error in bar(made, total=len(load), shown=several, desc="reconstruct"):
+            for name, photos, avatar, error in bar(
+                made, total=len(load), shown=several, desc="reconstruct"
+            ):
                 if error is not None:
                     if not several:
                         raise error
@@ -168,7 +188,13 @@ class Reconstruct:
                     tell(f"{name}: no masks: the avatar is not refined")
                 file = out / f"{name}.npz" if several else out
                 # in a set a file is a finished avatar: one that was interrupted is made again
-                _refine_and_save(avatar, photos, file, how if photos.masks is not None else None, unfinished=not several)
+                _refine_and_save(
+                    avatar,
+                    photos,
+                    file,
+                    how if photos.masks is not None else None,
+                    unfinished=not several,
+                )
         if not several:
             suggest("humangs view", out)
         if failed:
@@ -195,7 +221,9 @@ class Reconstruct:
             from humangs_jax.data.views import select_views
 
             with stage("choosing photos"):
-                photos = photos.select(select_views(photos, None if views == "auto" else int(views)))
+                photos = photos.select(
+                    select_views(photos, None if views == "auto" else int(views))
+                )
             tell(f"photos: {', '.join(photos.names)}")
         return photos
 
@@ -225,9 +253,13 @@ class Refine:
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     live: bool = False
     """Write the avatar so far to --out now and then, for `humangs view --live`."""
-    fit_masks: Annotated[bool, off("move masks that are too large or too small to the edges in the photos")] = True
+    fit_masks: Annotated[
+        bool, off("move masks that are too large or too small to the edges in the photos")
+    ] = True
     """Move masks that are too large or too small to the edges in the photos."""
-    check: Annotated[bool, off("check first whether photos, cameras and poses belong together")] = True
+    check: Annotated[bool, off("check first whether photos, cameras and poses belong together")] = (
+        True
+    )
     """Check first whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
@@ -250,11 +282,15 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
     folders = []
     for path in given:
         inside = [] if (path / "capture.json").is_file() else sorted(path.glob("*/capture.json"))
-        folders += [file.parent for file in inside if not file.parent.name.startswith(".")] or [path]
+        folders += [file.parent for file in inside if not file.parent.name.startswith(".")] or [
+            path
+        ]
     named = {folder.absolute().name: folder for folder in folders}
     if len(named) < len(folders):
         twice = next(folder for folder in folders if named[folder.absolute().name] != folder)
-        raise UsageError(f"{named[twice.absolute().name]} and {twice}: expected captures of different names")
+        raise UsageError(
+            f"{named[twice.absolute().name]} and {twice}: expected captures of different names"
+        )
     return named
 
 
@@ -333,7 +369,10 @@ class Export:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     out: Annotated[
-        Path | None, arg(help=f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none with it.")
+        Path | None,
+        arg(
+            help=f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none with it."
+        ),
     ] = None
     html: Annotated[Path | None, Place((".html",))] = None
     """The HTML viewer to write: one file that needs no network (docs: viewer)."""
@@ -346,7 +385,9 @@ class Export:
     """Which frame of the motion, from 0. Default: the first."""
     frames: str | None = None
     """Many frames: a:b:step as in Python, ":" for all. X.ply becomes X_0000.ply, X_0005.ply and so on."""
-    up: Annotated[Up | None, arg(help=f"The axis that points up in the file. Default: {_USUAL_UP}")] = None
+    up: Annotated[
+        Up | None, arg(help=f"The axis that points up in the file. Default: {_USUAL_UP}")
+    ] = None
     rest: bool = False
     """Add the 45 zero f_rest fields of 3DGS that some importers (Unity) require."""
     spz_version: Literal[3, 4] | None = None
@@ -362,14 +403,19 @@ class Export:
             from humangs_jax.avatar.avatar import Avatar
 
             avatar = Avatar.load(self.avatar)
-            motion = None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
+            motion = (
+                None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
+            )
         if self.html is not None:
             with stage("making the page"):
                 from humangs_jax.viewer.page import write_page
 
                 name = None if self.motion is None else self.motion.stem
                 size = write_page(self.html, avatar, motion, self.avatar.stem, name)
-            wrote(self.html, f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
+            wrote(
+                self.html,
+                f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser",
+            )
         if out is not None:
             self._write(out, avatar, motion)
         played = self.part.options(self.motion)
@@ -384,13 +430,21 @@ class Export:
             if value is not None and (self.motion is None or out is None):
                 raise UsageError(f"{option} {value}: expected --motion and --out with it")
         form = self._format(out)
-        if self.frame is not None and (self.frames is not None or (form is not None and form.animated)):
-            with_it = "--frames" if self.frames is not None else "a file that holds the whole motion: use --frames"
+        if self.frame is not None and (
+            self.frames is not None or (form is not None and form.animated)
+        ):
+            with_it = (
+                "--frames"
+                if self.frames is not None
+                else "a file that holds the whole motion: use --frames"
+            )
             raise UsageError(f"--frame {self.frame}: does not go with {with_it}")
         if self.rest and form is not None and not form.rest_fields:
             raise UsageError(f"--rest: {out} has no such fields: expected a file of 3DGS")
         if self.spz_version is not None and (form is None or not form.versions):
-            raise UsageError(f"--spz-version {self.spz_version}: expected a name of --out that ends in .spz")
+            raise UsageError(
+                f"--spz-version {self.spz_version}: expected a name of --out that ends in .spz"
+            )
 
     def _format(self, out: Path | None) -> "ExportFormat | None":
         return None if out is None else chosen_format(out.suffix, self.mesh)
@@ -403,13 +457,31 @@ class Export:
         name = "motion" if self.motion is None else self.motion.stem
         if motion is not None:
             motion, numbers = self._frames(motion, form.animated)
-        options = {"mesh": form.mesh, "up": self.up, "rest_fields": self.rest, "version": self.spz_version, "name": name}
+        options = {
+            "mesh": form.mesh,
+            "up": self.up,
+            "rest_fields": self.rest,
+            "version": self.spz_version,
+            "name": name,
+        }
         with stage("writing"):
             files = export(out, avatar, motion, None if form.animated else numbers, **options)
-        what = f"{len(avatar.faces):,} triangles" if form.mesh else f"{len(avatar.gaussians.means):,} Gaussians"
-        poses = f", {len(motion.translations)} frames" if motion is not None and form.animated else ""
-        written = str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
-        beside = f"; {' and '.join(out.with_suffix(suffix).name for suffix in form.beside)} belong to it" if form.beside else ""
+        what = (
+            f"{len(avatar.faces):,} triangles"
+            if form.mesh
+            else f"{len(avatar.gaussians.means):,} Gaussians"
+        )
+        poses = (
+            f", {len(motion.translations)} frames" if motion is not None and form.animated else ""
+        )
+        written = (
+            str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
+        )
+        beside = (
+            f"; {' and '.join(out.with_suffix(suffix).name for suffix in form.beside)} belong to it"
+            if form.beside
+            else ""
+        )
         wrote(written, f"{what}{poses}, feet on 0{beside}")
 
     def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
@@ -428,7 +500,12 @@ class Export:
             numbers = range(frame, frame + 1)
         chosen = slice(numbers.start, numbers.stop, numbers.step)
         fps = motion.fps / numbers.step
-        motion = replace(motion, rotations=motion.rotations[chosen], translations=motion.translations[chosen], fps=fps)
+        motion = replace(
+            motion,
+            rotations=motion.rotations[chosen],
+            translations=motion.translations[chosen],
+            fps=fps,
+        )
         return motion, None if self.frames is None else numbers
 
 
@@ -460,9 +537,15 @@ class Tune:
     """Network weights (.safetensors). Default: the shipped ones."""
 
     def run(self) -> None:
-        budgets: dict[str, Any] = {"reconstruct_ms": self.reconstruct_ms, "frame_ms": self.frame_ms, "memory_mb": self.memory_mb}
+        budgets: dict[str, Any] = {
+            "reconstruct_ms": self.reconstruct_ms,
+            "frame_ms": self.frame_ms,
+            "memory_mb": self.memory_mb,
+        }
         if all(value is None for value in budgets.values()):
-            raise UsageError("--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them")
+            raise UsageError(
+                "--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them"
+            )
         for name, value in budgets.items():
             if value is not None and not value > 0:
                 raise UsageError(f"--{name.replace('_', '-')} {value}: expected a positive number")
@@ -476,7 +559,12 @@ class Tune:
         with stage("measuring"):
             tuned = tune(variables, config, photos, **budgets, size=self.size, progress=True)
         costs = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
-        about = {"name": tuned.point.name, "budget": budgets, "frame_size": self.size, "measured": costs}
+        about = {
+            "name": tuned.point.name,
+            "budget": budgets,
+            "frame_size": self.size,
+            "measured": costs,
+        }
         save_settings(self.out, tuned.point.settings, **about)
         tell(tuned)
         wrote(self.out, "settings")

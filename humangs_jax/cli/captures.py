@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.cli.options import Place, UsageError, Workers, cores, require_replaceable, tell_deleted
+from humangs_jax.cli.options import (
+    Place,
+    UsageError,
+    Workers,
+    cores,
+    require_replaceable,
+    tell_deleted,
+)
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import CAMERAS
@@ -35,7 +42,13 @@ def keypoints_wanted() -> tuple[str, ...]:
     """What `humangs fit` has to be told: nothing where it finds keypoints itself."""
     from humangs_jax.detection.people import available
 
-    return () if available() else ("--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the photos)",)
+    return (
+        ()
+        if available()
+        else (
+            "--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the photos)",
+        )
+    )
 
 
 GIVE_IT = "move it away, or give keypoints that are there by --keypoints FILE"
@@ -54,7 +67,9 @@ def found_here(capture: Path, person: int | None) -> Path:
     file = folder / detect.KEYPOINTS_FILE
     photos = load_photos(folder)
     if not file.exists() or person is not None or photos.masks is None:
-        detect.check_found_place(folder, [f"{name}.png" for name in photos.names], GIVE_IT, masks=photos.masks is None)
+        detect.check_found_place(
+            folder, [f"{name}.png" for name in photos.names], GIVE_IT, masks=photos.masks is None
+        )
         people, number = detect.person_in_capture(folder, photos, person=person)
         detect.write_found(folder, people, number, masks=photos.masks is None, to_capture=True)
         tell_found(people, number)
@@ -70,7 +85,10 @@ class Detect:
     people.png shows everybody with a number. Needs `pip install 'humangs_jax[photos]'`. docs: your_photos.
     """
 
-    examples: ClassVar[tuple[str, ...]] = ("humangs detect photos --out found", "humangs detect photos --person 1 --out found")
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs detect photos --out found",
+        "humangs detect photos --person 1 --out found",
+    )
     photos: Positional[Path]
     """Folder of the photos, or a capture folder that has no body yet."""
     out: Annotated[Path, Place()]
@@ -85,7 +103,9 @@ class Detect:
             from humangs_jax.apps import detect
 
         if not self.overwrite:
-            detect.check_found_place(self.out, detect.names_in(self.photos), "choose another folder, or --overwrite")
+            detect.check_found_place(
+                self.out, detect.names_in(self.photos), "choose another folder, or --overwrite"
+            )
         with stage("finding people"):
             photos = detect.found_in_photos(self.photos)
             left_out = detect.left_out(self.photos)
@@ -118,7 +138,9 @@ class ImportCameras:
     )
     what: Positional[Literal["cameras"]]
     """"cameras"."""
-    source: Annotated[Positional[Path], arg(help=f"File or folder with the calibration: {CAMERAS.listed()}.")]
+    source: Annotated[
+        Positional[Path], arg(help=f"File or folder with the calibration: {CAMERAS.listed()}.")
+    ]
     images: Path
     """Folder of the photos, or of a video of each camera (CAMERA.mp4; all begin at the same moment)."""
     out: Path
@@ -144,7 +166,9 @@ class ImportCameras:
         with stage("starting"):
             from humangs_jax.data.calibration.importing import import_cameras
 
-        options = {name: value for name, value in vars(self).items() if name not in ("what", "max_frames")}
+        options = {
+            name: value for name, value in vars(self).items() if name not in ("what", "max_frames")
+        }
         if self.overwrite and (self.out / "capture.json").is_file():
             tell_deleted(self.out)
         with stage("importing"):
@@ -207,15 +231,21 @@ class Synth:
     def run(self) -> None:
         extras = self.extras
         if self.size not in SIZES:
-            raise UsageError(f"--size {self.size}: expected {', '.join(map(str, SIZES[:-1]))} or {SIZES[-1]}")
+            raise UsageError(
+                f"--size {self.size}: expected {', '.join(map(str, SIZES[:-1]))} or {SIZES[-1]}"
+            )
         if self.sequences and self.poses > self.motion_frames:
-            raise UsageError(f"--poses {self.poses}: expected at most --motion-frames {self.motion_frames}")
+            raise UsageError(
+                f"--poses {self.poses}: expected at most --motion-frames {self.motion_frames}"
+            )
         small = FOR_TRAINING if self.for_training else {}
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         for name, value in small.items():
             if getattr(self, name) not in (value, defaults[name]):
                 option = name.replace("_", "-")
-                raise UsageError(f"--{option} {getattr(self, name)}: does not go with --for-training, which means {value}")
+                raise UsageError(
+                    f"--{option} {getattr(self, name)}: does not go with --for-training, which means {value}"
+                )
         with stage("starting"):
             from humangs_jax.people.writer import Layout, write_set
 
@@ -223,12 +253,17 @@ class Synth:
             small.get("size", self.size),
             small.get("poses", self.poses),
             small.get("views", self.views or 60),
-            small.get("close_views", (12 if self.views is None else 0) if self.close_views is None else self.close_views),
+            small.get(
+                "close_views",
+                (12 if self.views is None else 0) if self.close_views is None else self.close_views,
+            ),
             extras.held_out,
             frames=self.motion_frames if self.sequences else 0,
             scan_texture=2048 if extras.scans else 0,
         )
         with stage("making people"):
-            folders = write_set(self.out, self.subjects, layout, self.split, self.first, workers=cores(self.workers))
+            folders = write_set(
+                self.out, self.subjects, layout, self.split, self.first, workers=cores(self.workers)
+            )
         wrote(self.out, f"{len(folders)} people")
         suggest("humangs train", self.out, "--out runs/train")

@@ -11,7 +11,14 @@ from typing import Annotated, Any, ClassVar, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.cli.captures import found_here, keypoints_of, tell_found
-from humangs_jax.cli.options import Place, UsageError, require_file, require_folder, require_replaceable, tell_deleted
+from humangs_jax.cli.options import (
+    Place,
+    UsageError,
+    require_file,
+    require_folder,
+    require_replaceable,
+    tell_deleted,
+)
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import KEYPOINTS
@@ -21,7 +28,9 @@ from humangs_jax.data.formats import KEYPOINTS
 class Detections:
     """2D keypoints of a detector."""
 
-    keypoints: Annotated[Path | None, arg(help=f"Keypoint file or folder: {KEYPOINTS.listed()}.")] = None
+    keypoints: Annotated[
+        Path | None, arg(help=f"Keypoint file or folder: {KEYPOINTS.listed()}.")
+    ] = None
     person: int | None = None
     """Which person of the keypoint file, from 0, if a view has several; without a file, of those on people.png."""
 
@@ -106,19 +115,28 @@ class Fit:
         """Fit in the way that was asked for."""
         if (self.capture is None) == (self.scan.scan is None):
             raise UsageError("give either a CAPTURE folder or --scan MESH")
-        way: Way = "--scan" if self.scan.scan else "--refine" if self.refinement.refine else "--keypoints"
+        way: Way = (
+            "--scan" if self.scan.scan else "--refine" if self.refinement.refine else "--keypoints"
+        )
         for option in self._given():
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
-                raise UsageError(f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}")
+                raise UsageError(
+                    f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}"
+                )
         self._check_places(way)
-        {"--scan": self._fit_scan, "--refine": self._refine, "--keypoints": self._fit_keypoints}[way]()
+        {"--scan": self._fit_scan, "--refine": self._refine, "--keypoints": self._fit_keypoints}[
+            way
+        ]()
 
     def _given(self) -> Iterator[str]:
         """Options of the ways of fitting whose value is not the default, in the order of the help."""
         for part in (self.refinement, self.scan, self.detections, self):
             for field in dataclasses.fields(part):
-                chosen = not dataclasses.is_dataclass(value := getattr(part, field.name)) and value != field.default
+                chosen = (
+                    not dataclasses.is_dataclass(value := getattr(part, field.name))
+                    and value != field.default
+                )
                 if chosen and field.name not in ("capture", "out", "overwrite"):
                     yield field.name
 
@@ -126,16 +144,22 @@ class Fit:
         """Whether the result can be written; the whole of it is checked again where the capture is known."""
         scan, keypoints = self.scan, self.detections.keypoints
         inputs = (self.capture, scan.scan, scan.joints, keypoints, self.body)
-        in_place = self.capture is not None and (self.out is None or self.out.resolve() == self.capture.resolve())
+        in_place = self.capture is not None and (
+            self.out is None or self.out.resolve() == self.capture.resolve()
+        )
         if scan.scan_views is not None:
             require_folder(scan.scan_views, "--scan-views")
         if self.out is not None and not in_place:
-            mark, views = ("scan_fit.json", scan.scan_views) if way == "--scan" else ("capture.json", None)
+            mark, views = (
+                ("scan_fit.json", scan.scan_views) if way == "--scan" else ("capture.json", None)
+            )
             require_replaceable(self.out, self.overwrite, mark, (*inputs, views))
         elif self.capture is not None and self.capture.is_dir():
             require_folder(self.capture, "CAPTURE")
             if (body := self.capture / "body.npz").exists() and not self.overwrite:
-                raise UsageError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
+                raise UsageError(
+                    f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere"
+                )
 
     def _fit_keypoints(self) -> None:
         assert self.capture is not None  # `run` has checked it
@@ -147,12 +171,16 @@ class Fit:
             from humangs_jax.fitting.files import check_place, write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
 
-        target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body))
+        target = check_place(
+            self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body)
+        )
         tell_deleted(target, unless=target if self.out is None else self.capture)
         detections = self.detections
         if detections.keypoints is None:
             if not available():
-                raise UsageError("--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are found here")
+                raise UsageError(
+                    "--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are found here"
+                )
             with stage("finding the person"):
                 detections = Detections(found_here(self.capture, detections.person))
         with stage("reading photos and keypoints"):
@@ -162,7 +190,14 @@ class Fit:
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         with stage("fitting"):
             fixed = self.refinement.fixed_cameras
-            fitted = fit_photos(photos, keypoints, body, body_file=body_file, smoothness=self.smoothness, fixed_cameras=fixed)
+            fitted = fit_photos(
+                photos,
+                keypoints,
+                body,
+                body_file=body_file,
+                smoothness=self.smoothness,
+                fixed_cameras=fixed,
+            )
         with stage("examining the fit"):
             report = fitted.report
         report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
@@ -185,7 +220,9 @@ class Fit:
             start = load_capture(self.capture, fit_masks=True)
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
         fixed, bare = self.refinement.fixed_cameras or cameras_are_unseen(start), self.scan.bare
-        config = usual_config(record is not None, fixed_cameras=fixed, bare=bare, calibrated=start.calibrated)
+        config = usual_config(
+            record is not None, fixed_cameras=fixed, bare=bare, calibrated=start.calibrated
+        )
         with stage("refining cameras and body"):
             refinement = refine_capture(start, keypoints=keypoints, config=config)
         tell(refinement.report)
@@ -200,9 +237,13 @@ class Fit:
     def _fit_scan(self) -> None:
         scan, keypoints = self.scan, self.detections.keypoints
         if scan.joints is not None and scan.scan_views is not None:
-            raise UsageError("--joints and --scan-views: give one of them, both say where the joints are")
+            raise UsageError(
+                "--joints and --scan-views: give one of them, both say where the joints are"
+            )
         if keypoints is not None and scan.scan_views is None:
-            raise UsageError("--keypoints of a scan needs --scan-views FOLDER, the images that they are of")
+            raise UsageError(
+                "--keypoints of a scan needs --scan-views FOLDER, the images that they are of"
+            )
         only_views = scan.scan_views is not None and keypoints is None
         if self.out is None and not only_views:
             raise UsageError("--out FOLDER is missing: where the body of the scan goes")
@@ -212,7 +253,11 @@ class Fit:
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import check_scan_folder, save_scan_fit
-            from humangs_jax.fitting.scan_files import joints_from_views, read_joints, render_scan_views
+            from humangs_jax.fitting.scan_files import (
+                joints_from_views,
+                read_joints,
+                render_scan_views,
+            )
             from humangs_jax.fitting.scan_fit import fit_scan
 
         assert scan.scan is not None  # `run` has checked it
@@ -221,21 +266,40 @@ class Fit:
             with stage("rendering the scan"):
                 render_scan_views(scan.scan, scan.scan_views)
             images, found = scan.scan_views / "images", scan.scan_views / "found"
-            wrote(scan.scan_views, f"images of the scan; find keypoints in {images}, as the first of these commands does")
+            wrote(
+                scan.scan_views,
+                f"images of the scan; find keypoints in {images}, as the first of these commands does",
+            )
             suggest("humangs detect", images, "--out", found)
             keypoints = found / KEYPOINTS_FILE
-            suggest("humangs fit --scan", scan.scan, "--scan-views", scan.scan_views, "--keypoints", keypoints, "--out FOLDER")
+            suggest(
+                "humangs fit --scan",
+                scan.scan,
+                "--scan-views",
+                scan.scan_views,
+                "--keypoints",
+                keypoints,
+                "--out FOLDER",
+            )
             return
         assert self.out is not None
-        check_scan_folder(self.out, self.overwrite, (scan.scan, scan.joints, scan.scan_views, keypoints, self.body))
+        check_scan_folder(
+            self.out,
+            self.overwrite,
+            (scan.scan, scan.joints, scan.scan_views, keypoints, self.body),
+        )
         tell_deleted(self.out)
         with stage("reading joints and body"):
             joints = None if scan.joints is None else read_joints(scan.joints)
             if scan.scan_views is not None:
-                joints = joints_from_views(scan.scan_views, self.detections.read(load_photos(scan.scan_views)))
+                joints = joints_from_views(
+                    scan.scan_views, self.detections.read(load_photos(scan.scan_views))
+                )
             body = load_body(self.body)
         with stage("fitting"):
-            fitted = fit_scan(scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height)
+            fitted = fit_scan(
+                scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height
+            )
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         with stage("writing"):
             save_scan_fit(self.out, fitted, body_file, overwrite=self.overwrite)
@@ -254,7 +318,10 @@ class Check:
     For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views do not determine.
     """
 
-    examples: ClassVar[tuple[str, ...]] = ("humangs check me --out check.png", "humangs check me --keypoints keypoints.json")
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs check me --out check.png",
+        "humangs check me --keypoints keypoints.json",
+    )
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
@@ -312,7 +379,9 @@ class Check:
         folder = capture_folder(self.capture)
         try:
             with stage("finding the person"):
-                people, person = detect.person_in_capture(folder, capture, keypoints, self.detections.person)
+                people, person = detect.person_in_capture(
+                    folder, capture, keypoints, self.detections.person
+                )
         except ValueError as error:
             warn(f"{error}; the check does without what it would have found")
             return capture, keypoints

@@ -13,7 +13,16 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from tyro.conf import Positional, arg
 
@@ -64,17 +73,30 @@ class PartOfMotion:
         for name, value in vars(self).items():
             if value is not None:  # what begins with a dash would be taken for an option
                 text = str(value)
-                said += [f"{option_of(name)}={text}"] if text.startswith("-") else [option_of(name), text]
+                said += (
+                    [f"{option_of(name)}={text}"]
+                    if text.startswith("-")
+                    else [option_of(name), text]
+                )
         return () if path is None else ("--motion", path, *said)
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
         """The motion of a file; None: the shipped walk. Raises: MotionError."""
         from humangs_jax.data.motion import load_motion
 
-        if path is None and (said := [name for name, value in vars(self).items() if value is not None]):
+        if path is None and (
+            said := [name for name, value in vars(self).items() if value is not None]
+        ):
             raise UsageError(f"{option_of(said[0])}: expected --motion with it")
         up = self.motion_up or "auto"
-        return load_motion(path, up=up, fps=self.motion_fps, person=self.person, clip=self.clip, rest_joints=rest_joints)
+        return load_motion(
+            path,
+            up=up,
+            fps=self.motion_fps,
+            person=self.person,
+            clip=self.clip,
+            rest_joints=rest_joints,
+        )
 
 
 WHOLE = PartOfMotion()
@@ -167,7 +189,11 @@ def _value_shown(kind: Any) -> str | None:
 def check_options(command: Any) -> None:
     """Before the work: are options in the ranges of their annotations, can their places be written to? Raises: UsageError."""
     cls = type(command)
-    hints = {name: hint for name, hint in get_type_hints(cls, include_extras=True).items() if hasattr(command, name)}
+    hints = {
+        name: hint
+        for name, hint in get_type_hints(cls, include_extras=True).items()
+        if hasattr(command, name)
+    }
     places = {name: place for name, hint in hints.items() for place in marks_in(hint, Place)}
     read = [getattr(command, name) for name in hints if name not in places]
     for name in hints:
@@ -180,7 +206,9 @@ def check_options(command: Any) -> None:
             raise UsageError(str(error)) from None
     for name, place in places.items():
         if (path := getattr(command, name)) is not None:
-            require_place(path, option_of(name), place, [each for each in read if isinstance(each, Path)])
+            require_place(
+                path, option_of(name), place, [each for each in read if isinstance(each, Path)]
+            )
 
 
 def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = ()) -> None:
@@ -194,14 +222,18 @@ def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = 
             with zipfile.ZipFile(path) as archive:
                 mine = {"header.npy", "skinning_weights.npy"} <= set(archive.namelist())
         except PermissionError:
-            raise UsageError(f"{option} {path}: exists, and there is no permission to read it") from None
+            raise UsageError(
+                f"{option} {path}: exists, and there is no permission to read it"
+            ) from None
         except (zipfile.BadZipFile, OSError):
             mine = False
         if not mine:
             raise UsageError(f"{option} {path}: exists and is no avatar: expected another name")
 
 
-def require_file(path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()) -> None:
+def require_file(
+    path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()
+) -> None:
     """A file with one of the suffixes can be written to that path, whose folder is made if it does not exist.
 
     read: what the command reads. Raises: UsageError.
@@ -229,7 +261,9 @@ def require_folder(path: Path, option: str = "--out") -> None:
     _require_writable(path, option)
 
 
-def require_replaceable(folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = ()) -> None:
+def require_replaceable(
+    folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = ()
+) -> None:
     """A folder of the kind that holds the file `mark` can be made there, or replaced with --overwrite. Raises: UsageError."""
     from humangs_jax.io.atomic import check_replaceable, remove_abandoned_lock
 
@@ -268,8 +302,12 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
     number = float(match["number"]) if match else 0.0
     in_steps = match is not None and match["unit"] == "steps"
     if not (number > 0 or in_steps) or (in_steps and number != int(number)):
-        raise UsageError(f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"')
-    return {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
+        raise UsageError(
+            f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"'
+        )
+    return (
+        {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
+    )
 
 
 def first_refinement(text: str | None) -> dict[str, Any] | None:
@@ -282,7 +320,9 @@ def first_refinement(text: str | None) -> dict[str, Any] | None:
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":
     """The settings that --preset names or that --config holds, None without either. Raises: UsageError for both; FileError."""
     if preset is not None and config is not None:
-        raise UsageError(f"--config {config}: does not go with --preset {preset}: expected one of them")
+        raise UsageError(
+            f"--config {config}: does not go with --preset {preset}: expected one of them"
+        )
     if preset is not None:
         from humangs_jax.apps.settings import PRESETS
 
@@ -304,5 +344,7 @@ def shard_of(text: str) -> tuple[int, int]:
 
 def cores(workers: int | None) -> int:
     """That many processes, by default one for each core that this one may use."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    available = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     return available if workers is None else workers

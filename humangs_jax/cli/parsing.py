@@ -26,8 +26,13 @@ def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
     asked_for_help = "--help" in words or "-h" in words
     said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said), contextlib.nullcontext() if asked_for_help else _wide_screen():
-            return tyro.cli(command, prog=f"humangs {name}", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+        with (
+            contextlib.redirect_stderr(said),
+            contextlib.nullcontext() if asked_for_help else _wide_screen(),
+        ):
+            return tyro.cli(
+                command, prog=f"humangs {name}", args=words, config=(tyro.conf.FlagCreatePairsOff,)
+            )
     except SystemExit as end:
         if not end.code:
             raise
@@ -57,7 +62,9 @@ def _one_line(command: type[Any], name: str, words: Sequence[str], lines: list[s
     """What is wrong with the words, after what tyro says in these lines."""
     text = " ".join(line.strip() for line in lines)
     example = f"as in `{command.examples[0]}`"
-    if match := re.search(r"[Ii]nvalid choice '(?P<given>.*?)' for argument '(?P<option>.*?)'", text):
+    if match := re.search(
+        r"[Ii]nvalid choice '(?P<given>.*?)' for argument '(?P<option>.*?)'", text
+    ):
         return _wrong_value(command, match["option"], match["given"])
     if match := re.search(r"Error parsing (?P<option>[\w-]+): ", text):
         return _wrong_value(command, match["option"], _value_after(words, match["option"]))
@@ -79,7 +86,11 @@ def _missing(lines: Sequence[str]) -> list[str]:
     rows = lines[start + 1 :]
     indents = [len(row) - len(row.lstrip()) for row in rows]
     end = next((i for i, row in enumerate(rows) if "For full helptext" in row), len(rows))
-    return [row.strip() for row, indent in zip(rows[:end], indents, strict=False) if indent == min(indents[:end])]
+    return [
+        row.strip()
+        for row, indent in zip(rows[:end], indents, strict=False)
+        if indent == min(indents[:end])
+    ]
 
 
 def _value_after(words: Sequence[str], option: str) -> str:
@@ -101,14 +112,24 @@ def _wrong_value(command: type[Any], option: str, given: str) -> str:
 def _no_value(command: type[Any], option: str, words: Sequence[str]) -> str:
     """An option without a value; what follows it looks like an option, as negative numbers and axes do."""
     following = words[words.index(option) + 1 :] if option in words else []
-    joined = f", as in {option}={following[0]}" if following and following[0][1:2] not in ("", "-") else ""
+    joined = (
+        f", as in {option}={following[0]}"
+        if following and following[0][1:2] not in ("", "-")
+        else ""
+    )
     return f"{option}: expected {_expected(command, option)} after it{joined}"
 
 
 def _usual(command: type[Any], option: str) -> str:
     """The default of an option that is a number."""
-    usual = next((field.default for field, _ in fields_of(command) if option_of(field.name) == option), None)
-    return f", such as {option} {usual}" if isinstance(usual, int | float) and not isinstance(usual, bool) else ""
+    usual = next(
+        (field.default for field, _ in fields_of(command) if option_of(field.name) == option), None
+    )
+    return (
+        f", such as {option} {usual}"
+        if isinstance(usual, int | float) and not isinstance(usual, bool)
+        else ""
+    )
 
 
 def _shown(option: str) -> str:
@@ -122,7 +143,11 @@ def _expected(command: type[Any], option: str) -> str:
     words = [*numbers, *_choices(kind)]
     if not words:
         return "a value"
-    return words[0] if len(words) == 1 else f"{'' if numbers else 'one of '}{', '.join(words[:-1])} or {words[-1]}"
+    return (
+        words[0]
+        if len(words) == 1
+        else f"{'' if numbers else 'one of '}{', '.join(words[:-1])} or {words[-1]}"
+    )
 
 
 def _kind(command: type[Any], option: str) -> Any:
@@ -145,4 +170,6 @@ def _parts(kind: Any) -> list[Any]:
 
 def _choices(kind: Any) -> list[str]:
     """The words that an option may be, in their order."""
-    return [str(each) for part in _parts(kind) if get_origin(part) is Literal for each in get_args(part)]
+    return [
+        str(each) for part in _parts(kind) if get_origin(part) is Literal for each in get_args(part)
+    ]

@@ -133,8 +133,12 @@ def silence(verbose: bool) -> None:
             shown(what)
 
     sys.unraisablehook = unraisable
-    sys.excepthook = lambda *what: say("".join(traceback.format_exception(*what)).rstrip(), error=True)
-    show = lambda *what, file=None, line=None: say(warnings.formatwarning(*what[:4], line).rstrip(), error=True)
+    sys.excepthook = lambda *what: say(
+        "".join(traceback.format_exception(*what)).rstrip(), error=True
+    )
+    show = lambda *what, file=None, line=None: say(
+        warnings.formatwarning(*what[:4], line).rstrip(), error=True
+    )
     warnings.showwarning = show  # ty: ignore[invalid-assignment]
     for stream in (sys.stdout, sys.stderr):  # what others print, such as --help; it may be no file
         if isinstance(stream, io.TextIOWrapper):
@@ -143,7 +147,9 @@ def silence(verbose: bool) -> None:
     if not root.handlers:  # else Python prints the warnings of all loggers, Orbax's among them
         handler = _Handler()
         handler.addFilter(lambda record: verbose or record.name.startswith("humangs_jax"))
-        handler.setFormatter(logging.Formatter("%(name)s: %(message)s" if verbose else "humangs: %(message)s"))
+        handler.setFormatter(
+            logging.Formatter("%(name)s: %(message)s" if verbose else "humangs: %(message)s")
+        )
         root.addHandler(handler)
 
 
@@ -173,7 +179,9 @@ def fail(error: BaseException, verbose: bool) -> None:
 
 def suggest(*command: str | Path) -> None:
     """What to do next: the parts of a command line; paths are quoted, text is not."""
-    progress.current().next.append(" ".join(quoted(part) if isinstance(part, Path) else part for part in command))
+    progress.current().next.append(
+        " ".join(quoted(part) if isinstance(part, Path) else part for part in command)
+    )
 
 
 def quoted(path: Path) -> str:
@@ -188,7 +196,10 @@ def quoted(path: Path) -> str:
         shown = progress.printable(text) == text
     if shown:
         return shlex.quote(text)
-    plain = [chr(byte) if 0x20 <= byte < 0x7F and byte not in b"'\\" else f"\\x{byte:02x}" for byte in os.fsencode(path)]
+    plain = [
+        chr(byte) if 0x20 <= byte < 0x7F and byte not in b"'\\" else f"\\x{byte:02x}"
+        for byte in os.fsencode(path)
+    ]
     return f"$'{''.join(plain)}'"
 
 

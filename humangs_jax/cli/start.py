@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import Positional, arg
 
 from humangs_jax.cli.captures import keypoints_of, tell_found
-from humangs_jax.cli.options import ITERATIONS_ALONE, UsageError, first_refinement, off, require_replaceable, tell_deleted
+from humangs_jax.cli.options import (
+    ITERATIONS_ALONE,
+    UsageError,
+    first_refinement,
+    off,
+    require_replaceable,
+    tell_deleted,
+)
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import Range, at_least
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS, START_MARK
@@ -38,10 +45,14 @@ class Start:
     """Folder of photos, perhaps with cameras, masks and keypoints in it. Or a video: its best frames become OUT_photos."""
     out: Path
     """The capture folder to write, with avatar.npz, avatar.html and check.png in it."""
-    cameras: Annotated[Path | None, arg(help=f"Calibration, if it is elsewhere: {CAMERAS.listed()}.")] = None
+    cameras: Annotated[
+        Path | None, arg(help=f"Calibration, if it is elsewhere: {CAMERAS.listed()}.")
+    ] = None
     masks: Path | None = None
     """Folder of the masks, if it is elsewhere."""
-    keypoints: Annotated[Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")] = None
+    keypoints: Annotated[
+        Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")
+    ] = None
     person: Annotated[int | None, at_least(0)] = None
     """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
     height: Annotated[float | None, Range(0.3, 3)] = None
@@ -52,7 +63,9 @@ class Start:
     """Axis of the calibration's world that points up, like --up=+z or --up=-y. Default: the format's."""
     without_masks: bool = False
     """Use no masks: the photos have nothing but white behind the person."""
-    fit_masks: Annotated[bool, off("move masks that are too large or too small to the edges in the photos")] = True
+    fit_masks: Annotated[
+        bool, off("move masks that are too large or too small to the edges in the photos")
+    ] = True
     """Move masks that are too large or too small to the edges in the photos."""
     refine: str | None = None
     """Fit the avatar to the photos for so long: 15s (or 15), 100steps, or 0. Default, with masks: iterations and the head."""
@@ -72,7 +85,9 @@ class Start:
             from humangs_jax.apps.start import look
             from humangs_jax.io.atomic import only_writer
 
-        material = look(self._photos(), cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
+        material = look(
+            self._photos(), cameras=self.cameras, masks=self.masks, keypoints=self.keypoints
+        )
         if self.without_masks:
             material = dataclasses.replace(material, masks=None)
         self._check_lengths(material)
@@ -83,11 +98,15 @@ class Start:
     def _check_lengths(self, material: "Material") -> None:
         """Raises: UsageError for an option that sets a scale or a direction which something else sets."""
         if material.cameras is not None and self.height is not None:
-            raise UsageError("--height: is for photos without cameras: the calibration has a scale (--scale)")
+            raise UsageError(
+                "--height: is for photos without cameras: the calibration has a scale (--scale)"
+            )
         if material.cameras is None:
             for option, value in (("--scale", self.scale), ("--up", self.up)):
                 if value is not None:
-                    raise UsageError(f"{option}: is for a calibration, and there is none (--height sets the scale)")
+                    raise UsageError(
+                        f"{option}: is for a calibration, and there is none (--height sets the scale)"
+                    )
 
     def _mark(self, **more: Any) -> dict[str, dict[str, Any]]:
         """The file that says which run made the folder: its photos, and the options that a later run has to repeat."""
@@ -95,9 +114,22 @@ class Start:
 
     def _decisive(self) -> dict[str, Any]:
         """Options that decide what the body is, as plain values."""
-        names = ("cameras", "masks", "keypoints", "person", "height", "scale", "up", "without_masks", "fit_masks")
+        names = (
+            "cameras",
+            "masks",
+            "keypoints",
+            "person",
+            "height",
+            "scale",
+            "up",
+            "without_masks",
+            "fit_masks",
+        )
         values = {name: getattr(self, name) for name in names}
-        return {name: str(value.resolve()) if isinstance(value, Path) else value for name, value in values.items()}
+        return {
+            name: str(value.resolve()) if isinstance(value, Path) else value
+            for name, value in values.items()
+        }
 
     def _check_same_options(self, mark: Any) -> None:
         """Raises: UsageError if the body of the earlier run was made with other options than this run has."""
@@ -108,7 +140,9 @@ class Start:
             if name in earlier and earlier[name] != value:
                 option, before = f"--{name.replace('_', '-')}", earlier[name]
                 how = "without it" if before is None else f"with {before}"
-                raise UsageError(f"{option}: the body in {self.out} was made {how}: --overwrite begins anew")
+                raise UsageError(
+                    f"{option}: the body in {self.out} was made {how}: --overwrite begins anew"
+                )
 
     def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """From where an earlier run came to an end, if there was one."""
@@ -136,7 +170,9 @@ class Start:
         masked = self.without_masks or (report is not None and report.masks)
         needed = missing(material, self.out / "images" if changed else None)
         needed = [each for each in needed if not (masked and each.name == "masks")]
-        detected = [each.name for each in needed if each.name in ("masks", "keypoints") and available()]
+        detected = [
+            each.name for each in needed if each.name in ("masks", "keypoints") and available()
+        ]
         needed = [each for each in needed if each.name not in detected]
         if needed:
             tell("\nto be made:\n" + "\n".join(map(str, needed)))
@@ -144,7 +180,9 @@ class Start:
                 tell(f"{' and '.join(detected)}: found in the photos, once the rest is there")
             suggest("humangs start", self.photos, "--out", self.out)
             names = " and ".join(", ".join(each.name for each in needed).rsplit(", ", 1))
-            raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
+            raise ValueError(
+                f"{self.photos}: {names} missing: make them as above and run the same command again"
+            )
         if detected:
             material = self._detect(material, detected)
         self._finish(*self._fit(material), limits)
@@ -185,7 +223,9 @@ class Start:
         with stage("writing what was found"):
             detect.write_found(self.out, people, person, masks="masks" in wanted, to_capture=True)
         tell_found(people, person)
-        tell(f"{' and '.join(wanted)} found in the photos: {self.out / detect.SHEET_FILE} shows them")
+        tell(
+            f"{' and '.join(wanted)} found in the photos: {self.out / detect.SHEET_FILE} shows them"
+        )
         return self._with_found(material, "masks" in wanted)
 
     def _with_found(self, material: "Material", masks: bool) -> "Material":
@@ -193,7 +233,9 @@ class Start:
         from humangs_jax.apps.detect import KEYPOINTS_FILE, MASKS
 
         keypoints = material.keypoints or self.out / KEYPOINTS_FILE
-        return dataclasses.replace(material, keypoints=keypoints, masks=self.out / MASKS if masks else material.masks)
+        return dataclasses.replace(
+            material, keypoints=keypoints, masks=self.out / MASKS if masks else material.masks
+        )
 
     def _photos(self) -> Path:
         """The folder of photos; that of a video is beside --out."""
@@ -217,7 +259,9 @@ class Start:
         require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
         return fitted
 
-    def _finish(self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None) -> None:
+    def _finish(
+        self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None
+    ) -> None:
         self._check(capture)
         self._reconstruct(capture, None if limits is None else estimate, limits)
 
@@ -237,11 +281,19 @@ class Start:
                 also=self._mark(),
             )
         told = {each.path for each in material.unused}
-        tell(dataclasses.replace(report, unused=tuple(each for each in report.unused if each.path not in told)))
+        tell(
+            dataclasses.replace(
+                report, unused=tuple(each for each in report.unused if each.path not in told)
+            )
+        )
         if report.undistorted and material.keypoints is not None:
-            warn(f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}")
+            warn(
+                f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}"
+            )
         if report.turned and material.keypoints is not None:
-            warn(f"photos were turned upright: {material.keypoints} should be of those in {self.out / 'images'}")
+            warn(
+                f"photos were turned upright: {material.keypoints} should be of those in {self.out / 'images'}"
+            )
         return report
 
     def _fit(self, material: "Material") -> "tuple[Capture, HeldOut | None]":
@@ -258,9 +310,13 @@ class Start:
 
             assert material.keypoints is not None
             # the detector's own masks are at the photos' edges already
-            photos = load_photos(self.out, fit_masks=self.fit_masks and material.masks != self.out / MASKS)
+            photos = load_photos(
+                self.out, fit_masks=self.fit_masks and material.masks != self.out / MASKS
+            )
             found_here = material.keypoints.parent == self.out  # of the one person who was chosen
-            keypoints = keypoints_of(photos, material.keypoints, None if found_here else self.person)
+            keypoints = keypoints_of(
+                photos, material.keypoints, None if found_here else self.person
+            )
             fitted = fit_photos(photos, keypoints, load_body())
         with stage("examining the fit"):
             report = fitted.report
@@ -270,12 +326,19 @@ class Start:
         if capture.masks is not None and (capture.masks > 0.5).any():
             with stage("refining the body by the masks"):
                 # calibrated ones move where the keypoints have shown that they are off
-                fixed = not fitted.camera_errors if capture.calibrated else cameras_are_unseen(capture)
+                fixed = (
+                    not fitted.camera_errors if capture.calibrated else cameras_are_unseen(capture)
+                )
                 loose, tight = (
                     refine_capture(
                         capture,
                         keypoints=fitted.record.keypoints,
-                        config=usual_config(fitted=True, fixed_cameras=fixed, tight=tight, calibrated=capture.calibrated),
+                        config=usual_config(
+                            fitted=True,
+                            fixed_cameras=fixed,
+                            tight=tight,
+                            calibrated=capture.calibrated,
+                        ),
                     )
                     for tight in (False, True)
                 )
@@ -299,7 +362,9 @@ class Start:
         tell(f"\n{report}")
         wrote(self.out / "check.png", "the body over the photos: look at it")
 
-    def _reconstruct(self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None) -> None:
+    def _reconstruct(
+        self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None
+    ) -> None:
         with stage("reconstructing"):
             from humangs_jax.avatar.reconstruct import reconstruct
             from humangs_jax.data.body_and_masks import usable_views
@@ -314,7 +379,9 @@ class Start:
                 from humangs_jax.refinement.config import RefineConfig
                 from humangs_jax.refinement.refine import refine_with_report
 
-                refinement = refine_with_report(avatar, capture, RefineConfig(**limits), progress=True)
+                refinement = refine_with_report(
+                    avatar, capture, RefineConfig(**limits), progress=True
+                )
                 avatar = refinement.avatar
             tell(refinement.summary())
             if refinement.interrupted:
@@ -324,14 +391,19 @@ class Start:
                 from humangs_jax.apps.start import held_out_psnr
                 from humangs_jax.refinement.config import RefineConfig
 
-                estimate = held_out_psnr(*weights, capture, None if limits is None else RefineConfig(**ITERATIONS_ALONE))
+                estimate = held_out_psnr(
+                    *weights, capture, None if limits is None else RefineConfig(**ITERATIONS_ALONE)
+                )
         if estimate is not None:
             tell(estimate)
         with stage("writing the page"):
             avatar.save(self.out / "avatar.npz")
             page = self.out / "avatar.html"
             write_page(page, avatar, title=self.photos.resolve().name)
-        wrote(self.out / "avatar.npz", f"{len(avatar.gaussians.means):,} Gaussians from {capture.view_count} photos")
+        wrote(
+            self.out / "avatar.npz",
+            f"{len(avatar.gaussians.means):,} Gaussians from {capture.view_count} photos",
+        )
         wrote(page, "the avatar in a browser")
         if self.browser:
             webbrowser.open(page.resolve().as_uri())

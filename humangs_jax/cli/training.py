@@ -76,7 +76,9 @@ class Preprocess:
 
         factors = NEAR_FACTORS if scans.near else scans.factors
         if not 0 < factors[0] <= factors[1]:
-            raise UsageError(f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers")
+            raise UsageError(
+                f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers"
+            )
         if not self.body.is_file():
             raise UsageError(f"--body {self.body}: no such file")
         with stage("starting"):
@@ -93,7 +95,9 @@ class Preprocess:
             test=scans.test,
         )
         with stage("preprocessing"):
-            report = preprocess(self.source, self.out, self.body, settings, part, cores(self.workers))
+            report = preprocess(
+                self.source, self.out, self.body, settings, part, cores(self.workers)
+            )
         wrote(self.out, str(report))
         suggest("humangs train", self.out, "--body", self.body, "--out RUN")
 
@@ -169,7 +173,9 @@ class Train:
 
     def run(self) -> None:
         if self.data is None and not self.on_the_fly:
-            raise UsageError("nobody to train on: name a folder of captures, or give --on-the-fly a number of people")
+            raise UsageError(
+                "nobody to train on: name a folder of captures, or give --on-the-fly a number of people"
+            )
         with stage("starting"):
             self.processes.join()  # before anything asks for devices
             from humangs_jax.data.datasets.subject import FileBody
@@ -184,7 +190,9 @@ class Train:
             files = self.networks
             asked = read_config(self.config)
             installed = bool(asked.loss.lpips or asked.loss.vgg16)
-            networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net, installed)
+            networks = load_loss_networks(
+                files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net, installed
+            )
             settings = fitting_losses(asked, networks)
             if self.steps is not None:
                 settings = dataclasses.replace(settings, steps=self.steps)
@@ -198,17 +206,32 @@ class Train:
             body = file_body.model
         with stage("finding people"):
             people = training_people(self.data, self.on_the_fly, self.out, body, file_body.file)
-            others = () if self.validation is None else people_on_disk(self.validation, file_body, split=None)
+            others = (
+                ()
+                if self.validation is None
+                else people_on_disk(self.validation, file_body, split=None)
+            )
         if self.diagnose:
             with stage("diagnosing"):
-                diagnosis = diagnose_run(self.out, body, people, networks=networks, variables=variables)
+                diagnosis = diagnose_run(
+                    self.out, body, people, networks=networks, variables=variables
+                )
             tell(diagnosis)
             return
         interrupted = None
         with stage("training"):
             fsdp, out = self.fsdp, self.out
             try:
-                state = train(settings, body, people, out, validation=others, variables=variables, networks=networks, fsdp=fsdp)
+                state = train(
+                    settings,
+                    body,
+                    people,
+                    out,
+                    validation=others,
+                    variables=variables,
+                    networks=networks,
+                    fsdp=fsdp,
+                )
             except TrainingInterrupted as stopped:  # all is saved, the same command goes on
                 state, interrupted = stopped.state, stopped
         done = None if state is None else int(state.step)
@@ -260,12 +283,19 @@ class Convert:
             networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
             converted = load_checkpoint(checkpoint, self.head_width)
         with stage("writing"):
-            save_weights(out, converted.variables, converted.config.with_conventions(pool=self.pool), self.dtype)
+            save_weights(
+                out,
+                converted.variables,
+                converted.config.with_conventions(pool=self.pool),
+                self.dtype,
+            )
             if losses is not None:
                 write_bytes(losses, save(networks))
         wrote(out, describe(converted))
         if losses is None:
-            tell(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them")
+            tell(
+                f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them"
+            )
         else:
             wrote(losses, " and ".join(names))
         suggest("humangs reconstruct CAPTURE --weights", out)
@@ -310,7 +340,9 @@ class Evaluate:
     """Network weights (.safetensors). Default, without --avatar and --predictions: the shipped ones."""
     predictions: Path | None = None
     """Folder with PERSON/VIEW.png, named like the photos; VIEW.png for one capture."""
-    protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = "humangs"
+    protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = (
+        "humangs"
+    )
     """Whose backgrounds, crops, networks and SSIM."""
     body: Path | None = None
     """Model file that the parameters of a data set belong to. Default: the body that comes with the package."""
@@ -339,7 +371,9 @@ class Evaluate:
         for net in ("vgg", "alex", "squeeze"):
             if found := getattr(self.lpips, f"lpips_{net}"):
                 if len(found) > 2:
-                    raise UsageError(f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}")
+                    raise UsageError(
+                        f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}"
+                    )
                 networks.append(load_lpips(net, *found))
         keep = self._kept()
         if keep is not None and (scored := len(list(keep.glob("person_*.json")))):
@@ -365,7 +399,10 @@ class Evaluate:
             shutil.rmtree(keep, ignore_errors=True)
         for name, path in files.items():
             if path is not None:
-                wrote(path, {"json": "all numbers", "html": "the images, worst first"}.get(name, "a table"))
+                wrote(
+                    path,
+                    {"json": "all numbers", "html": "the images, worst first"}.get(name, "a table"),
+                )
 
     def _kept(self) -> Path | None:
         """A folder in the user's cache, that of the same command on the same files; None where nothing can be written."""
@@ -377,7 +414,11 @@ class Evaluate:
         said: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None]
         for path in named:
             files = [] if path is None else [path, *sorted(path.rglob("*"))]
-            said += [(str(file.resolve()), (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files if file.exists()]
+            said += [
+                (str(file.resolve()), (stat := file.stat()).st_size, stat.st_mtime_ns)
+                for file in files
+                if file.exists()
+            ]
         try:
             root = user_cache() / "humangs_jax" / "evaluations"
             folder = root / hashlib.sha256(repr(said).encode()).hexdigest()[:16]

@@ -31,4 +31,18 @@ Vector3 = Float[Array, "3"]
 Matrix3 = Float[Array, "3 3"]
 Matrix4 = Float[Array, "4 4"]
 
-__all__ = ["Array", "Bool", "Float", "Int", "Key", "Matrix3", "Matrix4", "PyTree", "Scalar", "Shaped", "UInt", "UInt8", "Vector3"]
+__all__ = [
+    "Array",
+    "Bool",
+    "Float",
+    "Int",
+    "Key",
+    "Matrix3",
+    "Matrix4",
+    "PyTree",
+    "Scalar",
+    "Shaped",
+    "UInt",
+    "UInt8",
+    "Vector3",
+]

@@ -57,8 +57,12 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     a batch of what functions take one of (`one_at_a_time`).
     """
     signature = inspect.signature(function)
-    expected = {name: found for name, p in signature.parameters.items() if (found := _classes(p.annotation))}
-    arrays = {name: found for name, p in signature.parameters.items() if (found := _arrays(p.annotation))}
+    expected = {
+        name: found for name, p in signature.parameters.items() if (found := _classes(p.annotation))
+    }
+    arrays = {
+        name: found for name, p in signature.parameters.items() if (found := _arrays(p.annotation))
+    }
     call = _call(function, signature)
 
     @functools.wraps(function)
@@ -66,7 +70,9 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError as error:
-            raise TypeError(f"{call}: {_of_a_field(kwargs, signature, expected) or error}") from None
+            raise TypeError(
+                f"{call}: {_of_a_field(kwargs, signature, expected) or error}"
+            ) from None
         for name, classes in expected.items():
             if name not in given:
                 continue
@@ -82,7 +88,9 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
                 raise ValueError(f"{call}: {name}{fault}")
         for name in arrays.keys() & given.keys():
             if fault := _no_array(arrays[name], given[name]):
-                raise (ValueError if hasattr(given[name], "shape") else TypeError)(f"{call}: {name}: {fault}")
+                raise (ValueError if hasattr(given[name], "shape") else TypeError)(
+                    f"{call}: {name}: {fault}"
+                )
         return function(*args, **kwargs)
 
     return checked
@@ -114,9 +122,14 @@ def _classes(annotation: Any) -> tuple[type, ...]:
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     options = typing.get_args(annotation) if union else (annotation,)
     options = tuple(SEQUENCES.get(typing.get_origin(x), x) for x in options)
-    plain = [isinstance(x, type) and not typing.get_args(x) and not hasattr(x, "dims") for x in options]
+    plain = [
+        isinstance(x, type) and not typing.get_args(x) and not hasattr(x, "dims") for x in options
+    ]
     known = [x not in (*NUMBERS, inspect.Parameter.empty, object, Any) for x in options]
-    protocol = [getattr(x, "_is_protocol", False) and not getattr(x, "_is_runtime_protocol", False) for x in options]
+    protocol = [
+        getattr(x, "_is_protocol", False) and not getattr(x, "_is_runtime_protocol", False)
+        for x in options
+    ]
     return options if all(plain) and all(known) and not any(protocol) else ()
 
 
@@ -124,20 +137,36 @@ def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
     """The function with its parameters: those without a default, the others as dots."""
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     parameters = signature.parameters.values()
-    needed = [p.name for p in parameters if p.kind in kinds and p.default is inspect.Parameter.empty]
+    needed = [
+        p.name for p in parameters if p.kind in kinds and p.default is inspect.Parameter.empty
+    ]
     more = ["..."] if len(needed) < len(parameters) else []
     return f"{getattr(function, '__name__', 'function')}({', '.join(needed + more)})"
 
 
 def _other_class(classes: tuple[type, ...], value: Any) -> str:
     names = [x.__name__ for x in classes if x is not type(None)]
-    given = "None" if value is None else value.__name__ if isinstance(value, type) else type(value).__name__
-    shown = f" {value!r}" if isinstance(value, str) else f" the class {given}" if isinstance(value, type) else f" {given}"
+    given = (
+        "None"
+        if value is None
+        else value.__name__
+        if isinstance(value, type)
+        else type(value).__name__
+    )
+    shown = (
+        f" {value!r}"
+        if isinstance(value, str)
+        else f" the class {given}"
+        if isinstance(value, type)
+        else f" {given}"
+    )
     hint = next((HINTS[pair] for name in names if (pair := (name, given)) in HINTS), None)
     return f"expected {' or '.join(names)}, got{shown}{f'; {hint}' if hint else ''}"
 
 
-def _of_a_field(keywords: Any, signature: inspect.Signature, expected: dict[str, tuple[type, ...]]) -> str | None:
+def _of_a_field(
+    keywords: Any, signature: inspect.Signature, expected: dict[str, tuple[type, ...]]
+) -> str | None:
     """Where a name belongs that the function does not have: into one of its configurations."""
     for name in keywords:
         if name in signature.parameters:
@@ -171,7 +200,8 @@ POSITIVE = Values("finite numbers > 0", math.ulp(0.0))
 
 
 def check_values(
-    owner: str, arrays: Mapping[str, tuple[Shaped[Array, "..."] | Shaped[np.ndarray, "..."] | None, Values]]
+    owner: str,
+    arrays: Mapping[str, tuple[Shaped[Array, "..."] | Shaped[np.ndarray, "..."] | None, Values]],
 ) -> None:
     """Checks that arrays hold what they should.
 
@@ -181,23 +211,37 @@ def check_values(
     Raises: ValueError that names the first array with other values, says how many they are, and where the first one is.
     Nothing is checked if one of the arrays is traced.
     """
-    given = {name: (array, values) for name, (array, values) in arrays.items() if array is not None and array.size}
+    given = {
+        name: (array, values)
+        for name, (array, values) in arrays.items()
+        if array is not None and array.size
+    }
     if any(isinstance(array, Tracer) for array, _ in given.values()):
         return
-    on_device = {name: array for name, (array, _) in given.items() if not isinstance(array, np.ndarray)}
-    extremes = {name: (array.min(), array.max()) for name, (array, _) in given.items() if name not in on_device}
+    on_device = {
+        name: array for name, (array, _) in given.items() if not isinstance(array, np.ndarray)
+    }
+    extremes = {
+        name: (array.min(), array.max())
+        for name, (array, _) in given.items()
+        if name not in on_device
+    }
     if on_device:
         extremes |= zip(on_device, np.asarray(_extremes(tuple(on_device.values()))), strict=True)
     for name, (array, values) in given.items():
         low, high = (float(extreme) for extreme in extremes[name])  # NaN if any entry is
-        if not (math.isfinite(low) and math.isfinite(high) and values.low <= low and high <= values.high):
+        if not (
+            math.isfinite(low) and math.isfinite(high) and values.low <= low and high <= values.high
+        ):
             raise ValueError(f"{owner}: {name}: {_fault(np.asarray(array, np.float64), values)}")
 
 
 def require_concrete(owner: str, why: str, *trees: Any) -> None:
     """Raises: TypeError, one line, where arrays are traced. owner: the function that was called. why: it needs their values."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees)):
-        raise TypeError(f"{owner} {why}: call it outside of jit, vmap and grad, which know shapes only")
+        raise TypeError(
+            f"{owner} {why}: call it outside of jit, vmap and grad, which know shapes only"
+        )
 
 
 @jax.jit

@@ -94,7 +94,9 @@ def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
 
     cost, gain: in a few words. measured: the page of docs/ with the measurement.
     """
-    return dataclasses.field(default=default, metadata={"cost": cost, "gain": gain, "measured": measured})
+    return dataclasses.field(
+        default=default, metadata={"cost": cost, "gain": gain, "measured": measured}
+    )
 
 
 class ArgumentError(ValueError):
@@ -123,7 +125,9 @@ class Presets(dict[str, T]):
         self.hint = hint
 
     def __missing__(self, name: Any) -> T:
-        raise UnknownPresetError(f"no preset {name!r}: expected one of {', '.join(self)}{self.hint}")
+        raise UnknownPresetError(
+            f"no preset {name!r}: expected one of {', '.join(self)}{self.hint}"
+        )
 
 
 def check_fields(cls: type, values: Mapping[str, Any], owner: str) -> None:
@@ -135,7 +139,9 @@ def check_fields(cls: type, values: Mapping[str, Any], owner: str) -> None:
     for name, value in values.items():
         check_range(cls, name, value, f"{owner}.{name}")
         if not _fits(value, annotations[name]):
-            raise ValueError(f"{owner}.{name}: expected {in_words(annotations[name])}, got {value!r}")
+            raise ValueError(
+                f"{owner}.{name}: expected {in_words(annotations[name])}, got {value!r}"
+            )
 
 
 @functools.cache
@@ -151,12 +157,24 @@ def _fits(value: Any, annotation: Any) -> bool:
     if origin is Literal:
         return isinstance(value, str | int | None) and value in arguments
     if annotation in (int, float):
-        if isinstance(value, bool) or not isinstance(value, numbers.Integral if annotation is int else numbers.Real):
+        if isinstance(value, bool) or not isinstance(
+            value, numbers.Integral if annotation is int else numbers.Real
+        ):
             return False
-        return abs(int(value)) <= LARGEST_INTEGER if isinstance(value, numbers.Integral) else math.isfinite(value)
+        return (
+            abs(int(value)) <= LARGEST_INTEGER
+            if isinstance(value, numbers.Integral)
+            else math.isfinite(value)
+        )
     if origin is tuple:
-        items = arguments[:1] * len(value) if arguments[-1] is Ellipsis and isinstance(value, tuple) else arguments
-        return isinstance(value, tuple) and len(items) == len(value) and all(map(_fits, value, items))
+        items = (
+            arguments[:1] * len(value)
+            if arguments[-1] is Ellipsis and isinstance(value, tuple)
+            else arguments
+        )
+        return (
+            isinstance(value, tuple) and len(items) == len(value) and all(map(_fits, value, items))
+        )
     if annotation in (bool, str, type(None)) or dataclasses.is_dataclass(annotation):
         return isinstance(value, annotation)
     return True
@@ -168,7 +186,11 @@ def in_words(annotation: Any) -> str:
     words = []
     for option in typing.get_args(annotation) if union else [annotation]:
         literal = typing.get_origin(option) is Literal
-        words += map(repr, typing.get_args(option)) if literal else [_named(option).replace("NoneType", "None")]
+        words += (
+            map(repr, typing.get_args(option))
+            if literal
+            else [_named(option).replace("NoneType", "None")]
+        )
     return words[0] if len(words) == 1 else f"one of {', '.join(words)}"
 
 
@@ -222,7 +244,9 @@ def part(cls: type[T]) -> type[T]:
     """
     other = _PARTS.get(cls.__name__, cls)
     if other.__module__ != cls.__module__:  # the cell of a notebook may run again
-        raise ValueError(f"part {cls.__name__} of {cls.__module__}: {other.__module__} has one of this name")
+        raise ValueError(
+            f"part {cls.__name__} of {cls.__module__}: {other.__module__} has one of this name"
+        )
     configuration(cls)  # the class itself
     _PARTS[cls.__name__] = cls
     return cls
@@ -252,7 +276,9 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
             same = [each for each in known if each.rpartition(".")[2] == last]
             like = same or difflib.get_close_matches(path, known, cutoff=0.7)
             meant = f"; did you mean {' or '.join(like[:3])}?" if like else ""
-            raise ValueError(f"{path}: {type(config).__name__} has no such field{meant} (all paths: docs/knobs.md)")
+            raise ValueError(
+                f"{path}: {type(config).__name__} has no such field{meant} (all paths: docs/knobs.md)"
+            )
         config = _varied(config, path.split("."), value)
     return config
 
@@ -281,7 +307,9 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
         raise ValueError(f"{path}: expected at most {MOST_ITEMS} numbers, got {len(values)}")
     for allowed in ranges:
         for each in values:
-            if isinstance(each, numbers.Real) and not allowed.low <= each <= allowed.high:  # nor NaN
+            if (
+                isinstance(each, numbers.Real) and not allowed.low <= each <= allowed.high
+            ):  # nor NaN
                 raise ValueError(f"{path} {each:.15g}: expected {allowed}")
 
 
@@ -311,7 +339,9 @@ def _plain(value: Any, kind: bool = False) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         annotations = typing.get_type_hints(type(value))
         if kind and _PARTS.get(type(value).__name__) is not type(value):
-            raise ValueError(f"{type(value).__name__} is no registered part: decorate its class with `part`")
+            raise ValueError(
+                f"{type(value).__name__} is no registered part: decorate its class with `part`"
+            )
         named = {KIND: type(value).__name__} if kind else {}
         plain = lambda name: _plain(getattr(value, name), _holds_part(annotations[name]))
         return named | {name: plain(name) for name in field_names(type(value))}
@@ -356,18 +386,27 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
             raise ValueError(f"{path}: expected at most {MOST_ITEMS} items, got {len(value)}")
         if len(items) != len(value):
             return tuple(value)
-        built = tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
+        built = tuple(
+            _build(item, x, f"{path}[{i}]")
+            for i, (item, x) in enumerate(zip(items, value, strict=True))
+        )
         for i, item in enumerate(items):
             if not _fits(built[i], item):
                 raise ValueError(f"{path}[{i}]: expected {in_words(item)}, got {value[i]!r}")
         return built
-    return float(value) if annotation is float and type(value) is int and abs(value) <= LARGEST_INTEGER else value
+    return (
+        float(value)
+        if annotation is float and type(value) is int and abs(value) <= LARGEST_INTEGER
+        else value
+    )
 
 
 def _find_part(kind: Any, base: Any, path: str) -> type:
     """The class that a "kind" names."""
     known = {name: cls for name, cls in _PARTS.items() if issubclass(cls, base)}
-    name = kind.rpartition(".")[2] if isinstance(kind, str) else ""  # the first files say in which module, too
+    name = (
+        kind.rpartition(".")[2] if isinstance(kind, str) else ""
+    )  # the first files say in which module, too
     if name not in known:
         raise ValueError(
             f"{path}.{KIND}: expected the name of a registered {base.__name__}, one of {', '.join(sorted(known))} "
@@ -379,10 +418,14 @@ def _find_part(kind: Any, base: Any, path: str) -> type:
 def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object, got {values!r}")
-    annotations = {name: hint for name, hint in typing.get_type_hints(cls).items() if name in field_names(cls)}
+    annotations = {
+        name: hint for name, hint in typing.get_type_hints(cls).items() if name in field_names(cls)
+    }
     if unknown := sorted(set(values) - set(annotations)):
         raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
-    fields = {name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()}
+    fields = {
+        name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()
+    }
     required = lambda field: field.default is field.default_factory is dataclasses.MISSING
     needed = [f.name for f in dataclasses.fields(cls) if f.name in annotations and required(f)]
     if missing := [name for name in needed if name not in fields]:

@@ -12,11 +12,15 @@ from humangs_jax.core.array_types import Array, Float, PyTree
 
 def at_least_float32(tree: PyTree) -> PyTree:
     """The tree with its bfloat16 and float16 arrays in float32; wider ones unchanged. Gradients come back in the narrow type."""
-    widen = lambda a: a.astype(dtype) if (dtype := jnp.promote_types(a.dtype, jnp.float32)) != a.dtype else a
+    widen = lambda a: (
+        a.astype(dtype) if (dtype := jnp.promote_types(a.dtype, jnp.float32)) != a.dtype else a
+    )
     return jax.tree.map(widen, tree)
 
 
-def safe_divide(numerator: Float[Array, "*#n"], denominator: Float[Array, "*#n"]) -> Float[Array, "*n"]:
+def safe_divide(
+    numerator: Float[Array, "*#n"], denominator: Float[Array, "*#n"]
+) -> Float[Array, "*n"]:
     """numerator / denominator, and 0 with zero gradient where the denominator is 0."""
     zero = denominator == 0
     return jnp.where(zero, 0.0, numerator / jnp.where(zero, 1.0, denominator))

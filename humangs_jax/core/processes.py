@@ -46,7 +46,11 @@ def peak_memory() -> Generator[list[float | None]]:
     None where the system does not tell: it is read from Linux's /proc, with glibc. Memory of a GPU or TPU is not in it.
     """
     result: list[float | None] = [None]
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform.startswith("linux") else None
+    trim = (
+        getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if sys.platform.startswith("linux")
+        else None
+    )
     if trim is None:
         yield result
         return
@@ -106,7 +110,11 @@ T = TypeVar("T")
 
 
 def in_processes(
-    work: Callable[..., T], tasks: Mapping[K, tuple[Any, ...]], workers: int, prepare: Callable[..., object], *given: Any
+    work: Callable[..., T],
+    tasks: Mapping[K, tuple[Any, ...]],
+    workers: int,
+    prepare: Callable[..., object],
+    *given: Any,
 ) -> Iterator[tuple[K, T]]:
     """Yields (name, work(*arguments)) of tasks by name, as they end, from several processes of one thread each, on the CPU.
 
@@ -125,7 +133,9 @@ def in_processes(
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
         except concurrent.futures.process.BrokenProcessPool as error:
-            raise OSError("a working process was killed, perhaps for want of memory: try fewer workers") from error
+            raise OSError(
+                "a working process was killed, perhaps for want of memory: try fewer workers"
+            ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
@@ -141,7 +151,9 @@ def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     end_with_parent()
-    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+    os.environ["XLA_FLAGS"] = (
+        os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+    )
     jax.config.update("jax_platforms", "cpu")
     prepare(*given)
 
@@ -190,7 +202,11 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
         return None
-    if given := sys.modules["jax"].config.jax_compilation_cache_dir if "jax" in sys.modules else os.environ.get(OF_JAX):
+    if (
+        given := sys.modules["jax"].config.jax_compilation_cache_dir
+        if "jax" in sys.modules
+        else os.environ.get(OF_JAX)
+    ):
         return Path(given)
     try:
         root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()

@@ -52,7 +52,9 @@ def _escaped(c: str) -> str:
 def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     """Lines of a table: the first columns (left) aligned to the left, the others to the right; rows may end early."""
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows)))]
-    aligned = lambda row: (f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row))
+    aligned = lambda row: (
+        f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row)
+    )
     return ["  ".join(aligned(row)).rstrip() for row in rows]
 
 
@@ -97,7 +99,12 @@ def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
     """
     global _current
     terminal, shown = sys.stderr.isatty(), not quiet
-    _current = Progress(ticking=terminal and shown, naming=shown and not terminal, lines=lines and shown, quiet=quiet)
+    _current = Progress(
+        ticking=terminal and shown,
+        naming=shown and not terminal,
+        lines=lines and shown,
+        quiet=quiet,
+    )
     return _current
 
 
@@ -138,13 +145,17 @@ def stage(name: str) -> Generator[None]:
     current.paused = False
     started, stop = time.perf_counter(), threading.Event()
     outermost = len(current.names) == 1
-    ticker = threading.Thread(target=_tick if current.ticking else _name, args=(current, stop, started), daemon=True)
+    ticker = threading.Thread(
+        target=_tick if current.ticking else _name, args=(current, stop, started), daemon=True
+    )
     if outermost and (current.ticking or current.naming):
         ticker.start()
     try:
         yield
     except BaseException:
-        _close(set(_bars) - bars)  # else the traceback keeps them open, and the next line is glued to them
+        _close(
+            set(_bars) - bars
+        )  # else the traceback keeps them open, and the next line is glued to them
         raise
     finally:
         stop.set()
@@ -163,7 +174,9 @@ COMPILING = "compiling, once"
 """What a bar says until its first item is there, where a program of JAX is compiled for that: many seconds."""
 
 
-def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any) -> Any:
+def bar(
+    iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any
+) -> Any:
     """A bar of tqdm, whose options `how` are. It takes the place of the line of the stage around it.
 
     Where stderr is no terminal (a log, a notebook) it moves every `LONG` seconds.

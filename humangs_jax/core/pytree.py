@@ -46,7 +46,9 @@ def pytree_dataclass(cls: type[T]) -> type[T]:
         return children, tuple(getattr(tree, name) for name in static)
 
     def flatten(tree):
-        return [getattr(tree, name) for name in dynamic], tuple(getattr(tree, name) for name in static)
+        return [getattr(tree, name) for name in dynamic], tuple(
+            getattr(tree, name) for name in static
+        )
 
     def unflatten(aux, children):
         tree = object.__new__(cls)
@@ -77,11 +79,16 @@ def _make_exportable(cls: type[Any]) -> None:
         return
     if name in _EXPORTABLE:  # a module that is loaded again keeps its first class there
         if _EXPORTABLE[name] != cls.__module__:
-            raise TypeError(f"{cls.__module__} and {_EXPORTABLE[name]} both have a pytree {cls.__qualname__}")
+            raise TypeError(
+                f"{cls.__module__} and {_EXPORTABLE[name]} both have a pytree {cls.__qualname__}"
+            )
         return
     _EXPORTABLE[name] = cls.__module__
     jax.export.register_pytree_node_serialization(
-        cls, serialized_name=name, serialize_auxdata=_static_bytes, deserialize_auxdata=_static_values
+        cls,
+        serialized_name=name,
+        serialize_auxdata=_static_bytes,
+        deserialize_auxdata=_static_values,
     )
 
 
@@ -109,12 +116,21 @@ def short_repr(tree: Any) -> str:
 def _shortened(value: Any) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         kind = np.dtype(value.dtype) if isinstance(value, np.ndarray) else value.dtype
-        name = kind.name.replace("bfloat", "bf").replace("float", "f").replace("uint", "u").replace("int", "i")
+        name = (
+            kind.name.replace("bfloat", "bf")
+            .replace("float", "f")
+            .replace("uint", "u")
+            .replace("int", "i")
+        )
         return f"{name}[{','.join(map(str, value.shape))}]"
     text = repr(value)
     if len(text) > SHORT and isinstance(value, tuple | list | dict):
         return f"{type(value).__name__} of {len(value)}"
-    return text if dataclasses.is_dataclass(value) or len(text) <= SHORT else f"{type(value).__name__}(...)"
+    return (
+        text
+        if dataclasses.is_dataclass(value) or len(text) <= SHORT
+        else f"{type(value).__name__}(...)"
+    )
 
 
 class Batchable:
@@ -140,7 +156,9 @@ class Batchable:
         """Size of the first batch axis. Raises: TypeError for one example."""
         if shape := self.batch_shape:
             return shape[0]
-        raise TypeError(f"this {type(self).__name__} is not a batch: it has no length and cannot be indexed or iterated")
+        raise TypeError(
+            f"this {type(self).__name__} is not a batch: it has no length and cannot be indexed or iterated"
+        )
 
     def __bool__(self) -> bool:
         """True, whatever the length: `if camera` asks whether there is one."""
@@ -155,7 +173,9 @@ class Batchable:
         if not isinstance(index, slice | Tracer) and getattr(index, "ndim", 0) == 0:
             index = operator.index(index)
             if not -size <= index < size:
-                raise IndexError(f"{type(self).__name__}: index {index} is out of range for a batch of {size}")
+                raise IndexError(
+                    f"{type(self).__name__}: index {index} is out of range for a batch of {size}"
+                )
         return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __iter__(self: B) -> Iterator[B]:
@@ -188,7 +208,11 @@ def shape_fault(tree: Any) -> str | None:
     batch_rank = max(usual, 0) if issubclass(cls, Batchable) else 0
     for name, field in fields.items():
         value = getattr(tree, name)
-        fault = shape_fault(value) if field.axes is None else _array_fault(value, field, batch_rank, sizes)
+        fault = (
+            shape_fault(value)
+            if field.axes is None
+            else _array_fault(value, field, batch_rank, sizes)
+        )
         if fault:
             return f".{name}{fault}"
     return _size_fault(tree)
@@ -233,9 +257,15 @@ def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, in
         fits = fits and (isinstance(want, str) or want == size)
     if not fits:
         return f": expected shape {_shown_shape([*shape[:batch], *wanted])}, got {shape}"
-    if field.floating and not jnp.issubdtype(value.dtype, jnp.inexact) and value.dtype != jax.dtypes.float0:
+    if (
+        field.floating
+        and not jnp.issubdtype(value.dtype, jnp.inexact)
+        and value.dtype != jax.dtypes.float0
+    ):
         return f": expected floating-point numbers, got {value.dtype}{_advice(value.dtype)}"
-    sizes |= {axis: size for axis, size in zip(axes, shape[batch:], strict=True) if isinstance(axis, str)}
+    sizes |= {
+        axis: size for axis, size in zip(axes, shape[batch:], strict=True) if isinstance(axis, str)
+    }
     return None
 
 
@@ -249,14 +279,22 @@ def _shown_kind(value: Any) -> str:
 
 def _advice(dtype: Any) -> str:
     """What to do with integers."""
-    return "; colors of 0 to 255 are divided by 255" if dtype == np.uint8 else "; x.astype(float) makes them"
+    return (
+        "; colors of 0 to 255 are divided by 255"
+        if dtype == np.uint8
+        else "; x.astype(float) makes them"
+    )
 
 
 def _size_fault(tree: Any) -> str | None:
     """The first static field that should be an integer and is none."""
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
-        if field.metadata.get("static") and field.type is int and not isinstance(value, int | np.integer):
+        if (
+            field.metadata.get("static")
+            and field.type is int
+            and not isinstance(value, int | np.integer)
+        ):
             return f".{field.name}: expected a whole number, got {value!r}"
     return None
 
@@ -307,7 +345,9 @@ def replace(tree: T, **changes: Any) -> T:
     """
     names = {f.name for f in dataclasses.fields(tree)}  # ty: ignore[invalid-argument-type]
     if unknown := set(changes) - names:
-        raise TypeError(f"{type(tree).__name__} has no field {sorted(unknown)}; its fields are {sorted(names)}")
+        raise TypeError(
+            f"{type(tree).__name__} has no field {sorted(unknown)}; its fields are {sorted(names)}"
+        )
     copy = object.__new__(type(tree))
     for name in names:
         object.__setattr__(copy, name, changes.get(name, getattr(tree, name)))

@@ -52,7 +52,10 @@ class Formats(dict[str, F]):
     def recognized(self, path: Path) -> F | None:
         """The first of them that the file is, None for none; those that look into it are asked first."""
         found = sorted(self.of(path).values(), key=lambda each: each.recognizes is None)
-        return next((each for each in found if each.recognizes is None or imported(each.recognizes)(path)), None)
+        return next(
+            (each for each in found if each.recognizes is None or imported(each.recognizes)(path)),
+            None,
+        )
 
     def where(self, holds: Callable[[F], bool]) -> "Formats[F]":
         """Those for which this holds."""
@@ -62,8 +65,12 @@ class Formats(dict[str, F]):
         """All in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or by name where names do not tell."""
         groups: dict[tuple[str, ...], dict[str, None]] = {}  # each name once
         for name, each in self.items():
-            groups.setdefault(each.suffixes or (name,), {}).update(dict.fromkeys(each.about.split(", ")))
-        return "; ".join(f"{alternatives(key)}: {', '.join(abouts)}" for key, abouts in groups.items())
+            groups.setdefault(each.suffixes or (name,), {}).update(
+                dict.fromkeys(each.about.split(", "))
+            )
+        return "; ".join(
+            f"{alternatives(key)}: {', '.join(abouts)}" for key, abouts in groups.items()
+        )
 
 
 def alternatives(suffixes: tuple[str, ...]) -> str:

@@ -75,7 +75,9 @@ def unusable_views(capture: Capture) -> dict[int, str]:
         mask = np.asarray(capture.masks[i])
         if i in found or not np.isfinite(points[frame]).all():
             continue
-        x, y = points_in_image(points[frame], K[i], cam_from_world[i], *mask.shape[::-1]).astype(int).T
+        x, y = (
+            points_in_image(points[frame], K[i], cam_from_world[i], *mask.shape[::-1]).astype(int).T
+        )
         if not len(x) or (mask[y, x] > MASK_THRESHOLD).mean() < LEAST_SHARE:
             found[i] = "mask and posed body hardly meet (`humangs check` draws both)"
     return dict(sorted(found.items()))
@@ -83,14 +85,22 @@ def unusable_views(capture: Capture) -> dict[int, str]:
 
 def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
     """The views whose mask shows nobody."""
-    return [i for i, mask in enumerate(() if masks is None else masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]
+    return [
+        i
+        for i, mask in enumerate(() if masks is None else masks)
+        if not (np.asarray(mask) > MASK_THRESHOLD).any()
+    ]
 
 
 # Points on the skin ---------------------------------------------------------------------------------------------------
 
 
 def surface_points(
-    body: BodyModel, betas: Float[np.ndarray, " s"], poses: BodyPose, frames: Int[np.ndarray, " v"], count: int
+    body: BodyModel,
+    betas: Float[np.ndarray, " s"],
+    poses: BodyPose,
+    frames: Int[np.ndarray, " v"],
+    count: int,
 ) -> dict[int, Float[np.ndarray, "count 3"]]:
     """Points spread evenly over the skin, metres, by the frames that views show; without pose correctives."""
     rest = shaped(body, betas)
@@ -221,7 +231,9 @@ class MaskedView:
         """Signed distance to the edge of the mask, pixels."""
         return signed_distance(self.coverage).astype(np.float32)
 
-    def seen(self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)) -> tuple:
+    def seen(
+        self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)
+    ) -> tuple:
         """Pixels (*n, 2) of points in the rest pose, pixels for a metre there, and which the photo shows."""
         posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
         posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
@@ -233,7 +245,11 @@ class MaskedView:
 
 
 def displacement(
-    body: BodyModel, capture: Capture, inset: tuple[float, float] = Reach.inset, *, always: bool = True
+    body: BodyModel,
+    capture: Capture,
+    inset: tuple[float, float] = Reach.inset,
+    *,
+    always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
     """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it fills the masks; bounded.
 
@@ -248,7 +264,11 @@ def displacement(
     if not views:
         return total.astype(np.float32)
     faces = np.asarray(body.faces)
-    held = HELD * np.asarray(body.skinning_weights) @ [any(x in name for x in HELD_JOINTS) for name in body.joint_names]
+    held = (
+        HELD
+        * np.asarray(body.skinning_weights)
+        @ [any(x in name for x in HELD_JOINTS) for name in body.joint_names]
+    )
     if not always and _share_outside(views, rest, held < HELD / 2) < MISFIT:
         return total.astype(np.float32)
     total += to_edges(views, rest, faces, held, Reach(inset=inset))
@@ -257,7 +277,9 @@ def displacement(
     return total.astype(np.float32)
 
 
-def to_edges(views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: Reach) -> Points:
+def to_edges(
+    views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: Reach
+) -> Points:
     """How far the vertices of a surface in the T-pose move along its normals to the masks' edges, smoothly.
 
     held: weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette.
@@ -273,7 +295,10 @@ def to_edges(views: list[MaskedView], rest: Points, faces: Faces, held: PerVerte
 def shaped(body: BodyModel, betas: Float[np.ndarray, " s"]) -> Points:
     """The vertices of the person's body in the T-pose."""
     betas = np.asarray(betas, float)
-    return np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ betas
+    return (
+        np.asarray(body.template, float)
+        + np.asarray(body.shape_directions, float)[..., : len(betas)] @ betas
+    )
 
 
 def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
@@ -288,8 +313,13 @@ def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[Masked
             continue
         if frame not in posed:
             posed[frame] = skinned(body, joints, capture.poses, frame, weights, corrected=True)
-        K, matrix = np.asarray(capture.cameras.K[i], float), np.asarray(capture.cameras.cam_from_world[i], float)
-        if all(np.isfinite(x).all() for x in (rest, *posed[frame])):  # whoever poses the body names what is not
+        K, matrix = (
+            np.asarray(capture.cameras.K[i], float),
+            np.asarray(capture.cameras.cam_from_world[i], float),
+        )
+        if all(
+            np.isfinite(x).all() for x in (rest, *posed[frame])
+        ):  # whoever poses the body names what is not
             views.append(_window(mask, K @ matrix[:3], *posed[frame]))
     return views
 
@@ -311,11 +341,18 @@ def _window(
     rows, columns = (max(1, round(side * scale)) for side in window.shape)
     x, y = columns / window.shape[1], rows / window.shape[0]
     to_window = np.asarray([[x, 0, -left * x], [0, y, -top * y], [0, 0, 1]])
-    low, high = np.asarray([-left * x, -top * y]), np.asarray([(width - left) * x, (height - top) * y])
-    return MaskedView(resized(window, columns, rows), to_window @ project, linear, offset, low + NEAR, high - NEAR)
+    low, high = (
+        np.asarray([-left * x, -top * y]),
+        np.asarray([(width - left) * x, (height - top) * y]),
+    )
+    return MaskedView(
+        resized(window, columns, rows), to_window @ project, linear, offset, low + NEAR, high - NEAR
+    )
 
 
-def _share_outside(views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]) -> float:
+def _share_outside(
+    views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]
+) -> float:
     """Of the free vertices, those that are `OUTSIDE` outside of a mask; if few are outside at all, these."""
 
     def share(outside: Callable[[MaskedView, np.ndarray, np.ndarray], np.ndarray]) -> float:
@@ -325,11 +362,19 @@ def _share_outside(views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free
             found |= within & outside(view, pixels, per_metre)
         return float(found[free].mean()) if free.any() else 0.0
 
-    few = share(lambda view, pixels, _: at(view.coverage, pixels) < MASK_THRESHOLD)  # needs no distances
-    return few if few < MISFIT else share(lambda view, pixels, scale: at(view.mask, pixels) < -OUTSIDE * scale)
+    few = share(
+        lambda view, pixels, _: at(view.coverage, pixels) < MASK_THRESHOLD
+    )  # needs no distances
+    return (
+        few
+        if few < MISFIT
+        else share(lambda view, pixels, scale: at(view.mask, pixels) < -OUTSIDE * scale)
+    )
 
 
-def _targets(views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: Reach) -> tuple[PerVertex, PerVertex]:
+def _targets(
+    views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: Reach
+) -> tuple[PerVertex, PerVertex]:
     """For each vertex the number of photos that show it on the silhouette, and the sum of the distances to the masks' edges."""
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
     reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
@@ -371,14 +416,20 @@ def _crossing(
     return distance, found
 
 
-def silhouette_distance(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+def silhouette_distance(
+    pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
+) -> Float[np.ndarray, "h w"]:
     """Signed distance to the edge of the silhouette of a surface, pixels; positive inside."""
     a, b, c = np.moveaxis(pixels[faces], 1, 0)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    return signed_distance(silhouette(pixels, faces[turn < 0], shape)) - DRAWN  # the side that faces the camera covers all
+    return (
+        signed_distance(silhouette(pixels, faces[turn < 0], shape)) - DRAWN
+    )  # the side that faces the camera covers all
 
 
-def silhouette(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+def silhouette(
+    pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
+) -> Float[np.ndarray, "h w"]:
     """1 where triangles lie, larger by `DRAWN` than they are."""
     image = Image.new("L", (shape[1], shape[0]))
     pen = ImageDraw.Draw(image)
@@ -387,7 +438,14 @@ def silhouette(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int,
     return np.asarray(image, np.float32)
 
 
-def _spread(vertices: Points, faces: Faces, count: PerVertex, summed: PerVertex, held: PerVertex, reach: Reach) -> PerVertex:
+def _spread(
+    vertices: Points,
+    faces: Faces,
+    count: PerVertex,
+    summed: PerVertex,
+    held: PerVertex,
+    reach: Reach,
+) -> PerVertex:
     """The smooth displacement that is nearest to the targets."""
     areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
     laplacian = _laplacian(vertices, faces)
@@ -403,9 +461,15 @@ def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_
         a, b, c = (faces[:, (i + k) % 3] for k in range(3))
         u, v = vertices[a] - vertices[c], vertices[b] - vertices[c]
         cotangent = (u * v).sum(-1) / np.maximum(np.linalg.norm(np.cross(u, v), axis=-1), 1e-10)
-        rows, columns, values = [*rows, a, b], [*columns, b, a], [*values, *[np.clip(cotangent, 0.05, 5) / 2] * 2]
+        rows, columns, values = (
+            [*rows, a, b],
+            [*columns, b, a],
+            [*values, *[np.clip(cotangent, 0.05, 5) / 2] * 2],
+        )
     size = len(vertices)
-    weights = sparse.coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsr()
+    weights = sparse.coo_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)
+    ).tocsr()
     return (sparse.diags(np.asarray(weights.sum(axis=1))) - weights).tocsr()
 
 
@@ -436,7 +500,9 @@ def _outside(
     return move
 
 
-def at(image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
+def at(
+    image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]
+) -> Float[np.ndarray, "*b"]:
     """Bilinear; pixel centres at + 0.5."""
     x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
     return ndimage.map_coordinates(image, [y, x], order=1, mode="nearest", prefilter=False)

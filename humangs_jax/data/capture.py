@@ -120,7 +120,9 @@ class Capture:
         size = [max(1, round(side * longest / max(height, width))) for side in (width, height)]
         resize = lambda images: np.stack([resized(image, *size) for image in images])
         masks = None if self.masks is None else resize(self.masks)
-        return dataclasses.replace(self, images=resize(self.images), masks=masks, cameras=self.cameras.resized(*size))
+        return dataclasses.replace(
+            self, images=resize(self.images), masks=masks, cameras=self.cameras.resized(*size)
+        )
 
 
 @checked_arguments
@@ -185,16 +187,28 @@ def capture_from_arrays(
     K = numbers(K, source, "K")
     K = numbers(np.broadcast_to(K, (v, 3, 3)) if K.shape == (3, 3) else K, source, "K", (v, 3, 3))
     cam_from_world = numbers(cam_from_world, source, "cam_from_world", (v, 4, 4))
-    cameras = [checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}") for i in range(v)]
+    cameras = [
+        checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}")
+        for i in range(v)
+    ]
     body = _load_model(source, str(body_file)) if body is None else body
-    parameters = body_parameters(body, betas, rotations, translations, source, shape_names, displacement)
+    parameters = body_parameters(
+        body, betas, rotations, translations, source, shape_names, displacement
+    )
     rotations = parameters[1]
     if frames is None:
         if len(rotations) > 1:
-            raise CaptureError(source, "frames", f"expected a frame for each view, since there are {len(rotations)} poses")
+            raise CaptureError(
+                source,
+                "frames",
+                f"expected a frame for each view, since there are {len(rotations)} poses",
+            )
         frames = np.zeros(v, int)
     numbers(frames, source, "frames", (v,))
-    frames = [checked_frame(x.item(), len(rotations), source, f"frames[{i}]") for i, x in enumerate(np.asarray(frames))]
+    frames = [
+        checked_frame(x.item(), len(rotations), source, f"frames[{i}]")
+        for i, x in enumerate(np.asarray(frames))
+    ]
     names = tuple(f"{i:03d}" for i in range(v)) if names is None else tuple(names)
     check_names(names, v, source)
     check_background(background, source)
@@ -202,7 +216,9 @@ def capture_from_arrays(
         if fit_masks:
             masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
         images = np.stack([cut_out(*pair) for pair in zip(images, masks, strict=True)])
-    photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names, calibrated)
+    photos = Photos(
+        images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names, calibrated
+    )
     return _assemble(photos, body, body_file, *parameters)
 
 
@@ -295,7 +311,11 @@ def _assemble(
 def _load_model(file: object, name: str, folder: Path | None = None) -> BodyModel:
     model_file = Path(name) if folder is None else folder / name
     if name != DEFAULT_BODY and not model_file.is_file():
-        raise CaptureError(file, "body", f"no model file at {model_file}: expected {DEFAULT_BODY!r} or the path of one")
+        raise CaptureError(
+            file,
+            "body",
+            f"no model file at {model_file}: expected {DEFAULT_BODY!r} or the path of one",
+        )
     from humangs_jax.body.library import load_body
 
     if name == DEFAULT_BODY:
@@ -303,7 +323,9 @@ def _load_model(file: object, name: str, folder: Path | None = None) -> BodyMode
     try:
         return load_body(model_file)
     except Exception as error:
-        raise CaptureError(file, "body", f"{model_file} cannot be used as a body: {error}") from error
+        raise CaptureError(
+            file, "body", f"{model_file} cannot be used as a body: {error}"
+        ) from error
 
 
 def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
@@ -311,7 +333,9 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
     try:
         values, pickled = read_npz(file)
     except FileNotFoundError:
-        raise CaptureError(file, "", "no such file (capture.json: body names it); `humangs fit` makes one") from None
+        raise CaptureError(
+            file, "", "no such file (capture.json: body names it); `humangs fit` makes one"
+        ) from None
     except FileError as error:
         raise CaptureError("", "", error) from error
     if pickled:
@@ -321,11 +345,15 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
     if name.shape != () or name.dtype.kind not in "US" or not str(name.item()):
         problem = f"expected the string {DEFAULT_BODY!r} or the path of a model file, got {name!r}"
         raise CaptureError(file, "body", problem)
-    parameters: dict[str, Any] = {key: values[key] for key in ("betas", "rotations", "translations")}
+    parameters: dict[str, Any] = {
+        key: values[key] for key in ("betas", "rotations", "translations")
+    }
     parameters["displacement"] = values.get("displacement")
     if (names := values.get("shape_names")) is not None:
         if names.ndim != 1 or names.dtype.kind not in "US":
-            raise CaptureError(file, "shape_names", f"expected one name for each of betas, got shape {names.shape}")
+            raise CaptureError(
+                file, "shape_names", f"expected one name for each of betas, got shape {names.shape}"
+            )
         parameters["shape_names"] = names.astype(str).tolist()
     return str(name.astype(str)), parameters
 
@@ -338,10 +366,14 @@ def _check_before_writing(capture: Capture) -> None:
     v, (height, width) = len(capture.images), capture.images.shape[1:3]
     cameras, poses = capture.cameras, capture.poses
     if len(cameras.K) != v:
-        raise CaptureError("capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}")
+        raise CaptureError(
+            "capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}"
+        )
     if (cameras.width, cameras.height) != (width, height):
         got = f"{cameras.width} x {cameras.height}"
-        raise CaptureError("capture", "cameras", f"expected the image size {width} x {height}, got {got}")
+        raise CaptureError(
+            "capture", "cameras", f"expected the image size {width} x {height}, got {got}"
+        )
     capture_from_arrays(
         capture.images,
         np.asarray(cameras.K),
@@ -383,20 +415,29 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
 def capture_parameters(folder: Path, capture: Capture) -> dict[str, np.ndarray]:
     """The arrays of body.npz of a capture, see `parameter_arrays`."""
     poses = capture.poses
-    arrays = parameter_arrays(folder, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation)
+    arrays = parameter_arrays(
+        folder, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation
+    )
     if capture.displacement is not None:
         arrays["displacement"] = np.asarray(capture.displacement, np.float32)
     return arrays
 
 
 def parameter_arrays(
-    folder: Path, body: BodyModel, body_file: str | Path, betas: Any, rotations: Any, translations: Any
+    folder: Path,
+    body: BodyModel,
+    body_file: str | Path,
+    betas: Any,
+    rotations: Any,
+    translations: Any,
 ) -> dict[str, np.ndarray]:
     """The arrays of body.npz of a capture that will be in `folder`; a model file is named relative to it."""
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()
     numbers = {"betas": betas, "rotations": rotations, "translations": translations}
-    arrays = {"body": np.asarray(body_file)} | {name: np.asarray(x, np.float32) for name, x in numbers.items()}
+    arrays = {"body": np.asarray(body_file)} | {
+        name: np.asarray(x, np.float32) for name, x in numbers.items()
+    }
     if body.shape_names:
         arrays["shape_names"] = np.asarray(body.shape_names[: len(betas)], str)
     return arrays

@@ -68,13 +68,23 @@ def required(mapping: Mapping[str, Any], key: str, file: object, prefix: str = "
     return mapping[key]
 
 
-KINDS: dict[type, str] = {dict: "a JSON object", list: "a list", str: "a name or path", int: "an integer", float: "a number"}
+KINDS: dict[type, str] = {
+    dict: "a JSON object",
+    list: "a list",
+    str: "a name or path",
+    int: "an integer",
+    float: "a number",
+}
 """Of JSON values, in words."""
 
 
 def expect(value: Any, kind: type, file: object, field: str) -> Any:
     """A JSON value, of one of `KINDS`; names are not empty."""
-    if not isinstance(value, int | float if kind is float else kind) or isinstance(value, bool) or value == "":
+    if (
+        not isinstance(value, int | float if kind is float else kind)
+        or isinstance(value, bool)
+        or value == ""
+    ):
         raise CaptureError(file, field, f"expected {KINDS[kind]}, got {shown(value)}")
     return value
 
@@ -83,7 +93,10 @@ def members(value: Any, file: object, field: str = "", /, **kinds: type) -> list
     """The members of a JSON object with these names, each of its kind."""
     expect(value, dict, file, field)
     prefix = f"{field}." if field else ""
-    return [expect(required(value, key, file, prefix), kind, file, f"{prefix}{key}") for key, kind in kinds.items()]
+    return [
+        expect(required(value, key, file, prefix), kind, file, f"{prefix}{key}")
+        for key, kind in kinds.items()
+    ]
 
 
 def few(names: Sequence[str], most: int = 4) -> str:
@@ -106,7 +119,9 @@ numbers = functools.partial(file_numbers, dtype=np.float32)
 """Float32 numbers."""
 
 
-def floats(value: Any, file: object, field: str, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
+def floats(
+    value: Any, file: object, field: str, shape: tuple[int, ...]
+) -> Float[np.ndarray, "*shape"]:
     """Finite float64 numbers, however nested, reshaped to `shape` in row-major order."""
     array = file_numbers(value, file, field)
     if array.size != np.prod(shape):
@@ -125,7 +140,9 @@ def check_range(array: np.ndarray, file: object, field: str) -> None:
 # Parts of a capture --------------------------------------------------------------------------------------------------
 
 
-def checked_camera(K: np.ndarray, cam_from_world: np.ndarray, width: int, height: int, file: object, prefix: str) -> Camera:
+def checked_camera(
+    K: np.ndarray, cam_from_world: np.ndarray, width: int, height: int, file: object, prefix: str
+) -> Camera:
     """A camera of a rigid, right-handed pose."""
     try:
         return Camera.from_opencv(K, cam_from_world, width, height)
@@ -136,7 +153,9 @@ def checked_camera(K: np.ndarray, cam_from_world: np.ndarray, width: int, height
 def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
     """An integer that counts one of the poses."""
     if not 0 <= expect(frame, int, file, field) < count:
-        raise CaptureError(file, field, f"expected 0 to {count - 1} (there are {count} poses), got {frame}")
+        raise CaptureError(
+            file, field, f"expected 0 to {count - 1} (there are {count} poses), got {frame}"
+        )
     return frame
 
 
@@ -148,7 +167,12 @@ def body_parameters(
     file: object,
     shape_names: Sequence[str] | None = None,
     displacement: Any | None = None,
-) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"] | None]:
+) -> tuple[
+    Float[np.ndarray, " s"],
+    Float[np.ndarray, "m j 3"],
+    Float[np.ndarray, "m 3"],
+    Float[np.ndarray, "n 3"] | None,
+]:
     """betas, rotations, translations and displacement in float32, of the sizes that the body has.
 
     Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is none.
@@ -156,7 +180,11 @@ def body_parameters(
     joints = len(body.parents)
     rotations = numbers(rotations, file, "rotations")
     if rotations.ndim != 3 or rotations.shape[1:] != (joints, 3) or len(rotations) == 0:
-        raise CaptureError(file, "rotations", f"expected shape (frames, {joints}, 3) for this body, got {rotations.shape}")
+        raise CaptureError(
+            file,
+            "rotations",
+            f"expected shape (frames, {joints}, 3) for this body, got {rotations.shape}",
+        )
     translations = numbers(translations, file, "translations", (len(rotations), 3))
     betas = numbers(betas, file, "betas")
     if displacement is not None:
@@ -168,7 +196,9 @@ def body_parameters(
         ("displacement", displacement, LARGEST_DISPLACEMENT),
     ):
         if array is not None and (most := np.abs(array).max(initial=0)) > largest:
-            raise CaptureError(file, field, f"expected numbers of at most {largest:g} in magnitude, got {most:.4g}")
+            raise CaptureError(
+                file, field, f"expected numbers of at most {largest:g} in magnitude, got {most:.4g}"
+            )
     if betas.ndim != 1:
         raise CaptureError(file, "betas", f"expected a list of numbers, got shape {betas.shape}")
     return shape_coefficients(body, betas, shape_names, file), rotations, translations, displacement
@@ -183,19 +213,27 @@ def shape_coefficients(
     SMPL-X's shape, without expressions, or of all of the body's own directions.
     Raises: CaptureError for coefficients that the body has no direction for, unless they are 0.
     """
-    directions = body.shape_names or tuple(f"shape_{i}" for i in range(body.shape_directions.shape[-1]))
+    directions = body.shape_names or tuple(
+        f"shape_{i}" for i in range(body.shape_directions.shape[-1])
+    )
     places = {name: i for i, name in enumerate(directions)}
     if names is None:
         own = [name for name in directions if not name.startswith("expression_")]
         if betas[len(own) :].any():
-            problem = f"{len(betas)} coefficients, but body '{body.name}' has {len(own)} such directions"
+            problem = (
+                f"{len(betas)} coefficients, but body '{body.name}' has {len(own)} such directions"
+            )
             raise CaptureError(file, "betas", problem)
         if "shape_0" in places or len(betas) == len(own) or not betas.any():
             return betas[: len(own)]
         names = [f"shape_{i}" for i in range(len(betas))]
     if len(names) != len(betas) or len(set(names)) < len(names):
-        raise CaptureError(file, "shape_names", f"expected {len(betas)} different names, one for each of betas")
-    unknown = [name for name, value in zip(names, betas, strict=True) if value and name not in places]
+        raise CaptureError(
+            file, "shape_names", f"expected {len(betas)} different names, one for each of betas"
+        )
+    unknown = [
+        name for name, value in zip(names, betas, strict=True) if value and name not in places
+    ]
     if unknown:
         known = f"{len(places)}, from {directions[0]!r} to {directions[-1]!r}" if places else "none"
         problem = f"{unknown[0]!r} is no shape direction of body '{body.name}': expected coefficients of its own ({known})"
@@ -212,4 +250,6 @@ def check_names(names: Sequence[str], count: int, file: object) -> None:
         raise CaptureError(file, "names", f"expected {count} different names, got {list(names)}")
     for name in names:
         if not isinstance(name, str) or not re.fullmatch(r"[\w-][\w.-]*", name):
-            raise CaptureError(file, "names", f"expected letters, digits, '.', '_' and '-' only, got {shown(name)}")
+            raise CaptureError(
+                file, "names", f"expected letters, digits, '.', '_' and '-' only, got {shown(name)}"
+            )

@@ -124,7 +124,12 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
             unused.append(Unused(file, CLIP))
         elif suffix in OTHER_PICTURES + RAW_PICTURES + OTHER_VIDEOS:
             unused.append(Unused(file, OTHER_FORMAT))
-    return FolderScan(folder, tuple(photos), tuple(sorted(unused, key=lambda each: each.path)), tuple(masks) if whole else ())
+    return FolderScan(
+        folder,
+        tuple(photos),
+        tuple(sorted(unused, key=lambda each: each.path)),
+        tuple(masks) if whole else (),
+    )
 
 
 def photos_in(folder: Path) -> dict[str, Path]:
@@ -135,11 +140,17 @@ def photos_in(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         return {}
     with os.scandir(folder) as entries:
-        files = [Path(entry.path) for entry in entries if is_photo(Path(entry.name)) and entry.is_file()]
+        files = [
+            Path(entry.path) for entry in entries if is_photo(Path(entry.name)) and entry.is_file()
+        ]
     files = [file for file in files if not is_own_picture(file)]
     beside = masks_beside(files)
     photos = [file for file in files if file not in beside]
-    preferred = sorted(photos, key=lambda file: (PHOTO_SUFFIXES.index(file.suffix.lower()), file.name), reverse=True)
+    preferred = sorted(
+        photos,
+        key=lambda file: (PHOTO_SUFFIXES.index(file.suffix.lower()), file.name),
+        reverse=True,
+    )
     return {file.stem: file for file in preferred}
 
 
@@ -185,5 +196,8 @@ def unused_line(unused: Iterable[Unused]) -> str | None:
         groups.setdefault(each.why, []).append(each.path.name)
     if not groups:
         return None
-    parts = [f"{counted(len(names), why.noun)} {why.because} ({few(names, NAMES_SHOWN)})" for why, names in groups.items()]
+    parts = [
+        f"{counted(len(names), why.noun)} {why.because} ({few(names, NAMES_SHOWN)})"
+        for why, names in groups.items()
+    ]
     return f"not used: {'; '.join(parts)}"

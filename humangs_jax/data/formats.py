@@ -79,12 +79,18 @@ class SourceFormats(Formats[F]):
 
     def of_name(self, file: Path) -> F | None:
         """The first format of several files that one is of by its name."""
-        named = (each for each in self.values() if each.folder and any(fnmatch(file.name, name) for name in each.names))
+        named = (
+            each
+            for each in self.values()
+            if each.folder and any(fnmatch(file.name, name) for name in each.names)
+        )
         return next(named, None)
 
     def of_content(self, source: Any) -> F | None:
         """The first format that recognizes a source, a file; those of its suffix are asked before the others."""
-        asked = sorted(self.values(), key=lambda each: source.path.suffix.lower() not in each.suffixes)
+        asked = sorted(
+            self.values(), key=lambda each: source.path.suffix.lower() not in each.suffixes
+        )
         return next((each for each in asked if each.fits(source)), None)
 
     def listed(self) -> str:
@@ -98,7 +104,11 @@ CAMERAS = SourceFormats(
     colmap=CameraFormat(
         "COLMAP",
         _CAMERAS + "scenes:read_colmap",
-        files=tuple(place + name for place in _MODELS for name in ("images.txt", "cameras.txt", "images.bin")),
+        files=tuple(
+            place + name
+            for place in _MODELS
+            for name in ("images.txt", "cameras.txt", "images.bin")
+        ),
         content="text or binary: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV",
         folder=True,
         pixel_centers="half",
@@ -173,7 +183,10 @@ KEYPOINTS = SourceFormats(
         content="`--write_json`, a file an image: BODY_25, BODY_25B, COCO (18), hands; a list of frames of ControlNet's nodes",
     ),
     easymocap=SourceFormat(
-        "EasyMocap", _KEYPOINTS + "easymocap", files=("annots",), content="`annots`, a file an image: BODY_25, hands"
+        "EasyMocap",
+        _KEYPOINTS + "easymocap",
+        files=("annots",),
+        content="`annots`, a file an image: BODY_25, hands",
     ),
     coco=SourceFormat(
         "COCO, COCO-WholeBody or AlphaPose",
@@ -245,30 +258,64 @@ class MotionFormat(Format):
     """Of files of arrays by key; the first that fits a file is used, whatever its suffix."""
 
 
-def _arrays(about: str, keys: str, poses: str, use: dict[str, Any] | None = None, **more: Any) -> MotionFormat:
+def _arrays(
+    about: str, keys: str, poses: str, use: dict[str, Any] | None = None, **more: Any
+) -> MotionFormat:
     """keys: separated by spaces; poses: as "root=global_orient limbs=body_pose"."""
     places = dict(each.split("=") for each in poses.split())
-    return MotionFormat(about, ARRAYS, ARRAY_SUFFIXES, arrays=ArrayKeys(tuple(keys.split()), places, **(use or {}), **more))
+    return MotionFormat(
+        about,
+        ARRAYS,
+        ARRAY_SUFFIXES,
+        arrays=ArrayKeys(tuple(keys.split()), places, **(use or {}), **more),
+    )
 
 
 _FACE = "jaw=jaw_pose left_eye=leye_pose right_eye=reye_pose "
-_PARTS = f"root=global_orient limbs=body_pose {_FACE}left_hand=left_hand_pose right_hand=right_hand_pose"
-_OF_CAMERA = (*("trans", "transl", "cam_t", "pred_cam_t_full", "pred_cam_t"), *("camera", "cam_trans", "translation", "orig_cam"))
+_PARTS = (
+    f"root=global_orient limbs=body_pose {_FACE}left_hand=left_hand_pose right_hand=right_hand_pose"
+)
+_OF_CAMERA = (
+    *("trans", "transl", "cam_t", "pred_cam_t_full", "pred_cam_t"),
+    *("camera", "cam_trans", "translation", "orig_cam"),
+)
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
 """Estimators write what they find in a world, or in the coordinates of a camera, whose y points down."""
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
 MOTIONS = Formats(
-    humangs=_arrays(*("ours", "rotations", "all=rotations"), moves=("translations",), rates=("fps",), fixed=True, kind="ours"),
+    humangs=_arrays(
+        *("ours", "rotations", "all=rotations"),
+        moves=("translations",),
+        rates=("fps",),
+        fixed=True,
+        kind="ours",
+    ),
     aist=_arrays(
         *("AIST++", "smpl_poses", "all=smpl_poses"),
-        use={"moves": ("smpl_trans",), "rates": ("fps",), "fps": 60.0, "fixed": True, "scaling": "smpl_scaling"},
+        use={
+            "moves": ("smpl_trans",),
+            "rates": ("fps",),
+            "fps": 60.0,
+            "fixed": True,
+            "scaling": "smpl_scaling",
+        },
     ),
-    wham=_arrays("WHAM", "pose_world trans_world", "all=pose_world", use=_ALONE | {"moves": ("trans_world",)}),
-    tram=_arrays("TRAM", "pred_rotmat pred_trans", "all=pred_rotmat", use=_ALONE | {"moves": ("pred_trans",)}),
-    human3r=_arrays("Human3R", "rotvec transl", "all=rotvec", use=_ALONE | {"up": "-y", "also": ("y",), "pivot": "head"}),
+    wham=_arrays(
+        "WHAM", "pose_world trans_world", "all=pose_world", use=_ALONE | {"moves": ("trans_world",)}
+    ),
+    tram=_arrays(
+        "TRAM", "pred_rotmat pred_trans", "all=pred_rotmat", use=_ALONE | {"moves": ("pred_trans",)}
+    ),
+    human3r=_arrays(
+        "Human3R",
+        "rotvec transl",
+        "all=rotvec",
+        use=_ALONE | {"up": "-y", "also": ("y",), "pivot": "head"},
+    ),
     mdm=_arrays(
         *("MDM (_smpl_params.npy)", "thetas root_translation", "all=thetas"),
-        use=_ALONE | {"moves": ("root_translation",), "fps": 20.0, "also": (), "pivot": "joint", "six": True},
+        use=_ALONE
+        | {"moves": ("root_translation",), "fps": 20.0, "also": (), "pivot": "joint", "six": True},
     ),
     kimodo=_arrays(
         *("Kimodo", "local_rot_mats root_positions", "all=local_rot_mats"),
@@ -284,10 +331,17 @@ MOTIONS = Formats(
         use=_ALONE | {"also": ("z", "-y"), "stays": True},
     ),
     sam3d=_arrays(
-        "SAM 3D Body", "pred_joint_coords", "all=pred_joint_coords", use=_ALONE | {"moves": ("pred_cam_t",), "kind": "points"}
+        "SAM 3D Body",
+        "pred_joint_coords",
+        "all=pred_joint_coords",
+        use=_ALONE | {"moves": ("pred_cam_t",), "kind": "points"},
     ),
     smplcodec=_arrays(
-        *("smplcodec", "bodyPose", "body=bodyPose face=headPose left_hand=leftHandPose right_hand=rightHandPose"),
+        *(
+            "smplcodec",
+            "bodyPose",
+            "body=bodyPose face=headPose left_hand=leftHandPose right_hand=rightHandPose",
+        ),
         use=_FOUND | {"moves": ("bodyTranslation",), "rates": ("frameRate",), "stays": True},
     ),
     easymocap=_arrays(
@@ -320,8 +374,14 @@ MOTIONS = Formats(
     tcmr=_arrays("TCMR", "pose verts", "all=pose", use=_ALONE | {"stays": True}),
     local=_arrays("WHAM of one camera", "pose frame_ids", "all=pose", use=_ALONE | {"stays": True}),
     smpl=_arrays("SMPL (pose)", "pose", "all=pose", up="z", also=("y", "-y")),
-    bvh=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.clips:read_bvh", (".bvh",)),
-    glb=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.clips:read_animation", (".glb", ".vrma")),
+    bvh=MotionFormat(
+        "skeletons of other programs", "humangs_jax.data.motion.clips:read_bvh", (".bvh",)
+    ),
+    glb=MotionFormat(
+        "skeletons of other programs",
+        "humangs_jax.data.motion.clips:read_animation",
+        (".glb", ".vrma"),
+    ),
 )
 """By name, in the order in which keys and files are asked."""
 
@@ -342,8 +402,12 @@ class DataSetFormat(Format):
 
 def _data_set(about: str, place: str, **options: bool) -> DataSetFormat:
     """place: module and ending of its functions."""
-    code, find = (f"humangs_jax.data.datasets.{place.replace(':', f':{do}_')}" for do in ("open", "find"))
-    return DataSetFormat(about, code, find=find, lists=options.get("lists", False), scans=options.get("scans", False))
+    code, find = (
+        f"humangs_jax.data.datasets.{place.replace(':', f':{do}_')}" for do in ("open", "find")
+    )
+    return DataSetFormat(
+        about, code, find=find, lists=options.get("lists", False), scans=options.get("scans", False)
+    )
 
 
 DATASETS: Formats[DataSetFormat] = Formats(

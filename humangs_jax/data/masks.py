@@ -72,7 +72,9 @@ def masks_at_edges(
     found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
     seen = [shift for shift in found if shift is not None]
     return [
-        (mask, 0.0) if shift is None or not _believed(shift, seen) else (_moved(mask, shift), shift.excess)
+        (mask, 0.0)
+        if shift is None or not _believed(shift, seen)
+        else (_moved(mask, shift), shift.excess)
         for mask, shift in zip(masks, found, strict=True)
     ]
 
@@ -83,7 +85,10 @@ def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
     if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
         return False
     share = lambda votes: votes[0] / max(sum(votes), 1)
-    return bool(share(shift.votes) >= AGREE_ALONE and share(np.sum([other.votes for other in alike], axis=0)) >= AGREE)
+    return bool(
+        share(shift.votes) >= AGREE_ALONE
+        and share(np.sum([other.votes for other in alike], axis=0)) >= AGREE
+    )
 
 
 def _moved(mask: Float[np.ndarray, "h w"], shift: _Shift) -> Float[np.ndarray, "h w"]:
@@ -115,7 +120,9 @@ def _shift(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) ->
         return _Shift(0.0)
     moves = resized(moves.astype(np.float32), width, height) / reduced
     votes = sector_votes(*small, whole, reduced * unit)
-    return _Shift(whole / reduced, window, moves, unit, votes, _thin_parts(own, whole / reduced / unit))
+    return _Shift(
+        whole / reduced, window, moves, unit, votes, _thin_parts(own, whole / reduced / unit)
+    )
 
 
 def boundary_moves(
@@ -129,7 +136,9 @@ def boundary_moves(
     distances = signed_distance(mask)
     normal = np.gradient(ndimage.gaussian_filter(distances, 1.0))
     slopes = np.gradient(ndimage.gaussian_filter(image, (0.7, 0.7, 0)), axis=(0, 1))
-    contrast = np.linalg.norm(slopes[0] * normal[0][..., None] + slopes[1] * normal[1][..., None], axis=-1)
+    contrast = np.linalg.norm(
+        slopes[0] * normal[0][..., None] + slopes[1] * normal[1][..., None], axis=-1
+    )
     blurred = lambda values: ndimage.gaussian_filter(values, NEIGHBORHOOD * unit, truncate=2.5)
     best, moves, highest, whole = np.full(mask.shape, -np.inf), np.zeros(mask.shape), -np.inf, 0.0
     for step in np.arange(-REACH, REACH + STEP / 2, STEP) * unit:
@@ -143,7 +152,9 @@ def boundary_moves(
     return whole, ndimage.gaussian_filter(moves, SMOOTHING * unit)
 
 
-def sector_votes(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float) -> tuple[int, int]:
+def sector_votes(
+    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float
+) -> tuple[int, int]:
     """How many sectors of the silhouette have their edge about `whole` pixels inside of it, and how many do not, or have one
     where the mask ends. Sectors whose edge is not clear say nothing; nor do those where both sides of it are white.
     """
@@ -186,13 +197,25 @@ def sector_votes(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w
     votes = [0, 0]
     for sector in range(count):
         chosen = over & (sectors == sector)
-        if 2 * chosen.sum() < SECTOR_POINTS or all(np.median(x[chosen].min(axis=-1)) >= WHITE for x, _ in beside[:2]):
+        if 2 * chosen.sum() < SECTOR_POINTS or all(
+            np.median(x[chosen].min(axis=-1)) >= WHITE for x, _ in beside[:2]
+        ):
             continue
         texture = np.concatenate([size[seen & (sectors == sector)] for size, seen in textures])
-        least = (1 + OF_TEXTURE) * np.median(texture) + EDGE * highest[sector] if len(texture) else np.inf
+        least = (
+            (1 + OF_TEXTURE) * np.median(texture) + EDGE * highest[sector]
+            if len(texture)
+            else np.inf
+        )
         ends = abs(whole) >= SEEN_APART and np.median(across[chosen]) > least
         if ends or clear[sector]:
-            votes[bool(ends or abs(best[sector] - whole) > SEEN_APART * unit or abs(best[sector]) <= LEAST)] += 1
+            votes[
+                bool(
+                    ends
+                    or abs(best[sector] - whole) > SEEN_APART * unit
+                    or abs(best[sector]) <= LEAST
+                )
+            ] += 1
     return votes[0], votes[1]
 
 
@@ -229,7 +252,11 @@ def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Pixels from the silhouette, positive inside; where the mask is neither 0 nor 1, its values say how far."""
     inside = mask >= 0.5
-    whole = np.where(inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside))
+    whole = np.where(
+        inside,
+        ndimage.distance_transform_edt(inside) - 0.5,
+        0.5 - ndimage.distance_transform_edt(~inside),
+    )
     partly = (mask > 0.02) & (mask < 0.98) & (np.abs(whole) < 1.01)
     return np.where(partly, mask - 0.5, whole)
 
@@ -248,7 +275,9 @@ CONTRAST, CERTAIN = 0.02, 0.15
 """A pixel is taken for a mixture where the means differ by more than the first, if the room's share exceeds the second."""
 
 
-def clean_rims(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+def clean_rims(
+    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w 3"]:
     """A photo without the room's share in the pixels along the edge of the mask, and beyond: what they have of the difference
     between the colors further outside and further inside is taken away, and all other detail stays.
     """
@@ -258,9 +287,13 @@ def clean_rims(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
     low, high = person_box(inside)[0]
     unit = (high - low) / RIM_HEIGHT
     margin = int(np.ceil(4 * (DEPTH + SPREAD) * unit)) + 1
-    window = tuple(slice(max(first - margin, 0), end + margin) for first, end in box_of(mask > 0).tolist())
+    window = tuple(
+        slice(max(first - margin, 0), end + margin) for first, end in box_of(mask > 0).tolist()
+    )
     own, depth = image[window].astype(np.float32), _depth(inside[window])
-    (person, known), (room, _) = (_blurred(own, side * depth >= DEPTH * unit, SPREAD * unit) for side in (1, -1))
+    (person, known), (room, _) = (
+        _blurred(own, side * depth >= DEPTH * unit, SPREAD * unit) for side in (1, -1)
+    )
     toward = room - person
     apart = (toward**2).sum(-1)
     mixed = np.clip(((own - person) * toward).sum(-1) / np.maximum(apart, CONTRAST**2), 0, 1)
@@ -274,7 +307,11 @@ def clean_rims(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 
 def _depth(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Pixels from each pixel's centre to the edge, negative outside; the photo's own border is no edge of the person."""
-    of = lambda part: ndimage.distance_transform_edt(np.pad(part, 1, mode="edge"))[1:-1, 1:-1] if part.any() else 0
+    of = lambda part: (
+        ndimage.distance_transform_edt(np.pad(part, 1, mode="edge"))[1:-1, 1:-1]
+        if part.any()
+        else 0
+    )
     return np.where(inside, of(inside) - 0.5, 0.5 - of(~inside))
 
 
@@ -282,7 +319,9 @@ def _blurred(
     colors: Float[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"], sigma: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """The mean color of what is nearby and True, and whether there is anything."""
-    blur = lambda values: ndimage.gaussian_filter(values.astype(np.float32), sigma, truncate=4.0, mode="nearest")
+    blur = lambda values: ndimage.gaussian_filter(
+        values.astype(np.float32), sigma, truncate=4.0, mode="nearest"
+    )
     weight = blur(where)
     found = np.stack([blur(colors[..., i] * where) for i in range(3)], axis=-1)
     return found / np.maximum(weight, LEAST_WEIGHT)[..., None], weight >= LEAST_WEIGHT

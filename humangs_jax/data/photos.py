@@ -31,7 +31,15 @@ from humangs_jax.data.formats import START_MARK
 from humangs_jax.data.masks import clean_rims, masks_at_edges
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, orientation, read_grey, read_image
-from humangs_jax.io.reading import FileError, check_limit, inside, read_json, reading, shown, write_json
+from humangs_jax.io.reading import (
+    FileError,
+    check_limit,
+    inside,
+    read_json,
+    reading,
+    shown,
+    write_json,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -96,13 +104,17 @@ def capture_folder(path: str | Path) -> Path:
 
 def read_description(file: Path) -> dict[str, Any]:
     """capture.json with all keys and types checked, except the matrices. Its paths stay in the folder."""
-    description = checked_json(file, missing="no such file: a capture is a folder with a capture.json")
+    description = checked_json(
+        file, missing="no such file: a capture is a folder with a capture.json"
+    )
     for key, wanted in (("format", FORMAT), ("version", VERSION)):
         if (found := expect(description, dict, file, "").get(key)) != wanted:
             raise CaptureError(file, key, f"expected {wanted!r}, got {shown(found)}")
     check_keys(description, TOP_KEYS | OPTIONAL_TOP_KEYS, TOP_KEYS - {"background"}, file)
     if not isinstance(description.get("calibrated", True), bool):
-        raise CaptureError(file, "calibrated", f"expected true or false, got {shown(description['calibrated'])}")
+        raise CaptureError(
+            file, "calibrated", f"expected true or false, got {shown(description['calibrated'])}"
+        )
     body, views = members(description, file, body=str, views=list)
     if Path(body).suffix != ".npz":  # fits write it: it must not be a photo
         raise CaptureError(file, "body", f"expected the name of an npz file, got {shown(body)}")
@@ -112,9 +124,17 @@ def read_description(file: Path) -> dict[str, Any]:
         raise CaptureError(file, "views", "expected a list of at least one view")
     for i, view in enumerate(views):
         field = f"views[{i}]"
-        check_keys(expect(view, dict, file, field), VIEW_KEYS, VIEW_KEYS - {"mask", "frame"}, file, f"{field}.")
+        check_keys(
+            expect(view, dict, file, field),
+            VIEW_KEYS,
+            VIEW_KEYS - {"mask", "frame"},
+            file,
+            f"{field}.",
+        )
         for key in VIEW_KEYS & {"image", "mask"} & view.keys():
-            check_inside(file, f"{field}.{key}", expect(view[key], str, file, f"{field}.{key}"), photo=True)
+            check_inside(
+                file, f"{field}.{key}", expect(view[key], str, file, f"{field}.{key}"), photo=True
+            )
     return description
 
 
@@ -125,10 +145,18 @@ def check_inside(file: Path, field: str, name: str, photo: bool = False) -> None
 
 
 def write_description(
-    folder: Path, views: Sequence[dict[str, Any]], background: Background = "photo", calibrated: bool = True
+    folder: Path,
+    views: Sequence[dict[str, Any]],
+    background: Background = "photo",
+    calibrated: bool = True,
 ) -> None:
     """Write capture.json of views with the keys of the format; the body is in body.npz."""
-    description: dict[str, Any] = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background}
+    description: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "body": "body.npz",
+        "background": background,
+    }
     if not calibrated:
         description["calibrated"] = False
     write_json(folder / "capture.json", description | {"views": views})
@@ -150,11 +178,15 @@ def is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
     return True
 
 
-def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = "") -> None:
+def check_keys(
+    mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = ""
+) -> None:
     """Unknown keys are errors: most are misspelt optional ones, which would otherwise be ignored in silence."""
     for key in mapping:
         if key not in known:
-            raise CaptureError(file, f"{prefix}{key}", f"unknown key: expected only {', '.join(sorted(known))}")
+            raise CaptureError(
+                file, f"{prefix}{key}", f"unknown key: expected only {', '.join(sorted(known))}"
+            )
     for key in sorted(required):
         if key not in mapping:
             raise CaptureError(file, f"{prefix}{key}", "missing")
@@ -163,7 +195,11 @@ def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file
 def check_background(background: Any, file: object) -> None:
     """One of `Background`."""
     if background not in get_args(Background):
-        raise CaptureError(file, "background", f"expected one of {', '.join(get_args(Background))}, got {shown(background)}")
+        raise CaptureError(
+            file,
+            "background",
+            f"expected one of {', '.join(get_args(Background))}, got {shown(background)}",
+        )
 
 
 def read_frames_and_matrices(
@@ -181,7 +217,9 @@ def read_frames_and_matrices(
             raise CaptureError(file, f"{field}.frame", problem)
         frames.append(checked_frame(view.get("frame", 0), poses, file, f"{field}.frame"))
         shapes = (("K", (3, 3)), ("cam_from_world", (4, 4)))
-        matrices.append([numbers(view[key], file, f"{field}.{key}", shape) for key, shape in shapes])
+        matrices.append(
+            [numbers(view[key], file, f"{field}.{key}", shape) for key, shape in shapes]
+        )
     K, cam_from_world = (np.stack(column) for column in zip(*matrices, strict=True))
     return np.asarray(frames, np.int32), K, cam_from_world
 
@@ -205,31 +243,52 @@ def read_photos(
     """
     file, views = folder / "capture.json", description["views"]
     if poses is None:
-        frames = [expect(view.get("frame", 0), int, file, f"views[{i}].frame") for i, view in enumerate(views)]
+        frames = [
+            expect(view.get("frame", 0), int, file, f"views[{i}].frame")
+            for i, view in enumerate(views)
+        ]
         for i, frame in enumerate(frames):
             if frame < 0:
                 raise CaptureError(file, f"views[{i}].frame", f"expected 0 or more, got {frame}")
         poses = 1 + max(frames, default=0)
         with reading(file, "capture", CaptureError):
             check_limit("frames", poses, "frames")
-            check_limit("frames_per_photo", math.ceil(poses / len(views)), f"frames for each of {len(views)} photos")
+            check_limit(
+                "frames_per_photo",
+                math.ceil(poses / len(views)),
+                f"frames for each of {len(views)} photos",
+            )
     views = views if chosen is None else [views[i] for i in chosen]
     with_mask = ["mask" in view for view in views]
     if any(with_mask) and not all(with_mask):
         first = with_mask.index(False)
-        raise CaptureError(file, f"views[{first}].mask", "missing, but other views have one: give all or none")
+        raise CaptureError(
+            file, f"views[{first}].mask", "missing, but other views have one: give all or none"
+        )
     check_photos(folder, views, together=True)
     frames, K, cam_from_world = read_frames_and_matrices(views, poses, file)
-    images, masks = _read_images(folder, views, description.get("background", "photo") == "white", fit_masks)
+    images, masks = _read_images(
+        folder, views, description.get("background", "photo") == "white", fit_masks
+    )
     height, width = images.shape[1:3]
     _check_orientations(folder, views, K, width, height, warns=chosen is None)
-    cameras = [checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]") for i in range(len(views))]
+    cameras = [
+        checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]")
+        for i in range(len(views))
+    ]
     names = names_from_paths([view["image"] for view in views])
-    return Photos(images, masks, stack_cameras(cameras), frames, names, is_calibrated(folder, description))
+    return Photos(
+        images, masks, stack_cameras(cameras), frames, names, is_calibrated(folder, description)
+    )
 
 
 def _check_orientations(
-    folder: Path, views: Sequence[dict[str, Any]], K: Float[np.ndarray, "v 3 3"], width: int, height: int, warns: bool
+    folder: Path,
+    views: Sequence[dict[str, Any]],
+    K: Float[np.ndarray, "v 3 3"],
+    width: int,
+    height: int,
+    warns: bool,
 ) -> None:
     """Photos are read as stored: those with an EXIF flag are warned of, and refused where K is of the turned photo."""
     flagged = []
@@ -237,7 +296,9 @@ def _check_orientations(
         if (flag := read_checked(orientation, file := folder / view["image"])) == 1:
             continue
         flagged.append(file.name)
-        stored, shown = (np.abs(camera[:2, 2] / size - 0.5).max() for size in ((width, height), (height, width)))
+        stored, shown = (
+            np.abs(camera[:2, 2] / size - 0.5).max() for size in ((width, height), (height, width))
+        )
         if flag >= 5 and shown < stored - OFF_CENTER:
             problem = f"EXIF orientation {flag} is ignored, but K is of the turned photo: save it turned, without the flag"
             raise CaptureError(file, "orientation", problem)
@@ -271,7 +332,9 @@ def check_repeats(file: Path, photos: Sequence[Path]) -> None:
             found.add((status.st_dev, status.st_ino))
     with reading(file, "capture", CaptureError):
         each = math.ceil(len(photos) / max(len(found), 1))
-        check_limit("views_per_photo", each, f"views of each photo ({len(photos):,} of {len(found):,})")
+        check_limit(
+            "views_per_photo", each, f"views of each photo ({len(photos):,} of {len(found):,})"
+        )
 
 
 def _read_images(
@@ -289,7 +352,11 @@ def _read_images(
         file = folder / view["image"]
         if image.shape != images.shape[1:]:
             size = f"{image.shape[1]} x {image.shape[0]}"
-            raise CaptureError(file, "size", f"{size}, but the first view has {width} x {height}: expected one size")
+            raise CaptureError(
+                file,
+                "size",
+                f"{size}, but the first view has {width} x {height}: expected one size",
+            )
         if (mask is None) != (masks is None):
             raise CaptureError(file, "alpha", "expected an alpha channel in all images or in none")
         images[i] = image
@@ -307,7 +374,9 @@ def _read_images(
         off = float(np.median(moved))
         wrong = f"{abs(off):.1f} pixels too {'large' if off > 0 else 'small'}"
         count = f"{len(moved)} of {len(views)} masks"
-        logger.warning("%s: %s were off, the median %s: moved to the edges in the photos", folder, count, wrong)
+        logger.warning(
+            "%s: %s were off, the median %s: moved to the edges in the photos", folder, count, wrong
+        )
     if "mask" not in views[0] and masks is not None and masks.min() == 1:
         masks = None  # many programs write an opaque alpha channel: it says nothing
     return images, masks
@@ -323,7 +392,9 @@ def read_view(
     if "mask" not in view:
         return image, alpha, False
     mask = read_mask(folder / view["mask"], "its image", image.shape[1], image.shape[0])
-    if on_white or alpha is not None:  # composited already: the mask file only says what the person is
+    if (
+        on_white or alpha is not None
+    ):  # composited already: the mask file only says what the person is
         return image, mask, False
     return image, mask, True
 
@@ -340,7 +411,10 @@ def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarr
             sizes += " (is one of them turned by an EXIF orientation?)"
         raise CaptureError(file, "size", f"{sizes}: expected the same")
     top, some = float(mask.max()), np.count_nonzero(mask) > LEAST_LABELLED * mask.size
-    if some and (top <= LARGEST_LABEL or (top < NEARLY_WHITE and mask.min() == 0 and ((mask == 0) | (mask == top)).all())):
+    if some and (
+        top <= LARGEST_LABEL
+        or (top < NEARLY_WHITE and mask.min() == 0 and ((mask == 0) | (mask == top)).all())
+    ):
         problem = f"the largest is {255 * top:.3g} of 255: expected 0 (background) to 255 (person)"
         raise CaptureError(file, "values", problem)
     return mask
@@ -356,12 +430,16 @@ def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:
         raise CaptureError("", "", error) from error
 
 
-def on_white_background(image: Float[np.ndarray, "*v h w 3"], mask: Float[np.ndarray, "*v h w"]) -> Float[np.ndarray, "*v h w 3"]:
+def on_white_background(
+    image: Float[np.ndarray, "*v h w 3"], mask: Float[np.ndarray, "*v h w"]
+) -> Float[np.ndarray, "*v h w 3"]:
     """The masked part over white."""
     return image * mask[..., None] + (1 - mask[..., None])
 
 
-def cut_out(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+def cut_out(
+    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w 3"]:
     """The person of a photo over white, without what the rim has of the background (`clean_rims`)."""
     return on_white_background(clean_rims(image, mask), mask)
 
@@ -373,4 +451,6 @@ def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
         names = tuple(plain(name_of(Path(path)), i) for i, path in enumerate(paths))
         if len(set(names)) == len(names):
             return names
-    return tuple(f"{i:03d}_{name}" for i, name in enumerate(names))  # one photo used twice, "a b" and "a_b"
+    return tuple(
+        f"{i:03d}_{name}" for i, name in enumerate(names)
+    )  # one photo used twice, "a b" and "a_b"

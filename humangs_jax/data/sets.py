@@ -35,28 +35,42 @@ def read_manifest(folder: Path, kind: SetFormat) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != kind.format:
         raise CaptureError(file, "format", f"expected a manifest of {kind.format!r}")
     if content.get("version") != kind.version:
-        raise CaptureError(file, "version", f"expected {kind.version}, got {shown(content.get('version'))}")
+        raise CaptureError(
+            file, "version", f"expected {kind.version}, got {shown(content.get('version'))}"
+        )
     if not isinstance(content.get(SETTINGS), dict):
-        raise CaptureError(file, SETTINGS, f"expected an object, got {shown(content.get(SETTINGS))}")
+        raise CaptureError(
+            file, SETTINGS, f"expected an object, got {shown(content.get(SETTINGS))}"
+        )
     return content
 
 
-def begin_set(folder: Path, kind: SetFormat, made_with: Mapping[str, Any], alone: bool = False) -> None:
+def begin_set(
+    folder: Path, kind: SetFormat, made_with: Mapping[str, Any], alone: bool = False
+) -> None:
     """Start a set in a folder, or check that the one that is there can be gone on with.
 
     Arguments: made_with: what all of it is made with; `SETTINGS` in it is a dictionary. alone: a new set needs an empty folder.
     Raises: CaptureError for a set that was made with something else; ValueError.
     """
     if not (folder / MANIFEST).is_file():
-        if alone and folder.is_dir() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
-            raise ValueError(f"{folder}: the folder is not empty and holds no {MANIFEST}: choose another one")
+        if (
+            alone
+            and folder.is_dir()
+            and any(not entry.name.startswith(".") for entry in folder.iterdir())
+        ):
+            raise ValueError(
+                f"{folder}: the folder is not empty and holds no {MANIFEST}: choose another one"
+            )
         folder.mkdir(parents=True, exist_ok=True)
         write_manifest(folder, kind, made_with)
         return
     earlier = _flat(read_manifest(folder, kind), made_with)
     asked = _flat(made_with, made_with)
     pairs = {name: (earlier.get(name), asked.get(name)) for name in sorted({**asked, **earlier})}
-    if changed := [f"{name} {shown(old)} -> {shown(new)}" for name, (old, new) in pairs.items() if old != new]:
+    if changed := [
+        f"{name} {shown(old)} -> {shown(new)}" for name, (old, new) in pairs.items() if old != new
+    ]:
         problem = f"written with settings other than asked for now ({', '.join(changed)}): choose another folder"
         raise CaptureError(folder / MANIFEST, SETTINGS, problem)
 
@@ -65,7 +79,9 @@ def _flat(content: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
     return {key: content.get(key) for key in keys if key != SETTINGS} | content[SETTINGS]
 
 
-def write_manifest(folder: Path, kind: SetFormat, made_with: Mapping[str, Any], **found: Any) -> dict[str, Any]:
+def write_manifest(
+    folder: Path, kind: SetFormat, made_with: Mapping[str, Any], **found: Any
+) -> dict[str, Any]:
     """Written aside, then renamed, so that it is never half there. found: what is in the set. Returns its content."""
     content = {**kind._asdict(), **made_with, **found}
     write_json(folder / MANIFEST, content)
@@ -74,11 +90,18 @@ def write_manifest(folder: Path, kind: SetFormat, made_with: Mapping[str, Any], 
 
 def finished(folder: Path, mark: str) -> list[str]:
     """Names of the folders that hold the file `mark`, which is written with all of them at once."""
-    return sorted(path.parent.name for path in folder.glob(f"*/{mark}") if not path.parent.name.startswith("."))
+    return sorted(
+        path.parent.name
+        for path in folder.glob(f"*/{mark}")
+        if not path.parent.name.startswith(".")
+    )
 
 
 def made(
-    work: Callable[..., object], tasks: Mapping[K, tuple[Any, ...]], workers: int, load: Callable[[], object]
+    work: Callable[..., object],
+    tasks: Mapping[K, tuple[Any, ...]],
+    workers: int,
+    load: Callable[[], object],
 ) -> Iterator[tuple[K, Exception | None]]:
     """Yields (name, None or what is wrong with it) of tasks by name, as they end; an OSError ends all: the disk may be full.
 

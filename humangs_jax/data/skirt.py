@@ -56,18 +56,24 @@ def with_skirt(
 
     Arguments: body: one of `data.views.gaussian_body`, whose vertices come first. capture: with masks. displacement: of the body.
     """
-    hem = find_hem(body, capture) if body.texels is None else None  # a map of the surface has no place for it
+    hem = (
+        find_hem(body, capture) if body.texels is None else None
+    )  # a map of the surface has no place for it
     if hem is None:
         return None
     worn, count = with_tube(body, hem), len(body.template)
     rest, faces = shaped(worn, capture.betas), np.asarray(worn.faces)
     moved = np.concatenate([displacement, np.zeros((len(rest) - count, 3))])
     held = np.where(np.arange(len(rest)) < count, HELD, 0.0)
-    moved[count:] = to_edges(masked_views(worn, rest, capture), rest + moved, faces, held, REACH)[count:]
+    moved[count:] = to_edges(masked_views(worn, rest, capture), rest + moved, faces, held, REACH)[
+        count:
+    ]
     sides = np.sqrt(vertex_areas(rest + moved, faces))
     own = np.ones(count) if body.spacing is None else np.asarray(body.spacing)
     spacing = np.concatenate([own, sides[count:] / np.median(sides[:count] / own)])
-    return replace(worn, spacing=jnp.asarray(spacing, body.template.dtype)), moved.astype(np.float32)
+    return replace(worn, spacing=jnp.asarray(spacing, body.template.dtype)), moved.astype(
+        np.float32
+    )
 
 
 def find_hem(body: BodyModel, capture: Capture) -> float | None:
@@ -82,16 +88,22 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
     asked, shown, clear = np.zeros((3, ROWS))
     cameras, empty = jax.tree.map(np.asarray, capture.cameras), empty_views(capture.masks)
     for i in [i for i in range(capture.view_count) if i not in empty]:
-        linear, offset = skinned(body, joints, capture.poses, int(capture.frames[i]), np.eye(len(joints)))
+        linear, offset = skinned(
+            body, joints, capture.poses, int(capture.frames[i]), np.eye(len(joints))
+        )
         axes = _along(np.einsum("jab,jb->ja", linear, joints) + offset, legs, levels)
         between = (1 - shares) * axes[0][:, None] + shares * axes[1][:, None]
         project = cameras.K[i] @ cameras.cam_from_world[i, :3]
-        points, sides = (x.reshape(-1, 3) @ project[:, :3].T + project[:, 3] for x in (between, axes))
+        points, sides = (
+            x.reshape(-1, 3) @ project[:, :3].T + project[:, 3] for x in (between, axes)
+        )
         if min(points[:, 2].min(), sides[:, 2].min()) <= 0:
             continue
         pixels, centers = points[:, :2] / points[:, 2:], sides[:, :2] / sides[:, 2:]
         focal = float(cameras.K[i, 0, 0])
-        distances = np.linalg.norm(pixels[:, None] - centers, axis=-1) - radii.ravel() * focal / sides[:, 2]
+        distances = (
+            np.linalg.norm(pixels[:, None] - centers, axis=-1) - radii.ravel() * focal / sides[:, 2]
+        )
         apart = distances.min(axis=1) * points[:, 2] / focal
         height, width = capture.masks[i].shape
         framed = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
@@ -112,7 +124,9 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     """The body, then the vertices of a tube around its legs down to `hem`. Raises: ValueError if it has no such legs."""
     combined = _tube(body, np.linspace(TOP, hem, ROWS))
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
-    linear = {name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None}
+    linear = {
+        name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None
+    }
     for name, own in linear.items():
         added = (combined @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
         linear[name] = np.concatenate([own, added.astype(own.dtype)])
@@ -124,9 +138,13 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     return replace(
         body,
         **{name: jnp.asarray(x) for name, x in linear.items()},
-        faces=jnp.asarray(np.concatenate([np.asarray(body.faces), len(body.template) + tube]), body.faces.dtype),
+        faces=jnp.asarray(
+            np.concatenate([np.asarray(body.faces), len(body.template) + tube]), body.faces.dtype
+        ),
         joint_regressor=jnp.pad(body.joint_regressor, ((0, 0), (0, added))),  # joints stay
-        spacing=None if body.spacing is None else jnp.pad(body.spacing, (0, added), constant_values=1),
+        spacing=None
+        if body.spacing is None
+        else jnp.pad(body.spacing, (0, added), constant_values=1),
         uvs=None,
         uv_faces=None,
         collapse_order=None,
@@ -148,11 +166,20 @@ def _along(
     joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
 ) -> Float[np.ndarray, "2 r 3"]:
     """Points on the lines from hip to knee to ankle."""
-    return np.stack([np.stack([np.interp(levels, [0, 0.5, 1], joints[leg, i]) for i in range(3)], axis=1) for leg in legs])
+    return np.stack(
+        [
+            np.stack([np.interp(levels, [0, 0.5, 1], joints[leg, i]) for i in range(3)], axis=1)
+            for leg in legs
+        ]
+    )
 
 
 def _radii(
-    body: BodyModel, rest: Points, joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
+    body: BodyModel,
+    rest: Points,
+    joints: Float[np.ndarray, "j 3"],
+    legs: Int[np.ndarray, "2 3"],
+    levels: Float[np.ndarray, " r"],
 ) -> Float[np.ndarray, "2 r"]:
     """Mean distance of the skin of each leg from these lines, metres."""
     lines = _along(joints, legs, levels)
@@ -161,7 +188,9 @@ def _radii(
         own = rest[np.asarray(body.skinning_weights)[:, leg].sum(axis=1) > 0.5]
         row = np.abs(own[:, 1, None] - lines[side, :, 1]).argmin(axis=1)
         distances = np.linalg.norm((own - lines[side, row])[:, [0, 2]], axis=1)
-        radii[side] = np.bincount(row, distances, ROWS) / np.maximum(np.bincount(row, minlength=ROWS), 1)
+        radii[side] = np.bincount(row, distances, ROWS) / np.maximum(
+            np.bincount(row, minlength=ROWS), 1
+        )
     return radii
 
 
@@ -176,14 +205,24 @@ def _tube(body: BodyModel, levels: Float[np.ndarray, " r"]) -> sparse.csr_array:
     vertices, faces = np.asarray(body.template, float), np.asarray(body.faces)
     joints = np.asarray(body.joint_regressor, float) @ vertices
     names = [name for leg in LEGS for name in leg] + list(TRUNK)
-    own = np.asarray(body.skinning_weights)[:, [name in names for name in body.joint_names]].sum(axis=1) > 0.5
+    own = (
+        np.asarray(body.skinning_weights)[:, [name in names for name in body.joint_names]].sum(
+            axis=1
+        )
+        > 0.5
+    )
     faces = faces[own[faces].all(axis=1)]  # no hands
     turns = np.linspace(0, np.pi, HALF)
-    outwards = np.stack([np.sin(turns), 0 * turns, -np.cos(turns)], axis=1)  # of the left leg, from the back
+    outwards = np.stack(
+        [np.sin(turns), 0 * turns, -np.cos(turns)], axis=1
+    )  # of the left leg, from the back
     shares = np.arange(1, GAP + 1) / (GAP + 1)
     loops = []
     for origins in np.moveaxis(_along(joints, legs, levels), 1, 0):
-        left, right = (_farthest(vertices, faces, origins[i], way * outwards) for i, way in enumerate((1.0, -1.0)))
+        left, right = (
+            _farthest(vertices, faces, origins[i], way * outwards)
+            for i, way in enumerate((1.0, -1.0))
+        )
         gap = lambda a, b: sparse.csr_array((1 - shares)[:, None] * a + shares[:, None] * b)
         loops += [gap(left[[-1]], right[[0]]), right, gap(right[[-1]], left[[0]]), left]
     return sparse.vstack(loops, format="csr")
@@ -212,9 +251,13 @@ def _farthest(
     distance = (turned * v).sum(-1) * scale
     hit = (beta >= -1e-6) & (gamma >= -1e-6) & (beta + gamma <= 1 + 1e-6) & (distance > 0)
     if not hit.any(axis=1).all():
-        raise ValueError("body: expected legs whose skin is around the lines from hip to knee to ankle")
+        raise ValueError(
+            "body: expected legs whose skin is around the lines from hip to knee to ankle"
+        )
     rows = np.arange(len(rays))
     face = np.argmax(np.where(hit, distance, -np.inf), axis=1)
     beta, gamma = beta[rows, face], gamma[rows, face]
     weights = np.stack([1 - beta - gamma, beta, gamma], axis=1)
-    return sparse.csr_array((weights.ravel(), (rows.repeat(3), faces[face].ravel())), (len(rays), len(vertices)))
+    return sparse.csr_array(
+        (weights.ravel(), (rows.repeat(3), faces[face].ravel())), (len(rays), len(vertices))
+    )

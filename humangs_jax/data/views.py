@@ -25,7 +25,12 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD, unusable_views, usable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.motion.rules import nearest_axis, standing_axis, turned_upright, upright_matrix
+from humangs_jax.data.motion.rules import (
+    nearest_axis,
+    standing_axis,
+    turned_upright,
+    upright_matrix,
+)
 from humangs_jax.geometry.camera import Camera, project
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
@@ -69,10 +74,14 @@ class SubjectViews:
     def upright(self, body: BodyModel) -> "SubjectViews":
         """The views in a world whose y axis points up; the same object if theirs does. See `upright_world`. On the host."""
         pelvis = lambda: np.asarray(shape_body(body, self.betas).joints[0])
-        poses, cameras = upright_world(jax.vmap(BodyPose)(self.rotations, self.translations), self.cameras, pelvis)
+        poses, cameras = upright_world(
+            jax.vmap(BodyPose)(self.rotations, self.translations), self.cameras, pelvis
+        )
         if cameras is self.cameras:
             return self
-        return replace(self, cameras=cameras, rotations=poses.rotations, translations=poses.translation)
+        return replace(
+            self, cameras=cameras, rotations=poses.rotations, translations=poses.translation
+        )
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
@@ -102,7 +111,9 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """
     asked = config.runtime
     if None not in (asked.body_vertices, asked.longest_edge):
-        raise ValueError("runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of them")
+        raise ValueError(
+            "runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of them"
+        )
     return body if fits(body, config) else _remeshed(_ByContent(body), *_wanted(config))
 
 
@@ -113,7 +124,10 @@ def fits(body: BodyModel, config: HumanGSConfig) -> bool:
 
 def _wanted(config: HumanGSConfig) -> tuple[Any, ...]:
     trained, asked = config.conventions, config.runtime
-    vertices, edges = (trained.body_vertices, trained.longest_edge), (asked.body_vertices, asked.longest_edge)
+    vertices, edges = (
+        (trained.body_vertices, trained.longest_edge),
+        (asked.body_vertices, asked.longest_edge),
+    )
     return *vertices, *edges, config.architecture.surface_map
 
 
@@ -134,7 +148,12 @@ class _ByContent:
 
 @functools.lru_cache(maxsize=4)
 def _remeshed(
-    key: _ByContent, vertices: int | None, edge: float | int | None, fewer: int | None, longest: float | int | None, wanted: Any
+    key: _ByContent,
+    vertices: int | None,
+    edge: float | int | None,
+    fewer: int | None,
+    longest: float | int | None,
+    wanted: Any,
 ) -> BodyModel:
     body = key.body
     if vertices is not None and vertices < len(body.template):
@@ -154,15 +173,21 @@ def _remeshed(
     return replace(body, made_for=(vertices, edge, fewer, longest, wanted))
 
 
-def on_gaussian_body(displacement: Float[np.ndarray, "n 3"], body: BodyModel, config: HumanGSConfig) -> Float[Array, "m 3"]:
+def on_gaussian_body(
+    displacement: Float[np.ndarray, "n 3"], body: BodyModel, config: HumanGSConfig
+) -> Float[Array, "m 3"]:
     """A displacement of a body's vertices, of those of its `gaussian_body`: midpoints of edges move by the mean of the ends."""
-    carrier = replace(body, pose_directions=jnp.asarray(displacement)[..., None])  # linear, and no joint depends on them
+    carrier = replace(
+        body, pose_directions=jnp.asarray(displacement)[..., None]
+    )  # linear, and no joint depends on them
     carried = gaussian_body(carrier, config).pose_directions
     assert carried is not None
     return carried[..., 0]
 
 
-def subject_rest(body: BodyModel, betas: Float[Array, " s"], displacement: Float[Array, "n 3"] | None) -> RestBody:
+def subject_rest(
+    body: BodyModel, betas: Float[Array, " s"], displacement: Float[Array, "n 3"] | None
+) -> RestBody:
     """The person's body in the T-pose; a displacement does not move the joints."""
     rest = shape_body(body, betas)
     return rest if displacement is None else replace(rest, vertices=rest.vertices + displacement)
@@ -176,13 +201,17 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
     """
     rest = subject_rest(body, views.betas, views.displacement)
 
-    def pose_view(rotations: Float[Array, "j 3"], translation: Float[Array, "3"]) -> Float[Array, "n 3"]:
+    def pose_view(
+        rotations: Float[Array, "j 3"], translation: Float[Array, "3"]
+    ) -> Float[Array, "n 3"]:
         return pose_body(body, rest, BodyPose(rotations, translation)).vertices
 
     posed = jax.vmap(pose_view)(views.rotations, views.translations)
     unit = subject_unit(rest.vertices)
     canonical, cameras = rest.vertices / unit, views.cameras.in_units(unit)
-    draw = {"plain": plain_position_map, "gouraud": gouraud_position_map}[config.conventions.position_map]
+    draw = {"plain": plain_position_map, "gouraud": gouraud_position_map}[
+        config.conventions.position_map
+    ]
 
     def rasterize_view(arguments):
         vertices, camera = arguments
@@ -248,7 +277,9 @@ def _squares(
     size: int,
 ) -> tuple[Float[np.ndarray, "v size size 3"], Float[np.ndarray, "v size size"] | None, Camera]:
     """Photos, masks and cameras, each cut to a square (left, top, side), white beyond the photo, and resized to `size` pixels."""
-    cut = lambda array, fill: np.stack([resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)])
+    cut = lambda array, fill: np.stack(
+        [resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)]
+    )
     left, top, sides = np.asarray(boxes, np.float32).T
     shift = np.zeros((len(boxes), 3, 3), np.float32)
     shift[:, 0, 2], shift[:, 1, 2] = left, top
@@ -257,16 +288,25 @@ def _squares(
     return cut(images, 1.0), None if masks is None else cut(masks, 0.0), cameras
 
 
-def _window(image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float) -> Float[np.ndarray, "side side *c"]:
+def _window(
+    image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float
+) -> Float[np.ndarray, "side side *c"]:
     """A square of an image, filled up where it reaches beyond."""
     height, width = image.shape[:2]
     window = np.full((side, side, *image.shape[2:]), fill, np.float32)
-    rows, columns = slice(max(top, 0), min(top + side, height)), slice(max(left, 0), min(left + side, width))
-    window[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[rows, columns]
+    rows, columns = (
+        slice(max(top, 0), min(top + side, height)),
+        slice(max(left, 0), min(left + side, width)),
+    )
+    window[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[
+        rows, columns
+    ]
     return window
 
 
-def upright_world(poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]) -> tuple[BodyPose, Camera]:
+def upright_world(
+    poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]
+) -> tuple[BodyPose, Camera]:
     """Poses and cameras of some views in a world whose y axis points up; the same objects if theirs does.
 
     Captures are to have y up. One with z up is as consistent, but the network has seen no such world, and an avatar's light is
@@ -277,14 +317,24 @@ def upright_world(poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[n
     """
     rotations, translations = np.asarray(poses.rotations), np.asarray(poses.translation)
     up = standing_axis(rotations[:, 0])
-    if up in (None, "y") or nearest_axis(-np.asarray(cameras.cam_from_world)[:, 1, :3].mean(axis=0))[0] != up:
+    if (
+        up in (None, "y")
+        or nearest_axis(-np.asarray(cameras.cam_from_world)[:, 1, :3].mean(axis=0))[0] != up
+    ):
         return poses, cameras
-    logger.warning("the world of these views has %s up, person and cameras say: expected y up, it is turned", up)
+    logger.warning(
+        "the world of these views has %s up, person and cameras say: expected y up, it is turned",
+        up,
+    )
     rotations, translations = turned_upright(rotations, translations, up, pelvis())
     back = np.eye(4)
     back[:3, :3] = upright_matrix(up).T
-    turned = jax.vmap(BodyPose)(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32))
-    return turned, replace(cameras, cam_from_world=jnp.asarray(cameras.cam_from_world @ back, jnp.float32))
+    turned = jax.vmap(BodyPose)(
+        jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32)
+    )
+    return turned, replace(
+        cameras, cam_from_world=jnp.asarray(cameras.cam_from_world @ back, jnp.float32)
+    )
 
 
 def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews:
@@ -338,7 +388,11 @@ def select_views(capture: Capture, count: int | None) -> list[int]:
     usable = [names.index(name) for name in capture.names]
     if count is not None and len(usable) <= count:
         return usable
-    body = decimate(capture.body, SELECTION_VERTICES) if len(capture.body.template) > SELECTION_VERTICES else capture.body
+    body = (
+        decimate(capture.body, SELECTION_VERTICES)
+        if len(capture.body.template) > SELECTION_VERTICES
+        else capture.body
+    )
     quality = np.asarray(view_quality(body, standardize(capture, SELECTION_SIZE)))
     area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
     least = LEAST_GAIN if count is None else 0.0
@@ -375,13 +429,21 @@ def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
 
     def quality(camera, vertices, normals, depth_map):
         pixels, depths = project_vertices(camera, vertices)
-        seen = visible_vertices(pixels, depths, depth_map, (camera.width, camera.height), "half_pixel")
+        seen = visible_vertices(
+            pixels, depths, depth_map, (camera.width, camera.height), "half_pixel"
+        )
         towards = camera.center - vertices
-        facing = jnp.sum(towards * normals, -1) / jnp.maximum(jnp.linalg.norm(towards, axis=-1), 1e-6)
-        return jnp.where(seen, jnp.maximum(facing, 0) * camera.K[0, 0] / jnp.maximum(depths, 1e-6), 0)
+        facing = jnp.sum(towards * normals, -1) / jnp.maximum(
+            jnp.linalg.norm(towards, axis=-1), 1e-6
+        )
+        return jnp.where(
+            seen, jnp.maximum(facing, 0) * camera.K[0, 0] / jnp.maximum(depths, 1e-6), 0
+        )
 
     cameras = views.cameras.in_units(unit)
-    shown = jax.vmap(quality)(cameras, inputs.posed_vertices / unit, inputs.posed_normals, inputs.depth_maps)
+    shown = jax.vmap(quality)(
+        cameras, inputs.posed_vertices / unit, inputs.posed_normals, inputs.depth_maps
+    )
     return shown / jnp.maximum(jnp.max(shown), 1e-6)
 
 
@@ -435,16 +497,22 @@ def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
     if capture.masks is None or capture.view_count < 2:
         return np.ones((capture.view_count, 3))
     views = standardize(capture, EXPOSURE_SIZE, crop=True)
-    rest, per_view = shape_body(capture.body, views.betas), (views.images, views.masks, views.cameras)
+    rest, per_view = (
+        shape_body(capture.body, views.betas),
+        (views.images, views.masks, views.cameras),
+    )
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
     each = [
-        seen_colors(capture.body, rest, *jax.tree.map(lambda x, i=i: x[i], (poses, *per_view))) for i in range(capture.view_count)
+        seen_colors(capture.body, rest, *jax.tree.map(lambda x, i=i: x[i], (poses, *per_view)))
+        for i in range(capture.view_count)
     ]
     colors, seen = (np.stack(x) for x in zip(*each, strict=True))
     return gains_of(colors, seen)
 
 
-def gains_of(colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]) -> Float[np.ndarray, "v 3"]:
+def gains_of(
+    colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]
+) -> Float[np.ndarray, "v 3"]:
     """Gains of views from the colors of common points; all 1 where there is hardly a difference, or nothing in common.
 
     colors: in [0, 1]. seen: which points a view shows.
@@ -472,7 +540,9 @@ def gains_of(colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]) 
 
 
 def multiplied(
-    images: Float[np.ndarray, "v h w 3"], alpha: Float[np.ndarray, "v h w"], gains: Float[np.ndarray, "v 3"]
+    images: Float[np.ndarray, "v h w 3"],
+    alpha: Float[np.ndarray, "v h w"],
+    gains: Float[np.ndarray, "v 3"],
 ) -> Float[np.ndarray, "v h w 3"]:
     """Images over white with their colors multiplied. A rendering in the exposure of its camera: by 1 / gains."""
     white = 1 - alpha[..., None]
@@ -481,7 +551,12 @@ def multiplied(
 
 @jax.jit
 def seen_colors(
-    body: BodyModel, rest: RestBody, pose: BodyPose, image: Float[Array, "h w 3"], mask: Float[Array, "h w"], camera: Camera
+    body: BodyModel,
+    rest: RestBody,
+    pose: BodyPose,
+    image: Float[Array, "h w 3"],
+    mask: Float[Array, "h w"],
+    camera: Camera,
 ) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
     """Of one photo the colors of the body's vertices, and which of them it shows."""
     vertices = pose_body(body, rest, pose).vertices

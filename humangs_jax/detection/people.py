@@ -84,7 +84,9 @@ class Detection(NamedTuple):
     def crop(self) -> Crop:
         """The square that the landmark network looks at."""
         x, y = self.head - self.hips
-        return Crop(self.hips, 2 * ENLARGED * float(np.hypot(x, y)), float(np.pi / 2 - np.arctan2(-y, x)))
+        return Crop(
+            self.hips, 2 * ENLARGED * float(np.hypot(x, y)), float(np.pi / 2 - np.arctan2(-y, x))
+        )
 
 
 class Landmarks(NamedTuple):
@@ -136,7 +138,10 @@ class Networks:
         network = self._runs[which]
         network.set_tensor(network.get_input_details()[0]["index"], image[None].astype(np.float32))
         network.invoke()
-        return {output["name"]: network.get_tensor(output["index"])[0] for output in network.get_output_details()}
+        return {
+            output["name"]: network.get_tensor(output["index"])[0]
+            for output in network.get_output_details()
+        }
 
     def detect(self, photo: Float[np.ndarray, "h w 3"], window: Crop) -> list[Detection]:
         """People in an upright window of a photo with values in [0, 1]; black around it. The best first."""
@@ -180,33 +185,46 @@ def sampled(
 
 
 def bilinear(
-    image: Float[np.ndarray, "h w *c"], points: Float[np.ndarray, "a b 2"], outside: float | None = None
+    image: Float[np.ndarray, "h w *c"],
+    points: Float[np.ndarray, "a b 2"],
+    outside: float | None = None,
 ) -> Float[np.ndarray, "a b *c"]:
     """Values between pixels; whole numbers are pixels. outside: value beyond the image; None: that of its edge."""
     height, width = image.shape[:2]
     x, y = points[..., 0], points[..., 1]
     inside = (x > -1) & (x < width) & (y > -1) & (y < height)
     x, y = x.clip(0, width - 1), y.clip(0, height - 1)
-    left, top = np.minimum(x.astype(int), max(width - 2, 0)), np.minimum(y.astype(int), max(height - 2, 0))
+    left, top = (
+        np.minimum(x.astype(int), max(width - 2, 0)),
+        np.minimum(y.astype(int), max(height - 2, 0)),
+    )
     right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
     shape = x.shape + (1,) * (image.ndim - 2)
     u, v = (x - left).reshape(shape).astype(np.float32), (y - top).reshape(shape).astype(np.float32)
     upper = image[top, left] * (1 - u) + image[top, right] * u
     lower = image[bottom, left] * (1 - u) + image[bottom, right] * u
     values = upper * (1 - v) + lower * v
-    return values if outside is None else np.where(inside.reshape(shape), values, np.float32(outside))
+    return (
+        values if outside is None else np.where(inside.reshape(shape), values, np.float32(outside))
+    )
 
 
-def refined(points: Float[np.ndarray, "n 2"], heatmaps: Float[np.ndarray, "m m n"]) -> Float[np.ndarray, "n 2"]:
+def refined(
+    points: Float[np.ndarray, "n 2"], heatmaps: Float[np.ndarray, "m m n"]
+) -> Float[np.ndarray, "n 2"]:
     """Points in [0, 1], moved to the centroid of the heatmap around them where it has a peak."""
     size, half, moved = len(heatmaps), WINDOW // 2, points.copy()
     for i, (column, row) in enumerate(np.trunc(points * size).astype(int)):
         if not (0 <= column < size and 0 <= row < size):
             continue
-        rows, columns = (np.arange(max(0, at - half), min(size, at + half + 1)) for at in (row, column))
+        rows, columns = (
+            np.arange(max(0, at - half), min(size, at + half + 1)) for at in (row, column)
+        )
         heights = heatmaps[rows[:, None], columns, i].astype(np.float64)
         if heights.max() >= PEAK:
-            moved[i] = np.asarray([heights.sum(0) @ columns, heights.sum(1) @ rows]) / heights.sum() / size
+            moved[i] = (
+                np.asarray([heights.sum(0) @ columns, heights.sum(1) @ rows]) / heights.sum() / size
+            )
     return moved
 
 
@@ -231,7 +249,9 @@ def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> W
     """Returns the part of a photo that a crop reaches, and so many pixels around it; it may be empty."""
     corners = found.crop.to_photo(np.asarray([[0.0, 0], [0, 1], [1, 0], [1, 1]]))
     left, top = (np.floor(corners.min(0)).astype(int) - margin).clip(0, [width, height]).tolist()
-    right, bottom = (np.ceil(corners.max(0) + 1).astype(int) + margin).clip(0, [width, height]).tolist()
+    right, bottom = (
+        (np.ceil(corners.max(0) + 1).astype(int) + margin).clip(0, [width, height]).tolist()
+    )
     return slice(top, max(bottom, top)), slice(left, max(right, left))
 
 
@@ -250,7 +270,11 @@ def mask_in_window(found: Landmarks, window: Window) -> Float[np.ndarray, "h w"]
     start = origin + 0.5 - (across + down) / 2
     affine = tuple(np.stack([across, down, start], axis=-1).ravel().tolist())
     picture = Image.fromarray(found.mask.astype(np.float32))
-    return np.array(picture.transform((width, height), Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR))
+    return np.array(
+        picture.transform(
+            (width, height), Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR
+        )
+    )
 
 
 @functools.cache
@@ -258,23 +282,31 @@ def _anchors() -> Float[np.ndarray, "a 2"]:
     grids = []
     for stride, copies in STRIDES:
         middles = (np.arange(DETECTOR_SIZE // stride) + 0.5) * stride / DETECTOR_SIZE
-        grids.append(np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2).repeat(copies, axis=0))
+        grids.append(
+            np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2).repeat(copies, axis=0)
+        )
     return np.concatenate(grids)
 
 
-def _merged(scores: Float[np.ndarray, " n"], boxes: Float[np.ndarray, "n 12"]) -> list[tuple[float, np.ndarray]]:
+def _merged(
+    scores: Float[np.ndarray, " n"], boxes: Float[np.ndarray, "n 12"]
+) -> list[tuple[float, np.ndarray]]:
     """Weighted non-maximum suppression: what overlaps the best is averaged by score."""
     left, merged = np.argsort(-scores), []
     while len(left):
         same = _overlaps(boxes[left[0]], boxes[left]) > SAME_BOX
         same[0] = True
         weights = scores[left[same], None]
-        merged.append((float(scores[left[0]]), (boxes[left[same]] * weights).sum(0) / weights.sum()))
+        merged.append(
+            (float(scores[left[0]]), (boxes[left[same]] * weights).sum(0) / weights.sum())
+        )
         left = left[~same]
     return merged
 
 
-def _overlaps(box: Float[np.ndarray, "12"], boxes: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, " n"]:
+def _overlaps(
+    box: Float[np.ndarray, "12"], boxes: Float[np.ndarray, "n 12"]
+) -> Float[np.ndarray, " n"]:
     low = np.maximum(box[:2] - box[2:4] / 2, boxes[:, :2] - boxes[:, 2:4] / 2)
     high = np.minimum(box[:2] + box[2:4] / 2, boxes[:, :2] + boxes[:, 2:4] / 2)
     shared = np.prod(np.maximum(high - low, 0), axis=1)
@@ -349,7 +381,10 @@ def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list
     """The people of a photo with values in [0, 1], the largest first."""
     height, width = photo.shape[:2]
     found = find_people(networks, photo)
-    return [DetectedPerson(p.pixels + 0.5, *p[1:4], mask_in_photo(p, width, height), p.crop.side) for p in found]
+    return [
+        DetectedPerson(p.pixels + 0.5, *p[1:4], mask_in_photo(p, width, height), p.crop.side)
+        for p in found
+    ]
 
 
 def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Landmarks]:
@@ -363,7 +398,9 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
     return found
 
 
-def _people(networks: Networks, photo: Float[np.ndarray, "h w 3"], detections: list[Detection]) -> list[Landmarks]:
+def _people(
+    networks: Networks, photo: Float[np.ndarray, "h w 3"], detections: list[Detection]
+) -> list[Landmarks]:
     """The landmarks of those detections that are people, the largest first."""
     height, width = photo.shape[:2]
     found = []
@@ -374,13 +411,21 @@ def _people(networks: Networks, photo: Float[np.ndarray, "h w 3"], detections: l
             found.append((drift, person))
     kept: list[Landmarks] = []
     # crops far off that still drift towards a person have wrong landmarks: the one that settled speaks for the person
-    for _, person in sorted(found, key=lambda pair: pair[0] > SETTLED):  # among these the detector's best
-        if not any(_shared(*pair, width, height) > MOST_SHARED for o in kept for pair in ((person, o), (o, person))):
+    for _, person in sorted(
+        found, key=lambda pair: pair[0] > SETTLED
+    ):  # among these the detector's best
+        if not any(
+            _shared(*pair, width, height) > MOST_SHARED
+            for o in kept
+            for pair in ((person, o), (o, person))
+        ):
             kept.append(person)
     return sorted(kept, key=lambda person: -person.crop.side)
 
 
-def _settled(networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop) -> tuple[Landmarks, float]:
+def _settled(
+    networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop
+) -> tuple[Landmarks, float]:
     """Landmarks of a crop that they confirm, and how far they would still move it, a share of its side.
 
     The landmark network knows hips and size better than the detector. It looks at least twice.
@@ -397,23 +442,34 @@ def _settled(networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop) 
     return look, float(drift)
 
 
-def window_detections(networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]) -> list[Detection]:
+def window_detections(
+    networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]
+) -> list[Detection]:
     """What the detector finds in the windows with these shares of the longer side."""
     height, width = photo.shape[:2]
-    return [each for window in windows(width, height, shares) for each in networks.detect(photo, window)]
+    return [
+        each for window in windows(width, height, shares) for each in networks.detect(photo, window)
+    ]
 
 
-def windows(width: int, height: int, shares: Sequence[float] = (*SHARES, *SMALL_SHARES)) -> list[Crop]:
+def windows(
+    width: int, height: int, shares: Sequence[float] = (*SHARES, *SMALL_SHARES)
+) -> list[Crop]:
     """Upright squares that cover a photo: one around it, then smaller ones that overlap by half, without those beside it."""
     longest, found = max(width, height), []
     for share in shares:
         side = share * longest
-        steps = [1 if size <= side else int(np.ceil(2 * (size - side) / side)) + 1 for size in (width, height)]
+        steps = [
+            1 if size <= side else int(np.ceil(2 * (size - side) / side)) + 1
+            for size in (width, height)
+        ]
         starts = [
             np.asarray([(size - side) / 2]) if count == 1 else np.linspace(0, size - side, count)
             for size, count in zip((width, height), steps, strict=True)
         ]
-        found += [Crop(np.asarray([x, y]) + side / 2, side, 0.0) for y in starts[1] for x in starts[0]]
+        found += [
+            Crop(np.asarray([x, y]) + side / 2, side, 0.0) for y in starts[1] for x in starts[0]
+        ]
     return found
 
 
@@ -422,14 +478,19 @@ def distinct(detections: list[Detection], longest: int) -> list[Detection]:
     kept: list[Detection] = []
     for detection in detections:
         side = detection.crop().side
-        if side >= SMALLEST * longest and not any(_same_detection(detection, other) for other in kept):
+        if side >= SMALLEST * longest and not any(
+            _same_detection(detection, other) for other in kept
+        ):
             kept.append(detection)
     return kept
 
 
 def _same_detection(a: Detection, b: Detection) -> bool:
     sides = sorted((a.crop().side, b.crop().side))
-    return float(np.hypot(*(a.hips - b.hips))) < SAME_HIPS * sides[1] and sides[1] < SAME_SIZE * sides[0]
+    return (
+        float(np.hypot(*(a.hips - b.hips))) < SAME_HIPS * sides[1]
+        and sides[1] < SAME_SIZE * sides[0]
+    )
 
 
 def _on_mask(person: Landmarks, width: int, height: int) -> float:
@@ -458,20 +519,26 @@ MOST = 2.0
 """Pixels of the reduced photo for one of the detector's mask."""
 
 
-def sharpened(mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float) -> Float[np.ndarray, "h w"]:
+def sharpened(
+    mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float
+) -> Float[np.ndarray, "h w"]:
     """A mask with its edges at those of the photo. pixel: pixels of the photo for one of the detector's mask."""
     rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     if not len(rows):
         return mask
     margin = filter_margin(pixel)
-    window = tuple(slice(max(int(each[0]) - margin, 0), int(each[-1]) + 1 + margin) for each in (rows, columns))
+    window = tuple(
+        slice(max(int(each[0]) - margin, 0), int(each[-1]) + 1 + margin) for each in (rows, columns)
+    )
     guide, own = photo[window], np.clip(mask[window] * 0.5 / LEVEL, 0, 1)
     height, width = own.shape
     reduced = min(1.0, MOST / pixel)
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
     small = (resized(guide, *size), resized(own, *size)) if reduced < 1 else (guide, own)
     slopes, offsets = _affine(*small, max(1, round(RADIUS * reduced * pixel)))
-    back = (lambda values: resized(values, width, height)) if reduced < 1 else (lambda values: values)
+    back = (
+        (lambda values: resized(values, width, height)) if reduced < 1 else (lambda values: values)
+    )
     found, result = back(offsets).copy(), np.zeros_like(mask)
     for color in range(3):  # one at a time: all together take gigabytes of a large photo
         found += back(slopes[..., color]) * guide[..., color]
@@ -492,7 +559,12 @@ def _affine(
     mean = lambda x: ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
     colors, level = mean(guide), mean(mask)
     together = mean(guide * mask[..., None]) - colors * level[..., None]
-    spread = mean(guide[..., :, None] * guide[..., None, :]) - colors[..., :, None] * colors[..., None, :]
-    slopes = np.linalg.solve(spread + EPSILON * np.eye(3), together[..., None].astype(float))[..., 0]
+    spread = (
+        mean(guide[..., :, None] * guide[..., None, :])
+        - colors[..., :, None] * colors[..., None, :]
+    )
+    slopes = np.linalg.solve(spread + EPSILON * np.eye(3), together[..., None].astype(float))[
+        ..., 0
+    ]
     offsets = level - (slopes * colors).sum(-1)
     return mean(slopes).astype(np.float32), mean(offsets).astype(np.float32)

@@ -119,7 +119,9 @@ def find_people(
         return People(names, lambda index: _load(folders[index], choice, body))
     if isinstance(source, Source):
         names = tuple(f"{index:04d}" for index in range(len(source)))
-        return People(names, lambda index: _from_source(source, index, names[index], inputs, _model(body)))
+        return People(
+            names, lambda index: _from_source(source, index, names[index], inputs, _model(body))
+        )
     cases = list(source)
     if others := [type(case).__name__ for case in cases if not isinstance(case, Case)]:
         raise TypeError(f"evaluate: source: expected Cases, got a {others[0]} among them")
@@ -132,7 +134,9 @@ def _load(folder: Path, choice: Choice, body: BodyModel | None) -> Case:
         return _split(folder.name, capture, choice)
     first = int(np.sum(np.asarray(capture.frames) == capture.frames[0]))
     count = min(DEFAULT_INPUTS, first) if choice.inputs is None else choice.inputs
-    chosen = spread_views(folder.name, capture.frames, np.asarray(capture.cameras.cam_from_world), count)
+    chosen = spread_views(
+        folder.name, capture.frames, np.asarray(capture.cameras.cam_from_world), count
+    )
     return Case(folder.name, load_capture(held_out, body=capture.body), capture.select(chosen))
 
 
@@ -150,7 +154,9 @@ def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path |
         subject, size, name = people[index].subject, people[index].size, names[index]
         chosen, targets = choose_views(name, subject.frames, subject.cam_from_world, choice)
         if len(targets) > MOST_TARGETS:
-            raise ValueError(f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices")
+            raise ValueError(
+                f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices"
+            )
         seen = subject.capture(chosen, file_body, size) if chosen else None
         return Case(name, subject.capture(targets, file_body, size), seen)
 
@@ -168,12 +174,17 @@ def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 def _split(name: str, capture: Capture, choice: Choice) -> Case:
     """Inputs and targets of one capture."""
-    chosen, targets = choose_views(name, capture.frames, np.asarray(capture.cameras.cam_from_world), choice)
+    chosen, targets = choose_views(
+        name, capture.frames, np.asarray(capture.cameras.cam_from_world), choice
+    )
     return Case(name, capture.select(targets), capture.select(chosen) if chosen else None)
 
 
 def choose_views(
-    name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], choice: Choice = ANY
+    name: str,
+    frames: Int[np.ndarray, " v"],
+    cam_from_world: Float[np.ndarray, "v 4 4"],
+    choice: Choice = ANY,
 ) -> tuple[list[int], list[int]]:
     """The views of a person that are inputs, and those to compare with. Raises: ValueError naming the person."""
     count, (inputs, indices, reconstructs) = len(frames), choice
@@ -182,18 +193,24 @@ def choose_views(
             raise ValueError(f"indices: {name!r} is missing")
         chosen, targets = (list(indices[name].get(key, ())) for key in ("context", "target"))
         if not targets or not all(0 <= i < count for i in (*chosen, *targets)):
-            raise ValueError(f"indices: {name}: expected views from 0 to {count - 1} and at least one target")
+            raise ValueError(
+                f"indices: {name}: expected views from 0 to {count - 1} and at least one target"
+            )
         return chosen, targets
     if inputs is None and not reconstructs:
         return [], list(range(count))
-    chosen = spread_views(name, frames, cam_from_world, DEFAULT_INPUTS if inputs is None else inputs)
+    chosen = spread_views(
+        name, frames, cam_from_world, DEFAULT_INPUTS if inputs is None else inputs
+    )
     targets = [i for i in range(count) if i not in chosen]
     if not targets:
         raise ValueError(f"{name}: {count} views, all of them inputs: none is left to compare with")
     return chosen, targets
 
 
-def spread_views(name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int) -> list[int]:
+def spread_views(
+    name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
+) -> list[int]:
     """Views of the first view's frame, that one among them, evenly spaced around the person; in order. Raises: ValueError."""
     same = np.flatnonzero(np.asarray(frames) == frames[0])
     if not 1 <= count <= len(same):
@@ -205,8 +222,12 @@ def spread_views(name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float
     return sorted(int(around[i * len(same) // count]) for i in range(count))
 
 
-def _from_source(source: Source, index: int, name: str, inputs: int | None, body: BodyModel | None) -> Case:
-    count = inputs or (DEFAULT_INPUTS if DEFAULT_INPUTS in source.input_counts else source.input_counts[0])
+def _from_source(
+    source: Source, index: int, name: str, inputs: int | None, body: BodyModel | None
+) -> Case:
+    count = inputs or (
+        DEFAULT_INPUTS if DEFAULT_INPUTS in source.input_counts else source.input_counts[0]
+    )
     example = source.example(0, index, count)
     body = load_body() if body is None else body
     return Case(name, capture_of(example.targets, body), capture_of(example.inputs, body))
@@ -216,7 +237,9 @@ def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
     """Views of a source as a capture: equal poses are one frame, names are numbers."""
     views = jax.tree.map(np.asarray, views)
     count = len(views.images) if views.view_count is None else int(views.view_count)
-    poses = np.concatenate([views.rotations.reshape(len(views.images), -1), views.translations], axis=1)[:count]
+    poses = np.concatenate(
+        [views.rotations.reshape(len(views.images), -1), views.translations], axis=1
+    )[:count]
     _, first, frames = np.unique(poses, axis=0, return_index=True, return_inverse=True)
     numbers = np.argsort(np.argsort(first))  # frames in the order in which they appear
     first = np.sort(first)
@@ -227,7 +250,9 @@ def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
         frames=numbers[frames.ravel()].astype(np.int32),
         body=body,
         betas=views.betas,
-        poses=jax.vmap(BodyPose)(jnp.asarray(views.rotations[first]), jnp.asarray(views.translations[first])),
+        poses=jax.vmap(BodyPose)(
+            jnp.asarray(views.rotations[first]), jnp.asarray(views.translations[first])
+        ),
         names=tuple(f"{i:03d}" for i in range(count)),
     )
 
@@ -251,13 +276,19 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
     folder = None if isinstance(avatar, Avatar) else Path(avatar)
     if folder is None or not folder.is_dir():
         if people != 1:
-            raise ValueError(f"one avatar for {people} people: expected a folder with PERSON.npz for each")
+            raise ValueError(
+                f"one avatar for {people} people: expected a folder with PERSON.npz for each"
+            )
         loaded = avatar if isinstance(avatar, Avatar) else Avatar.load(avatar)
         return lambda case, background: draw_views(loaded, case.truth, background)
 
     def one_of(case: Case, background: float) -> Predicted:
         file = folder / f"{case.name}.npz"
-        return draw_views(Avatar.load(file), case.truth, background) if file.is_file() else _nothing(case, (str(file),))
+        return (
+            draw_views(Avatar.load(file), case.truth, background)
+            if file.is_file()
+            else _nothing(case, (str(file),))
+        )
 
     return one_of
 
@@ -300,7 +331,9 @@ def predictions_method(folder: str | Path, people: int) -> Method:
             counts = f"{len(coverage)} of {len(read)} images"
             raise ValueError(f"{place}: {counts} have an alpha channel: expected all or none")
         images = np.stack([image for image, _ in read])
-        return Predicted(images, np.stack(coverage) if coverage else None, tuple(i for i, _ in found), missing)
+        return Predicted(
+            images, np.stack(coverage) if coverage else None, tuple(i for i, _ in found), missing
+        )
 
     return method
 
@@ -316,15 +349,21 @@ def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | No
 
 
 def _prediction(place: Path, name: str, index: int) -> Path | None:
-    candidates = (place / f"{stem}{suffix}" for stem in (name, f"view_{index:03d}") for suffix in SUFFIXES)
+    candidates = (
+        place / f"{stem}{suffix}" for stem in (name, f"view_{index:03d}") for suffix in SUFFIXES
+    )
     return next((file for file in candidates if file.is_file()), None)
 
 
-def _read_prediction(file: Path, size: tuple[int, int], background: float) -> tuple[np.ndarray, np.ndarray | None]:
+def _read_prediction(
+    file: Path, size: tuple[int, int], background: float
+) -> tuple[np.ndarray, np.ndarray | None]:
     image, alpha = read_image(file)
     if image.shape[:2] != size:
         sizes = " x ".join(map(str, image.shape[1::-1])), " x ".join(map(str, size[::-1]))
-        raise ValueError(f"{file}: size {sizes[0]}, but the true image has {sizes[1]}: expected the same")
+        raise ValueError(
+            f"{file}: size {sizes[0]}, but the true image has {sizes[1]}: expected the same"
+        )
     if alpha is not None:
         image = image * alpha[..., None] + background * (1 - alpha[..., None])
     return image, alpha
@@ -348,7 +387,12 @@ def choose_method(
     method: Method | None = None,
 ) -> tuple[str, Method]:
     """What is asked for, by a name for reports; the shipped weights if nothing is. Raises: ValueError for more than one."""
-    given: dict[str, Any] = {"avatar": avatar, "weights": weights, "predictions": predictions, "method": method}
+    given: dict[str, Any] = {
+        "avatar": avatar,
+        "weights": weights,
+        "predictions": predictions,
+        "method": method,
+    }
     asked = [name for name, value in given.items() if value is not None]
     if len(asked) > 1:
         raise ValueError(f"{' and '.join(asked)}: expected one of them")

@@ -39,12 +39,16 @@ class KeptScores:
     Raises: CaptureError for a folder of scores that were made with other settings.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], method: CaseKey, ordered: bool) -> None:
+    def __init__(
+        self, folder: Path, settings: Mapping[str, Any], method: CaseKey, ordered: bool
+    ) -> None:
         begin_set(folder, SCORES, {SETTINGS: {"version": __version__, **settings}})
         self._folder, self._method, self._ordered = folder, method, ordered
         self._before = checksum({}, repr(sorted(settings.items())))
 
-    def __call__(self, case: Case, score: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
+    def __call__(
+        self, case: Case, score: Callable[[], dict[str, Any]]
+    ) -> tuple[dict[str, Any], bool]:
         """What there is to say of a person, and whether it was kept; `score` is called where it was not."""
         key = checksum({}, self._before, case_key(case), self._method(case))
         if self._ordered:
@@ -77,9 +81,16 @@ def case_key(case: Case) -> str:
 
 
 def _capture_key(capture: Capture) -> str:
-    arrays = {"images": capture.images, "masks": capture.masks, "frames": capture.frames, "betas": capture.betas}
+    arrays = {
+        "images": capture.images,
+        "masks": capture.masks,
+        "frames": capture.frames,
+        "betas": capture.betas,
+    }
     moved = {"displacement": capture.displacement}
-    known = {name: np.asarray(array) for name, array in {**arrays, **moved}.items() if array is not None}
+    known = {
+        name: np.asarray(array) for name, array in {**arrays, **moved}.items() if array is not None
+    }
     placed = tree_key((capture.cameras, capture.poses))
     return checksum(known, placed, tree_key(capture.body), repr(capture.names))
 
@@ -88,7 +99,10 @@ def indices_key(indices: Mapping[str, Any] | None) -> str | None:
     """A short checksum of which views are inputs and targets; None without."""
     if indices is None:
         return None
-    plain = {name: {key: [int(view) for view in views] for key, views in each.items()} for name, each in indices.items()}
+    plain = {
+        name: {key: [int(view) for view in views] for key, views in each.items()}
+        for name, each in indices.items()
+    }
     return checksum({}, json.dumps(plain, sort_keys=True))[:SHORT]
 
 
@@ -120,7 +134,9 @@ def method_key(
         return _source_key(method)[:SHORT], nothing
     if predictions is not None:
         root = Path(predictions)
-        return "images", lambda case: _files_key(file for file in prediction_files(root, case, people).values() if file)
+        return "images", lambda case: _files_key(
+            file for file in prediction_files(root, case, people).values() if file
+        )
     if isinstance(avatar, Avatar):
         return tree_key(avatar)[:SHORT], nothing
     if avatar is not None:

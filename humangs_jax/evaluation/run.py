@@ -28,7 +28,14 @@ from humangs_jax.data.body_and_masks import empty_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
-from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
+from humangs_jax.evaluation.cases import (
+    Case,
+    Indices,
+    Method,
+    Predicted,
+    choose_method,
+    find_people,
+)
 from humangs_jax.evaluation.kept import KeptScores, body_key, indices_key, method_key, networks_key
 from humangs_jax.evaluation.scores import (
     CONFIDENCE,
@@ -85,7 +92,10 @@ COLUMNS = {
     "foreground": Column("share of the person", 3, ""),
 }
 _OF_PATCHES = ("psnr", "ssim", "lpips_vgg", "lpips_alex", "lpips_squeeze")
-COLUMNS |= {f"patch_{x}": COLUMNS[x]._replace(heading=f"{COLUMNS[x].heading} of patches") for x in _OF_PATCHES}
+COLUMNS |= {
+    f"patch_{x}": COLUMNS[x]._replace(heading=f"{COLUMNS[x].heading} of patches")
+    for x in _OF_PATCHES
+}
 COLUMNS["patches"] = Column("patches", 1, "")
 
 
@@ -104,7 +114,9 @@ class Gallery:
         key = 0.0 if psnr is None else -psnr
         if len(self._shots) >= self.limit and (not self._shots or key <= self._shots[0][0]):
             return
-        (heapq.heappushpop if len(self._shots) >= self.limit else heapq.heappush)(self._shots, (key, row, images()))
+        (heapq.heappushpop if len(self._shots) >= self.limit else heapq.heappush)(
+            self._shots, (key, row, images())
+        )
 
     @property
     def shots(self) -> dict[int, dict[str, str]]:
@@ -115,7 +127,11 @@ class Gallery:
 def _shot(truth: Float[np.ndarray, "h w 3"], ours: Float[np.ndarray, "h w 3"]) -> dict[str, str]:
     """Truth, ours and error, small."""
     ours = np.clip(ours, 0, 1)
-    images = {"truth": truth, "ours": ours, "error": error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)}
+    images = {
+        "truth": truth,
+        "ours": ours,
+        "error": error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR),
+    }
     return {name: _data_url(image, SIDE) for name, image in images.items()}
 
 
@@ -147,7 +163,9 @@ def page_html(evaluation: dict[str, Any], notes: list[str], gallery: Gallery) ->
         "title": html.escape(f"{evaluation['name']}, protocol {evaluation['protocol']['name']}"),
         "style": read("style.css"),
         "script": read("report.js"),
-        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # a name may not end the script
+        "data": json.dumps(data, separators=(",", ":")).replace(
+            "<", "\\u003c"
+        ),  # a name may not end the script
     }
     return _MARK.sub(lambda mark: parts[mark[1]], read("index.html"))
 
@@ -200,23 +218,33 @@ class Evaluation:
         notes = [f"Each number is the {ORDER}."]
         if any(mean is not None and mean.low is not None for mean in self.means.values()):
             over = next(mean.over for mean in self.means.values() if mean is not None)
-            notes.append(f"Intervals: {CONFIDENCE:.0%} of the mean under resampling of {over} (bootstrap).")
+            notes.append(
+                f"Intervals: {CONFIDENCE:.0%} of the mean under resampling of {over} (bootstrap)."
+            )
         for reason in dict.fromkeys(self.reasons.values()):
             scores = [COLUMNS[name].heading for name, why in self.reasons.items() if why == reason]
             notes.append(f"Missing: {', '.join(scores)}: {reason}.")
         side = self.protocol.published_side
         if side is not None and self.about["sides"] != [[side, side]]:
             found = ", ".join(f"{width} x {height}" for width, height in self.about["sides"])
-            notes.append(f"Published numbers of this protocol are of {side} x {side} pixels; these images have {found}.")
+            notes.append(
+                f"Published numbers of this protocol are of {side} x {side} pixels; these images have {found}."
+            )
         if self.about["everything"]:
-            notes.append("Compared on all views of the captures: if some of them were inputs, name those that were not.")
+            notes.append(
+                "Compared on all views of the captures: if some of them were inputs, name those that were not."
+            )
         if self.missing:
-            notes.append(f"{_counted(len(self.missing), 'prediction', 'predictions')} missing: {_listed(self.missing)}")
+            notes.append(
+                f"{_counted(len(self.missing), 'prediction', 'predictions')} missing: {_listed(self.missing)}"
+            )
         return notes
 
     def to_json(self) -> dict[str, Any]:
         """Everything but the images, as plain values."""
-        means = {name: None if mean is None else mean._asdict() for name, mean in self.means.items()}
+        means = {
+            name: None if mean is None else mean._asdict() for name, mean in self.means.items()
+        }
         return {
             "name": self.name,
             "protocol": {"name": self.protocol_name, "settings": _plain(self.protocol)},
@@ -233,7 +261,10 @@ class Evaluation:
         """Header and rows: a person each, then the mean."""
         names = [name for name, mean in self.means.items() if mean is not None]
         header = ["person", *(COLUMNS[name].heading for name in names)]
-        rows = [[person, *(shown(row[name], name) for name in names)] for person, row in self.people.items()]
+        rows = [
+            [person, *(shown(row[name], name) for name in names)]
+            for person, row in self.people.items()
+        ]
         return header, [*rows, ["mean", *(shown_mean(self.means[name], name) for name in names)]]
 
     def write(
@@ -309,9 +340,15 @@ def evaluate(
         raise ValueError(f"no protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
     rules = PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
     networks = {network.net: network for network in lpips}
-    networks |= {net: load_lpips(net) for net in rules.lpips if net not in networks and net in installed_lpips()}
+    networks |= {
+        net: load_lpips(net)
+        for net in rules.lpips
+        if net not in networks and net in installed_lpips()
+    }
     choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
-    people = find_people(source, inputs, choice, body, avatar is None and predictions is None and method is None)
+    people = find_people(
+        source, inputs, choice, body, avatar is None and predictions is None and method is None
+    )
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
     kept = None
     if keep is not None:
@@ -341,21 +378,32 @@ def evaluate(
             gallery.inputs[rows[-1].person] = person["input_images"]
             scored.append(person)
     if not rows:
-        raise ValueError(f"no prediction was found; {len(missing)} were expected: {_listed(missing)}")
+        raise ValueError(
+            f"no prediction was found; {len(missing)} were expected: {_listed(missing)}"
+        )
     people_shown = {row.person for row in rows}
     about = {
         "source": printable(_told(source)),
         "counts": f"{_counted(len(rows), 'image', 'images')} of {_counted(len(people_shown), 'person', 'people')}",
         "sides": sorted({tuple(person["side"]) for person in scored}),
         "inputs": sorted({person["inputs"] for person in scored} - {None}),
-        "everything": isinstance(source, str | Path | Capture) and any(person["inputs"] is None for person in scored),
+        "everything": isinstance(source, str | Path | Capture)
+        and any(person["inputs"] is None for person in scored),
     }
     has = {part: all(person[part] for person in scored) for part in ("masks", "alpha")}
     reasons = missing_reasons(rules, networks, has["masks"], has["alpha"])
-    unknown = [score for score in score_names(rules) if all(row.scores[score] is None for row in rows)]
-    reasons |= {score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons}
+    unknown = [
+        score for score in score_names(rules) if all(row.scores[score] is None for row in rows)
+    ]
+    reasons |= {
+        score: "no image is large enough, or shows enough of a person"
+        for score in unknown
+        if score not in reasons
+    }
     label = protocol if isinstance(protocol, str) else "custom"
-    return Evaluation(printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+    return Evaluation(
+        printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery
+    )
 
 
 def _told(source: Any) -> str:
@@ -364,11 +412,23 @@ def _told(source: Any) -> str:
 
 
 def _score_person(
-    case: Case, predict: Method, rules: EvaluationProtocol, networks: dict[str, Lpips], gallery: Gallery, first: int
+    case: Case,
+    predict: Method,
+    rules: EvaluationProtocol,
+    networks: dict[str, Lpips],
+    gallery: Gallery,
+    first: int,
 ) -> dict[str, Any]:
     """What there is to say of a person, as JSON has it; its images go to the gallery. first: number of its first row."""
-    predicted, name = _without_nobody(case, predict(case, rules.behind)), printable(case.name)  # of a folder: now one line
-    about: dict[str, Any] = {"missing": [printable(file) for file in predicted.missing], "rows": [], "shots": []}
+    predicted, name = (
+        _without_nobody(case, predict(case, rules.behind)),
+        printable(case.name),
+    )  # of a folder: now one line
+    about: dict[str, Any] = {
+        "missing": [printable(file) for file in predicted.missing],
+        "rows": [],
+        "shots": [],
+    }
     if not predicted.views:
         return about
     truth, inputs = case.truth.select(predicted.views), case.inputs
@@ -378,7 +438,9 @@ def _score_person(
         raise ValueError(f"{name}: {error}") from error
     for i, scores in enumerate(scored):
         mask = None if truth.masks is None else truth.masks[i]
-        shot = functools.partial(_shot, on_background(truth.images[i], mask, rules), predicted.images[i])
+        shot = functools.partial(
+            _shot, on_background(truth.images[i], mask, rules), predicted.images[i]
+        )
         gallery.add(first + i, scores["psnr"], shot)
         about["rows"].append([name, int(truth.frames[i]), printable(truth.names[i]), scores])
     shots = gallery.shots
@@ -388,7 +450,9 @@ def _score_person(
         "alpha": predicted.alpha is not None,
         "side": truth.images.shape[2:0:-1],
         "inputs": None if inputs is None else inputs.view_count,
-        "input_images": [_data_url(image, INPUT_SIDE) for image in inputs.images] if inputs and gallery.limit else [],
+        "input_images": [_data_url(image, INPUT_SIDE) for image in inputs.images]
+        if inputs and gallery.limit
+        else [],
     }
 
 
@@ -398,7 +462,11 @@ def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
     if not empty:
         return predicted
     names = ", ".join(case.truth.names[i] for i in sorted(empty))
-    count = "1 view is not compared, its" if len(empty) == 1 else f"{len(empty)} views are not compared, their"
+    count = (
+        "1 view is not compared, its"
+        if len(empty) == 1
+        else f"{len(empty)} views are not compared, their"
+    )
     logger.warning("%s: %s mask is empty: %s", case.name, count, names)
     kept = [row for row, view in enumerate(predicted.views) if view not in empty]
     return predicted._replace(
@@ -421,7 +489,9 @@ def _plain(value: Any) -> Any:
     if not dataclasses.is_dataclass(value):
         return list(value) if isinstance(value, tuple) else value
     fields = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return fields if isinstance(value, EvaluationProtocol) else {"kind": type(value).__name__} | fields
+    return (
+        fields if isinstance(value, EvaluationProtocol) else {"kind": type(value).__name__} | fields
+    )
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------
@@ -447,7 +517,9 @@ _MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The first column to the left, the others to the right."""
     rule = ["---", *["---:"] * (len(header) - 1)]
-    escape = lambda cell: "".join(_MARKDOWN.get(c, c) for c in printable(cell)).replace("](", "]\\(")
+    escape = lambda cell: "".join(_MARKDOWN.get(c, c) for c in printable(cell)).replace(
+        "](", "]\\("
+    )
     lines = (" | ".join(map(escape, row)) for row in (header, *rows))
     first, *others = (f"| {line} |" for line in lines)
     return "\n".join([first, f"| {' | '.join(rule)} |", *others]) + "\n"
@@ -459,9 +531,13 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 def latex_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A tabular with rules of the package booktabs."""
     special = _LATEX | {sign: f"\\{sign}" for sign in "&%$#_{}"}
-    line = lambda row: " & ".join("".join(special.get(c, c) for c in printable(cell)) for cell in row) + r" \\"
+    line = lambda row: (
+        " & ".join("".join(special.get(c, c) for c in printable(cell)) for cell in row) + r" \\"
+    )
     body = "\n".join(line(row) for row in rows)
-    begin = f"\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}\n\\toprule\n{line(header)}\n\\midrule\n"
+    begin = (
+        f"\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}\n\\toprule\n{line(header)}\n\\midrule\n"
+    )
     return f"{begin}{body}\n\\bottomrule\n\\end{{tabular}}\n"
 
 
@@ -480,7 +556,12 @@ def csv_text(rows: Sequence[Scored]) -> str:
     writer.writerow(["person", "frame", "view", *names])
     for row in rows:
         writer.writerow(
-            [_cell(row.person), row.frame, _cell(row.view), *("" if (x := row.scores[n]) is None else x for n in names)]
+            [
+                _cell(row.person),
+                row.frame,
+                _cell(row.view),
+                *("" if (x := row.scores[n]) is None else x for n in names),
+            ]
         )
     return text.getvalue()
 

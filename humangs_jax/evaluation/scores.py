@@ -51,7 +51,9 @@ Image = Float[np.ndarray, "h w 3"]
 class Crop(Protocol):
     """A part of an image, found by the true mask."""
 
-    def cut(self, image: Image, mask: Float[np.ndarray, "h w"], background: float) -> Float[np.ndarray, "y x 3"]:
+    def cut(
+        self, image: Image, mask: Float[np.ndarray, "h w"], background: float
+    ) -> Float[np.ndarray, "y x 3"]:
         """The part; `background` (0 or 1) fills what lies outside of the image. The mask is not empty."""
         ...
 
@@ -69,7 +71,9 @@ class WholeFrame:
 class MaskBox:
     """The bounding box of the pixels where the mask is above a half."""
 
-    def cut(self, image: Image, mask: Float[np.ndarray, "h w"], background: float) -> Float[np.ndarray, "y x 3"]:
+    def cut(
+        self, image: Image, mask: Float[np.ndarray, "h w"], background: float
+    ) -> Float[np.ndarray, "y x 3"]:
         """See `Crop`."""
         (top, bottom), (left, right) = box_of(mask > 0.5)
         return image[top:bottom, left:right]
@@ -87,16 +91,23 @@ class SquareBox:
     margin: int = 50
     side: int = 512
 
-    def cut(self, image: Image, mask: Float[np.ndarray, "h w"], background: float) -> Float[np.ndarray, "s s 3"]:
+    def cut(
+        self, image: Image, mask: Float[np.ndarray, "h w"], background: float
+    ) -> Float[np.ndarray, "s s 3"]:
         """See `Crop`."""
         from skimage.transform import resize
 
-        rows, columns = (slice(max(0, first - self.margin), end - 1 + self.margin) for first, end in box_of(mask > 0))
+        rows, columns = (
+            slice(max(0, first - self.margin), end - 1 + self.margin)
+            for first, end in box_of(mask > 0)
+        )
         part = image[rows, columns]
         largest = max(part.shape[:2])
         missing = [((largest - side) // 2, (largest - side + 1) // 2) for side in part.shape[:2]]
         square = np.pad(part.astype(np.float32), [*missing, (0, 0)], constant_values=background)
-        return resize(square, (self.side, self.side), order=1, mode="edge", anti_aliasing=False).astype(np.float32)
+        return resize(
+            square, (self.side, self.side), order=1, mode="edge", anti_aliasing=False
+        ).astype(np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,14 +121,18 @@ class CentredWindow:
     width: int = 500
     side: int = 1024
 
-    def cut(self, image: Image, mask: Float[np.ndarray, "h w"], background: float) -> Float[np.ndarray, "y x 3"]:
+    def cut(
+        self, image: Image, mask: Float[np.ndarray, "h w"], background: float
+    ) -> Float[np.ndarray, "y x 3"]:
         """See `Crop`."""
         factor = self.side / max(mask.shape)
         height, width = (max(1, round(factor * side)) for side in mask.shape)
         if factor != 1:
             image, mask = resized(image, width, height), resized(mask, width, height)
         corner = []
-        for (first, end), size, side in zip(box_of(mask > 0), (self.height, self.width), mask.shape, strict=True):
+        for (first, end), size, side in zip(
+            box_of(mask > 0), (self.height, self.width), mask.shape, strict=True
+        ):
             start = first - (size - (end - first)) // 2
             corner.append(int(np.clip(start, 0, max(0, side - size))))
         return image[corner[0] : corner[0] + self.height, corner[1] : corner[1] + self.width]
@@ -155,15 +170,23 @@ class EvaluationProtocol:
     @property
     def needs_masks(self) -> bool:
         """Whether it is not defined without the true masks."""
-        return self.masked or self.background == "black" or not all(isinstance(crop, WholeFrame) for crop in self.crops)
+        return (
+            self.masked
+            or self.background == "black"
+            or not all(isinstance(crop, WholeFrame) for crop in self.crops)
+        )
 
 
 PROTOCOLS: Presets[EvaluationProtocol] = Presets(
     {
         "humangs": EvaluationProtocol(published_side=512),
         "animatable-gaussians": EvaluationProtocol(lpips_crop=SquareBox(), ssim=UNIFORM),
-        "ghg": EvaluationProtocol("black", CentredWindow(), lpips=("alex", "vgg"), ssim=UNIFORM, published_side=1024),
-        "giga": EvaluationProtocol("black", MaskBox(), masked=True, lpips=("alex",), ssim=TORCHMETRICS),
+        "ghg": EvaluationProtocol(
+            "black", CentredWindow(), lpips=("alex", "vgg"), ssim=UNIFORM, published_side=1024
+        ),
+        "giga": EvaluationProtocol(
+            "black", MaskBox(), masked=True, lpips=("alex",), ssim=TORCHMETRICS
+        ),
         "lhm": EvaluationProtocol(lpips=("squeeze",), ssim=TORCHMETRICS),
         "lhm++": EvaluationProtocol(masked=True, lpips=("alex",), ssim=UNIFORM),
         "lvsm": EvaluationProtocol("dataset"),
@@ -205,8 +228,13 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
     """Means of the scores of some images or people; None for what one of them lacks."""
     listed = list(rows)
     columns = {name: [row.get(name) for row in listed] for name in listed[0]}
-    known = {name: [value for value in values if value is not None] for name, values in columns.items()}
-    return {name: sum(values) / len(values) if len(values) == len(listed) else None for name, values in known.items()}
+    known = {
+        name: [value for value in values if value is not None] for name, values in columns.items()
+    }
+    return {
+        name: sum(values) / len(values) if len(values) == len(listed) else None
+        for name, values in known.items()
+    }
 
 
 def known_means(rows: Sequence[Row]) -> Row:
@@ -243,7 +271,9 @@ def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
     found: dict[str, Mean | None] = {}
     for name in rows[0].scores:
         values = [value for unit in levels[over] if (value := unit[name]) is not None]
-        found[name] = Mean(float(np.mean(values)), *bootstrap(values), len(values), over) if values else None
+        found[name] = (
+            Mean(float(np.mean(values)), *bootstrap(values), len(values), over) if values else None
+        )
     return found
 
 
@@ -274,7 +304,10 @@ Networks = Mapping[str, Lpips]
 
 @functools.partial(jax.jit, static_argnames="window")
 def pair_scores(
-    predicted: Float[Array, "h w 3"], truth: Float[Array, "h w 3"], size: Int[Array, "2"], window: SsimWindow
+    predicted: Float[Array, "h w 3"],
+    truth: Float[Array, "h w 3"],
+    size: Int[Array, "2"],
+    window: SsimWindow,
 ) -> dict[str, Scalar]:
     """psnr (dB) and ssim of two images in [0, 1], of which the first size[0] rows and size[1] columns count."""
     rows, columns = (jnp.arange(side) < n for side, n in zip(truth.shape[:2], size, strict=True))
@@ -297,7 +330,9 @@ def person_scores(
     mask: coverage. band: 1 along its silhouette. Both 0 beyond the size. Without a patch that counts their scores are NaN.
     """
     shares = _patch_means(mask, PATCH)
-    within = [STRIDE * jnp.arange(side) + PATCH <= n for side, n in zip(shares.shape, size, strict=True)]
+    within = [
+        STRIDE * jnp.arange(side) + PATCH <= n for side, n in zip(shares.shape, size, strict=True)
+    ]
     kept = (shares > LEAST_FOREGROUND) & within[0][:, None] & within[1]
     errors = jnp.mean(jnp.square(predicted - truth), axis=-1)
     similarities = jnp.mean(similarity_map(predicted, truth, window), axis=-1)
@@ -322,7 +357,9 @@ def alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[
 
 
 def _precise_lpips(weights: Lpips, predicted: Any, truth: Any, size: Any = None) -> Scalar:
-    with jax.default_matmul_precision("highest"):  # accelerators round the factors of convolutions by default
+    with jax.default_matmul_precision(
+        "highest"
+    ):  # accelerators round the factors of convolutions by default
         return lpips(weights, predicted, truth, size)
 
 
@@ -343,13 +380,20 @@ def score_image(
     predicted, truth: in [0, 1], on the protocol's background. mask: the true one. alpha: the prediction's coverage.
     """
     empty = mask is None or not (mask > 0.5).any()
-    predicted, window, row = np.clip(predicted, 0, 1), protocol.ssim, dict.fromkeys(score_names(protocol))
+    predicted, window, row = (
+        np.clip(predicted, 0, 1),
+        protocol.ssim,
+        dict.fromkeys(score_names(protocol)),
+    )
     if protocol.masked and mask is not None:
         predicted = predicted * mask[..., None] + protocol.behind * (1 - mask[..., None])
     for crop in protocol.crops:
         if empty and not isinstance(crop, WholeFrame):
             continue
-        pair = [image if mask is None else crop.cut(image, mask, protocol.behind) for image in (predicted, truth)]
+        pair = [
+            image if mask is None else crop.cut(image, mask, protocol.behind)
+            for image in (predicted, truth)
+        ]
         size, least = jnp.asarray(pair[0].shape[:2]), min(pair[0].shape[:2])
         pair = [_padded(image) for image in pair]
         if crop is protocol.crops[0] and least >= window.size:
@@ -370,7 +414,9 @@ def score_image(
             row |= {"patch_psnr": None, "patch_ssim": None}
         for net in protocol.lpips:
             if net in networks and len(kept):
-                row[f"patch_lpips_{net}"] = _patch_lpips(networks[net], predicted, truth, STRIDE * kept)
+                row[f"patch_lpips_{net}"] = _patch_lpips(
+                    networks[net], predicted, truth, STRIDE * kept
+                )
     return {name: None if value is None else float(value) for name, value in row.items()}
 
 
@@ -380,11 +426,18 @@ def _padded(image: np.ndarray) -> Array:
     return jnp.asarray(np.pad(image, missing + [(0, 0)] * (image.ndim - 2)), jnp.float32)
 
 
-def _patch_lpips(weights: Lpips, predicted: np.ndarray, truth: np.ndarray, corners: np.ndarray) -> float:
+def _patch_lpips(
+    weights: Lpips, predicted: np.ndarray, truth: np.ndarray, corners: np.ndarray
+) -> float:
     """The mean over the patches with these upper left corners."""
-    pairs = [np.stack([x[i : i + PATCH, j : j + PATCH] for i, j in corners]) for x in (predicted, truth)]
+    pairs = [
+        np.stack([x[i : i + PATCH, j : j + PATCH] for i, j in corners]) for x in (predicted, truth)
+    ]
     total, count = 0.0, len(corners)
-    pairs = [np.pad(x, [(0, -count % PATCHES_AT_ONCE), (0, 0), (0, 0), (0, 0)], mode="edge") for x in pairs]
+    pairs = [
+        np.pad(x, [(0, -count % PATCHES_AT_ONCE), (0, 0), (0, 0), (0, 0)], mode="edge")
+        for x in pairs
+    ]
     for start in range(0, count, PATCHES_AT_ONCE):
         found = _lpips_of_patches(weights, *(x[start : start + PATCHES_AT_ONCE] for x in pairs))
         total += float(jnp.sum(found[: count - start]))
@@ -395,10 +448,21 @@ def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
     """The scores of an image, in the order in which tables show them."""
     nets = [f"lpips_{net}" for net in protocol.lpips]
     person = ("psnr_fg", "psnr_boundary", "iou", "semi_transparent", "foreground")
-    return ("psnr", "ssim", *nets, *person, "patch_psnr", "patch_ssim", *(f"patch_{net}" for net in nets), "patches")
+    return (
+        "psnr",
+        "ssim",
+        *nets,
+        *person,
+        "patch_psnr",
+        "patch_ssim",
+        *(f"patch_{net}" for net in nets),
+        "patches",
+    )
 
 
-def missing_reasons(protocol: EvaluationProtocol, networks: Networks, masks: bool, alpha: bool) -> dict[str, str]:
+def missing_reasons(
+    protocol: EvaluationProtocol, networks: Networks, masks: bool, alpha: bool
+) -> dict[str, str]:
     """Why scores are missing, by name. masks, alpha: whether truths have masks and predictions have alpha."""
     reasons = {}
     for name in score_names(protocol):
@@ -424,18 +488,24 @@ def score_views(
     Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks that the capture lacks.
     """
     if predicted.shape != truth.images.shape:
-        raise ValueError(f"predicted images have shape {predicted.shape}, the true ones {truth.images.shape}")
+        raise ValueError(
+            f"predicted images have shape {predicted.shape}, the true ones {truth.images.shape}"
+        )
     check_values("evaluate", {"predicted images": (predicted, FINITE), "alpha": (alpha, FINITE)})
     if truth.masks is None and protocol.needs_masks:
         raise ValueError("the protocol needs a mask for every view, and the capture has none")
     for i in range(truth.view_count):
         mask = None if truth.masks is None else np.asarray(truth.masks[i])
         image = on_background(truth.images[i], mask, protocol)
-        yield score_image(predicted[i], image, mask, None if alpha is None else alpha[i], protocol, networks or {})
+        yield score_image(
+            predicted[i], image, mask, None if alpha is None else alpha[i], protocol, networks or {}
+        )
 
 
 def on_background(
-    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"] | None, protocol: EvaluationProtocol
+    image: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w"] | None,
+    protocol: EvaluationProtocol,
 ) -> Float[np.ndarray, "h w 3"]:
     """A photo of a capture, which is on white where its mask is known, as a protocol wants it."""
     if protocol.background != "black" or mask is None:

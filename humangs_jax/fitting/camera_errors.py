@@ -47,11 +47,26 @@ MOST_LATE, TIMED = 3, 12
 EITHER_WAY = tuple(range(-MOST_LATE, MOST_LATE + 1))
 LATE_SHARE, LATE_CLEAR = 0.15, 4.0
 """Share of the cost, and standard errors over landmarks, by which a shift in time has to explain more than none."""
-PARTS = ("nose", "eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "heel", "big_toe", "foot_index")
+PARTS = (
+    "nose",
+    "eye",
+    "ear",
+    "shoulder",
+    "elbow",
+    "wrist",
+    "hip",
+    "knee",
+    "ankle",
+    "heel",
+    "big_toe",
+    "foot_index",
+)
 """Landmarks that err independently: those of a face or a hand err together."""
 
 
-Bundle = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m k 3"], Float[np.ndarray, "m c k"], float]
+Bundle = tuple[
+    Float[np.ndarray, "n 3"], Float[np.ndarray, "m k 3"], Float[np.ndarray, "m c k"], float
+]
 """Rotations of the cameras, points, weights of what is no outlier, noise in pixels."""
 
 
@@ -91,7 +106,9 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
     return (*late, *_turned_cameras(photos, keypoints, camera_of))
 
 
-def _turned_cameras(photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"]) -> list[CameraError]:
+def _turned_cameras(
+    photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"]
+) -> list[CameraError]:
     seen = _Seen.of(photos, keypoints, camera_of)
     if seen is None:
         return []
@@ -130,7 +147,9 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
     rotations = np.zeros((len(photos.names), 3), np.float32)
     for error in errors:
         rotations[list(error.views)] = error.rotation
-    turns = transform.make(quaternion.matrix_from_axis_angle(jnp.asarray(rotations)), jnp.zeros((len(rotations), 3)))
+    turns = transform.make(
+        quaternion.matrix_from_axis_angle(jnp.asarray(rotations)), jnp.zeros((len(rotations), 3))
+    )
     matrices = jnp.matmul(turns, photos.cameras.cam_from_world, precision=transform.EXACT)
     return dataclasses.replace(photos, cameras=replace(photos.cameras, cam_from_world=matrices))
 
@@ -156,7 +175,9 @@ def _late_cameras(
         by[list(late)] = list(late.values())
         views = view_at[camera_of, np.asarray(photos.frames) + MOST_LATE + by[camera_of]]
         confidences = np.where(views[:, None] < 0, 0.0, keypoints.confidences[views])
-        return dataclasses.replace(keypoints, points=keypoints.points[views], confidences=confidences, world=None)
+        return dataclasses.replace(
+            keypoints, points=keypoints.points[views], confidences=confidences, world=None
+        )
 
     def look(late):
         return _Seen.of(photos, shifted(late), camera_of, edge=MOST_LATE)
@@ -169,7 +190,9 @@ def _late_cameras(
         for c in set(range(count)) - set(found):
             others = seen.without(c, state)
             nearest = sorted(EITHER_WAY, key=lambda by: look(found | {c: by}).misses(c, others))
-            guesses += [(c, by) for by in nearest[:2] if nearest[0] and by]  # else it is where it should be
+            guesses += [
+                (c, by) for by in nearest[:2] if nearest[0] and by
+            ]  # else it is where it should be
         if not guesses:
             break
         tried = {guess: look(found | dict([guess])) for guess in guesses}
@@ -183,7 +206,9 @@ def _late_cameras(
         found[best[0]] = best[1]
         seen, state = tried[best], states[best]
     views = {c: np.flatnonzero(camera_of == c).tolist() for c in found}
-    errors = [CameraError(tuple(own), (photos.names[own[0]],), late=found[c]) for c, own in views.items()]
+    errors = [
+        CameraError(tuple(own), (photos.names[own[0]],), late=found[c]) for c, own in views.items()
+    ]
     return errors, shifted(found)
 
 
@@ -203,10 +228,17 @@ class _Seen:
 
     @classmethod
     def of(
-        cls, photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"], edge: int = 0
+        cls,
+        photos: Photos | Capture,
+        keypoints: Keypoints,
+        camera_of: Int[np.ndarray, " v"],
+        edge: int = 0,
     ) -> "_Seen | None":
         """None if there is too little to say anything. edge: moments at either end that are left out."""
-        kinds = [name.removeprefix("left_").removeprefix("right_") in PARTS for name in keypoints.set.names]
+        kinds = [
+            name.removeprefix("left_").removeprefix("right_") in PARTS
+            for name in keypoints.set.names
+        ]
         observations, views = group_by_frame(photos, keypoints)
         some = np.unique(np.linspace(edge, len(views) - 1 - edge, FRAMES).round().astype(int))
         as_double = lambda name: np.asarray(getattr(observations, name), np.float64)[some]
@@ -215,7 +247,14 @@ class _Seen:
         if ((weights > 0).any((0, 1))).sum() < 8:
             return None
         points, count = as_double("points")[:, :, kinds], int(camera_of.max()) + 1
-        return cls(points, weights, as_double("K"), as_double("cam_from_world"), camera_of[views[some]], count)
+        return cls(
+            points,
+            weights,
+            as_double("K"),
+            as_double("cam_from_world"),
+            camera_of[views[some]],
+            count,
+        )
 
     def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
         """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and Hessians (k, 3 n, 3 n), in
@@ -228,7 +267,12 @@ class _Seen:
 
     def bundle(self) -> Bundle:
         """Rotations (n, 3) and points (m, k, 3) that fit best, weights (m, c, k) of what is no outlier, noise in pixels."""
-        turned, points, weights, noise = np.zeros((self.count, 3)), self._middle(), self.weights, 1.0
+        turned, points, weights, noise = (
+            np.zeros((self.count, 3)),
+            self._middle(),
+            self.weights,
+            1.0,
+        )
         for _ in range(ITERATIONS):
             gradients, matrices, errors, points = self._linear(turned, points, weights)
             turned = turned - _solve(gradients.sum(0), matrices.sum(0)).reshape(-1, 3)
@@ -265,9 +309,13 @@ class _Seen:
         centers = -np.einsum("mcba,mcb->mca", self.matrices[..., :3, :3], self.matrices[..., :3, 3])
         across = np.eye(3) - axes[..., :, None] * axes[..., None, :]
         total, right = across.sum((0, 1)), np.einsum("mcab,mcb->a", across, centers)
-        return np.broadcast_to(np.linalg.solve(total + 1e-6 * np.eye(3), right), (len(axes), self.points.shape[2], 3))
+        return np.broadcast_to(
+            np.linalg.solve(total + 1e-6 * np.eye(3), right), (len(axes), self.points.shape[2], 3)
+        )
 
-    def _project(self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]) -> tuple[np.ndarray, ...]:
+    def _project(
+        self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
+    ) -> tuple[np.ndarray, ...]:
         """Rotations (m, c, 3, 3), points in the cameras (m, c, k, 3), depths, slopes, focal lengths, and errors (m, c, k, 2)."""
         turn = Rotation.from_rotvec(turned).as_matrix()[self.camera]
         rotation = turn @ self.matrices[..., :3, :3]
@@ -275,21 +323,42 @@ class _Seen:
         local = np.einsum("mcab,mkb->mcka", rotation, points) + shift[:, :, None]
         depth = np.maximum(local[..., 2], 0.05)
         focal, slope = self.K[:, :, None, [0, 1], [0, 1]], local[..., :2] / depth[..., None]
-        return rotation, local, depth, slope, focal, slope * focal + self.K[:, :, None, :2, 2] - self.points
+        return (
+            rotation,
+            local,
+            depth,
+            slope,
+            focal,
+            slope * focal + self.K[:, :, None, :2, 2] - self.points,
+        )
 
     def _linear(
-        self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"], weights: Float[np.ndarray, "m c k"]
-    ) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"], Float[np.ndarray, "m c k 2"], Float[np.ndarray, "m k 3"]]:
+        self,
+        turned: Float[np.ndarray, "n 3"],
+        points: Float[np.ndarray, "m k 3"],
+        weights: Float[np.ndarray, "m c k"],
+    ) -> tuple[
+        Float[np.ndarray, "k u"],
+        Float[np.ndarray, "k u u"],
+        Float[np.ndarray, "m c k 2"],
+        Float[np.ndarray, "m k 3"],
+    ]:
         """Gradients and Hessians at rotations, the residuals, and the points after one more step of Gauss and Newton."""
         rotation, local, depth, slope, focal, errors = self._project(turned, points)
         by_local = np.zeros((*depth.shape, 2, 3))
         by_local[..., [0, 1], [0, 1]] = focal / depth[..., None]
         by_local[..., 2] = -focal * slope / depth[..., None]
         by_point = np.einsum("mckia,mcab->mckib", by_local, rotation)
-        by_turn = np.einsum("mckia,mckab->mckib", by_local, np.cross(local[..., None, :], np.eye(3)))
+        by_turn = np.einsum(
+            "mckia,mckab->mckib", by_local, np.cross(local[..., None, :], np.eye(3))
+        )
         own = np.einsum("mck,mckia,mckib->mkab", weights, by_point, by_point)
-        inverse = np.linalg.inv(own + (1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]) * np.eye(3))
-        step = np.einsum("mkab,mck,mckib,mcki->mka", inverse, weights, by_point, errors, optimize=True)
+        inverse = np.linalg.inv(
+            own + (1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]) * np.eye(3)
+        )
+        step = np.einsum(
+            "mkab,mck,mckib,mcki->mka", inverse, weights, by_point, errors, optimize=True
+        )
         left = errors - np.einsum("mckib,mkb->mcki", by_point, step)
         mixed = np.einsum("mck,mckia,mckib->mckab", weights, by_turn, by_point)
         k, n = points.shape[1], self.count
@@ -303,7 +372,9 @@ class _Seen:
         return gradients.transpose(1, 0, 2).reshape(k, 3 * n), flat, errors, points - step
 
 
-def _solve(gradient: Float[np.ndarray, " u"], matrix: Float[np.ndarray, "u u"]) -> Float[np.ndarray, " u"]:
+def _solve(
+    gradient: Float[np.ndarray, " u"], matrix: Float[np.ndarray, "u u"]
+) -> Float[np.ndarray, " u"]:
     return np.linalg.solve(matrix + np.eye(len(matrix)) / PRIOR**2, gradient)
 
 
@@ -315,7 +386,9 @@ class _Solved(NamedTuple):
     clear: float
 
 
-def _solved(gradients: Float[np.ndarray, "k u"], matrices: Float[np.ndarray, "k u u"], cameras: list[int]) -> _Solved:
+def _solved(
+    gradients: Float[np.ndarray, "k u"], matrices: Float[np.ndarray, "k u u"], cameras: list[int]
+) -> _Solved:
     at = (3 * np.asarray(cameras)[:, None] + np.arange(3)).ravel()
     own, curved = gradients[:, at], matrices[:, at[:, None], at]
     total = curved.sum(0)

@@ -63,7 +63,9 @@ class FitRecord:
         if missing := [name for name in names if name not in self.names]:
             raise UnknownViewError(f"the capture's fit knows no view {few(missing)}: fit it again")
         rows = [self.names.index(name) for name in names]
-        points, confidences = (getattr(self.keypoints, name)[rows] for name in ("points", "confidences"))
+        points, confidences = (
+            getattr(self.keypoints, name)[rows] for name in ("points", "confidences")
+        )
         return dataclasses.replace(self.keypoints, points=points, confidences=confidences)
 
 
@@ -88,24 +90,40 @@ def read_fit_record(path: str | Path) -> FitRecord:
     with reading(path, "fit.npz", CaptureError):
         file = ArrayFile.open(path, CaptureError)
         if missing := [key for key in KEYS if key not in file and key not in file.pickled]:
-            raise CaptureError(path, missing[0], "missing: expected a file that `humangs fit` wrote")
+            raise CaptureError(
+                path, missing[0], "missing: expected a file that `humangs fit` wrote"
+            )
         own = lambda key, shape=None: numbers(file.array(key), path, key, shape)
         name, names = str(file.array("set")), tuple(map(str, file.array("names")))
         if name not in KEYPOINT_SETS:
-            raise CaptureError(path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
+            raise CaptureError(
+                path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}"
+            )
         kind = KEYPOINT_SETS[name]
         v, k = len(names), len(kind.names)
         kind = kind.adapted(own("places", (k, 3)), own("certainty", (k,)))
         keypoints = Keypoints(own("points", (v, k, 2)), own("confidences", (v, k)), kind)
         noise = own("noise", (None,))
         joint_std = own("joint_std", (len(noise), None))
-        return FitRecord(keypoints, names, noise, joint_std, own("determined", joint_std.shape), own("shape_covariance"))
+        return FitRecord(
+            keypoints,
+            names,
+            noise,
+            joint_std,
+            own("determined", joint_std.shape),
+            own("shape_covariance"),
+        )
 
 
 # Captures ------------------------------------------------------------------------------------------------------------
 
 
-def check_place(source: str | Path, out: str | Path | None, overwrite: bool, inputs: Iterable[str | Path | None] = ()) -> Path:
+def check_place(
+    source: str | Path,
+    out: str | Path | None,
+    overwrite: bool,
+    inputs: Iterable[str | Path | None] = (),
+) -> Path:
     """The folder that a fit of the capture `source` is written to, checked before the work begins.
 
     Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced. inputs: further files and
@@ -127,11 +145,17 @@ def check_place(source: str | Path, out: str | Path | None, overwrite: bool, inp
 
 def _photo_files(description: dict[str, Any]) -> list[str]:
     """Images and masks of a capture, as its description has them."""
-    return sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view})
+    return sorted(
+        {view[key] for view in description["views"] for key in ("image", "mask") if key in view}
+    )
 
 
 def write_fitted(
-    source: str | Path, target: str | Path, capture: Capture, report: FitReport, record: FitRecord | None = None
+    source: str | Path,
+    target: str | Path,
+    capture: Capture,
+    report: FitReport,
+    record: FitRecord | None = None,
 ) -> None:
     """Write cameras and body of a capture: into the capture folder `source` itself, or with its photos into another folder.
 
@@ -158,7 +182,9 @@ def write_fitted(
 
     if target.resolve() == source.resolve():
         invalid = () if record is not None else (FIT_FILE,)  # a record of other cameras
-        add_files(target, write_fit, invalid=invalid, last=name)  # `humangs start` asks for the body
+        add_files(
+            target, write_fit, invalid=invalid, last=name
+        )  # `humangs start` asks for the body
     else:
         check_place(source, target, overwrite=True)
         replace_folder(target, write, mark="capture.json")
@@ -168,8 +194,14 @@ def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, An
     """capture.json with the cameras of the capture where they have changed."""
     views = []
     for i, view in enumerate(description["views"]):
-        new = {name: np.asarray(getattr(capture.cameras, name)[i], float) for name in ("K", "cam_from_world")}
-        same = {name: np.array_equal(np.asarray(view[name], np.float32), value) for name, value in new.items()}
+        new = {
+            name: np.asarray(getattr(capture.cameras, name)[i], float)
+            for name in ("K", "cam_from_world")
+        }
+        same = {
+            name: np.array_equal(np.asarray(view[name], np.float32), value)
+            for name, value in new.items()
+        }
         views.append(view | {name: value.tolist() for name, value in new.items() if not same[name]})
     return description | {"views": views}
 
@@ -177,7 +209,9 @@ def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, An
 def _copy(source: Path, folder: Path, file: str) -> None:
     target = folder / file
     if not target.resolve().is_relative_to(folder.resolve()):
-        raise CaptureError(source / "capture.json", file, "lies outside of the capture folder: fit it in place")
+        raise CaptureError(
+            source / "capture.json", file, "lies outside of the capture folder: fit it in place"
+        )
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source / file, target)
 
@@ -185,7 +219,9 @@ def _copy(source: Path, folder: Path, file: str) -> None:
 # Scans ---------------------------------------------------------------------------------------------------------------
 
 
-def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BODY, *, overwrite: bool = False) -> None:
+def save_scan_fit(
+    folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BODY, *, overwrite: bool = False
+) -> None:
     """Write body.npz (as in captures), scan_fit.json and body_in_scan.ply; all or nothing.
 
     Arguments: body_file: where the model comes from, see `Capture`. Raises: see `check_scan_folder`.
@@ -194,7 +230,11 @@ def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BOD
     pose, align = fit.pose, fit.world_from_scan
     poses = np.asarray(pose.rotations)[None], np.asarray(pose.translation)[None]
     arrays = parameter_arrays(Path(folder), fit.body, body_file, fit.betas, *poses)
-    place = {"world_from_scan": align.matrix().tolist(), "scale": align.scale, "rotation": align.rotation.tolist()}
+    place = {
+        "world_from_scan": align.matrix().tolist(),
+        "scale": align.scale,
+        "rotation": align.rotation.tolist(),
+    }
     place |= {"translation": align.translation.tolist(), "up": fit.up}
 
     def write(temporary: Path):
@@ -209,6 +249,8 @@ def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BOD
     replace_folder(folder, write, mark=SCAN_REPORT_FILE)
 
 
-def check_scan_folder(folder: Path, overwrite: bool, inputs: Iterable[str | Path | None] = ()) -> None:
+def check_scan_folder(
+    folder: Path, overwrite: bool, inputs: Iterable[str | Path | None] = ()
+) -> None:
     """Raises: ValueError unless the folder is empty, or with `overwrite` a fit to a scan; see also `check_replaceable`."""
     check_replaceable(folder, overwrite, SCAN_REPORT_FILE, inputs)

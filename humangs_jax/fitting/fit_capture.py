@@ -68,26 +68,39 @@ class Uncertainty(NamedTuple):
         return np.sqrt(np.trace(self.joint_covariances, axis1=-2, axis2=-1))
 
 
-def fit_uncertainty(model: LandmarkModel, observations: Observations, fit: LandmarkFit) -> Uncertainty:
+def fit_uncertainty(
+    model: LandmarkModel, observations: Observations, fit: LandmarkFit
+) -> Uncertainty:
     """The covariance of a fit to these observations, in float64."""
     model = replace(model, certainty=fit.certainty)
     derivatives = _derivatives(model, replace(observations, noise=fit.noise), fit)
     residuals_by, joints_by = (np.asarray(x, np.float64) for x in derivatives)
     shapes = len(fit.betas)
     by_pose, by_shape = np.split(residuals_by, [residuals_by.shape[-1] - shapes], axis=-1)
-    own = np.linalg.inv(np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1]))
+    own = np.linalg.inv(
+        np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1])
+    )
     coupling = np.einsum("mra,mrs->mas", by_pose, by_shape)
     carried = own @ coupling
-    shape_information = np.einsum("mrs,mrt->st", by_shape, by_shape) - np.einsum("mas,mat->st", coupling, carried)
+    shape_information = np.einsum("mrs,mrt->st", by_shape, by_shape) - np.einsum(
+        "mas,mat->st", coupling, carried
+    )
     shape = np.linalg.inv(shape_information + np.eye(shapes))
     poses = own + carried @ shape @ carried.swapaxes(-1, -2)
     mixed = -carried @ shape
-    whole = np.block([[poses, mixed], [mixed.swapaxes(-1, -2), np.broadcast_to(shape, (len(own), shapes, shapes))]])
+    whole = np.block(
+        [
+            [poses, mixed],
+            [mixed.swapaxes(-1, -2), np.broadcast_to(shape, (len(own), shapes, shapes))],
+        ]
+    )
     covariances = np.einsum("mjap,mpq,mjbq->mjab", joints_by, whole, joints_by, optimize=True)
     return Uncertainty(covariances, _determined(keypoint_problem(model), poses), shape)
 
 
-def _determined(problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]) -> Float[np.ndarray, "m j"]:
+def _determined(
+    problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]
+) -> Float[np.ndarray, "m j"]:
     """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order global_orient, transl, body_pose."""
     joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
     left = variances[:, 6:].reshape(len(poses), len(joints), 3)
@@ -104,15 +117,23 @@ def _derivatives(
 ) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
     """Of residuals and joints of each frame by its unknowns: global_orient, transl, body_pose, then the shape."""
     problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
-    poses = jnp.concatenate([state.global_orient, state.transl, state.body_pose.reshape(m, -1)], axis=1)
+    poses = jnp.concatenate(
+        [state.global_orient, state.transl, state.body_pose.reshape(m, -1)], axis=1
+    )
     p = poses.shape[1]
 
     def both(vector, seen):
-        pose = {"global_orient": vector[:3], "transl": vector[3:6], "body_pose": vector[6:p].reshape(-1, 3)}
+        pose = {
+            "global_orient": vector[:3],
+            "transl": vector[3:6],
+            "body_pose": vector[6:p].reshape(-1, 3),
+        }
         moved = replace(state, betas=vector[p:], **pose)
         found = frame_residuals(problem, seen, moved, ROBUST_SCALES[-1])
         found.pop("shape")
-        return jnp.concatenate([leaf.ravel() for leaf in found.values()]), problem.landmarks_and_joints(moved)[1]
+        return jnp.concatenate(
+            [leaf.ravel() for leaf in found.values()]
+        ), problem.landmarks_and_joints(moved)[1]
 
     vectors = jnp.concatenate([poses, jnp.tile(state.betas, (m, 1))], axis=1)
     return jax.lax.map(lambda each: jax.jacfwd(both)(*each), (vectors, observations))
@@ -147,23 +168,35 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     Raises: ValueError if the number of views differs, the record is of fewer frames, or the body has none of the landmarks.
     """
     if len(keypoints.points) != capture.view_count:
-        raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}")
+        raise ValueError(
+            f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}"
+        )
     names = capture.body.joint_names
-    if record is not None and (len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(names)):
+    if record is not None and (
+        len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(names)
+    ):
         raise ValueError(
             f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]} joints, but the capture has "
             f"{capture.frames.max() + 1} and {len(names)}: fit it again"
         )
     observations, views = group_by_frame(capture, keypoints)
-    expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
+    expected, poses = (
+        np.asarray(observations.noise),
+        jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses),
+    )
     kind = keypoints.set
     model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
-    errors = np.asarray(body_errors(model, jnp.asarray(capture.betas), poses, observations, np.arange(len(views))))
+    errors = np.asarray(
+        body_errors(model, jnp.asarray(capture.betas), poses, observations, np.arange(len(views)))
+    )
     compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
     if record is None:
-        noise, undetermined = np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)), ()
+        noise, undetermined = (
+            np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)),
+            (),
+        )
     else:
         noise, shown = record.noise[: len(views)], np.flatnonzero(compared.any((1, 2)))
         undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
@@ -171,13 +204,19 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
 
     frame_of, slot_of = np.argwhere(views >= 0)[np.argsort(views[views >= 0])].T
     by_view = lambda values: values[frame_of, slot_of]
-    numbers = zip(capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True)
+    numbers = zip(
+        capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True
+    )
     rows = tuple(_view_report(*own) for own in numbers)
     violations = limit_violations(names, poses)
     hands = find_exchanged_hands(keypoints, capture.names)
     explained = {swap.views[0] for swap in hands}
     others = find_swaps(observations, kind, views, capture.names)
-    others = (swap for swap in others if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead)))
+    others = (
+        swap
+        for swap in others
+        if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead))
+    )
     swaps = (*others, *hands)
     report = FitReport(
         fitted="keypoints",
@@ -188,7 +227,10 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         undetermined=undetermined,
         notes=_worst_frame(frames),
         warnings=(
-            *(f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}" for error in find_camera_errors(capture, keypoints)),
+            *(
+                f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}"
+                for error in find_camera_errors(capture, keypoints)
+            ),
             *keypoint_warnings(rows, expected, violations, swaps),
         ),
     )
@@ -202,10 +244,14 @@ def _worst_frame(frames: Float[np.ndarray, " m"]) -> tuple[str, ...]:
         return ()
     worst = known[np.argmax(frames[known])]
     middle = np.median(frames[known])
-    return (f"frames: median error {middle:.1f} px, worst in frame {worst}: {frames[worst]:.1f} px",)
+    return (
+        f"frames: median error {middle:.1f} px, worst in frame {worst}: {frames[worst]:.1f} px",
+    )
 
 
-def _view_report(name: str, frame: int, lengths: Float[np.ndarray, " k"], outliers: Bool[np.ndarray, " k"]) -> ViewReport:
+def _view_report(
+    name: str, frame: int, lengths: Float[np.ndarray, " k"], outliers: Bool[np.ndarray, " k"]
+) -> ViewReport:
     count = int(np.isfinite(lengths).sum())
     share = float(outliers.sum() / max(count, 1))
     return ViewReport(name, frame, count, _quantile(lengths, 0.5), _quantile(lengths, 0.9), share)
@@ -262,11 +308,21 @@ def fit_photos(
     first joint.
     """
     if len(keypoints.points) != len(photos.names):
-        raise ValueError(f"keypoints of {len(keypoints.points)} views, but there are {len(photos.names)} photos")
+        raise ValueError(
+            f"keypoints of {len(keypoints.points)} views, but there are {len(photos.names)} photos"
+        )
     if body.parents.index(-1) != 0:
-        raise ValueError(f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}")
-    fixed_cameras = fixed_cameras or not photos.calibrated  # found from such keypoints, which tell nothing new about them
-    errors = () if fixed_cameras else tuple(e for e in find_camera_errors(photos, keypoints) if not e.late)
+        raise ValueError(
+            f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
+        )
+    fixed_cameras = (
+        fixed_cameras or not photos.calibrated
+    )  # found from such keypoints, which tell nothing new about them
+    errors = (
+        ()
+        if fixed_cameras
+        else tuple(e for e in find_camera_errors(photos, keypoints) if not e.late)
+    )
     photos = mended(photos, errors) if errors else photos
     kind = keypoints.set
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
@@ -276,11 +332,15 @@ def fit_photos(
         raise ValueError("no view has a keypoint that the body has: nothing to fit")
     fit = fit_landmarks(model, observations, smoothness)
     found = fit_uncertainty(model, observations, fit)
-    capture = Capture(**vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file)
+    capture = Capture(
+        **vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file
+    )
     moved = np.zeros((len(kind.names), 3))
     if fit.state.places is not None:
         moved = model.by_landmark(PLACE_STD * fit.state.places)
-    keypoints = dataclasses.replace(keypoints, set=kind.adapted(kind.offsets + moved, np.asarray(fit.certainty)))
+    keypoints = dataclasses.replace(
+        keypoints, set=kind.adapted(kind.offsets + moved, np.asarray(fit.certainty))
+    )
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
     record = FitRecord(keypoints, photos.names, *known)
     notes = (*_places(model, fit), *(f"{error}: turned back" for error in errors))
@@ -294,8 +354,15 @@ def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
     if fit.state.places is None:
         return
     moved = 1000 * PLACE_STD * np.linalg.norm(np.asarray(fit.state.places), axis=-1)
-    kinds = {group: kind_of(model.names[row]) for row, (group, _) in zip(model.placed, model.groups, strict=True)}
-    far = [f"{kinds[group]} {moved[group]:.0f} mm" for group in np.argsort(-moved)[:3] if moved[group] > FAR_MM]
+    kinds = {
+        group: kind_of(model.names[row])
+        for row, (group, _) in zip(model.placed, model.groups, strict=True)
+    }
+    far = [
+        f"{kinds[group]} {moved[group]:.0f} mm"
+        for group in np.argsort(-moved)[:3]
+        if moved[group] > FAR_MM
+    ]
     if far:
         yield f"the detector sees landmarks beside where the body has them, which is undone: {', '.join(far)}"
 
@@ -311,7 +378,9 @@ def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str
             yield f"frame {frame}: seen by one view: distance and height are hardly determined"
 
 
-def _motion_warnings(joints: Float[np.ndarray, "m j 3"], held: float, smoothness: float) -> Iterator[str]:
+def _motion_warnings(
+    joints: Float[np.ndarray, "m j 3"], held: float, smoothness: float
+) -> Iterator[str]:
     """Warnings about motion that was to be smooth. held: the smoothness to which accelerations were held."""
     if not smoothness:
         return

@@ -91,7 +91,9 @@ class LandmarkFit:
 
 
 @checked_arguments
-def fit_landmarks(model: LandmarkModel, observations: Observations, smoothness: float = 0.0) -> LandmarkFit:
+def fit_landmarks(
+    model: LandmarkModel, observations: Observations, smoothness: float = 0.0
+) -> LandmarkFit:
     """Shape and poses of one person.
 
     Arguments: observations: a batch of m frames, in their order in time where motion is to be smooth. smoothness: expected
@@ -99,7 +101,11 @@ def fit_landmarks(model: LandmarkModel, observations: Observations, smoothness: 
     frames without keypoints rest in the prior's usual pose, or with smooth motion are interpolated.
     """
     fit = _fit_frames(model, observations)
-    return smooth_motion(model, observations, fit, smoothness) if smoothness and len(fit.noise) > 2 else fit
+    return (
+        smooth_motion(model, observations, fit, smoothness)
+        if smoothness and len(fit.noise) > 2
+        else fit
+    )
 
 
 @jax.jit
@@ -111,7 +117,11 @@ def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit
     model = replace(model, certainty=_certainty_found(problem, observations, states))
     problem = keypoint_problem(model)
     groups = len({group for group, _ in model.groups})
-    many = groups and observations.points.shape[0] >= PLACED_FRAMES and observations.points.shape[1] > 1
+    many = (
+        groups
+        and observations.points.shape[0] >= PLACED_FRAMES
+        and observations.points.shape[1] > 1
+    )
     places = jnp.zeros((groups, 3)) if many else None
     start = replace(states, betas=jnp.median(states.betas, axis=0), places=places)
     residuals = lambda state: _person_residuals(problem, observations, state)
@@ -119,11 +129,20 @@ def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit
     return _result(problem, observations.noise, state, jnp.zeros(()))
 
 
-def _result(problem: KeypointProblem, noise: Float[Array, " m"], state: FitState, smoothness: Float[Array, ""]) -> LandmarkFit:
+def _result(
+    problem: KeypointProblem,
+    noise: Float[Array, " m"],
+    state: FitState,
+    smoothness: Float[Array, ""],
+) -> LandmarkFit:
     betas = betas_of(problem.origin, state)
     poses = _poses(problem, state)
-    landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model_of(state), betas, pose))(poses)
-    return LandmarkFit(betas, poses, landmarks, joints, noise, state, smoothness, problem.model.certainty)
+    landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model_of(state), betas, pose))(
+        poses
+    )
+    return LandmarkFit(
+        betas, poses, landmarks, joints, noise, state, smoothness, problem.model.certainty
+    )
 
 
 def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
@@ -162,7 +181,11 @@ COARSE = 30.0
 
 
 def _rigid_starts(
-    problem: KeypointProblem, observations: Observations, points: Float[Array, "k 3"], counts: Float[Array, " k"], kept: int
+    problem: KeypointProblem,
+    observations: Observations,
+    points: Float[Array, "k 3"],
+    counts: Float[Array, " k"],
+    kept: int,
 ) -> FitState:
     """The `kept` best positions and orientations of a resting body, a batch.
 
@@ -178,15 +201,21 @@ def _rigid_starts(
     product = functools.partial(jnp.matmul, precision=EXACT)
     turned = _kabsch(landmarks, points, weights * (counts >= 2))
     rotations = jnp.concatenate([turned[None], jnp.asarray(cube_rotations(), jnp.float32)])
-    positions = jax.vmap(lambda r: _position(observations, product(landmarks - pelvis, r.T), weights))(rotations)
+    positions = jax.vmap(
+        lambda r: _position(observations, product(landmarks - pelvis, r.T), weights)
+    )(rotations)
     vectors = quaternion.to_axis_angle(quaternion.from_matrix(rotations))
     start = lambda vector, position: replace(
-        resting, global_orient=vector / math.radians(FREE.global_orient), transl=(position - pelvis) / FREE.transl
+        resting,
+        global_orient=vector / math.radians(FREE.global_orient),
+        transl=(position - pelvis) / FREE.transl,
     )
     starts = jax.vmap(start)(vectors, positions)
 
     def cost(state):
-        errors = keypoint_residuals(problem.model, observations, problem.landmarks_and_joints(state)[0], COARSE)
+        errors = keypoint_residuals(
+            problem.model, observations, problem.landmarks_and_joints(state)[0], COARSE
+        )
         return 0.5 * jnp.sum(weights[:, None] * jnp.square(errors))
 
     best = jnp.argsort(jax.vmap(cost)(starts))[:kept]
@@ -203,17 +232,24 @@ def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
     return np.stack([m for m in signed if np.linalg.det(m) > 0])
 
 
-def _kabsch(a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]) -> Float[Array, "3 3"]:
+def _kabsch(
+    a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
+) -> Float[Array, "3 3"]:
     """The rotation about weighted centres that takes points a to b best; the identity where nothing is known."""
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
-    u, _, vt = jnp.linalg.svd(jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a, precision=EXACT) + 1e-9 * jnp.eye(3))
+    u, _, vt = jnp.linalg.svd(
+        jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a, precision=EXACT)
+        + 1e-9 * jnp.eye(3)
+    )
     sign = jnp.sign(jnp.linalg.det(jnp.matmul(u, vt, precision=EXACT)))
     return jnp.matmul(u * jnp.stack([jnp.ones(()), jnp.ones(()), sign]), vt, precision=EXACT)
 
 
 def _position(
-    observations: Observations, offsets: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
+    observations: Observations,
+    offsets: Float[Array, "k 3"],
+    weights: Float[Array | np.ndarray, " k"],
 ) -> Float[Array, "3"]:
     """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a detection over the focal
     length, x (z + t_z) = X + t_x and likewise y, linear in t.
@@ -230,7 +266,9 @@ def _position(
     return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
 
 
-def _metres_per_pixel(seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]) -> Float[Array, ""]:
+def _metres_per_pixel(
+    seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]
+) -> Float[Array, ""]:
     centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
     distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
     each = distance / seen.K[:, :1, 0]
@@ -278,19 +316,30 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
 
 
-def _noise_found(problem: KeypointProblem, observations: Observations, states: FitState) -> Float[Array, " m"]:
+def _noise_found(
+    problem: KeypointProblem, observations: Observations, states: FitState
+) -> Float[Array, " m"]:
     def of_frame(seen, state):
-        lengths = jnp.linalg.norm(keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1)
-        return found_noise(jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan), seen.noise)
+        lengths = jnp.linalg.norm(
+            keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1
+        )
+        return found_noise(
+            jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan), seen.noise
+        )
 
     return jax.vmap(of_frame)(observations, states)
 
 
-def _certainty_found(problem: KeypointProblem, observations: Observations, states: FitState) -> Float[Array, " k"]:
+def _certainty_found(
+    problem: KeypointProblem, observations: Observations, states: FitState
+) -> Float[Array, " k"]:
     """(k,) of landmarks, from the errors of the first stages in the frames that several views show: a robust noise of each pair,
     over that of all. The fewer there are, the nearer to the usual.
     """
-    model, pair = problem.model, np.asarray([problem.model.names.index(mirrored_name(n)) for n in problem.model.names])
+    model, pair = (
+        problem.model,
+        np.asarray([problem.model.names.index(mirrored_name(n)) for n in problem.model.names]),
+    )
 
     def lengths(seen, state):
         errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0]) / seen.noise
@@ -307,7 +356,9 @@ def _certainty_found(problem: KeypointProblem, observations: Observations, state
     return 1 / jnp.maximum(jnp.sqrt(variance), LEAST_RATIO * usual)
 
 
-def _person_residuals(problem: KeypointProblem, observations: Observations, state: FitState) -> dict[str, Float[Array, "..."]]:
+def _person_residuals(
+    problem: KeypointProblem, observations: Observations, state: FitState
+) -> dict[str, Float[Array, "..."]]:
     """All frames at once with one shape."""
     of_frame = lambda seen, own: frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
     found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
@@ -330,7 +381,10 @@ FEW = 6
 
 @jax.jit
 def smooth_motion(
-    model: LandmarkModel, observations: Observations, fit: LandmarkFit, smoothness: float | Float[Array, ""]
+    model: LandmarkModel,
+    observations: Observations,
+    fit: LandmarkFit,
+    smoothness: float | Float[Array, ""],
 ) -> LandmarkFit:
     """A fit whose joints move as smoothly as `smoothness` expects, and as its keypoints allow.
 
@@ -347,8 +401,12 @@ def smooth_motion(
 
     def costs(state):
         """(m,) of the keypoints of each frame."""
-        landmarks = jax.vmap(lambda own: problem.landmarks_and_joints(own)[0], in_axes=(axes,))(state)
-        errors = lambda each, points: half_squares(keypoint_residuals(problem.model, each, points, ROBUST_SCALES[-1]))
+        landmarks = jax.vmap(lambda own: problem.landmarks_and_joints(own)[0], in_axes=(axes,))(
+            state
+        )
+        errors = lambda each, points: half_squares(
+            keypoint_residuals(problem.model, each, points, ROBUST_SCALES[-1])
+        )
         return jax.vmap(errors)(seen, landmarks)
 
     observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
@@ -364,11 +422,15 @@ def smooth_motion(
 
         state, _ = solve(residuals, state, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
         good = jnp.all(costs(state) <= limit)
-        kept, held = jax.tree.map(lambda new, old: jnp.where(good, new, old), (state, std), (kept, held))
+        kept, held = jax.tree.map(
+            lambda new, old: jnp.where(good, new, old), (state, std), (kept, held)
+        )
         return (state, kept, held), None
 
     start = _bridged(problem, seen, fit.state)
-    kept = jax.tree.map(lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state)
+    kept = jax.tree.map(
+        lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state
+    )
     carry = (start, kept, jnp.zeros(()))
     (_, state, held), _ = jax.lax.scan(run, carry, smoothness * jnp.asarray(MOTION_LEVELS))
     return _result(problem, fit.noise, state, held)
@@ -398,5 +460,8 @@ def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> F
     )
     bridged = jax.vmap(lambda pose: state_of(problem.origin, betas, pose))(between)
     pick = lambda new, old: jnp.where(shown.reshape(m, *[1] * (old.ndim - 1)), old, new)
-    moved = {name: pick(getattr(bridged, name), getattr(state, name)) for name in ("global_orient", "transl", "body_pose")}
+    moved = {
+        name: pick(getattr(bridged, name), getattr(state, name))
+        for name in ("global_orient", "transl", "body_pose")
+    }
     return replace(state, **moved)

@@ -94,7 +94,10 @@ def align_views(
     """Generalised Kabsch: the mean shape (k, 3) of landmarks that are turned together, and the rotations (c, 3, 3) from it to
     each view's axes.
     """
-    shape, rotations = worlds[int(np.argmax(weights.sum(1)))], np.tile(np.eye(3), (len(worlds), 1, 1))
+    shape, rotations = (
+        worlds[int(np.argmax(weights.sum(1)))],
+        np.tile(np.eye(3), (len(worlds), 1, 1)),
+    )
     total = np.maximum(weights.sum(0), 1e-9)[:, None]
     for _ in range(ALTERNATIONS if len(worlds) > 1 else 0):
         rotations = turns_onto(shape, worlds, weights)
@@ -103,7 +106,9 @@ def align_views(
 
 
 def turns_onto(
-    shape: Float[np.ndarray, "k 3"], worlds: Float[np.ndarray, "c k 3"], weights: Float[np.ndarray, "c k"]
+    shape: Float[np.ndarray, "k 3"],
+    worlds: Float[np.ndarray, "c k 3"],
+    weights: Float[np.ndarray, "c k"],
 ) -> Float[np.ndarray, "c 3 3"]:
     """The rotations (c, 3, 3) that bring a shape onto the landmarks of each view best (Kabsch 1976); of points on a line, one of
     those.
@@ -117,7 +122,10 @@ def turns_onto(
 
 
 def place_person(
-    points: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, " k"], offsets: Float[np.ndarray, "k 3"], focal: float
+    points: Float[np.ndarray, "k 2"],
+    weights: Float[np.ndarray, " k"],
+    offsets: Float[np.ndarray, "k 3"],
+    focal: float,
 ) -> Float[np.ndarray, "3"]:
     """Where landmarks at `offsets`, in camera axes, have to be put to project to their pixels: with (x, y) a pixel over the focal
     length, x (z + t_z) = X + t_x and likewise y, linear in t. By the person's size where that puts it behind the camera.
@@ -128,7 +136,9 @@ def place_person(
     rows[..., 2] = -xy
     right = xy * offsets[:, 2:] - offsets[:, :2]
     w = np.sqrt(weights)[:, None]
-    place = np.linalg.lstsq((w[..., None] * rows).reshape(-1, 3), (w * right).ravel(), rcond=None)[0]
+    place = np.linalg.lstsq((w[..., None] * rows).reshape(-1, 3), (w * right).ravel(), rcond=None)[
+        0
+    ]
     share = weights / weights.sum()
     spread = lambda p: float(np.sqrt(share @ np.sum((p - share @ p) ** 2, axis=1)))
     distance = spread(offsets[:, :2]) / max(spread(xy), 1e-9)
@@ -175,7 +185,9 @@ class Derivatives:
 def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "c k 2"]:
     """Landmarks as the cameras see them, less those detected, pixels."""
     seen = _turned(rig) + rig.places[:, None]
-    return rig.focal[:, None, None] * seen[..., :2] / np.maximum(seen[..., 2:], NEAR) - evidence.points
+    return (
+        rig.focal[:, None, None] * seen[..., :2] / np.maximum(seen[..., 2:], NEAR) - evidence.points
+    )
 
 
 def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
@@ -217,7 +229,9 @@ def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
     # d rho / d q = s / sqrt(s^2 + |q|^2) (1 - q q^T / (s^2 + |q|^2))
     q = pixel_errors(evidence, rig) / evidence.noise[:, None, None]
     square = (scale**2 + np.sum(q**2, axis=-1))[..., None, None]
-    by_error = root * scale / np.sqrt(square) * (np.eye(2) - q[..., :, None] * q[..., None, :] / square)
+    by_error = (
+        root * scale / np.sqrt(square) * (np.eye(2) - q[..., :, None] * q[..., None, :] / square)
+    )
     by_error /= evidence.noise[:, None, None, None]
 
     pixels = by_error @ by_point
@@ -226,7 +240,11 @@ def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
     zoom = evidence.focal_std[:, None, None] * (pixel_errors(evidence, rig) + evidence.points)
     by_focal = np.concatenate([(by_error @ zoom[..., None])[..., 0], np.zeros((c, k, 3))], axis=-1)
     by_own = np.concatenate([pixels, world], axis=2)
-    by_view = [by_own @ by_turn, np.concatenate([pixels @ by_place[:, None], 0 * world], 2), np.concatenate([none, -world], 2)]
+    by_view = [
+        by_own @ by_turn,
+        np.concatenate([pixels @ by_place[:, None], 0 * world], 2),
+        np.concatenate([none, -world], 2),
+    ]
     return Derivatives(
         by_landmark=by_own @ rig.rotations[:, None],
         by_view=np.concatenate(by_view, axis=-1),
@@ -235,7 +253,9 @@ def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
     )
 
 
-def _tied(evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "c k 3"]) -> Float[np.ndarray, "t k 3"]:
+def _tied(
+    evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "c k 3"]
+) -> Float[np.ndarray, "t k 3"]:
     """d log r / d L = the sum over views of share R^T (X - mean) / r^2, and of bones d |a - b| / d a = (a - b) / |a - b|."""
     share = _shares(evidence)
     centered = turned - np.sum(share * turned, axis=1, keepdims=True)
@@ -294,19 +314,28 @@ class Step:
 
 def moved(evidence: Evidence, rig: Rig, step: Step) -> Rig:
     """A rig after a step."""
-    turns, sideways, deeper = step.views[:, :3], step.views[:, 3:5], np.clip(step.views[:, 5:6], -FURTHEST, FURTHEST)
+    turns, sideways, deeper = (
+        step.views[:, :3],
+        step.views[:, 3:5],
+        np.clip(step.views[:, 5:6], -FURTHEST, FURTHEST),
+    )
     depth = rig.places[:, 2:] * np.exp(deeper)  # never behind the camera
     factors = (_factors(evidence, rig) + step.focal)[evidence.kinds]
     return Rig(
         landmarks=rig.landmarks + step.landmarks,
         rotations=Rotation.from_rotvec(turns).as_matrix() @ rig.rotations,
-        places=np.concatenate([(rig.places[:, :2] / rig.places[:, 2:] + sideways) * depth, depth], axis=1),
+        places=np.concatenate(
+            [(rig.places[:, :2] / rig.places[:, 2:] + sideways) * depth, depth], axis=1
+        ),
         focal=evidence.focal * np.exp(np.clip(evidence.focal_std * factors, -FURTHEST, FURTHEST)),
     )
 
 
 def adjust(
-    evidence: Evidence, start: Rig, tolerance: float = EXACT, scales: Sequence[float] = ROBUST_SCALES
+    evidence: Evidence,
+    start: Rig,
+    tolerance: float = EXACT,
+    scales: Sequence[float] = ROBUST_SCALES,
 ) -> tuple[Rig, float]:
     """Bundle adjustment by Levenberg and Marquardt: the cameras, and half the square sum of the residuals.
 
@@ -371,7 +400,9 @@ def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalE
     transposed = np.swapaxes(landmark, -1, -2)
     between = np.zeros((k, 3, m))
     between[..., : VIEW * c] = np.moveaxis(transposed @ view, 0, 2).reshape(k, 3, VIEW * c)
-    between[..., VIEW * c :] = np.einsum("cka,cg->kag", (transposed @ focal[..., None])[..., 0], own)
+    between[..., VIEW * c :] = np.einsum(
+        "cka,cg->kag", (transposed @ focal[..., None])[..., 0], own
+    )
 
     # between cameras: views among themselves, and with the kind of theirs
     views = view.reshape(c, k * 5, VIEW)
@@ -420,7 +451,9 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     K[:m, :m] = normal.cameras + np.diag(damped_cameras)
     K[m:, m:] = -np.eye(ties)
 
-    solved = np.linalg.solve(D, np.concatenate([F, normal.by_landmarks[..., None]], axis=2)).reshape(3 * k, -1)
+    solved = np.linalg.solve(
+        D, np.concatenate([F, normal.by_landmarks[..., None]], axis=2)
+    ).reshape(3 * k, -1)
     F = F.reshape(3 * k, -1)
     right = F.T @ solved[:, -1] - np.concatenate([normal.by_cameras, normal.tied_rows])
     cameras = np.linalg.solve(K - F.T @ solved[:, :-1], right)
@@ -428,6 +461,8 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
 
     q = cameras[:m]
     a = normal.by_landmarks + np.einsum("tka,t->ka", normal.tied, normal.tied_rows)
-    expected = 0.5 * (np.sum(landmarks * (damped * landmarks - a)) + q @ (damped_cameras * q - normal.by_cameras))
+    expected = 0.5 * (
+        np.sum(landmarks * (damped * landmarks - a)) + q @ (damped_cameras * q - normal.by_cameras)
+    )
     views = VIEW * ((m - normal.kinds) // VIEW)
     return Step(landmarks, q[:views].reshape(-1, VIEW), q[views:]), float(expected)

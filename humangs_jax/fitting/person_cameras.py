@@ -77,27 +77,40 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
     if explained.trial is not None:
         views = explained.views
         found = _cameras(seen.select(views), explained.trial, height)
-        return dataclasses.replace(found, views=views, warnings=(*found.warnings, *explained.warnings))
+        return dataclasses.replace(
+            found, views=views, warnings=(*found.warnings, *explained.warnings)
+        )
 
     # each photo shows a person, and has a world, of its own
     every = range(len(seen.photos))
     alone = [seen.select([view]) for view in every]
-    found = [_cameras(own, best_trial(own), height) for own in under_bar(alone, "cameras of each photo")]
+    found = [
+        _cameras(own, best_trial(own), height) for own in under_bar(alone, "cameras of each photo")
+    ]
     warnings = (*explained.warnings, *(warning for each in found for warning in each.warnings))
     names = ("landmarks", "mirrored", "errors")
     joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in names}
     cameras = tuple(each.cameras[0] for each in found)
-    return PersonCameras(tuple(every), cameras, moments=len(found), warnings=tuple(dict.fromkeys(warnings)), **joined)
+    return PersonCameras(
+        tuple(every), cameras, moments=len(found), warnings=tuple(dict.fromkeys(warnings)), **joined
+    )
 
 
 def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCameras:
     """Cameras and landmarks of a trial of these photos, in the world of the person."""
     rig = trial.rig
     if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):
-        raise ValueError(f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the person")
-    medians = np.asarray([np.median(e[w > SEEN]) for e, w in zip(trial.pixels, trial.evidence.weights, strict=True)])
+        raise ValueError(
+            f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the person"
+        )
+    medians = np.asarray(
+        [np.median(e[w > SEEN]) for e, w in zip(trial.pixels, trial.evidence.weights, strict=True)]
+    )
     cameras, landmarks = _in_world(seen, rig, height)
-    views, every = tuple(range(len(cameras))), np.broadcast_to(landmarks, (len(cameras), *landmarks.shape))
+    views, every = (
+        tuple(range(len(cameras))),
+        np.broadcast_to(landmarks, (len(cameras), *landmarks.shape)),
+    )
     warnings = tuple(_warnings(seen, trial.mirrored, height))
     return PersonCameras(views, cameras, every, trial.mirrored, 1, medians, warnings)
 
@@ -110,31 +123,45 @@ def _check(seen: PersonViews, height: float | None) -> None:
     if not views:
         raise ValueError("no photo of the person: expected one or more")
     counts = {len(x) for x in (seen.visibility, seen.world, seen.sizes, seen.focal, seen.photos)}
-    if counts != {views} or {len(seen.names)} != {x.shape[1] for x in (seen.points, seen.visibility, seen.world)}:
-        raise ValueError(f"expected points, visibility, world, sizes, focal and photos of {views} views")
+    if counts != {views} or {len(seen.names)} != {
+        x.shape[1] for x in (seen.points, seen.visibility, seen.world)
+    }:
+        raise ValueError(
+            f"expected points, visibility, world, sizes, focal and photos of {views} views"
+        )
     if height is not None and not 0.3 < height < 3:
         raise ValueError(f"height {height:g}: expected metres between 0.3 and 3")
     for photo, points, visible in zip(seen.photos, seen.points, known_landmarks(seen), strict=True):
         if visible.sum() < FEWEST:
-            raise ValueError(f"{photo}: {visible.sum()} landmarks of the person are seen, expected {FEWEST} or more")
+            raise ValueError(
+                f"{photo}: {visible.sum()} landmarks of the person are seen, expected {FEWEST} or more"
+            )
         if np.ptp(points[visible], axis=0).max() < SMALLEST:
-            raise ValueError(f"{photo}: all landmarks of the person lie within {SMALLEST:.0f} pixels")
+            raise ValueError(
+                f"{photo}: all landmarks of the person lie within {SMALLEST:.0f} pixels"
+            )
     for photo, world, visible in zip(seen.photos, seen.world, known_landmarks(seen), strict=True):
         if not np.ptp(world[visible], axis=0).any():
             raise ValueError(f"{photo}: all 3D landmarks of the person are one point")
     for photo, focal in zip(seen.photos, seen.focal, strict=True):
         if focal <= 0 or np.isinf(focal):
-            raise ValueError(f"{photo}: focal length {focal:g}: expected pixels, or NaN where it is unknown")
+            raise ValueError(
+                f"{photo}: focal length {focal:g}: expected pixels, or NaN where it is unknown"
+            )
 
 
 # The world -----------------------------------------------------------------------------------------------------------
 
 
-def _in_world(seen: PersonViews, rig: Rig, height: float | None) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
+def _in_world(
+    seen: PersonViews, rig: Rig, height: float | None
+) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
     """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this height."""
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
     names = seen.names
-    hips, shoulders, ankles = (middle_of(points, names, part) for part in ("hip", "shoulder", "ankle"))
+    hips, shoulders, ankles = (
+        middle_of(points, names, part) for part in ("hip", "shoulder", "ankle")
+    )
     body = (shoulders - ankles) / np.linalg.norm(shoulders - ankles)
     level = rotations[:, 0]  # images' x axes: horizontal if the cameras are level
     precision = level.T @ level / LEVEL**2 + np.eye(3) / UPRIGHT**2
@@ -147,9 +174,15 @@ def _in_world(seen: PersonViews, rig: Rig, height: float | None) -> tuple[tuple[
     scale = 1.0
     if height is not None:
         part = lambda a, b: np.mean(
-            [np.linalg.norm(points[names.index(f"{s}_{a}")] - points[names.index(f"{s}_{b}")]) for s in ("left", "right")]
+            [
+                np.linalg.norm(points[names.index(f"{s}_{a}")] - points[names.index(f"{s}_{b}")])
+                for s in ("left", "right")
+            ]
         )
-        scale = height / (STATURE * (np.linalg.norm(shoulders - hips) + part("hip", "knee") + part("knee", "ankle")))
+        scale = height / (
+            STATURE
+            * (np.linalg.norm(shoulders - hips) + part("hip", "knee") + part("knee", "ankle"))
+        )
     turned = scale * points @ world_from_rig.T
     middle = scale * world_from_rig @ hips
     origin = np.asarray([middle[0], turned[:, 1].min(), middle[2]])
@@ -158,11 +191,17 @@ def _in_world(seen: PersonViews, rig: Rig, height: float | None) -> tuple[tuple[
         matrix = np.eye(4)
         matrix[:3, :3] = rotation @ world_from_rig.T
         matrix[:3, 3] = scale * place + matrix[:3, :3] @ origin
-        cameras.append(Camera.from_opencv([[f, 0, width / 2], [0, f, tall / 2], [0, 0, 1]], matrix, width, tall))
+        cameras.append(
+            Camera.from_opencv(
+                [[f, 0, width / 2], [0, f, tall / 2], [0, 0, 1]], matrix, width, tall
+            )
+        )
     return tuple(cameras), turned - origin
 
 
-def _warnings(seen: PersonViews, mirrored: Bool[np.ndarray, " c"], height: float | None) -> Iterator[str]:
+def _warnings(
+    seen: PersonViews, mirrored: Bool[np.ndarray, " c"], height: float | None
+) -> Iterator[str]:
     if height is None:
         yield "the person's height is not given: lengths are a detector's guess, often 6 to 11 % too small"
     if not np.isfinite(seen.focal).any():
@@ -181,7 +220,9 @@ def scaled_to_height(capture: Capture, height: float) -> Capture:
     scale = height / float(heights[top] - heights[bottom])
     # joints as if all of the body were scaled, the stature exactly so
     joints = np.asarray(before.joints, np.float64)
-    bones = np.einsum("jn,nas->jas", np.asarray(capture.body.joint_regressor, np.float64), directions)
+    bones = np.einsum(
+        "jn,nas->jas", np.asarray(capture.body.joint_regressor, np.float64), directions
+    )
     rows = [
         (bones - bones[:1]).reshape(-1, len(betas)) / BONES_STD,
         (directions[top, 1] - directions[bottom, 1])[None] / STATURE_STD,

@@ -80,7 +80,9 @@ class PersonViews:
     def select(self, views: Sequence[int]) -> "PersonViews":
         """Some of the photos, in this order."""
         rows, few = list(views), lambda values: tuple(values[view] for view in views)
-        arrays = {name: getattr(self, name)[rows] for name in ("points", "visibility", "world", "focal")}
+        arrays = {
+            name: getattr(self, name)[rows] for name in ("points", "visibility", "world", "focal")
+        }
         return dataclasses.replace(self, sizes=few(self.sizes), photos=few(self.photos), **arrays)
 
 
@@ -158,14 +160,20 @@ def explain(seen: PersonViews) -> Explanation:
 
     # the others have to agree, but for one
     if len(chosen) < len(every):
-        trial, views = _with_others(seen, trial, views, [view for view in every if view not in chosen])
+        trial, views = _with_others(
+            seen, trial, views, [view for view in every if view not in chosen]
+        )
     if len(views) < len(every) - 1 or trial.error > ONE_MOMENT:
         return Explanation(None, every)
 
     # from one side the landmarks of one photo decide nothing about the others
     angle = _angle(trial.rig)
     if len(every) > 1 and angle < LEAST_ANGLE:
-        which = "all photos" if len(views) == len(every) else ", ".join(seen.photos[view] for view in views)
+        which = (
+            "all photos"
+            if len(views) == len(every)
+            else ", ".join(seen.photos[view] for view in views)
+        )
         side = f"{which} are from one side (directions differ by {angle:.1f} degrees, expected {LEAST_ANGLE:.0f} or more)"
         return Explanation(None, every, (f"{side}: each photo stands for itself",))
 
@@ -174,10 +182,15 @@ def explain(seen: PersonViews) -> Explanation:
     return Explanation(trial, views, tuple(f"{photo}: {left}" for photo in out))
 
 
-def _without_one(seen: PersonViews, chosen: tuple[int, ...]) -> tuple[Trial, tuple[int, ...]] | None:
+def _without_one(
+    seen: PersonViews, chosen: tuple[int, ...]
+) -> tuple[Trial, tuple[int, ...]] | None:
     """Cameras of all photos but one, if they are of one moment then."""
     rests = [tuple(v for v in chosen if v != out) for out in chosen]
-    trials = [_try(seen.select(rest), np.zeros(len(rest), bool)) for rest in under_bar(rests, "cameras without one photo")]
+    trials = [
+        _try(seen.select(rest), np.zeros(len(rest), bool))
+        for rest in under_bar(rests, "cameras without one photo")
+    ]
     best = int(np.argmin([trial.error for trial in trials]))
     if trials[best].error >= MOMENT_WITHOUT:
         return None
@@ -185,7 +198,9 @@ def _without_one(seen: PersonViews, chosen: tuple[int, ...]) -> tuple[Trial, tup
     return (found, rests[best]) if found.error <= ONE_MOMENT else None
 
 
-def _with_others(seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]) -> tuple[Trial, tuple[int, ...]]:
+def _with_others(
+    seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
+) -> tuple[Trial, tuple[int, ...]]:
     """Cameras of further photos, too: of those that show the person of the trial, mirrored or not."""
     mirrored = dict(zip(views, trial.mirrored, strict=True))
     for view in under_bar(others, "cameras of further photos"):
@@ -228,7 +243,9 @@ def best_trial(seen: PersonViews) -> Trial:
     if views > 1:
         found = _least(seen, found)
         if found.error > DOUBTFUL:
-            found = min(found, _least(seen, _try(seen, np.ones(views, bool))), key=lambda each: each.cost)
+            found = min(
+                found, _least(seen, _try(seen, np.ones(views, bool))), key=lambda each: each.cost
+            )
         if handedness(found.rig.landmarks, seen.names) < 0:
             found = _try(seen, ~found.mirrored)
     return _polished(found)
@@ -291,9 +308,13 @@ def _focal_lengths(
     """
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)
-    usual = np.median((seen.focal / diagonals)[known]) if known.any() else USUAL_FOCAL / DIAGONAL_35MM
+    usual = (
+        np.median((seen.focal / diagonals)[known]) if known.any() else USUAL_FOCAL / DIAGONAL_35MM
+    )
     std = np.where(known, EXIF_STD, USUAL_STD)
-    cameras = [() if own else tuple(sorted(size)) for own, size in zip(known, seen.sizes, strict=True)]
+    cameras = [
+        () if own else tuple(sorted(size)) for own, size in zip(known, seen.sizes, strict=True)
+    ]
     kinds = np.asarray([sorted(set(cameras)).index(own) for own in cameras])
     return np.where(known, seen.focal, usual * diagonals), std, kinds
 
@@ -303,24 +324,32 @@ def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Ev
     focal, std, kinds = _focal_lengths(seen)
     mirror = [seen.names.index(mirrored_name(name)) for name in seen.names]
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
-    pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
+    pick = lambda values: np.take_along_axis(
+        values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1
+    )
     points, weights = pick(seen.points - np.asarray(seen.sizes)[:, None] / 2), pick(seen.visibility)
     world = pick(seen.world)
     for own, flipped in zip(world, mirrored, strict=True):
-        if flipped and handedness(own, seen.names) < 0:  # the detector saw the body turned round as well
+        if (
+            flipped and handedness(own, seen.names) < 0
+        ):  # the detector saw the body turned round as well
             own[:, 2] *= -1
     K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
     hips = np.asarray([name in ("left_hip", "right_hip") for name in seen.names])
     middle = np.where((weights * hips).all(1, where=hips, keepdims=True), weights * hips, weights)
     world = in_camera_axes(world, points, middle, K)
-    world = np.asarray([x - (w[:, None] * x).sum(0) / w.sum() for x, w in zip(world, weights, strict=True)])
+    world = np.asarray(
+        [x - (w[:, None] * x).sum(0) / w.sum() for x, w in zip(world, weights, strict=True)]
+    )
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]
     shape, rotations = align_views(world, weights)
     size = lambda p, w: float(np.ptp(np.quantile(p[w > 0], OUTER, axis=0), axis=0).max())
     noise = np.asarray([size(p, w) * NOISE for p, w in zip(points, weights, strict=True)])
     offsets = np.einsum("cab,kb->cka", rotations, shape)
-    places = np.stack([place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)])
+    places = np.stack(
+        [place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)]
+    )
     evidence = Evidence(points, weights, noise, world, focal, std, kinds, _bones(seen.names))
     return evidence, Rig(shape, rotations, places, focal)
 
@@ -337,14 +366,24 @@ def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
 # The body ------------------------------------------------------------------------------------------------------------
 
 
-def middle_of(points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str) -> Float[np.ndarray, "3"]:
+def middle_of(
+    points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str
+) -> Float[np.ndarray, "3"]:
     """The middle of the left and the right of a part."""
     return np.mean([points[names.index(f"{side}_{part}")] for side in ("left", "right")], axis=0)
 
 
 def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    ends = [(f"{side}_{toe}", f"{side}_heel") for toe in ("foot_index", "big_toe") for side in ("left", "right")]
-    found = [points[names.index(a)] - points[names.index(b)] for a, b in ends if a in names and b in names]
+    ends = [
+        (f"{side}_{toe}", f"{side}_heel")
+        for toe in ("foot_index", "big_toe")
+        for side in ("left", "right")
+    ]
+    found = [
+        points[names.index(a)] - points[names.index(b)]
+        for a, b in ends
+        if a in names and b in names
+    ]
     if {"nose", "left_ear", "right_ear"} <= set(names):
         found.append(points[names.index("nose")] - middle_of(points, names, "ear"))
     return np.sum(found, axis=0) if found else np.zeros(3)

@@ -105,20 +105,33 @@ SKIN, TIGHT = 0.001, 0.015
 
 
 def usual_config(
-    fitted: bool, *, fixed_cameras: bool = False, bare: bool = False, tight: bool = False, calibrated: bool = True
+    fitted: bool,
+    *,
+    fixed_cameras: bool = False,
+    bare: bool = False,
+    tight: bool = False,
+    calibrated: bool = True,
 ) -> CaptureRefineConfig:
     """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the body is to fill the
     masks. tight: the person wears tight clothes. calibrated: False for cameras that were found from the person.
     """
     start = FITTED if calibrated else FROM_PERSON
     std = start if fitted else StateStd()
-    config = CaptureRefineConfig(fixed_cameras=fixed_cameras, independent=100.0 if fitted else CaptureRefineConfig.independent)
-    if bare or tight or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
+    config = CaptureRefineConfig(
+        fixed_cameras=fixed_cameras,
+        independent=100.0 if fitted else CaptureRefineConfig.independent,
+    )
+    if (
+        bare or tight or not calibrated
+    ):  # the masks are believed; cameras were fitted to these very keypoints
         config = dataclasses.replace(config, keypoints_worse=math.inf)
     if tight:
         std = dataclasses.replace(std, clothing=TIGHT, betas=2.0, body_pose=10.0)
     if bare:
-        std, config = dataclasses.replace(std, clothing=SKIN), dataclasses.replace(config, robust_scales=(1.0, 1.0))
+        std, config = (
+            dataclasses.replace(std, clothing=SKIN),
+            dataclasses.replace(config, robust_scales=(1.0, 1.0)),
+        )
     return dataclasses.replace(config, std=std)
 
 
@@ -135,7 +148,10 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
     body = capture.body
     named = [j for j, name in enumerate(body.joint_names) if name in BODY_NAMES]
     joints = tuple(j for j in named or range(len(body.parents)) if body.parents[j] >= 0)
-    wanted = max(len(capture.betas), min(config.coefficients, without_expression(body).shape_directions.shape[-1]))
+    wanted = max(
+        len(capture.betas),
+        min(config.coefficients, without_expression(body).shape_directions.shape[-1]),
+    )
     return Origin(
         betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
         pose=capture.poses,
@@ -160,7 +176,9 @@ def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
     own = replace(origin, cameras=replace(origin.views, K=capture.cameras.K))
     (K, cam_from_world), betas, poses = _moved(own, state)
     cameras = replace(capture.cameras, K=K, cam_from_world=cam_from_world)
-    return dataclasses.replace(capture, cameras=cameras, betas=np.asarray(betas), poses=poses, displacement=None)
+    return dataclasses.replace(
+        capture, cameras=cameras, betas=np.asarray(betas), poses=poses, displacement=None
+    )
 
 
 @jax.jit
@@ -200,14 +218,25 @@ def evidence_residuals(
         seen = jnp.matmul(posed, matrix[:3, :3].T, precision=EXACT) + matrix[:3, 3]
         focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
         clothes = clothing_thickness(origin, state, points.weights) * focal.mean() / depth[:, 0]
-        pixels, scales = seen[:, :2] / depth * focal + K[:2, 2], (evidence.scales[0], evidence.scales[1])
-        return silhouettes.silhouette_residuals(matches, pixels, clothes, evidence.noise, scales, independent)
+        pixels, scales = (
+            seen[:, :2] / depth * focal + K[:2, 2],
+            (evidence.scales[0], evidence.scales[1]),
+        )
+        return silhouettes.silhouette_residuals(
+            matches, pixels, clothes, evidence.noise, scales, independent
+        )
 
-    parts = {"silhouettes": jax.vmap(silhouette)(evidence.points, evidence.matches, frame, K, cam_from_world)}
+    parts = {
+        "silhouettes": jax.vmap(silhouette)(
+            evidence.points, evidence.matches, frame, K, cam_from_world
+        )
+    }
     if evidence.keypoints is not None:
 
         def landmarks(features, transforms, joints):
-            return landmarks_from(model, joints, pose_points(model.points, betas, features, transforms))
+            return landmarks_from(
+                model, joints, pose_points(model.points, betas, features, transforms)
+            )
 
         seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
         points = jax.vmap(landmarks)(features, transforms, joints)[frame]
@@ -222,7 +251,9 @@ def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
 
 
 @functools.partial(jax.jit, static_argnames="independent")
-def solve_round(model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float) -> FitState:
+def solve_round(
+    model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float
+) -> FitState:
     """The state after some steps with fixed matches."""
 
     def residuals(y):
@@ -230,7 +261,9 @@ def solve_round(model: LandmarkModel, origin: Origin, evidence: Evidence, state:
         return evidence_residuals(model, origin, y, evidence, independent), counted
 
     many = sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS
-    return solve(residuals, state, PATIENCE * STEPS if many else STEPS, method="lbfgs" if many else "lm")[0]
+    return solve(
+        residuals, state, PATIENCE * STEPS if many else STEPS, method="lbfgs" if many else "lm"
+    )[0]
 
 
 # Iterations ----------------------------------------------------------------------------------------------------------
@@ -251,12 +284,17 @@ class Score:
 class Scene:
     """What stays the same over the iterations: masks at the size that is looked at, keypoints, and the origin."""
 
-    def __init__(self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig) -> None:
+    def __init__(
+        self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig
+    ) -> None:
         self.capture, self.config = capture, config
         small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
         looked_at = capture if small else capture.resized(LONGEST_SIDE)
         empty = np.zeros(looked_at.images.shape[:3], np.float32)
-        self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
+        self.cameras, self.masks = (
+            looked_at.cameras,
+            empty if looked_at.masks is None else looked_at.masks,
+        )
         self.faces = np.asarray(capture.body.faces)
         self.edges = silhouettes.body_edges(self.faces)
         self.boundaries = [silhouettes.mask_boundary(mask, config.points) for mask in self.masks]
@@ -264,7 +302,9 @@ class Scene:
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
         self.scale = self.cameras.width / capture.cameras.width
-        seen_by = lambda cameras: None if keypoints is None else scaled_observations(cameras, keypoints, capture.cameras)
+        seen_by = lambda cameras: (
+            None if keypoints is None else scaled_observations(cameras, keypoints, capture.cameras)
+        )
         self.keypoints, self.observations = seen_by(capture.cameras), seen_by(self.cameras)
         self.height = _person_height(self.masks, self.observations)
         self.origin = capture_origin(capture, self.cameras, config)
@@ -274,10 +314,15 @@ class Scene:
         config, state, move = self.config, start_state(self.origin, self.config), 0.0
         first, last = REACH
         for turn in range(config.iterations):
-            evidence = self.look(state, self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)))
+            evidence = self.look(
+                state,
+                self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)),
+            )
             before = state
             state = solve_round(self.model, self.origin, evidence, state, config.independent)
-            moves = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before)
+            moves = jax.tree.map(
+                lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before
+            )
             move = max(jax.tree.leaves(moves))
         return state, move
 
@@ -285,11 +330,19 @@ class Scene:
         """What the views show, matched within `reach` pixels of the body in this state."""
         count = self.config.points
         moved = moved_capture(self.capture, self.origin, state)
-        boundaries = [silhouettes.body_boundary(view, self.faces, self.edges, count) for view in self.body_views(moved)]
+        boundaries = [
+            silhouettes.body_boundary(view, self.faces, self.edges, count)
+            for view in self.body_views(moved)
+        ]
         views = zip(boundaries, self.masks, self.boundaries, strict=True)
-        matches = [silhouettes.match(boundary, mask, other, reach, count) for boundary, mask, other in views]
+        matches = [
+            silhouettes.match(boundary, mask, other, reach, count)
+            for boundary, mask, other in views
+        ]
         return Evidence(
-            points=silhouettes.boundary_points(self.capture.body, boundaries, count, len(self.origin.betas)),
+            points=silhouettes.boundary_points(
+                self.capture.body, boundaries, count, len(self.origin.betas)
+            ),
             matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
             noise=jnp.asarray(_noise(boundaries, matches), jnp.float32),
             scales=reach * jnp.asarray(self.config.robust_scales, jnp.float32),
@@ -305,9 +358,15 @@ class Scene:
 
     def _errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
         """Errors of the keypoints in pixels of the photos; NaN where there is none."""
-        seen = replace(seen, K=capture.cameras.K[:, None], cam_from_world=capture.cameras.cam_from_world[:, None])
+        seen = replace(
+            seen,
+            K=capture.cameras.K[:, None],
+            cam_from_world=capture.cameras.cam_from_world[:, None],
+        )
         betas = jnp.asarray(capture.betas)
-        errors = body_errors(self.model, betas, capture.poses, seen, capture.frames, reprojection_errors)
+        errors = body_errors(
+            self.model, betas, capture.poses, seen, capture.frames, reprojection_errors
+        )
         known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
         return np.where(known, errors, np.nan)[:, 0]
 
@@ -316,7 +375,10 @@ class Scene:
         cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
         vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
         faces = capture.body.faces
-        return [silhouettes.view_body(vertices[int(frame)], faces, cameras[i]) for i, frame in enumerate(capture.frames)]
+        return [
+            silhouettes.view_body(vertices[int(frame)], faces, cameras[i])
+            for i, frame in enumerate(capture.frames)
+        ]
 
     def score(self, capture: Capture) -> Score:
         """How well the body of a capture of these photos agrees with masks and keypoints."""
@@ -324,7 +386,10 @@ class Scene:
         ious = np.asarray([overlap(view.covered, mask) for view, mask in pairs])
         iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
         loss = 0.0 if iou is None else 1 - iou
-        if self.keypoints is not None and np.isfinite(errors := self._errors(capture, self.keypoints)).any():
+        if (
+            self.keypoints is not None
+            and np.isfinite(errors := self._errors(capture, self.keypoints)).any()
+        ):
             keypoints = float(np.nanmedian(errors))
             loss += keypoints * self.scale / self.height
         return Score(ious, iou, keypoints, loss)
@@ -333,20 +398,28 @@ class Scene:
 def overlap(covered: Bool[np.ndarray, "h w"], mask: Float[np.ndarray, "h w"]) -> float:
     """Intersection over union of a body and a mask; NaN if the mask is empty."""
     person = mask > 0.5
-    return float((covered & person).sum() / (covered | person).sum()) if person.any() else float("nan")
+    return (
+        float((covered & person).sum() / (covered | person).sum()) if person.any() else float("nan")
+    )
 
 
 @jax.jit
-def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose) -> Float[jax.Array, "m n 3"]:
+def posed_vertices(
+    body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose
+) -> Float[jax.Array, "m n 3"]:
     """Vertices of a person in a batch of m poses, metres."""
     rest = shape_body(body, betas)
     return jax.lax.map(lambda pose: pose_body(body, rest, pose).vertices, poses)
 
 
-def _noise(boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]) -> float:
+def _noise(
+    boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
+) -> float:
     """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a body that is not yet there."""
     off = [
-        np.asarray(silhouettes.distances(m, jnp.asarray(boundary.positions, jnp.float32)))[np.asarray(m.weights) > 0]
+        np.asarray(silhouettes.distances(m, jnp.asarray(boundary.positions, jnp.float32)))[
+            np.asarray(m.weights) > 0
+        ]
         for boundary, m in zip(boundaries, matches, strict=True)
         if len(boundary.positions)
     ]
@@ -355,12 +428,17 @@ def _noise(boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhoue
 
 
 def _person_height(
-    masks: Sequence[Float[np.ndarray, "h w"]] | Float[np.ndarray, "v h w"], observations: Observations | None
+    masks: Sequence[Float[np.ndarray, "h w"]] | Float[np.ndarray, "v h w"],
+    observations: Observations | None,
 ) -> float:
     """Height of the person in the image, pixels: median over the views of the extent of masks, or else of keypoints."""
     sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
     if not sizes and observations is not None:
-        pairs = zip(np.asarray(observations.points)[:, 0], np.asarray(observations.confidences)[:, 0] > 0, strict=True)
+        pairs = zip(
+            np.asarray(observations.points)[:, 0],
+            np.asarray(observations.confidences)[:, 0] > 0,
+            strict=True,
+        )
         sizes = [np.ptp(points[seen], axis=0).max() for points, seen in pairs if seen.any()]
     return float(np.median(sizes)) if sizes else float("nan")
 
@@ -386,7 +464,10 @@ class RefinedCapture:
 
 
 def refine_capture(
-    capture: Capture, *, keypoints: Keypoints | None = None, config: CaptureRefineConfig = DEFAULT_CONFIG
+    capture: Capture,
+    *,
+    keypoints: Keypoints | None = None,
+    config: CaptureRefineConfig = DEFAULT_CONFIG,
 ) -> RefinedCapture:
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 
@@ -396,11 +477,15 @@ def refine_capture(
     number of views.
     """
     if keypoints is not None and len(keypoints.points) != capture.view_count:
-        raise ValueError(f"keypoints: of {len(keypoints.points)} views, but the capture has {capture.view_count}")
+        raise ValueError(
+            f"keypoints: of {len(keypoints.points)} views, but the capture has {capture.view_count}"
+        )
     masked = capture.masks is not None and (np.asarray(capture.masks) > 0.5).any()
     if not masked and (keypoints is None or not (keypoints.confidences > 0).any()):
         raise CaptureError(
-            "capture", "masks", "none shows anybody, and there are no keypoints: refinement needs one or the other"
+            "capture",
+            "masks",
+            "none shows anybody, and there are no keypoints: refinement needs one or the other",
         )
     scene = Scene(capture, keypoints, config)
     state, move = scene.run()
@@ -427,7 +512,9 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, note: st
     names = {"silhouette_iou": "iou", "keypoint_error_px": "keypoints", "loss": "loss"}
     pairs = {name: (getattr(before, key), getattr(after, key)) for name, key in names.items()}
     errors = {name: Change(b, a) for name, (a, b) in pairs.items() if b is not None}
-    ious = zip(start.names, start.frames.tolist(), before.ious.tolist(), after.ious.tolist(), strict=True)
+    ious = zip(
+        start.names, start.frames.tolist(), before.ious.tolist(), after.ious.tolist(), strict=True
+    )
     moved = how_far(start, best) if kept else {}
     notes = [note, f"kept: {'refined' if kept else 'start'}"]
     if kept:
@@ -436,15 +523,23 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, note: st
             "joints {joint_degrees:.2f} degrees, person {transl_cm:.1f} cm (means)".format(**moved)
         )
         if start.displacement is not None:
-            notes.append("the displacement of body.npz is left out: it was made for the shape before")
+            notes.append(
+                "the displacement of body.npz is left out: it was made for the shape before"
+            )
     apart = after.iou is not None and after.iou < LEAST_IOU
     return FitReport(
         fitted="refinement",
         kept=kept,
         errors=errors,
-        views=tuple(ViewReport(name, frame, iou_before=a, iou_after=b) for name, frame, a, b in ious),
+        views=tuple(
+            ViewReport(name, frame, iou_before=a, iou_after=b) for name, frame, a, b in ious
+        ),
         moved=moved,
         violations=limit_violations(best.body.joint_names, best.poses),
         notes=tuple(notes),
-        warnings=("body and masks do not agree: the start was too far off; `humangs check` shows why",) if apart else (),
+        warnings=(
+            "body and masks do not agree: the start was too far off; `humangs check` shows why",
+        )
+        if apart
+        else (),
     )

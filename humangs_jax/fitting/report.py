@@ -110,7 +110,9 @@ class FitReport:
             lines.append(f"{label}: {start}{form.format(change.after)}")
         lines += self.notes
         if self.undetermined:
-            lines.append(f"not determined by the views, taken from the prior: {', '.join(self.undetermined)}")
+            lines.append(
+                f"not determined by the views, taken from the prior: {', '.join(self.undetermined)}"
+            )
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
 
 
@@ -123,20 +125,30 @@ def _plain(value: Any) -> Any:
 
 
 def _view_rows(views: Sequence[ViewReport]) -> list[str]:
-    error = lambda view: np.nan_to_num(view.median if view.iou_after is None else 1 - view.iou_after, nan=np.inf)
+    error = lambda view: np.nan_to_num(
+        view.median if view.iou_after is None else 1 - view.iou_after, nan=np.inf
+    )
     worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
     masks = views[0].iou_after is not None
-    rows = [["view", "IoU before", "after"] if masks else ["view", "keypoints", "median error", "90 % below", "outliers"]]
+    rows = [
+        ["view", "IoU before", "after"]
+        if masks
+        else ["view", "keypoints", "median error", "90 % below", "outliers"]
+    ]
     for view in (views[i] for i in sorted(worst)):
         if not masks:
-            errors = [f"{view.median:.1f} px", f"{view.high:.1f} px"] if view.keypoints else ["-", "-"]
+            errors = (
+                [f"{view.median:.1f} px", f"{view.high:.1f} px"] if view.keypoints else ["-", "-"]
+            )
             rows.append([view.name, str(view.keypoints), *errors, f"{view.outliers:.0%}"])
         elif np.isfinite(view.iou_before):
             rows.append([view.name, f"{view.iou_before:.3f}", f"{view.iou_after:.3f}"])
         else:
             rows.append([view.name, "no mask"])
     lines = text_table(rows)
-    return lines if len(views) <= ROWS else [*lines, f"...  {len(views) - ROWS} more that fit better"]
+    return (
+        lines if len(views) <= ROWS else [*lines, f"...  {len(views) - ROWS} more that fit better"]
+    )
 
 
 # What points to a mistake --------------------------------------------------------------------------------------------
@@ -151,7 +163,10 @@ UNSURE, UNDECIDED = 0.03, 0.1
 """A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is determined: a mean over axes, of
 which knees and fingers have one that turns."""
 
-_FINGERS = {side: [f"{side}_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)] for side in ("left", "right")}
+_FINGERS = {
+    side: [f"{side}_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)]
+    for side in ("left", "right")
+}
 GROUPS = {
     "left hand": _FINGERS["left"],
     "right hand": _FINGERS["right"],
@@ -168,29 +183,44 @@ def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Vio
     prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
     beyond = np.rad2deg(np.maximum(prior.lower - rotations, rotations - prior.upper))
     found = np.argwhere(beyond > SLIGHTLY_BEYOND)
-    return tuple(Violation(int(m), joint_names[j], "xyz"[axis], float(beyond[m, j, axis])) for m, j, axis in found)
+    return tuple(
+        Violation(int(m), joint_names[j], "xyz"[axis], float(beyond[m, j, axis]))
+        for m, j, axis in found
+    )
 
 
 def undetermined_joints(
-    joint_names: tuple[str, ...], joint_std: Float[np.ndarray, "m j"], determined: Float[np.ndarray, "m j"]
+    joint_names: tuple[str, ...],
+    joint_std: Float[np.ndarray, "m j"],
+    determined: Float[np.ndarray, "m j"],
 ) -> tuple[str, ...]:
     """Joints that the views do not determine in m frames; fingers and other groups as one.
 
     Arguments: joint_std: metres. determined: shares.
     """
     unknown = (joint_std > UNSURE) | (determined < UNDECIDED)
-    counts = {name: count for name, count in zip(joint_names, unknown.sum(0).tolist(), strict=True) if count}
+    counts = {
+        name: count
+        for name, count in zip(joint_names, unknown.sum(0).tolist(), strict=True)
+        if count
+    }
     found = []
     for group, members in GROUPS.items():
         if all(name in counts for name in members):
             found.append((group, max(counts.pop(name) for name in members)))
     found += counts.items()
     total = len(unknown)
-    return tuple(name if count == total else f"{name} (in {count} of {total} frames)" for name, count in found)
+    return tuple(
+        name if count == total else f"{name} (in {count} of {total} frames)"
+        for name, count in found
+    )
 
 
 def keypoint_warnings(
-    views: Sequence[ViewReport], expected: Float[np.ndarray, " m"], violations: Sequence[Violation], swaps: Sequence[Swap]
+    views: Sequence[ViewReport],
+    expected: Float[np.ndarray, " m"],
+    violations: Sequence[Violation],
+    swaps: Sequence[Swap],
 ) -> tuple[str, ...]:
     """What points to a mistake. expected: noise of the keypoints of each frame, pixels."""
     found = [str(swap) for swap in swaps[:NAMED]]
@@ -202,9 +232,13 @@ def keypoint_warnings(
     if blind:
         found.append(f"no keypoints in {_names(blind)}")
     if off:
-        found.append(f"body and keypoints disagree in {_names(off)}: median error {_span(off, 'median', '{:.0f}')} px")
+        found.append(
+            f"body and keypoints disagree in {_names(off)}: median error {_span(off, 'median', '{:.0f}')} px"
+        )
     if wild:
-        found.append(f"many keypoints are outliers in {_names(wild)}: {_span(wild, 'outliers', '{:.0%}')}")
+        found.append(
+            f"many keypoints are outliers in {_names(wild)}: {_span(wild, 'outliers', '{:.0%}')}"
+        )
     far: dict[tuple[str, str], list[Violation]] = {}
     for each in violations:
         if each.degrees > FAR_BEYOND:
@@ -212,7 +246,9 @@ def keypoint_warnings(
     for (joint, axis), of in far.items():
         worst = max(each.degrees for each in of)
         frames = few([str(each.frame) for each in of], NAMED)
-        found.append(f"{joint} is {worst:.0f} degrees beyond its limit about {axis}, in frame {frames}")
+        found.append(
+            f"{joint} is {worst:.0f} degrees beyond its limit about {axis}, in frame {frames}"
+        )
     return tuple(found)
 
 
@@ -231,8 +267,12 @@ def how_far(start: Capture, refined: Capture) -> dict[str, float]:
     rotations, transl_cm of the root.
     """
     a, b = start.cameras, refined.cameras
-    turns = lambda cameras: Rotation.from_matrix(np.asarray(cameras.cam_from_world[:, :3, :3], float))
-    joints = lambda capture: Rotation.from_rotvec(np.asarray(capture.poses.rotations, float).reshape(-1, 3))
+    turns = lambda cameras: Rotation.from_matrix(
+        np.asarray(cameras.cam_from_world[:, :3, :3], float)
+    )
+    joints = lambda capture: Rotation.from_rotvec(
+        np.asarray(capture.poses.rotations, float).reshape(-1, 3)
+    )
     degrees = lambda first, second: float(np.degrees((first.inv() * second).magnitude().mean()))
     length = lambda x: float(np.linalg.norm(np.asarray(x), axis=-1).mean())
     return {

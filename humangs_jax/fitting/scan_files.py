@@ -69,14 +69,20 @@ def read_mesh(path: str | Path, colors: bool = False) -> Any:
 
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"{path}: {'a folder' if path.is_dir() else 'no such file'}: expected a mesh (OBJ, PLY, GLB, ...)")
+        raise ValueError(
+            f"{path}: {'a folder' if path.is_dir() else 'no such file'}: expected a mesh (OBJ, PLY, GLB, ...)"
+        )
     parts = read_meshes(path, colors=colors)
     faces = sum(len(part.faces) for part in parts)
     if faces < LEAST_FACES:
-        raise ValueError(f"{path}: {faces} faces: expected the surface of a person, at least {LEAST_FACES}, no cloud of points")
+        raise ValueError(
+            f"{path}: {faces} faces: expected the surface of a person, at least {LEAST_FACES}, no cloud of points"
+        )
     mesh: Any = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
     if not (np.isfinite(mesh.vertices[np.unique(mesh.faces)]).all() and mesh.area > 0):
-        raise ValueError(f"{path}: corners that are not finite numbers, or faces without area: expected a clean mesh")
+        raise ValueError(
+            f"{path}: corners that are not finite numbers, or faces without area: expected a clean mesh"
+        )
     return mesh
 
 
@@ -101,7 +107,9 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
     rng = np.random.default_rng(0)
     ends = np.cumsum(area)
     total = OCCLUDERS * count
-    face = np.minimum(np.searchsorted(ends, rng.random(total) * ends[-1], side="right"), len(faces) - 1)
+    face = np.minimum(
+        np.searchsorted(ends, rng.random(total) * ends[-1], side="right"), len(faces) - 1
+    )
     a, b = rng.random((2, total))
     swap = a + b > 1
     a, b = np.where(swap, 1 - a, a), np.where(swap, 1 - b, b)
@@ -110,7 +118,9 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
     turned = bool(np.einsum("fa,fa->", corners[:, 0], across) < 0)  # six times the volume
     cell = float(np.sqrt(PER_CELL * 0.5 * ends[-1] / total))
     some = points[:count]
-    seen = [in_front(some, points, forward, cell, BEHIND * cell) for forward in directions_around(VIEWS)]
+    seen = [
+        in_front(some, points, forward, cell, BEHIND * cell) for forward in directions_around(VIEWS)
+    ]
     outside = np.flatnonzero(np.any(seen, axis=0))
     chosen = face[outside]
     normals = across[chosen] / area[chosen][:, None] * (-1 if turned else 1)
@@ -120,22 +130,43 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
 # Known landmarks ------------------------------------------------------------------------------------------------------
 
 SIDES = ("left", "right")
-PARTS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe", "small_toe", "heel")
+PARTS = (
+    "eye",
+    "ear",
+    "shoulder",
+    "elbow",
+    "wrist",
+    "hip",
+    "knee",
+    "ankle",
+    "big_toe",
+    "small_toe",
+    "heel",
+)
 SCAN_LANDMARKS = (
     *("nose", "neck", "mid_hip"),
     *(f"{side}_{part}" for part in PARTS for side in SIDES),
-    *(f"{side}_{finger}_{joint}" for side in SIDES for finger in FINGERS for joint in FINGER_JOINTS),
+    *(
+        f"{side}_{finger}_{joint}"
+        for side in SIDES
+        for finger in FINGERS
+        for joint in FINGER_JOINTS
+    ),
 )
 """Names that joints of a scan may have: the landmarks of `body/landmarks.py` without duplicates and the face."""
 
 
-def checked_joints(joints: Mapping[str, Any]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+def checked_joints(
+    joints: Mapping[str, Any],
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
     """Points (k, 3) in the order of `SCAN_LANDMARKS` and which of them are known (k,).
 
     Raises: ValueError for unknown names and points that are not three finite numbers.
     """
     if unknown := sorted(set(joints) - set(SCAN_LANDMARKS)):
-        raise ValueError(f"joint '{unknown[0]}' is no landmark of ours: expected names such as {', '.join(SCAN_LANDMARKS[:6])}")
+        raise ValueError(
+            f"joint '{unknown[0]}' is no landmark of ours: expected names such as {', '.join(SCAN_LANDMARKS[:6])}"
+        )
     points, known = np.zeros((len(SCAN_LANDMARKS), 3)), np.zeros(len(SCAN_LANDMARKS))
     for name, point in joints.items():
         values = np.asarray(point)
@@ -172,10 +203,14 @@ HEIGHT = 1.7
 """Metres: the scan's longest side in that world (arbitrary)."""
 DISTANCE, FIELD_OF_VIEW = 4.0, np.radians(36.0)
 """Distance of the cameras, metres, and their vertical field of view, radians."""
-AXES = {f"{sign}{axis}": (s, i) for s, sign in ((1, "+"), (-1, "-")) for i, axis in enumerate("xyz")}
+AXES = {
+    f"{sign}{axis}": (s, i) for s, sign in ((1, "+"), (-1, "-")) for i, axis in enumerate("xyz")
+}
 
 
-def render_scan_views(mesh_path: str | Path, out: str | Path, views: int = 8, size: int = 512, up: str | None = None) -> Path:
+def render_scan_views(
+    mesh_path: str | Path, out: str | Path, views: int = 8, size: int = 512, up: str | None = None
+) -> Path:
     """Write images of a scan from all around as a capture folder without a body.
 
     Arguments: up: which axis of the file is up for the person, "+y", "-z", ...; None: the positive one along which the scan is
@@ -199,7 +234,9 @@ def render_scan_views(mesh_path: str | Path, out: str | Path, views: int = 8, si
     return out
 
 
-def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Float[np.ndarray, "3"]]:
+def joints_from_views(
+    folder: str | Path, keypoints: Keypoints
+) -> dict[str, Float[np.ndarray, "3"]]:
     """Landmarks by name, in the scan's coordinates, on which at least two views agree.
 
     Arguments: keypoints: of the images that `render_scan_views` wrote to the folder.
@@ -211,9 +248,13 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
     points, counts, _ = triangulate_robustly(jax.tree.map(lambda leaf: leaf[0], observations))
     points = align.inverse()(np.asarray(points, np.float64))
     names = keypoints.set.names
-    found = {name: points[i] for i, name in enumerate(names) if counts[i] >= 2 and name in SCAN_LANDMARKS}
+    found = {
+        name: points[i] for i, name in enumerate(names) if counts[i] >= 2 and name in SCAN_LANDMARKS
+    }
     if len(found) < 3:
-        raise ValueError(f"{folder}: views agree on {len(found)} landmarks: expected at least three")
+        raise ValueError(
+            f"{folder}: views agree on {len(found)} landmarks: expected at least three"
+        )
     return found
 
 
@@ -223,9 +264,14 @@ def read_placement(file: Path) -> Similarity:
         content = expect(read_json(file), dict, file, "")
         matrix = floats(required(content, PLACEMENT, file), file, PLACEMENT, (4, 4))
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        rigid = scale > 0 and np.abs(matrix[:3, :3] @ matrix[:3, :3].T / scale**2 - np.eye(3)).max() < ROUNDING
+        rigid = (
+            scale > 0
+            and np.abs(matrix[:3, :3] @ matrix[:3, :3].T / scale**2 - np.eye(3)).max() < ROUNDING
+        )
         if not rigid or (matrix[3] != (0, 0, 0, 1)).any():
-            raise Refused(f"{PLACEMENT}: expected a rotation times a scale above 0, a translation, and 0 0 0 1")
+            raise Refused(
+                f"{PLACEMENT}: expected a rotation times a scale above 0, a translation, and 0 0 0 1"
+            )
         return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
 
@@ -242,21 +288,28 @@ def _into_world(vertices: Float[np.ndarray, "n 3"], up: str | None) -> Similarit
 
 
 def _draw(
-    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], colors: Float[np.ndarray, "n 3"], cameras: Camera
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "f 3"],
+    colors: Float[np.ndarray, "n 3"],
+    cameras: Camera,
 ) -> Iterator[tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]]:
     """Images with their masks."""
     normals, corners = unit(face_crosses(vertices, faces)), jnp.asarray(faces, jnp.int32)
     number = lambda x: jnp.asarray(x, jnp.float32)
     for camera in cameras:
         fragments = rasterize_mesh(number(vertices), corners, camera)
-        painted = np.asarray(interpolate_attributes(fragments, corners, number(colors), jnp.ones(3)))
+        painted = np.asarray(
+            interpolate_attributes(fragments, corners, number(colors), jnp.ones(3))
+        )
         face = np.asarray(fragments.face_ids)
         facing = np.abs(normals @ np.asarray(camera.cam_from_world)[2, :3])
         shade = np.where(face >= 0, 0.45 + 0.55 * facing[np.maximum(face, 0)], 1.0)
         yield painted * shade[..., None], (face >= 0).astype(np.float32)
 
 
-def _write(folder: Path, drawn: Iterable[tuple[np.ndarray, np.ndarray]], cameras: Camera, align: Similarity) -> None:
+def _write(
+    folder: Path, drawn: Iterable[tuple[np.ndarray, np.ndarray]], cameras: Camera, align: Similarity
+) -> None:
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     listed = []
@@ -264,7 +317,10 @@ def _write(folder: Path, drawn: Iterable[tuple[np.ndarray, np.ndarray]], cameras
         files = {kind: f"{kind}s/{view:03d}.png" for kind in ("image", "mask")}
         write_png(folder / files["image"], image)
         write_png(folder / files["mask"], mask)
-        matrices = {key: np.asarray(getattr(cameras, key)[view], np.float64).tolist() for key in ("K", "cam_from_world")}
+        matrices = {
+            key: np.asarray(getattr(cameras, key)[view], np.float64).tolist()
+            for key in ("K", "cam_from_world")
+        }
         listed.append({**files, "frame": 0, **matrices})
     write_description(folder, listed, "white")
     write_json(folder / SCAN_FILE, {PLACEMENT: align.matrix().tolist()}, indent=None)

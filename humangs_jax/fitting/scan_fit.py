@@ -24,7 +24,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import BODY_NAMES
-from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_body, without_expression
+from humangs_jax.body.model import (
+    BodyModel,
+    BodyPose,
+    person_vertices,
+    shape_body,
+    without_expression,
+)
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.pytree import replace
@@ -46,7 +52,15 @@ from humangs_jax.fitting.residuals.scan import (
     scan_residuals,
 )
 from humangs_jax.fitting.scan_files import SCAN_LANDMARKS, Scan, checked_joints, read_scan
-from humangs_jax.fitting.state import MIRROR, FitState, half_squares, pose_prior, scale_of, solve, state_of
+from humangs_jax.fitting.state import (
+    MIRROR,
+    FitState,
+    half_squares,
+    pose_prior,
+    scale_of,
+    solve,
+    state_of,
+)
 from humangs_jax.fitting.triangulation import Similarity, align_robustly
 from humangs_jax.geometry.mesh import directions_around, face_areas
 
@@ -69,7 +83,14 @@ class Round:
 
 COARSE = (
     *(Round(1.0, 0.4, 3.0), Round(0.6, 0.3, 3.0), Round(0.5, 0.3, 2.0), Round(0.4, 0.2, 2.0)),
-    *(Round(0.3, 0.15), Round(0.3, 0.15), Round(0.2, 0.1), Round(0.2, 0.1), Round(0.15, 0.07), Round(0.15, 0.07)),
+    *(
+        Round(0.3, 0.15),
+        Round(0.3, 0.15),
+        Round(0.2, 0.1),
+        Round(0.2, 0.1),
+        Round(0.15, 0.07),
+        Round(0.15, 0.07),
+    ),
 )
 """Rounds of every start of the search."""
 ALONE = 0.1
@@ -81,7 +102,12 @@ LOOSE = 0.01
 
 
 def run_iterations(
-    problem: ScanProblem, target: Target, given: Given, tolerances: Tolerances, state: FitState, iterations: tuple[Round, ...]
+    problem: ScanProblem,
+    target: Target,
+    given: Given,
+    tolerances: Tolerances,
+    state: FitState,
+    iterations: tuple[Round, ...],
 ) -> tuple[FitState, Float[Array, "2"]]:
     """The body after some iterations, and the cost before and after the last one."""
     costs = jnp.zeros(2)
@@ -94,7 +120,12 @@ def run_iterations(
 
 @functools.partial(jax.jit, static_argnames="steps")
 def improve(
-    problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState, steps: int = STEPS
+    problem: ScanProblem,
+    matches: ScanMatches,
+    given: Given,
+    tolerances: Tolerances,
+    state: FitState,
+    steps: int = STEPS,
 ) -> tuple[FitState, Float[Array, "2"]]:
     """The body after at most `steps` steps of the solver with these pairs, and the cost before and after them."""
     residuals = lambda y: scan_residuals(problem, matches, given, tolerances, y)
@@ -102,7 +133,9 @@ def improve(
     return found, jnp.stack([half_squares(residuals(state)), after])
 
 
-def leftover(problem: ScanProblem, target: Target, given: Given, tolerances: Tolerances, state: FitState) -> float:
+def leftover(
+    problem: ScanProblem, target: Target, given: Given, tolerances: Tolerances, state: FitState
+) -> float:
     """Half the square sum of all residuals with fresh pairs, by which starts are compared."""
     matches = target.matches(problem, state, ALONE, ALONE, tolerances)
     alone = float(jnp.sum(matches.weights == 0)) * target.effective / len(matches.weights)
@@ -111,7 +144,13 @@ def leftover(problem: ScanProblem, target: Target, given: Given, tolerances: Tol
 
 
 @jax.jit
-def _cost(problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState) -> Float[Array, ""]:
+def _cost(
+    problem: ScanProblem,
+    matches: ScanMatches,
+    given: Given,
+    tolerances: Tolerances,
+    state: FitState,
+) -> Float[Array, ""]:
     return half_squares(scan_residuals(problem, matches, given, tolerances, state))
 
 
@@ -138,7 +177,11 @@ STANCES = {
     "arms up": {"left_shoulder": (0, 0, 1.2), "left_elbow": (0, -0.3, 0)},
     "arms forward": {"left_shoulder": (0, -1.2, -0.3), "left_elbow": (0, -0.6, 0)},
     "hands at the waist": {"left_shoulder": (0.3, 0, -0.9), "left_elbow": (0, -1.7, 0)},
-    "crouch": {"left_shoulder": (0, -0.8, -0.6), "left_hip": (-1.5, 0, 0.2), "left_knee": (1.8, 0, 0)},
+    "crouch": {
+        "left_shoulder": (0, -0.8, -0.6),
+        "left_hip": (-1.5, 0, 0.2),
+        "left_knee": (1.8, 0, 0),
+    },
 }
 """Rotation vectors of the left side, which the right mirrors; the other joints rest."""
 POINTS = 400
@@ -219,7 +262,10 @@ def _stance_points(
 
 def _grid() -> Float[np.ndarray, "turns 3 3"]:
     """Rotations from all sides: the body's axis along many directions, turned about it in steps."""
-    turns, found = Rotation.from_euler("y", 45 * np.arange(8)[:, None], degrees=True).as_matrix(), []
+    turns, found = (
+        Rotation.from_euler("y", 45 * np.arange(8)[:, None], degrees=True).as_matrix(),
+        [],
+    )
     for up in directions_around(TURNS):
         side = np.linalg.svd(up[None])[2][1]
         found.append(turns @ np.stack([side, up, np.cross(side, up)]))
@@ -230,7 +276,9 @@ def _different(starts: Sequence[Start], kept: int) -> list[Start]:
     """The first ones, at most `ALIKE` of those that are turned alike."""
     chosen: list[Start] = []
     for start in starts:
-        alike = [np.trace(other.align.rotation.T @ start.align.rotation) > SAME_TURN for other in chosen]
+        alike = [
+            np.trace(other.align.rotation.T @ start.align.rotation) > SAME_TURN for other in chosen
+        ]
         same = [other.rotations is start.rotations for other in chosen]
         if sum(alike) < ALIKE and not any(np.logical_and(alike, same)):
             chosen.append(start)
@@ -240,24 +288,37 @@ def _different(starts: Sequence[Start], kept: int) -> list[Start]:
 
 
 def facing_back(
-    surface: BodySurface, start: Start, rotations: Float[np.ndarray, "j 3"], pelvis: Float[np.ndarray, "3"], size: float
+    surface: BodySurface,
+    start: Start,
+    rotations: Float[np.ndarray, "j 3"],
+    pelvis: Float[np.ndarray, "3"],
+    size: float,
 ) -> Start:
     """The start for a body that fills the same place but faces the other way: left limbs where right ones were, if joints allow.
 
     Arguments: start: from which a body was fitted. rotations, pelvis: of that body. size: metres per unit of the start's frame.
     """
     model, prior = surface.landmarks, pose_prior(surface.landmarks.joint_names)
-    swapped = rotations[[model.joint_names.index(mirrored_name(name)) for name in model.joint_names]] * HALF_TURN
+    swapped = (
+        rotations[[model.joint_names.index(mirrored_name(name)) for name in model.joint_names]]
+        * HALF_TURN
+    )
     swapped = np.clip(swapped, prior.lower, prior.upper)
     swapped[0] = 0
     turn = HALF_TURN[:, None] * Rotation.from_rotvec(rotations[0]).as_matrix().T
     there = np.asarray(model.joints[0], np.float64)
     move = Similarity(1.0, turn, there - turn @ pelvis)
-    return Start(move.after(Similarity(size, np.eye(3), np.zeros(3))).after(start.align), swapped, start.cost)
+    return Start(
+        move.after(Similarity(size, np.eye(3), np.zeros(3))).after(start.align), swapped, start.cost
+    )
 
 
 def search(
-    scan: Scan, whole: ScanProblem, tolerances: Tolerances, given: Callable[[Similarity], Given], effective: float
+    scan: Scan,
+    whole: ScanProblem,
+    tolerances: Tolerances,
+    given: Callable[[Similarity], Given],
+    effective: float,
 ) -> tuple[Start, FitState]:
     """The best start, and the body after its coarse iterations, with all joints of `whole` free.
 
@@ -275,11 +336,17 @@ def search(
     def turned(start, state):
         betas, pose = trunk.body(state)
         pelvis = np.asarray(landmarks_and_joints(trunk, betas, pose)[1][0], np.float64)
-        return facing_back(whole.surface, start, np.asarray(pose.rotations), pelvis, float(scale_of(state)))
+        return facing_back(
+            whole.surface, start, np.asarray(pose.rotations), pelvis, float(scale_of(state))
+        )
 
-    found = sorted(map(follow, search_starts(whole.surface, scan, FOLLOWED)), key=lambda each: each[0])
+    found = sorted(
+        map(follow, search_starts(whole.surface, scan, FOLLOWED)), key=lambda each: each[0]
+    )
     best = found[:TURNED]
-    found = [follow(start, state) for _, start, state in best]  # as many iterations as those that are turned
+    found = [
+        follow(start, state) for _, start, state in best
+    ]  # as many iterations as those that are turned
     found += [follow(turned(start, state)) for _, start, state in best]
     _, start, state = min(found, key=lambda each: each[0])
     return start, replace(state_of(whole.origin, *trunk.body(state)), log_scale=state.log_scale)
@@ -293,7 +360,13 @@ LANDMARK_STEPS = 5
 """Steps of the solver in each of these iterations."""
 CLOSER = COARSE[4:]
 """Rounds of the best start of a search with all joints."""
-FINE = (Round(0.15, 0.07), Round(0.1, 0.05), Round(0.1, 0.03), Round(0.08, 0.03), *(Round(0.05, 0.02),) * 6)
+FINE = (
+    Round(0.15, 0.07),
+    Round(0.1, 0.05),
+    Round(0.1, 0.03),
+    Round(0.08, 0.03),
+    *(Round(0.05, 0.02),) * 6,
+)
 """The last iterations."""
 FINE_NORMAL = 0.02
 """Metres that a difference of 1 between normals counts like in the last iterations."""
@@ -352,11 +425,15 @@ def fit_scan(
     known = known * np.asarray(surface.landmarks.known)
     whole = scan_problem(surface, surface.landmarks.joint_names, SHAPES)
     effective = EFFECTIVE[int(clothed)]
-    tolerances = Tolerances(jnp.float32(SKIN), jnp.float32(CLOTH if clothed else SKIN), jnp.float32(1.0))
+    tolerances = Tolerances(
+        jnp.float32(SKIN), jnp.float32(CLOTH if clothed else SKIN), jnp.float32(1.0)
+    )
     given = lambda align: _given(align, points, known, height)
     if known.any():
         resting = BodyPose(jnp.asarray(whole.prior.mean), jnp.zeros(3))
-        landmarks = np.asarray(landmarks_and_joints(whole, whole.origin.betas, resting)[0], np.float64)
+        landmarks = np.asarray(
+            landmarks_and_joints(whole, whole.origin.betas, resting)[0], np.float64
+        )
         weights = known * np.square(trunk_weights(surface.landmarks.names))
         start = Start(align_robustly(points, landmarks, weights, TRUNK_STD), whole.prior.mean, 0.0)
         state = start_state(whole, start.rotations)
@@ -369,19 +446,27 @@ def fit_scan(
         iterations = (*CLOSER, *FINE)
     target = Target(scan, start.align, FINE_POINTS, effective, FINE_NORMAL)
     if clothed:
-        iterations = tuple(dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations)
+        iterations = tuple(
+            dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE))
+            for each in iterations
+        )
     state, costs = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
     scale, (betas, pose) = float(scale_of(state)), whole.body(state)
     pose, world_from_scan, up = place_upright(body, scan, betas, pose, start.align, scale)
     away, covered = target.distances(whole, state, iterations[-1].gate)
-    report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, costs)
+    report = _report(
+        scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, costs
+    )
     violations = limit_violations(body.joint_names, jax.tree.map(lambda leaf: leaf[None], pose))
     report = dataclasses.replace(report, violations=violations)
     return ScanFit(body, np.asarray(betas), pose, world_from_scan, up, scale * away, report)
 
 
 def _given(
-    align: Similarity, points: Float[np.ndarray, "k 3"], known: Float[np.ndarray, " k"], height: float | int | None
+    align: Similarity,
+    points: Float[np.ndarray, "k 3"],
+    known: Float[np.ndarray, " k"],
+    height: float | int | None,
 ) -> Given:
     number = lambda x: jnp.asarray(x, jnp.float32)
     return Given(
@@ -405,11 +490,21 @@ def _report(
     errors = {"scan_near_body": Change(covered)}
     if len(distances):
         low, middle, high = 1000 * np.quantile(distances, (0.05, 0.5, 0.95))
-        values = {"scan_outside_median_mm": middle, "scan_outside_5_mm": low, "scan_outside_95_mm": high}
+        values = {
+            "scan_outside_median_mm": middle,
+            "scan_outside_5_mm": low,
+            "scan_outside_95_mm": high,
+        }
         errors = {name: Change(float(value)) for name, value in values.items()} | errors
-    origin = "given joints" if from_joints else "a search, without joints: look at the result before you use it"
+    origin = (
+        "given joints"
+        if from_joints
+        else "a search, without joints: look at the result before you use it"
+    )
     notes = [f"start: {origin}", f"scale: {scale:.5g} metres per unit of the scan; up: {up}"]
-    notes.append(f"left out, because it cannot be seen from outside: {scan.hidden:.0%} of the surface")
+    notes.append(
+        f"left out, because it cannot be seen from outside: {scan.hidden:.0%} of the surface"
+    )
     if scan.turned:
         notes.append("the faces of the file were inside out and have been reversed")
     before, after = costs.tolist()
@@ -426,7 +521,12 @@ def _report(
 
 
 def place_upright(
-    body: BodyModel, scan: Scan, betas: Float[Array, " s"], pose: BodyPose, align: Similarity, size: float
+    body: BodyModel,
+    scan: Scan,
+    betas: Float[Array, " s"],
+    pose: BodyPose,
+    align: Similarity,
+    size: float,
 ) -> tuple[BodyPose, Similarity, str]:
     """A fit in our world: y up, facing +z, the scan standing on y = 0 with the pelvis over the origin.
 
@@ -448,10 +548,16 @@ def place_upright(
     number = lambda x: jnp.asarray(x, jnp.float32)
     rotations = pose.rotations.at[0].set(number(Rotation.from_matrix(turn @ root).as_rotvec()))
     world_from_frame = Similarity(1.0, turn, move)
-    return BodyPose(rotations, number(center + move - pelvis)), world_from_frame.after(frame_from_scan), up
+    return (
+        BodyPose(rotations, number(center + move - pelvis)),
+        world_from_frame.after(frame_from_scan),
+        up,
+    )
 
 
-def _up_axis(own: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3"], str]:
+def _up_axis(
+    own: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "3"], str]:
     """Up in the frame, and its name: an axis of the scan near to the person's own axis, or that."""
     along = own @ rotation
     best = int(np.abs(along).argmax())

@@ -54,7 +54,9 @@ def robust(errors: Float[Array, "*n d"], scale: Float[Array, ""] | float) -> Flo
 
     Like e near 0, and no longer than c far off: a keypoint on another person pulls no harder than one that is a little off.
     """
-    return errors * (scale / jnp.sqrt(scale * scale + jnp.sum(jnp.square(errors), axis=-1, keepdims=True)))
+    return errors * (
+        scale / jnp.sqrt(scale * scale + jnp.sum(jnp.square(errors), axis=-1, keepdims=True))
+    )
 
 
 def solve(
@@ -76,15 +78,21 @@ def solve(
     import optimistix
 
     with jax.default_matmul_precision("highest"):  # the solvers' own products, too
-        flat, unravel = ravel_pytree(start)  # programs over one vector compile in half the time of those over trees
+        flat, unravel = ravel_pytree(
+            start
+        )  # programs over one vector compile in half the time of those over trees
         moving = None if free is None else ravel_pytree(free)[0]
         hold = lambda y: y if moving is None else jnp.where(moving, y, flat)
         of = lambda y: residuals(unravel(hold(y)))
         if method == "lbfgs":
             lbfgs = optimistix.LBFGS(tolerance, tolerance, history_length=20)
-            found = optimistix.minimise(lambda y, _: half_squares(of(y)), lbfgs, flat, max_steps=steps, throw=False)
+            found = optimistix.minimise(
+                lambda y, _: half_squares(of(y)), lbfgs, flat, max_steps=steps, throw=False
+            )
         else:
-            lm = optimistix.LevenbergMarquardt(tolerance, tolerance, linear_solver=lineax.Normal(lineax.Cholesky()))
+            lm = optimistix.LevenbergMarquardt(
+                tolerance, tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
+            )
             vector = lambda y, _: ravel_pytree(of(y))[0]
             found = optimistix.least_squares(vector, lm, flat, max_steps=steps, throw=False)
         before, after = half_squares(of(flat)), half_squares(of(found.value))
@@ -112,7 +120,12 @@ class Range(NamedTuple):
     upper: Vector
 
 
-_UNKNOWN = Range((0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED))
+_UNKNOWN = Range(
+    (0.0, 0.0, 0.0),
+    (0.3, 0.3, 0.3),
+    (-UNLIMITED, -UNLIMITED, -UNLIMITED),
+    (UNLIMITED, UNLIMITED, UNLIMITED),
+)
 _SPINE = Range((0.03, 0.0, 0.0), (0.2, 0.15, 0.15), (-0.5, -0.5, -0.5), (0.8, 0.5, 0.5))
 _NECK = Range((0.0, 0.0, 0.0), (0.25, 0.3, 0.2), (-0.8, -0.9, -0.6), (0.8, 0.9, 0.6))
 _THUMB = Range((0.1, 0.15, -0.05), (0.3, 0.3, 0.3), (-0.8, -0.9, -1.0), (0.8, 1.2, 0.8))
@@ -127,7 +140,9 @@ RANGES = {
     "neck": _NECK,
     "head": _NECK,
     "left_hip": Range((-0.2, 0.05, 0.05), (0.6, 0.3, 0.3), (-2.6, -1.2, -0.8), (0.8, 1.2, 1.6)),
-    "left_knee": Range((0.4, 0.0, 0.0), (0.6, 0.08, 0.08), (-0.15, -0.25, -0.25), (2.7, 0.25, 0.25)),
+    "left_knee": Range(
+        (0.4, 0.0, 0.0), (0.6, 0.08, 0.08), (-0.15, -0.25, -0.25), (2.7, 0.25, 0.25)
+    ),
     "left_ankle": Range((-0.1, 0.0, 0.0), (0.3, 0.15, 0.2), (-1.0, -0.6, -0.7), (1.0, 0.6, 0.7)),
     "left_foot": Range((0.0, 0.0, 0.0), (0.3, 0.05, 0.05), (-1.2, -0.2, -0.2), (0.5, 0.2, 0.2)),
     "left_collar": Range((0.0, 0.0, 0.0), (0.1, 0.12, 0.15), (-0.3, -0.5, -0.4), (0.3, 0.5, 0.7)),
@@ -165,7 +180,9 @@ def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
     return PosePrior(*np.stack(rows, axis=1).astype(np.float32))
 
 
-def limit_residuals(prior: PosePrior, joints: tuple[int, ...], rotations: Float[Array, "j 3"]) -> Float[Array, "a 3"]:
+def limit_residuals(
+    prior: PosePrior, joints: tuple[int, ...], rotations: Float[Array, "j 3"]
+) -> Float[Array, "a 3"]:
     """How far joints turn beyond their limits, in standard deviations."""
     rows = np.asarray(joints, int)
     turned = rotations[rows]
@@ -280,7 +297,9 @@ def zero_state(origin: Origin) -> FitState:
     cameras = None
     if (views := origin.cameras) is not None:
         count = int(views.camera.max()) + 1
-        cameras = CameraState(jnp.zeros((count, 3)), jnp.zeros((count, 3)), jnp.zeros(int(views.focal.max()) + 1))
+        cameras = CameraState(
+            jnp.zeros((count, 3)), jnp.zeros((count, 3)), jnp.zeros(int(views.focal.max()) + 1)
+        )
     return FitState(
         betas=jnp.zeros(len(origin.betas)),
         global_orient=jnp.zeros((*frames, 3)),
@@ -305,7 +324,9 @@ def betas_of(origin: Origin, state: FitState) -> Float[Array, " s"]:
 def pose_of(origin: Origin, state: FitState) -> BodyPose:
     """The pose, or the batch of poses; differentiable everywhere. Joints that are not free are as in the origin."""
     rotations = origin.pose.rotations
-    rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(origin.body_pose_std * state.body_pose)
+    rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(
+        origin.body_pose_std * state.body_pose
+    )
     turn = quaternion.from_axis_angle(RADIANS * origin.std.global_orient * state.global_orient)
     root = quaternion.multiply(turn, quaternion.from_axis_angle(origin.pose.rotations[..., 0, :]))
     rotations = rotations.at[..., 0, :].set(quaternion.to_axis_angle(root))
@@ -327,7 +348,9 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
     )
 
 
-def cameras_of(origin: Origin, state: FitState) -> tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]]:
+def cameras_of(
+    origin: Origin, state: FitState
+) -> tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]]:
     """K and cam_from_world of every view: a camera turns about its centre, in its own axes, and the centre moves.
 
     A state without cameras leaves them where they are. Raises: ValueError if the origin is without cameras.
@@ -335,8 +358,13 @@ def cameras_of(origin: Origin, state: FitState) -> tuple[Float[Array, "v 3 3"], 
     start, moved, std = origin.views, state.cameras, origin.std
     if moved is None:
         return start.K, start.cam_from_world
-    turn = quaternion.matrix_from_axis_angle(RADIANS * std.camera_rotation * moved.rotations[start.camera])
-    center = transform.invert_rigid(start.cam_from_world)[:, :3, 3] + std.camera_center * moved.centers[start.camera]
+    turn = quaternion.matrix_from_axis_angle(
+        RADIANS * std.camera_rotation * moved.rotations[start.camera]
+    )
+    center = (
+        transform.invert_rigid(start.cam_from_world)[:, :3, 3]
+        + std.camera_center * moved.centers[start.camera]
+    )
     rotation = jnp.matmul(turn, start.cam_from_world[:, :3, :3], precision=EXACT)
     translation = -jnp.einsum("vab,vb->va", rotation, center, precision=EXACT)
     zoom = jnp.exp(std.focal * moved.log_focals)[start.focal]
@@ -345,11 +373,15 @@ def cameras_of(origin: Origin, state: FitState) -> tuple[Float[Array, "v 3 3"], 
     return K, transform.make(rotation, translation)
 
 
-def clothing_thickness(origin: Origin, state: FitState, weights: Float[Array, "*p j"]) -> Float[Array, "*p"]:
+def clothing_thickness(
+    origin: Origin, state: FitState, weights: Float[Array, "*p j"]
+) -> Float[Array, "*p"]:
     """Metres by which masks reach beyond the body, at points with these skinning weights; 0 without clothing."""
     if origin.segment is None or state.clothing is None:
         return jnp.zeros(weights.shape[:-1])
-    return origin.std.clothing * jnp.matmul(weights, state.clothing[origin.segment], precision=EXACT)
+    return origin.std.clothing * jnp.matmul(
+        weights, state.clothing[origin.segment], precision=EXACT
+    )
 
 
 def scale_of(state: FitState) -> Float[Array, ""]:
@@ -373,10 +405,14 @@ def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigi
     K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     camera = camera_numbers(K, matrices, SAME)
     focal = _numbered(np.log(K[:, [0, 1], [0, 1]]), SAME)
-    return CameraOrigin(cameras.K, cameras.cam_from_world, *map(jnp.asarray, (camera, focal, frames)))
+    return CameraOrigin(
+        cameras.K, cameras.cam_from_world, *map(jnp.asarray, (camera, focal, frames))
+    )
 
 
-def camera_numbers(K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], same: float) -> Int[np.ndarray, " v"]:
+def camera_numbers(
+    K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], same: float
+) -> Int[np.ndarray, " v"]:
     """(v,) from 0, equal for views of one camera that stood still. same: largest difference, see below."""
     focal, flat = K[:, :1, 0], lambda values: values.reshape(len(K), -1)
     return _numbered(np.concatenate([np.log(focal), flat(K) / focal, flat(matrices)], axis=1), same)

@@ -68,7 +68,10 @@ class Swap:
 
 
 def find_swaps(
-    observations: Observations, kind: KeypointSet, views: Int[np.ndarray, "m c"], names: tuple[str, ...]
+    observations: Observations,
+    kind: KeypointSet,
+    views: Int[np.ndarray, "m c"],
+    names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
     """Exchanged cameras, the clearest first, and then sides by view. Frames need two views for sides and three for cameras.
 
@@ -84,7 +87,9 @@ def find_swaps(
             exchanges.append(_cameras(best, tried, views, names))
             order = order.exchanged(best.frames, best.a, best.b)
         elif flips:
-            frames, slots = (np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("frames", "a"))
+            frames, slots = (
+                np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("frames", "a")
+            )
             order = order.exchanged(frames, slots, None)
         else:
             return (*exchanges, *_sides(observations, views, order, names))
@@ -114,7 +119,12 @@ class Order(NamedTuple):
     source: Int[np.ndarray, "m c"]
     mirrored: Bool[np.ndarray, "m c"]
 
-    def exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None) -> "Order":
+    def exchanged(
+        self,
+        frames: Int[np.ndarray, " e"],
+        a: Int[np.ndarray, " e"],
+        b: Int[np.ndarray, " e"] | None,
+    ) -> "Order":
         """The order with the keypoints of cameras a and b exchanged in some frames, or without b left and right of camera a's."""
         source, mirrored = self.source.copy(), self.mirrored.copy()
         if b is None:
@@ -129,14 +139,23 @@ def given(frames: int, views: int) -> Order:
     return Order(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
 
 
-def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: Order) -> Observations:
+def arranged(
+    observations: Observations, mirror: Int[np.ndarray, " k"], order: Order
+) -> Observations:
     """The keypoints of m frames in an order. mirror: index of each keypoint's mirror image."""
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
-    pick = lambda values: jnp.asarray(np.asarray(values)[rows[..., None], order.source[..., None], columns])
+    pick = lambda values: jnp.asarray(
+        np.asarray(values)[rows[..., None], order.source[..., None], columns]
+    )
     # where left and right are exchanged the detector may have seen the body turned round: its depths say nothing then
     world = None if observations.world is None or order.mirrored.any() else pick(observations.world)
-    return replace(observations, points=pick(observations.points), confidences=pick(observations.confidences), world=world)
+    return replace(
+        observations,
+        points=pick(observations.points),
+        confidences=pick(observations.confidences),
+        world=world,
+    )
 
 
 class Agreement(NamedTuple):
@@ -152,7 +171,9 @@ class Agreement(NamedTuple):
 
 
 @jax.jit
-def _agreements(observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]) -> Agreement:
+def _agreements(
+    observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]
+) -> Agreement:
     """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror image."""
 
     def of_frame(seen):
@@ -162,12 +183,16 @@ def _agreements(observations: Observations, mirror: Int[Array, " k"] | Int[np.nd
             """Agreement (c,) of all views if each had these keypoints (k, 2)."""
             everywhere = lambda own, of: jnp.broadcast_to(own, of.shape)
             alike = replace(
-                seen, points=everywhere(keypoints, seen.points), confidences=everywhere(confidences, seen.confidences)
+                seen,
+                points=everywhere(keypoints, seen.points),
+                confidences=everywhere(confidences, seen.confidences),
             )
             return jnp.sum((counts >= 2) * agreement(alike, points), axis=-1)
 
         crossed = jax.vmap(near, out_axes=1)(seen.points, seen.confidences)
-        mirrored = jnp.diagonal(jax.vmap(near, out_axes=1)(seen.points[:, mirror], seen.confidences[:, mirror]))
+        mirrored = jnp.diagonal(
+            jax.vmap(near, out_axes=1)(seen.points[:, mirror], seen.confidences[:, mirror])
+        )
         return Agreement(jnp.sum(weights, axis=-1), crossed, mirrored)
 
     return jax.lax.map(of_frame, observations)
@@ -193,9 +218,18 @@ class _Search:
     """
 
     def __init__(
-        self, observations: Observations, mirror: Int[np.ndarray, " k"], cameras: Int[np.ndarray, "m c"], order: Order
+        self,
+        observations: Observations,
+        mirror: Int[np.ndarray, " k"],
+        cameras: Int[np.ndarray, "m c"],
+        order: Order,
     ) -> None:
-        self.observations, self.mirror, self.cameras, self.order = observations, mirror, cameras, order
+        self.observations, self.mirror, self.cameras, self.order = (
+            observations,
+            mirror,
+            cameras,
+            order,
+        )
         seen = arranged(observations, mirror, order)
         found = jax.tree.map(np.asarray, _agreements(seen, mirror))
         self.confidences = np.asarray(seen.confidences)
@@ -204,10 +238,15 @@ class _Search:
         self.sides = self.views & (count > 1) & ((count < MANY) | (found.mirrored > own))
         self.several = self.views & (count > 2)
         better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
-        self.pairs = self.several[:, :, None] & self.several[:, None] & ((count < MANY)[..., None] | better)
+        self.pairs = (
+            self.several[:, :, None] & self.several[:, None] & ((count < MANY)[..., None] | better)
+        )
 
     def gains(
-        self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None = None
+        self,
+        frames: Int[np.ndarray, " e"],
+        a: Int[np.ndarray, " e"],
+        b: Int[np.ndarray, " e"] | None = None,
     ) -> Float[np.ndarray, " e"]:
         """(e,) agreement that an exchange adds in each of its frames."""
         order = self.order.exchanged(frames, a, b)
@@ -243,7 +282,9 @@ class _Search:
         tried: dict[tuple[int, ...], list[_Trial]] = {}
         for a, b in itertools.combinations(range(self.views.shape[1]), 2):
             frames = np.flatnonzero(self.several[:, a] & self.several[:, b])
-            frames = np.asarray([frame for frame in frames if cameras(frame, a, b) in suspected], int)
+            frames = np.asarray(
+                [frame for frame in frames if cameras(frame, a, b) in suspected], int
+            )
             if len(frames):
                 slots = [np.full(len(frames), slot) for slot in (a, b)]
                 for row, gain in enumerate(self.gains(frames, *slots).tolist()):
@@ -257,19 +298,29 @@ class _Search:
 
 def _together(trials: Sequence[_Trial]) -> _Trial:
     """Exchanges of two cameras in several frames as one."""
-    frames, a, b = (np.concatenate([getattr(trial, key) for trial in trials]) for key in ("frames", "a", "b"))
+    frames, a, b = (
+        np.concatenate([getattr(trial, key) for trial in trials]) for key in ("frames", "a", "b")
+    )
     return _Trial(sum(trial.gain for trial in trials), frames, a, b)
 
 
-def _cameras(best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]) -> Swap:
+def _cameras(
+    best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]
+) -> Swap:
     """The swap of the best exchange, and the others of the same frames that gain as much."""
-    name = lambda trial: tuple(names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]]))
+    name = lambda trial: tuple(
+        names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]])
+    )
     alike = [each for each in tried if each is not best and each.gain > ALIKE * best.gain]
-    others = [" and ".join(name(each)) for each in alike if np.array_equal(each.frames, best.frames)]
+    others = [
+        " and ".join(name(each)) for each in alike if np.array_equal(each.frames, best.frames)
+    ]
     return Swap("cameras", name(best), tuple(others), len(best.frames))
 
 
-def _sides(observations: Observations, views: Int[np.ndarray, "m c"], order: Order, names: Sequence[str]) -> list[Swap]:
+def _sides(
+    observations: Observations, views: Int[np.ndarray, "m c"], order: Order, names: Sequence[str]
+) -> list[Swap]:
     """A swap for each view whose sides are exchanged; if these are half of the views, it may be the other half."""
     found = []
     seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)
@@ -280,10 +331,14 @@ def _sides(observations: Observations, views: Int[np.ndarray, "m c"], order: Ord
     return found
 
 
-def _camera_numbers(observations: Observations, views: Int[np.ndarray, "m c"]) -> Int[np.ndarray, "m c"]:
+def _camera_numbers(
+    observations: Observations, views: Int[np.ndarray, "m c"]
+) -> Int[np.ndarray, "m c"]:
     """(m, c) equal for views of one camera that stands still; -1 where there is no view."""
     there = np.nonzero(views >= 0)
-    matrices = (np.asarray(x, np.float64)[there] for x in (observations.K, observations.cam_from_world))
+    matrices = (
+        np.asarray(x, np.float64)[there] for x in (observations.K, observations.cam_from_world)
+    )
     numbers = np.full(views.shape, -1)
     numbers[there] = camera_numbers(*matrices, SAME_CAMERA)
     return numbers

@@ -47,11 +47,17 @@ def triangulate(
     points = _nearest(origins, directions, weights)
     for _ in range(REWEIGHTED):
         distance = jnp.sum(directions * (points - origins[:, None]), axis=-1)
-        points = _nearest(origins, directions, weights * jnp.square(focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1)))
+        points = _nearest(
+            origins,
+            directions,
+            weights * jnp.square(focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1)),
+        )
     return points, jnp.sum(weights > 0, axis=0).astype(jnp.float32)
 
 
-def triangulate_robustly(observations: Observations) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
+def triangulate_robustly(
+    observations: Observations,
+) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
     """Points (k, 3), how many views agree with each (k,), and those views' weights (c, k).
 
     Every pair of views proposes a point; the proposal that the views agree with most is improved from those views alone. A
@@ -72,7 +78,9 @@ def triangulate_robustly(observations: Observations) -> tuple[Float[Array, "k 3"
     # of all pairs only their points are kept: with 48 views there are 1128 pairs, each with an agreement of every view
     proposals, agreed = jax.lax.map(propose, jnp.asarray(chosen), batch_size=PAIRS_AT_ONCE)
     best = jnp.argmax(agreed, axis=0)
-    weights = agreement(observations, jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0])
+    weights = agreement(
+        observations, jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0]
+    )
     weights = jnp.where(jnp.sum(weights > 0, axis=0) >= 2, weights, 0.0)
     points, count = triangulate(observations, weights)
     return points, count, weights
@@ -81,10 +89,14 @@ def triangulate_robustly(observations: Observations) -> tuple[Float[Array, "k 3"
 def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
     """How well the views agree with points: their confidences, less for larger errors, 0 beyond the margin."""
     errors = reprojection_errors(observations, points)
-    return observations.confidences * jnp.maximum(1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0)
+    return observations.confidences * jnp.maximum(
+        1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0
+    )
 
 
-def reprojection_errors(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
+def reprojection_errors(
+    observations: Observations, points: Float[Array, "k 3"]
+) -> Float[Array, "c k"]:
     """Distance in pixels between points as the views would show them and the detections; huge behind a camera."""
     seen = in_cameras(observations, points)
     depth = seen[..., 2]
@@ -95,10 +107,15 @@ def reprojection_errors(observations: Observations, points: Float[Array, "k 3"])
 
 
 def _rays(observations: Observations) -> tuple[Float[Array, "c 3"], Float[Array, "c k 3"]]:
-    rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
+    rotation, translation = (
+        observations.cam_from_world[:, :3, :3],
+        observations.cam_from_world[:, :3, 3],
+    )
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
     local = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
-    directions = safe_normalize(jnp.einsum("cba,ckb->cka", rotation, local, precision=EXACT), jnp.asarray([0.0, 0.0, 1.0]))
+    directions = safe_normalize(
+        jnp.einsum("cba,ckb->cka", rotation, local, precision=EXACT), jnp.asarray([0.0, 0.0, 1.0])
+    )
     return -jnp.einsum("cba,cb->ca", rotation, translation, precision=EXACT), directions
 
 
@@ -133,7 +150,9 @@ class Similarity:
     def after(self, first: "Similarity") -> "Similarity":
         """The composition: first `first`, then this one."""
         return Similarity(
-            self.scale * first.scale, self.rotation @ first.rotation, self(np.asarray(first.translation, np.float64))
+            self.scale * first.scale,
+            self.rotation @ first.rotation,
+            self(np.asarray(first.translation, np.float64)),
         )
 
     def inverse(self) -> "Similarity":
@@ -147,7 +166,9 @@ class Similarity:
 
 
 def align_points(
-    source: Float[np.ndarray, "k 3"], target: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
+    source: Float[np.ndarray, "k 3"],
+    target: Float[np.ndarray, "k 3"],
+    weights: Float[np.ndarray, " k"],
 ) -> Similarity:
     """The similarity from source to target whose weighted square distances are least (Umeyama 1991, eq. 40 to 43).
 
@@ -167,7 +188,10 @@ def align_points(
 
 
 def align_robustly(
-    source: Float[np.ndarray, "k 3"], target: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"], std: float
+    source: Float[np.ndarray, "k 3"],
+    target: Float[np.ndarray, "k 3"],
+    weights: Float[np.ndarray, " k"],
+    std: float,
 ) -> Similarity:
     """The same with Cauchy weights: points farther off than `std`, in units of the target, count less.
 
@@ -250,14 +274,18 @@ def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
             trials.append((error, points, known))
         flipped = _is_exchanged(trials[0][0], trials[1][0])
         if trials[flipped][0] < AGREE:
-            groups.append(_gathered(views, flipped_order, {(v, p): False, (w, q): flipped}, *trials[flipped]))
+            groups.append(
+                _gathered(views, flipped_order, {(v, p): False, (w, q): flipped}, *trials[flipped])
+            )
     matches = []
     # the group that most views agree with, and of these the one that agrees best
     for group, error in sorted(groups, key=lambda each: (-len(each[0]), each[1])):
         if all(key in left for key in group):
             left -= set(group)
             matches.append(_match(views, flipped_order, group, error))
-    return matches + [_match(views, flipped_order, {key: False}, float("inf")) for key in sorted(left)]
+    return matches + [
+        _match(views, flipped_order, {key: False}, float("inf")) for key in sorted(left)
+    ]
 
 
 def _gathered(
@@ -273,7 +301,9 @@ def _gathered(
     for v in set(range(len(views))) - {v for v, _ in pair}:
         trials = []
         for p, row in enumerate(views[v].people):
-            plain, exchanged = (_error(views[v], each, points, known) for each in (row, row[mirror]))
+            plain, exchanged = (
+                _error(views[v], each, points, known) for each in (row, row[mirror])
+            )
             flipped = _is_exchanged(plain, exchanged)
             trials.append((exchanged if flipped else plain, (v, p), flipped))
         best = min(trials, default=None)
@@ -289,18 +319,26 @@ def _is_exchanged(plain: float, exchanged: float) -> bool:
     return exchanged < (CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain))
 
 
-def _match(views: Sequence[Seen], mirror: Int[np.ndarray, " k"], group: dict[Key, bool], error: float) -> Match:
+def _match(
+    views: Sequence[Seen], mirror: Int[np.ndarray, " k"], group: dict[Key, bool], error: float
+) -> Match:
     members: list[int | None] = [None] * len(views)
     mirrored = [False] * len(views)
     for (v, p), flipped in group.items():
         members[v], mirrored[v] = p, flipped
-    rows = {v: views[v].people[p][mirror] if flipped else views[v].people[p] for (v, p), flipped in group.items()}
+    rows = {
+        v: views[v].people[p][mirror] if flipped else views[v].people[p]
+        for (v, p), flipped in group.items()
+    }
     center = np.full(3, np.nan)
     if len(rows) > 1:
         points, known = _triangulated(views, rows)
         center = np.median(points[known], axis=0) if known.any() else center
     if 2 * sum(mirrored) > len(group):  # the exchanged ones are the fewer
-        mirrored = [member is not None and not flipped for member, flipped in zip(members, mirrored, strict=True)]
+        mirrored = [
+            member is not None and not flipped
+            for member, flipped in zip(members, mirrored, strict=True)
+        ]
     return Match(tuple(members), tuple(mirrored), error, center)
 
 
@@ -320,7 +358,12 @@ def _triangulated(
     return points, known & np.isfinite(points).all(-1)
 
 
-def _error(view: Seen, row: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "k 3"], known: Bool[np.ndarray, " k"]) -> float:
+def _error(
+    view: Seen,
+    row: Float[np.ndarray, "k 3"],
+    points: Float[np.ndarray, "k 3"],
+    known: Bool[np.ndarray, " k"],
+) -> float:
     """Median distance of landmarks from points over the size of the person; infinite behind the camera or with few in common."""
     seen = known & (row[:, 2] >= SEEN)
     if seen.sum() < FEWEST:
@@ -329,7 +372,9 @@ def _error(view: Seen, row: Float[np.ndarray, "k 3"], points: Float[np.ndarray, 
     if np.median(local[:, 2]) <= 0:
         return float("inf")
     pixels = local @ view.K.T
-    distances = np.linalg.norm(pixels[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan) - row[seen, :2], axis=-1)
+    distances = np.linalg.norm(
+        pixels[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan) - row[seen, :2], axis=-1
+    )
     size = np.ptp(row[row[:, 2] >= SEEN, :2], axis=0).max()
     return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
 
@@ -339,7 +384,9 @@ def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]
     return int(((first[:, 2] >= SEEN) & (second[:, 2] >= SEEN)).sum()) >= FEWEST
 
 
-def in_order_of_time(frames: Sequence[list[Match]], shown: Sequence[Sequence[Seen]] | None = None) -> list[list[Match | None]]:
+def in_order_of_time(
+    frames: Sequence[list[Match]], shown: Sequence[Sequence[Seen]] | None = None
+) -> list[list[Match | None]]:
     """The matches of frames that follow each other, so that the i-th of each is one person.
 
     The ways of all together are the shortest, in space and, of those whom space does not tell, in the photos of one camera.
@@ -353,7 +400,9 @@ def in_order_of_time(frames: Sequence[list[Match]], shown: Sequence[Sequence[See
     for f, matches in enumerate(frames):
         last = [max(g for g in range(f) if person[g] is not None) for person in people]
         centers = [_last_center(person) for person in people]
-        ways = np.asarray([[np.linalg.norm(match.center - center) for match in matches] for center in centers])
+        ways = np.asarray(
+            [[np.linalg.norm(match.center - center) for match in matches] for center in centers]
+        )
         chosen = dict(_plainly_shortest(ways.reshape(len(people), len(matches)), FARTHEST))
         if shown is not None:
             free = [j for j in range(len(people)) if j not in chosen]
@@ -373,26 +422,36 @@ def in_order_of_time(frames: Sequence[list[Match]], shown: Sequence[Sequence[See
 
 def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
     """Where several views last saw a person; NaN if they never did."""
-    centers = [match.center for match in person if match is not None and np.isfinite(match.center).all()]
+    centers = [
+        match.center for match in person if match is not None and np.isfinite(match.center).all()
+    ]
     return centers[-1] if centers else np.full(3, np.nan)
 
 
 def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tuple[int, int]]:
     """People and their matches: those with the shortest ways of all together, where any others are plainly longer."""
-    ways = np.fmin(ways, FAR * longest)  # longer ones, and those that are not known, are all as unlikely
+    ways = np.fmin(
+        ways, FAR * longest
+    )  # longer ones, and those that are not known, are all as unlikely
     pairs = list(zip(*(each.tolist() for each in linear_sum_assignment(ways)), strict=True))
     chosen = []
     for j, i in pairs:
         longer = [ways[j, k] + ways[m, i] - ways[j, i] - ways[m, k] for m, k in pairs if m != j]
         # whoever has no match now, or is nobody's match, could have this one
-        longer += [ways[m, i] - ways[j, i] for m in range(len(ways)) if m not in {m for m, _ in pairs}]
-        longer += [ways[j, k] - ways[j, i] for k in range(ways.shape[1]) if k not in {k for _, k in pairs}]
+        longer += [
+            ways[m, i] - ways[j, i] for m in range(len(ways)) if m not in {m for m, _ in pairs}
+        ]
+        longer += [
+            ways[j, k] - ways[j, i] for k in range(ways.shape[1]) if k not in {k for _, k in pairs}
+        ]
         if ways[j, i] < longest and min(longer, default=np.inf) >= SHORTER * longest:
             chosen.append((j, i))
     return chosen
 
 
-def _moved_in_photos(before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match) -> float:
+def _moved_in_photos(
+    before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match
+) -> float:
     """How far one person would have gone in the photos of all cameras that show both, at the most, a share of the size.
 
     Infinite if no camera does, or if the size in a photo changed too much.
@@ -402,9 +461,15 @@ def _moved_in_photos(before: Sequence[Seen], first: Match, now: Sequence[Seen], 
         p, q = first.members[v], second.members[w]
         if p is None or q is None or not _stands_still(before[v], now[w]):
             continue
-        (place, size), (other, other_size) = (_box(row) for row in (before[v].people[p], now[w].people[q]))
+        (place, size), (other, other_size) = (
+            _box(row) for row in (before[v].people[p], now[w].people[q])
+        )
         resized = max(size, other_size) > RESIZED * min(size, other_size)
-        moved.append(float("inf") if resized else float(np.linalg.norm(other - place)) / max(size, other_size, 1e-9))
+        moved.append(
+            float("inf")
+            if resized
+            else float(np.linalg.norm(other - place)) / max(size, other_size, 1e-9)
+        )
     return max(moved, default=float("inf"))
 
 
@@ -424,14 +489,18 @@ def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
     return np.median(seen, axis=0), float(np.ptp(seen, axis=0).max())
 
 
-def match_colors(first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]) -> tuple[int, ...] | None:
+def match_colors(
+    first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]
+) -> tuple[int, ...] | None:
     """For each of m people of a photo which of n >= m of another one has the same colors; None if that is not plain.
 
     It is plain if any other order of people leaves larger differences at whatever exposure suits that order best.
 
     Arguments: colors in [0, 1] of k parts of the body; NaN for parts that are not seen.
     """
-    apart = np.linalg.norm(second[:, None] - EXPOSURES[:, None, None, None, None] * first[None], axis=-1)
+    apart = np.linalg.norm(
+        second[:, None] - EXPOSURES[:, None, None, None, None] * first[None], axis=-1
+    )
     seen = np.isfinite(apart)
     apart = np.where(seen, apart, 0).sum(-1) / np.maximum(seen.sum(-1), 1)
     options = sorted(

@@ -57,7 +57,9 @@ class Camera(Batchable):
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((K, cam_from_world)))
         array = jnp.asarray if traced else np.asarray
         K, cam_from_world = array(K), array(cam_from_world)
-        kept = jnp.promote_types(jnp.result_type(K, cam_from_world), jnp.float32)  # float64 only if JAX has it
+        kept = jnp.promote_types(
+            jnp.result_type(K, cam_from_world), jnp.float32
+        )  # float64 only if JAX has it
         if K.shape != (3, 3):
             raise ValueError(f"K: expected shape (3, 3), got {K.shape}")
         if cam_from_world.shape != (4, 4):
@@ -68,16 +70,29 @@ class Camera(Batchable):
         K, cam_from_world = K.astype(np.float64), cam_from_world.astype(np.float64)
         for name, values in (("K", K), ("cam_from_world", cam_from_world)):
             if not np.abs(values).max() <= LARGEST_NUMBER:  # nor NaN
-                raise ValueError(f"{name} must be finite numbers, at most {LARGEST_NUMBER:g} in magnitude")
+                raise ValueError(
+                    f"{name} must be finite numbers, at most {LARGEST_NUMBER:g} in magnitude"
+                )
         if not (K[0, 0] > 0 and K[1, 1] > 0):
-            raise ValueError(f"K: focal lengths must be positive, got fx = {K[0, 0]}, fy = {K[1, 1]}")
-        if abs(K[0, 1]) > RIGID_TOLERANCE * K[0, 0] or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+            raise ValueError(
+                f"K: focal lengths must be positive, got fx = {K[0, 0]}, fy = {K[1, 1]}"
+            )
+        if abs(K[0, 1]) > RIGID_TOLERANCE * K[0, 0] or not np.allclose(
+            K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]
+        ):
             raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
         rotation = cam_from_world[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise ValueError("cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and det R = 1)")
+        if (
+            np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE
+            or np.linalg.det(rotation) < 0
+        ):
+            raise ValueError(
+                "cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and det R = 1)"
+            )
         if not np.allclose(cam_from_world[3], [0, 0, 0, 1]):
-            raise ValueError(f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}")
+            raise ValueError(
+                f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}"
+            )
         return cls(jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept), width, height)
 
     @property
@@ -107,7 +122,9 @@ def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
     if not (width >= 1 and height >= 1):
         raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if width % 1 or height % 1 or math.inf in (width, height):
-        raise ValueError(f"width and height: expected whole numbers of pixels, got {width} x {height}")
+        raise ValueError(
+            f"width and height: expected whole numbers of pixels, got {width} x {height}"
+        )
     return int(width), int(height)
 
 
@@ -134,11 +151,16 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
 
 
-def project(camera: Camera, points: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
+def project(
+    camera: Camera, points: Float[Array, "*b 3"]
+) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
     """World points of one camera -> pixel positions and depths z (metres). No guard at z = 0: see `rendering.projection`."""
     p = transform.apply(camera.cam_from_world, points)
     depth = p[..., 2]
-    uv = p[..., :2] / depth[..., None] * jnp.stack([camera.K[0, 0], camera.K[1, 1]]) + camera.K[:2, 2]
+    uv = (
+        p[..., :2] / depth[..., None] * jnp.stack([camera.K[0, 0], camera.K[1, 1]])
+        + camera.K[:2, 2]
+    )
     return uv, depth
 
 
@@ -158,7 +180,9 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
 
 
 @checked_arguments
-def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, height: int) -> Camera:
+def look_at(
+    eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, height: int
+) -> Camera:
     """A camera that looks at a point.
 
     Args:
@@ -179,7 +203,12 @@ def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, 
     right = safe_normalize(jnp.cross(forward, up), jnp.asarray([1.0, 0.0, 0.0]))
     down = jnp.cross(forward, right)
     rotation = jnp.stack([right, down, forward])
-    return Camera(K, transform.make(rotation, -jnp.matmul(rotation, eye, precision=transform.EXACT)), width, height)
+    return Camera(
+        K,
+        transform.make(rotation, -jnp.matmul(rotation, eye, precision=transform.EXACT)),
+        width,
+        height,
+    )
 
 
 @checked_arguments
@@ -213,15 +242,24 @@ def orbit(
         >>> cameras = hg.orbit(jnp.array([0.0, 0.9, 0.0]), 3.0, jnp.linspace(0, 2 * jnp.pi, 8), 0.1, K, 512, 512)
     """
     azimuths = jnp.asarray(azimuths)
-    azimuths = azimuths.astype(jnp.promote_types(azimuths.dtype, jnp.float32))  # integers, too, are radians
+    azimuths = azimuths.astype(
+        jnp.promote_types(azimuths.dtype, jnp.float32)
+    )  # integers, too, are radians
     if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > RIGHT_ANGLE):
         raise ValueError(f"orbit: elevations {elevations}: expected radians between -pi/2 and pi/2")
-    distance, elevations = (jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape) for x in (distance, elevations))
+    distance, elevations = (
+        jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape)
+        for x in (distance, elevations)
+    )
 
     def one(r, azimuth, elevation):
         horizontal = jnp.cos(elevation)
-        direction = jnp.stack([horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)])
-        return look_at(target + r * direction, target, jnp.asarray([0.0, 1.0, 0.0]), K, width, height)
+        direction = jnp.stack(
+            [horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)]
+        )
+        return look_at(
+            target + r * direction, target, jnp.asarray([0.0, 1.0, 0.0]), K, width, height
+        )
 
     return jax.vmap(one)(distance, azimuths, elevations)
 
@@ -232,8 +270,12 @@ def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]
     y = (jnp.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     x, y = jnp.meshgrid(x, y)
     in_camera = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
-    in_camera = in_camera / jnp.linalg.norm(in_camera, axis=-1, keepdims=True)  # z = 1: the norm is at least 1
-    return camera.center, jnp.matmul(in_camera, camera.cam_from_world[:3, :3], precision=transform.EXACT)
+    in_camera = in_camera / jnp.linalg.norm(
+        in_camera, axis=-1, keepdims=True
+    )  # z = 1: the norm is at least 1
+    return camera.center, jnp.matmul(
+        in_camera, camera.cam_from_world[:3, :3], precision=transform.EXACT
+    )
 
 
 def plucker_rays(camera: Camera) -> Float[Array, "h w 6"]:

@@ -5,29 +5,41 @@ import numpy as np
 from humangs_jax.core.array_types import Bool, Float, Int
 
 
-def face_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+def face_crosses(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "f 3"]:
     """The normal of each face, twice its area long; outwards where corners go round counter-clockwise."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
 
-def face_areas(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
+def face_areas(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, " f"]:
     """Areas of the faces, in the unit of the vertices squared."""
     return 0.5 * np.linalg.norm(face_crosses(vertices, faces), axis=-1)
 
 
-def vertex_areas(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " n"]:
+def vertex_areas(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, " n"]:
     """A third of the area of the faces around each vertex."""
     return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), len(vertices))
 
 
-def vertex_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
+def vertex_crosses(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "n 3"]:
     """The sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of it. 0 where there is no face."""
     around = np.tile(face_crosses(vertices, faces), (3, 1))
-    return np.stack([np.bincount(faces.T.ravel(), around[:, i], len(vertices)) for i in range(3)], axis=-1)
+    return np.stack(
+        [np.bincount(faces.T.ravel(), around[:, i], len(vertices)) for i in range(3)], axis=-1
+    )
 
 
-def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
+def mesh_edges(
+    faces: Int[np.ndarray, "f 3"],
+) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
     """Undirected edges (e, 2), and which of them each side, corner i to i + 1, of each face is (f, 3)."""
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
     edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
@@ -48,7 +60,11 @@ def directions_around(count: int, turned: float = 0.5) -> Float[np.ndarray, "d 3
 
 
 def in_front(
-    some: Float[np.ndarray, "q 3"], points: Float[np.ndarray, "p 3"], forward: Float[np.ndarray, "3"], cell: float, behind: float
+    some: Float[np.ndarray, "q 3"],
+    points: Float[np.ndarray, "p 3"],
+    forward: Float[np.ndarray, "3"],
+    cell: float,
+    behind: float,
 ) -> Bool[np.ndarray, " q"]:
     """Which of some points are at most `behind` behind the nearest of all points in their cell of a grid across `forward`."""
     right = np.linalg.svd(forward[None])[2][1]
@@ -74,7 +90,9 @@ def smallest_turns(
 
     a, b = np.broadcast_arrays(a, b)
     real = 0.5 * np.sum((a + b) ** 2, axis=-1, keepdims=True)  # 1 + a.b without cancellation
-    real = np.where((a == 0).all(axis=-1, keepdims=True) | (b == 0).all(axis=-1, keepdims=True), 1.0, real)
+    real = np.where(
+        (a == 0).all(axis=-1, keepdims=True) | (b == 0).all(axis=-1, keepdims=True), 1.0, real
+    )
     side = unit(np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])))
     half = np.concatenate([side, np.zeros_like(real)], axis=-1)
     turn = np.where(real < opposite, half, np.concatenate([np.cross(a, b), real], axis=-1))

@@ -60,14 +60,19 @@ def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def candidates_from_matrix(m: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
+def candidates_from_matrix(
+    m: Float[Array, "*b 3 3"],
+) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
     """The four quaternions that a rotation matrix can be read as, and how well conditioned each is.
 
     q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, 0.1). Of a rotation
     they are all the same; of another matrix they are not.
     """
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    squared = jnp.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], axis=-1)
+    squared = jnp.stack(
+        [1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22],
+        axis=-1,
+    )
     positive = squared > 0
     q_abs = jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
     a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
@@ -96,14 +101,18 @@ def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     return jnp.take_along_axis(candidates, best, axis=-2)[..., 0, :]
 
 
-def _sine_and_cosine_ratios(angle_squared: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+def _sine_and_cosine_ratios(
+    angle_squared: Float[Array, "*b"],
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """sin(t)/t and (1 - cos t)/t^2 from t^2, smooth through 0."""
     small = angle_squared < SMALL_ANGLE_SQUARED
     squared = jnp.where(small, 1.0, angle_squared)
     angle = jnp.sqrt(squared)
     sine = jnp.where(small, 1 - angle_squared / 6 + angle_squared**2 / 120, jnp.sin(angle) / angle)
     half = jnp.sin(angle / 2)  # 1 - cos t = 2 sin^2(t/2): no cancellation
-    cosine = jnp.where(small, 0.5 - angle_squared / 24 + angle_squared**2 / 720, 2 * half * half / squared)
+    cosine = jnp.where(
+        small, 0.5 - angle_squared / 24 + angle_squared**2 / 720, 2 * half * half / squared
+    )
     return sine, cosine
 
 
@@ -136,7 +145,9 @@ def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
     return q[..., 1:] * jnp.where(turned, 2 * jnp.arctan2(sine, q[..., :1]) / sine, 2.0)
 
 
-def interpolate(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"], share: Float[Array, "*#b"]) -> Float[Array, "*b 3"]:
+def interpolate(
+    a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"], share: Float[Array, "*#b"]
+) -> Float[Array, "*b 3"]:
     """The rotation vector that many shares of the shortest way from a to b: spherical linear interpolation (Shoemake 1985,
     https://doi.org/10.1145/325165.325242).
     """
@@ -153,7 +164,9 @@ SWEEPS = 6
 """Cyclic Jacobi converges quadratically; 3x3 matrices reach float64 rounding after five sweeps (tests), float32 after four."""
 
 
-def left_singular_vectors(m: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3"]]:
+def left_singular_vectors(
+    m: Float[Array, "*b 3 3"],
+) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3"]]:
     """Rotations U (det +1) and singular values s >= 0, in no particular order, with m m^T = U diag(s)^2 U^T.
 
     Not meant to be differentiated: U is not unique where singular values coincide. A zero column is completed to a rotation.
@@ -166,20 +179,26 @@ def left_singular_vectors(m: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 3
     return _complete_to_rotation(jnp.stack(columns, axis=-1), norms), norms
 
 
-def _orthogonalize(a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
+def _orthogonalize(
+    a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]
+) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Rotate two columns in their plane until they are orthogonal."""
     aa, bb, ab = (jnp.sum(x * y, axis=-1, keepdims=True) for x, y in ((a, a), (b, b), (a, b)))
     needed = ab != 0
     ratio = (bb - aa) / (2 * jnp.where(needed, ab, 1))
     # the smaller root of t^2 + 2 ratio t - 1, in the form that neither cancels nor overflows for large ratios
-    tangent = jnp.where(ratio >= 0, 1, -1) / (jnp.abs(ratio) + jnp.hypot(jnp.ones_like(ratio), ratio))
+    tangent = jnp.where(ratio >= 0, 1, -1) / (
+        jnp.abs(ratio) + jnp.hypot(jnp.ones_like(ratio), ratio)
+    )
     cosine = 1 / jnp.hypot(jnp.ones_like(tangent), tangent)
     sine = cosine * tangent
     cosine, sine = jnp.where(needed, cosine, 1), jnp.where(needed, sine, 0)
     return cosine * a - sine * b, sine * a + cosine * b
 
 
-def _complete_to_rotation(columns: Float[Array, "*b 3 3"], norms: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+def _complete_to_rotation(
+    columns: Float[Array, "*b 3 3"], norms: Float[Array, "*b 3"]
+) -> Float[Array, "*b 3 3"]:
     """Normalise the two longest columns and take their cross product as the third: proper even where columns vanish."""
     order = jnp.argsort(-norms, axis=-1)
     first = jnp.take_along_axis(columns, order[..., None, 0:1], axis=-1)[..., 0]

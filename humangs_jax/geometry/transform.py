@@ -11,7 +11,9 @@ from humangs_jax.core.array_types import Array, Float, Int
 EXACT = jax.lax.Precision.HIGHEST
 
 
-def make(rotation: Float[Array, "*#b 3 3"], translation: Float[Array, "*#b 3"]) -> Float[Array, "*b 4 4"]:
+def make(
+    rotation: Float[Array, "*#b 3 3"], translation: Float[Array, "*#b 3"]
+) -> Float[Array, "*b 4 4"]:
     """[[rotation, translation], [0, 0, 0, 1]]."""
     batch = jnp.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     rotation = jnp.broadcast_to(rotation, (*batch, 3, 3))
@@ -21,15 +23,22 @@ def make(rotation: Float[Array, "*#b 3 3"], translation: Float[Array, "*#b 3"]) 
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def apply(transform: Float[Array, "*#b 4 4"], points: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
+def apply(
+    transform: Float[Array, "*#b 4 4"], points: Float[Array, "*#b 3"]
+) -> Float[Array, "*b 3"]:
     """Move points by the transform; batch axes broadcast. The last row is taken as (0, 0, 0, 1)."""
-    return jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points, precision=EXACT) + transform[..., :3, 3]
+    return (
+        jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points, precision=EXACT)
+        + transform[..., :3, 3]
+    )
 
 
 def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
     """Inverse of a rotation with translation (the linear part is not checked to be orthogonal)."""
     rotation = jnp.swapaxes(transform[..., :3, :3], -1, -2)
-    return make(rotation, -jnp.einsum("...ij,...j->...i", rotation, transform[..., :3, 3], precision=EXACT))
+    return make(
+        rotation, -jnp.einsum("...ij,...j->...i", rotation, transform[..., :3, 3], precision=EXACT)
+    )
 
 
 BITS = 10

@@ -18,7 +18,14 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.progress import printable
 from humangs_jax.io.atomic import replace_file
-from humangs_jax.io.reading import FileError, Refused, check_limit, check_unpacked, open_file, reading
+from humangs_jax.io.reading import (
+    FileError,
+    Refused,
+    check_limit,
+    check_unpacked,
+    open_file,
+    reading,
+)
 from humangs_jax.io.restricted_pickle import as_array, plain_array, read_pickle
 
 SHORT = 16
@@ -45,10 +52,18 @@ def numbers(
 
     Raises: `error` with file, field and what was expected.
     """
-    words = "numbers" if shape is None or None in shape else f"{' x '.join(map(str, shape))} numbers".lstrip()
+    words = (
+        "numbers"
+        if shape is None or None in shape
+        else f"{' x '.join(map(str, shape))} numbers".lstrip()
+    )
     try:
         array = np.asarray(value)
-        if nulls and array.dtype.kind == "O" and all(x is None or type(x) in (int, float) for x in array.flat):
+        if (
+            nulls
+            and array.dtype.kind == "O"
+            and all(x is None or type(x) in (int, float) for x in array.flat)
+        ):
             array = array.astype(dtype)
         if array.dtype.kind not in "fiub":  # numpy would read numbers in words, too
             raise TypeError
@@ -64,7 +79,9 @@ def numbers(
         finite = np.isfinite(array.astype(np.float32, copy=False))
     if not nulls and not finite.all():
         where = np.argwhere(~finite)[0].tolist()
-        raise error(file, field, f"expected finite numbers, got {array[tuple(where)]} at index {where}")
+        raise error(
+            file, field, f"expected finite numbers, got {array[tuple(where)]} at index {where}"
+        )
     if largest < math.inf and array.size and np.abs(array).max() > largest:
         where = [int(i) for i in np.unravel_index(np.abs(array).argmax(), array.shape)]
         found = f"got {array[tuple(where)]:.4g} at index {where}: another unit?"
@@ -73,7 +90,9 @@ def numbers(
 
 
 def _fits(array: np.ndarray, shape: tuple[int | None, ...]) -> bool:
-    return array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
+    return array.ndim == len(shape) and all(
+        b in (None, a) for a, b in zip(array.shape, shape, strict=True)
+    )
 
 
 def _in_words(shape: tuple[int | None, ...]) -> str:
@@ -81,7 +100,11 @@ def _in_words(shape: tuple[int | None, ...]) -> str:
 
 
 def check_array(
-    name: str, array: np.ndarray, shape: tuple[int | None, ...], low: float = -math.inf, high: float = math.inf
+    name: str,
+    array: np.ndarray,
+    shape: tuple[int | None, ...],
+    low: float = -math.inf,
+    high: float = math.inf,
 ) -> None:
     """Real numbers in [low, high] that are finite in float32, of a shape in which None is any size."""
     if not _fits(array, shape):
@@ -91,9 +114,15 @@ def check_array(
     if not array.size:
         return
     least, most = float(array.min()), float(array.max())  # NaN if any entry is
-    largest = float(np.finfo(np.float32).max)  # what becomes inf when it is cast is no number either
+    largest = float(
+        np.finfo(np.float32).max
+    )  # what becomes inf when it is cast is no number either
     if not (max(low, -largest) <= least and most <= min(high, largest)):
-        words = "finite numbers" if math.inf in (-low, high) and low != 0 else f"numbers in [{low:g}, {high:g}]"
+        words = (
+            "finite numbers"
+            if math.inf in (-low, high) and low != 0
+            else f"numbers in [{low:g}, {high:g}]"
+        )
         raise Refused(f"{name}: expected {words}, got {least:.9g} to {most:.9g}")
 
 
@@ -111,7 +140,9 @@ def check_row_sums(name: str, weights: np.ndarray) -> None:
 def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], bound: int) -> None:
     """Integers in [0, bound)."""
     check_array(name, array, shape)
-    if array.dtype.kind not in "iu" or (array.size and not 0 <= int(array.min()) <= int(array.max()) < bound):
+    if array.dtype.kind not in "iu" or (
+        array.size and not 0 <= int(array.min()) <= int(array.max()) < bound
+    ):
         raise Refused(f"{name}: expected integers in [0, {bound})")
 
 
@@ -119,14 +150,21 @@ def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
     """A tree of joints with names and one root, whose parent is -1."""
     check_limit("joints", len(parents), "joints")
     count = len(parents)
-    if not all(type(parent) is int and -1 <= parent < count for parent in parents) or list(parents).count(-1) != 1:
-        raise Refused("parents: expected the number of the parent of each joint, -1 for one of them")
+    if (
+        not all(type(parent) is int and -1 <= parent < count for parent in parents)
+        or list(parents).count(-1) != 1
+    ):
+        raise Refused(
+            "parents: expected the number of the parent of each joint, -1 for one of them"
+        )
     up = np.asarray([*(count if parent == -1 else parent for parent in parents), count])
     for _ in range(count.bit_length()):
         up = up[up]  # twice as far up each time
     if (up != count).any():
         raise Refused("parents: expected joints that all descend from the root")
-    if len(names) != len(parents) or not all(isinstance(name, str) and name == printable(name) for name in names):
+    if len(names) != len(parents) or not all(
+        isinstance(name, str) and name == printable(name) for name in names
+    ):
         raise Refused(f"joint_names: expected {len(parents)} printable names")
 
 
@@ -152,20 +190,29 @@ def file_checksum(file: Path) -> str:
 def check_checksum(recorded: Any, found: str) -> None:
     """Whether a file records this checksum. None: a file of a version that wrote none."""
     if recorded not in (None, found):
-        raise Refused(f"damaged: its contents have the checksum {found[:12]}, recorded is {str(recorded)[:12]}")
+        raise Refused(
+            f"damaged: its contents have the checksum {found[:12]}, recorded is {str(recorded)[:12]}"
+        )
 
 
 class ArrayFile:
     """Named arrays of a file. error: the class of what is raised for a value that is not what it should be."""
 
     def __init__(
-        self, path: str | Path, values: Mapping[str, Any], pickled: tuple[str, ...] = (), error: type[FileError] = FileError
+        self,
+        path: str | Path,
+        values: Mapping[str, Any],
+        pickled: tuple[str, ...] = (),
+        error: type[FileError] = FileError,
     ) -> None:
         self.path, self.values, self.pickled, self.error = Path(path), values, pickled, error
 
     @classmethod
     def open(
-        cls, path: str | Path, error: type[FileError] = FileError, wanted: Callable[[str], bool] | None = None
+        cls,
+        path: str | Path,
+        error: type[FileError] = FileError,
+        wanted: Callable[[str], bool] | None = None,
     ) -> "ArrayFile":
         """An npz archive, by suffix or content, or else a pickle (read without running anything in it).
 
@@ -186,16 +233,24 @@ class ArrayFile:
         """What is under a key, as an array of any kind. Raises: `error`."""
         if key not in self.values:
             found = ", ".join(sorted(map(str, self.values))) or "none"
-            reason = "a pickled object, which is never read" if key in self.pickled else f"missing (keys: {found})"
+            reason = (
+                "a pickled object, which is never read"
+                if key in self.pickled
+                else f"missing (keys: {found})"
+            )
             raise self.error(self.path, key, reason)
         try:
             return as_array(self.values[key])
         except (ValueError, TypeError, OverflowError) as error:
             raise self.error(self.path, key, error) from error
 
-    def numbers(self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf) -> Float[np.ndarray, "..."]:
+    def numbers(
+        self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf
+    ) -> Float[np.ndarray, "..."]:
         """Finite float64 numbers under a key, at least one, see `numbers`."""
-        return numbers(self.array(key), self.path, key, shape, some=True, largest=largest, error=self.error)
+        return numbers(
+            self.array(key), self.path, key, shape, some=True, largest=largest, error=self.error
+        )
 
     def number(self, key: str) -> float:
         """A single number, however nested. Raises: as `numbers`."""
@@ -215,14 +270,19 @@ class ArrayFile:
 _ONE_AT_A_TIME = threading.Lock()
 """numpy reads the header of an array through Python's syntax trees, and CPython 3.11 counts the depth of these for all
 threads together: two at once are rarely, but then "AST constructor recursion depth mismatch" (python/cpython#106905)."""
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 LONGEST_HEADER = 512
 """Characters; that of a plain array takes some hundred, and longer ones can exhaust Python's parser."""
 PLAIN_KINDS = "biufcSU"
 """Kinds of dtypes that are read: numbers and strings, no objects, no records."""
 
 
-def read_npz(path: str | Path, wanted: Callable[[str], bool] | None = None) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def read_npz(
+    path: str | Path, wanted: Callable[[str], bool] | None = None
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """The arrays of an npz archive by name, and the names of the entries that are pickled objects (never read).
 
     Arguments: wanted: which names to read; None: all.
@@ -268,7 +328,11 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
     members = archive.infolist()
     if len({member.filename for member in members}) < len(members):
         raise Refused("two members of one name")
-    if strange := [m.filename for m in members if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)]:
+    if strange := [
+        m.filename
+        for m in members
+        if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    ]:
         raise Refused(f"{strange[0]}: compressed by a method that is not read")
     check_unpacked(size, sum(member.file_size for member in members))
     return archive
@@ -290,7 +354,9 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
         return None
     if dtype.kind not in PLAIN_KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):
         raise Refused(f"expected numbers or strings, got {dtype}")
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != (left := size - member.tell()):
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != (
+        left := size - member.tell()
+    ):
         raise Refused(f"shape {shape} of {dtype} does not fit its {size - member.tell():,} bytes")
     data = np.empty(left, np.uint8)
     at = 0
@@ -300,10 +366,16 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
             raise EOFError("cut off")
         data[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
         at += len(piece)
-    return plain_array(data, dtype, shape[::-1]).T if columns_first else plain_array(data, dtype, shape)
+    return (
+        plain_array(data, dtype, shape[::-1]).T
+        if columns_first
+        else plain_array(data, dtype, shape)
+    )
 
 
-def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True) -> None:
+def write_npz(
+    path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True
+) -> None:
     """Write an npz archive of array-likes by name, under any suffix; it appears whole or not at all. Raises: OSError."""
     save = np.savez_compressed if compressed else np.savez
     converted: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}

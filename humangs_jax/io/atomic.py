@@ -27,7 +27,9 @@ MOVE_AWAY = "move it away, or choose another folder"
 """What can be done where a file that was not written here has the name of one that is to be written."""
 TOLD = 12
 """Entries of a folder that are named before it is deleted; the others are counted."""
-_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?")
+_TEMPORARY = re.compile(
+    r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
+)
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -50,7 +52,12 @@ def encoded(text: str) -> bytes:
 
 def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
     """Write files in UTF-8, all of them or none. Raises: OSError."""
-    replace_files({path: functools.partial(Path.write_bytes, data=encoded(text)) for path, text in texts.items()})
+    replace_files(
+        {
+            path: functools.partial(Path.write_bytes, data=encoded(text))
+            for path, text in texts.items()
+        }
+    )
 
 
 def replace_file(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
@@ -70,7 +77,9 @@ def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], obje
         for path, write in ((Path(path), write) for path, write in writers.items()):
             unfinished.enter_context(_made_folder(path.parent))
             _sweep(path.parent.resolve())
-            temporaries[path] = temporary = path.with_name(f".{path.stem}.new-{_tag()}{path.suffix}")
+            temporaries[path] = temporary = path.with_name(
+                f".{path.stem}.new-{_tag()}{path.suffix}"
+            )
             unfinished.enter_context(_unfinished(temporary))
             with _naming(path, temporary):
                 write(temporary)
@@ -97,7 +106,9 @@ def _made_folder(folder: Path) -> Generator[None]:
         raise
 
 
-def replace_folder(folder: str | os.PathLike[str], write: Callable[[Path], object], *, mark: str) -> None:
+def replace_folder(
+    folder: str | os.PathLike[str], write: Callable[[Path], object], *, mark: str
+) -> None:
     """Calls write(temporary), which makes that folder, and renames it to `folder`; an existing one is replaced.
 
     The existing folder is moved aside first and deleted last, so its contents are never lost. Parents are made.
@@ -184,21 +195,36 @@ def check_replaceable(
     above = next(parent for parent in place.parents if parent.exists())
     for wrong, problem in (
         (folder.is_file(), "is a file: expected a folder name"),
-        (Path.cwd().is_relative_to(place), "is the working folder or contains it: expected another folder"),
-        (os.path.ismount(folder), "is a mount point, which cannot be renamed: expected a folder in it"),
-        (not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)), f"cannot be made: {above} cannot be written to"),
+        (
+            Path.cwd().is_relative_to(place),
+            "is the working folder or contains it: expected another folder",
+        ),
+        (
+            os.path.ismount(folder),
+            "is a mount point, which cannot be renamed: expected a folder in it",
+        ),
+        (
+            not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)),
+            f"cannot be made: {above} cannot be written to",
+        ),
     ):
         if wrong:
             raise ValueError(f"{folder}: {problem}")
     for path in (Path(path) for path in inputs if path is not None):
         # a loop of links ends `Path.resolve` with a RuntimeError
-        if place.exists() and any(real.is_relative_to(place) for real in (Path(os.path.realpath(path)), path.absolute())):
-            raise ValueError(f"{folder}: {path} lies in it and would be deleted: expected another folder")
+        if place.exists() and any(
+            real.is_relative_to(place) for real in (Path(os.path.realpath(path)), path.absolute())
+        ):
+            raise ValueError(
+                f"{folder}: {path} lies in it and would be deleted: expected another folder"
+            )
     entries = _entries(folder)
     if mark is None or not entries:
         return
     if mark not in entries:
-        raise ValueError(f"{folder}: the folder holds no {mark}: refusing to overwrite something else")
+        raise ValueError(
+            f"{folder}: the folder holds no {mark}: refusing to overwrite something else"
+        )
     if not overwrite:
         problem = f"{folder}: the folder is not empty: choose another one or ask to overwrite it"
         raise ValueError(f"{problem}, which deletes {contents(folder)}")
@@ -249,7 +275,9 @@ def add_files(
         whatever `write` raises.
     """
     folder = Path(folder)
-    inside = folder.is_dir()  # on the same disk, even if others hold the folder and what is beside it
+    inside = (
+        folder.is_dir()
+    )  # on the same disk, even if others hold the folder and what is beside it
     if inside:
         _sweep(folder.resolve())
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -261,7 +289,9 @@ def add_files(
         with undisturbed():
             folder.mkdir(exist_ok=True)
             with _locked(folder, wait=True):
-                new = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
+                new = sorted(
+                    path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file()
+                )
                 if last is not None:
                     new.sort(key=lambda file: file == Path(last))
                 if first is not None:
@@ -278,7 +308,9 @@ def add_files(
                     (folder / file).unlink(missing_ok=True)
 
 
-def check_ours(files: Iterable[Path], ours: Callable[[Path], bool], advice: str = MOVE_AWAY) -> None:
+def check_ours(
+    files: Iterable[Path], ours: Callable[[Path], bool], advice: str = MOVE_AWAY
+) -> None:
     """Whether files can be written without losing what others wrote there, to be asked before the work, too.
 
     Arguments: ours: whether a file that is there may be replaced. advice: what the user can do.
@@ -338,7 +370,9 @@ def _locked(folder: Path, wait: bool, lock: Path | None = None) -> Generator[Non
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
-            raise BlockingIOError(f"{folder}: another process is writing here: expected another folder") from None
+            raise BlockingIOError(
+                f"{folder}: another process is writing here: expected another folder"
+            ) from None
         except OSError:  # a disk without locks
             pass
         yield

@@ -59,7 +59,9 @@ PAPER_HLG = 0.265
 def _pq_to_light(levels: np.ndarray) -> np.ndarray:
     """SMPTE ST 2084."""
     root = levels ** (1 / 78.84375)
-    nits = 10_000 * (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (1 / 0.1593017578125)
+    nits = 10_000 * (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (
+        1 / 0.1593017578125
+    )
     return nits / PAPER_NITS
 
 
@@ -88,14 +90,22 @@ def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 # Primaries ----------------------------------------------------------------------------------------------------------------
 
 D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
-BRADFORD = np.asarray([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+BRADFORD = np.asarray(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
 SRGB = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
 PRIMARIES = {
     9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
 }
 """Chromaticities of red, green and blue, by their code point (H.273): BT.2020 and Display P3. All others are close to sRGB's."""
-CURVES: dict[int, Curve] = {4: _power(2.2), 5: _power(2.8), 8: _power(1.0), 16: _pq_to_light, 18: _hlg_to_light}
+CURVES: dict[int, Curve] = {
+    4: _power(2.2),
+    5: _power(2.8),
+    8: _power(1.0),
+    16: _pq_to_light,
+    18: _hlg_to_light,
+}
 """By their code point (H.273). Files of BT.709 and its kin are shown as sRGB by all programs."""
 PQ, HLG = 16, 18
 
@@ -184,18 +194,24 @@ BLOCK = 1 << 20
 """Pixels that are converted together."""
 
 
-def pixels_in_srgb(levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding) -> Float[np.ndarray, "h w 3"]:
+def pixels_in_srgb(
+    levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding
+) -> Float[np.ndarray, "h w 3"]:
     """Colors in sRGB, in [0, 1], of whole levels from 0 to `most`, of one channel (grey) or three."""
     height, width, channels = levels.shape
     curves = encoding.curves * (3 // len(encoding.curves))
     tables = [curve(np.arange(most + 1) / most).astype(np.float32) for curve in curves]
     back = _encode(encoding)(np.arange(STEPS) / (STEPS - 1)).astype(np.float32)
     found, rows = np.empty((height, width, 3), np.float32), max(1, BLOCK // width)
-    for top in range(0, height, rows):  # a block after the other: a photo of 64 million pixels takes no gigabytes
+    for top in range(
+        0, height, rows
+    ):  # a block after the other: a photo of 64 million pixels takes no gigabytes
         block = levels[top : top + rows]
         light = np.stack([tables[i][block[..., i % channels]] for i in range(3)], axis=-1)
         light = _light_in_srgb(light.reshape(-1, 3), encoding)
-        found[top : top + rows] = back[np.rint(light * (STEPS - 1)).astype(np.int32)].reshape(-1, width, 3)
+        found[top : top + rows] = back[np.rint(light * (STEPS - 1)).astype(np.int32)].reshape(
+            -1, width, 3
+        )
     return found
 
 
@@ -204,7 +220,9 @@ def cube(encoding: Encoding, side: int = 49) -> str:
     steps = np.linspace(0, 1, side)
     blue, green, red = (axis.ravel() for axis in np.meshgrid(steps, steps, steps, indexing="ij"))
     rows = in_srgb(np.stack([red, green, blue], axis=-1), encoding)
-    return f"LUT_3D_SIZE {side}\n" + "".join(f"{r:.6f} {g:.6f} {b:.6f}\n" for r, g, b in rows.tolist())
+    return f"LUT_3D_SIZE {side}\n" + "".join(
+        f"{r:.6f} {g:.6f} {b:.6f}\n" for r, g, b in rows.tolist()
+    )
 
 
 # ICC profiles -------------------------------------------------------------------------------------------------------------
@@ -280,7 +298,9 @@ def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
     to_xyz = np.asarray(columns, float).T / 65536
     if np.abs(to_xyz.sum(axis=1) - _xyz(D50)).max() > WHITE_SLACK:
         raise Refused("its primaries do not make white")
-    return Encoding(tuple(_curve(tags[name + b"TRC"]) for name in (b"r", b"g", b"b")), FROM_XYZ @ to_xyz)
+    return Encoding(
+        tuple(_curve(tags[name + b"TRC"]) for name in (b"r", b"g", b"b")), FROM_XYZ @ to_xyz
+    )
 
 
 def _curve(tag: bytes) -> Curve:
@@ -308,7 +328,9 @@ def _curve(tag: bytes) -> Curve:
         a, b, c, d = rest
     elif kind == 4:
         a, b, c, d, e, f = rest
-    return lambda levels: np.where(levels >= d, np.maximum(a * levels + b, 0) ** g + e, c * levels + f)
+    return lambda levels: np.where(
+        levels >= d, np.maximum(a * levels + b, 0) ** g + e, c * levels + f
+    )
 
 
 def by_tables(image: Any, profile: bytes) -> Any:
@@ -321,6 +343,8 @@ def by_tables(image: Any, profile: bytes) -> Any:
             return image
         intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.BLACKPOINTCOMPENSATION
         target = ImageCms.createProfile("sRGB")
-        return ImageCms.profileToProfile(image, source, target, intent, outputMode="RGB", flags=flags)
+        return ImageCms.profileToProfile(
+            image, source, target, intent, outputMode="RGB", flags=flags
+        )
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
         raise Refused("it is damaged, or not for this photo") from error

@@ -31,7 +31,9 @@ JPEG_START = b"\xff\xd8"
 JPEG_MARKER = re.compile(rb"\xff([^\x00\xff])")
 """FF 00 is a byte FF of the compressed data, and before the last FF there may be any number of others."""
 END, SCAN = 0xD9, 0xDA
-WITH_LENGTH = frozenset((*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE))
+WITH_LENGTH = frozenset(
+    (*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE)
+)
 """Markers that two bytes of length follow, as libjpeg reads them; all others stand alone, or libjpeg ends there."""
 
 
@@ -65,7 +67,9 @@ def webp_size(data: bytes) -> tuple[int, int]:
         bits = int.from_bytes(body[1:5], "little")
         return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
     if len(body) == 10 and kind == b"VP8 ":
-        return int.from_bytes(body[6:8], "little") & 0x3FFF, int.from_bytes(body[8:10], "little") & 0x3FFF
+        return int.from_bytes(body[6:8], "little") & 0x3FFF, int.from_bytes(
+            body[8:10], "little"
+        ) & 0x3FFF
     raise Refused("not a readable image: a WebP without a picture")
 
 

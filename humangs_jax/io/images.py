@@ -22,7 +22,15 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.io.atomic import write_bytes
-from humangs_jax.io.color_spaces import Encoding, by_tables, is_srgb, of_code_points, of_gamma, pixels_in_srgb, read_profile
+from humangs_jax.io.color_spaces import (
+    Encoding,
+    by_tables,
+    is_srgb,
+    of_code_points,
+    of_gamma,
+    pixels_in_srgb,
+    read_profile,
+)
 from humangs_jax.io.image_headers import (
     JPEG_START,
     check_png_chunks,
@@ -50,7 +58,15 @@ GREY_MASK = "grey from 0 (background) to 255 (person)"
 ORIENTATION_TAG, EXIF_TAGS, FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
 DIAGONAL_35MM = 43.27
 """Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle along the diagonal."""
-EXIF_MARKS = (b"Exif", b"eXIf", b"EXIF", b"ftypavi", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
+EXIF_MARKS = (
+    b"Exif",
+    b"eXIf",
+    b"EXIF",
+    b"ftypavi",
+    b"Raw profile type",
+    b"adobe.com/xap",
+    b"com.adobe.xmp",
+)
 """A file without any of these has no EXIF; looking further would decode a PNG. An AVIF may be turned without it."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
@@ -64,7 +80,9 @@ GREY_AND_ALPHA = 4
 """The color type of two channels."""
 
 
-def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
+def read_image(
+    path: str | Path,
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
     """Colors in sRGB and, where the file has an alpha channel, alpha. Grey images become three equal channels.
 
     A color profile that cannot be used is warned of, and the values are taken as stored.
@@ -74,7 +92,9 @@ def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.n
     return _colors_and_alpha(_read_pixels(path))
 
 
-def _colors_and_alpha(pixels: Float[np.ndarray, "h w c"]) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
+def _colors_and_alpha(
+    pixels: Float[np.ndarray, "h w c"],
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
     if pixels.shape[-1] in (1, 3):
         return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3))), None
     colors = np.broadcast_to(pixels[..., :-1], (*pixels.shape[:2], 3))
@@ -96,7 +116,9 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
             check_png_chunks(data)
         if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
             colors = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
-            return _mask_of_labels(np.asarray(image), np.pad(colors, ((0, 256 - len(colors)), (0, 0))))
+            return _mask_of_labels(
+                np.asarray(image), np.pad(colors, ((0, 256 - len(colors)), (0, 0)))
+            )
     colors, alpha = _colors_and_alpha(_read_pixels(path, as_stored=True))
     with reading(path, "mask"):
         if alpha is not None and alpha.min() < 1:
@@ -106,7 +128,9 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
         codes = to_uint8(colors).astype(np.uint32) @ np.asarray([1 << 16, 1 << 8, 1], np.uint32)
         if (count := np.count_nonzero(np.unique(codes))) != 1 or codes.all():
             black = " without black" if codes.all() else ""
-            raise Refused(f"{count} colors{black}: which is the person? expected one on black, or {GREY_MASK}")
+            raise Refused(
+                f"{count} colors{black}: which is the person? expected one on black, or {GREY_MASK}"
+            )
         return (codes > 0).astype(np.float32)
 
 
@@ -118,7 +142,9 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
     """The mask of a palette image: labels (h, w), colors of the palette (256, 3) from 0 to 255."""
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
-    if 0 in used:  # tools count the background as 0, people draw it black: where these differ nobody knows
+    if (
+        0 in used
+    ):  # tools count the background as 0, people draw it black: where these differ nobody knows
         background = 0 if 0 in black else None
     elif not black and not palette[0].any():
         background = 0
@@ -131,8 +157,14 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
     if len(used) > 2 and colors.max() >= 128 and _is_grey(colors / 255):
         return palette[labels].mean(axis=-1, dtype=np.float32) / np.float32(255)
     shown = ", ".join(map(str, others[:5])) + (", ..." if len(others) > 5 else "")
-    which = "which is the person" if background is not None else "0 is not black: which is the background"
-    raise Refused(f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or {GREY_MASK}")
+    which = (
+        "which is the person"
+        if background is not None
+        else "0 is not black: which is the background"
+    )
+    raise Refused(
+        f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or {GREY_MASK}"
+    )
 
 
 def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -140,7 +172,9 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     flat = not len(shown) or np.ptp(shown, axis=0).max() <= GREY_SLACK
     if flat or not _is_grey(shown) or np.abs(shown[:, 0] - alpha[alpha > 0]).max() <= GREY_SLACK:
         return alpha
-    raise Refused("the image has an alpha channel besides its greys: which is the mask? expected one of them")
+    raise Refused(
+        "the image has an alpha channel besides its greys: which is the mask? expected one of them"
+    )
 
 
 def orientation(path: str | Path) -> int:
@@ -159,7 +193,11 @@ def focal_length(path: str | Path) -> float | None:
     with open_image(path) as (image, data):
         tags = _exif(image, data, EXIF_TAGS)
         equivalent = tags.get(FOCAL_LENGTH_35MM_TAG)
-        if not isinstance(equivalent, int) or equivalent <= 0 or other_frame(tags, image.size) is not None:
+        if (
+            not isinstance(equivalent, int)
+            or equivalent <= 0
+            or other_frame(tags, image.size) is not None
+        ):
             return None
         return equivalent / DIAGONAL_35MM * float(np.hypot(*image.size))
 
@@ -208,7 +246,9 @@ def write_png(
 
 
 def png_bytes(
-    image: Float[np.ndarray, "h w *c"] | UInt8[np.ndarray, "h w *c"], compress_level: int = 6, mark: str | None = None
+    image: Float[np.ndarray, "h w *c"] | UInt8[np.ndarray, "h w *c"],
+    compress_level: int = 6,
+    mark: str | None = None,
 ) -> bytes:
     """The content of the file that `write_png` writes."""
     from PIL import Image
@@ -218,7 +258,9 @@ def png_bytes(
     if mark is not None:
         texts.add_text(MARK_KEY, mark)
     file = io.BytesIO()
-    Image.fromarray(to_uint8(image)).save(file, format="PNG", compress_level=compress_level, pnginfo=texts)
+    Image.fromarray(to_uint8(image)).save(
+        file, format="PNG", compress_level=compress_level, pnginfo=texts
+    )
     return file.getvalue()
 
 
@@ -250,12 +292,19 @@ def is_own_output(path: str | Path) -> bool:
     return False
 
 
-def image_row(images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240) -> Float[np.ndarray, "height w c"]:
+def image_row(
+    images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240
+) -> Float[np.ndarray, "height w c"]:
     """Images side by side, reduced to one height, pixels."""
-    return np.concatenate([resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images], axis=1)
+    return np.concatenate(
+        [resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images],
+        axis=1,
+    )
 
 
-def to_uint8(image: Float[np.ndarray, "*shape"] | UInt8[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+def to_uint8(
+    image: Float[np.ndarray, "*shape"] | UInt8[np.ndarray, "*shape"],
+) -> UInt8[np.ndarray, "*shape"]:
     """[0, 1] -> 0..255, rounded to nearest and clipped; NaN becomes 0. Bytes stay as they are."""
     if np.asarray(image).dtype == np.uint8:
         return np.asarray(image)
@@ -336,12 +385,16 @@ def _formats(data: bytes) -> tuple[str, ...]:
         try:
             importlib.import_module("pi_heif").register_heif_opener()
         except ImportError:
-            raise Refused('a HEIC photo: expected PNG or JPEG, or pip install "humangs_jax[heic]"') from None
+            raise Refused(
+                'a HEIC photo: expected PNG or JPEG, or pip install "humangs_jax[heic]"'
+            ) from None
     elif kind == "AVIF":
         from PIL import features
 
         if not features.check("avif"):
-            raise Refused("an AVIF photo, which this Pillow cannot read: expected PNG or JPEG, or pip install -U Pillow")
+            raise Refused(
+                "an AVIF photo, which this Pillow cannot read: expected PNG or JPEG, or pip install -U Pillow"
+            )
     elif is_webp(data):
         kind = "WEBP"
     return FORMATS if kind is None else (kind,)
@@ -364,7 +417,11 @@ def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
             _check_size(*image.size)
             yield image
     except Image.UnidentifiedImageError as error:
-        wrong = f"neither {' nor '.join(FORMATS)}" if formats == FORMATS else f"damaged {NAMES[formats[0]]}"
+        wrong = (
+            f"neither {' nor '.join(FORMATS)}"
+            if formats == FORMATS
+            else f"damaged {NAMES[formats[0]]}"
+        )
         raise ValueError(wrong) from error
 
 
@@ -476,7 +533,9 @@ def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
     return None if points is None else of_code_points(*points)
 
 
-def _by_tables(image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int) -> Float[np.ndarray, "h w 3"] | None:
+def _by_tables(
+    image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int
+) -> Float[np.ndarray, "h w 3"] | None:
     """Colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones are added as they are."""
     from PIL import Image
 
@@ -489,7 +548,9 @@ def _by_tables(image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], mo
         return None
     colors = np.asarray(converted).astype(np.float32) / np.float32(255)
     if most > 255:
-        colors += levels.astype(np.float32) / np.float32(most) - stored.astype(np.float32) / np.float32(255)
+        colors += levels.astype(np.float32) / np.float32(most) - stored.astype(
+            np.float32
+        ) / np.float32(255)
     return np.clip(colors, 0, 1)
 
 

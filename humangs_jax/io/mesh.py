@@ -19,7 +19,17 @@ import numpy as np
 
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.images import image_in
-from humangs_jax.io.reading import FileError, Refused, check_limit, check_unpacked, inside, parse_json, read_bytes, reading, shown
+from humangs_jax.io.reading import (
+    FileError,
+    Refused,
+    check_limit,
+    check_unpacked,
+    inside,
+    parse_json,
+    read_bytes,
+    reading,
+    shown,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -87,8 +97,12 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
     count, start, width = count_of(accessor), accessor.get("byteOffset", 0), _width(accessor)
     step = view.get("byteStride", width)
     if step < width or (count and start + (count - 1) * step + width > len(data)):
-        raise Refused(f"{count} elements of {width} bytes from {start}, but there are {len(data)} bytes")
-    array = np.ndarray((count, columns), dtype, data, start, (step, dtype.itemsize)).astype(np.float64)
+        raise Refused(
+            f"{count} elements of {width} bytes from {start}, but there are {len(data)} bytes"
+        )
+    array = np.ndarray((count, columns), dtype, data, start, (step, dtype.itemsize)).astype(
+        np.float64
+    )
     if accessor.get("normalized") and dtype.kind != "f":
         array = np.maximum(array / np.iinfo(dtype.str).max, -1.0)
     return array
@@ -122,13 +136,17 @@ class GlbWriter:
         self.data += data
         return len(self.views) - 1
 
-    def array(self, kind: str, values: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
+    def array(
+        self, kind: str, values: np.ndarray, target: int | None = None, bounds: bool = False
+    ) -> int:
         """Index of the accessor of an array: float32 unless it has unsigned integers.
 
         Arguments: kind: as in COLUMNS. bounds: also tell the least and the largest of each column, as positions and times must.
         """
         values = np.ascontiguousarray(values, values.dtype if values.dtype.kind == "u" else "<f4")
-        component = next(code for code, name in COMPONENTS.items() if np.dtype(name) == values.dtype)
+        component = next(
+            code for code, name in COMPONENTS.items() if np.dtype(name) == values.dtype
+        )
         accessor = {
             "bufferView": self.bytes_(values.tobytes(), target),
             "componentType": component,
@@ -145,8 +163,14 @@ class GlbWriter:
         """Write the file with a glTF document to which arrays, buffer and `asset` are added. It appears whole or not at all."""
         self.data += bytes(-len(self.data) % 4)
         document = {"asset": {"version": "2.0", "generator": "humangs_jax"}} | document
-        document |= {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": len(self.data)}]}
-        text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()  # JSON has no NaN
+        document |= {
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": len(self.data)}],
+        }
+        text = json.dumps(
+            document, separators=(",", ":"), allow_nan=False
+        ).encode()  # JSON has no NaN
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
         chunks += struct.pack("<II", len(self.data), BINARY_CHUNK) + bytes(self.data)
@@ -171,7 +195,9 @@ def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = Fals
     with reading(path, "mesh"):
         kind = path.suffix.lower().removeprefix(".")
         if kind not in TYPES:
-            raise Refused(f"not a mesh that can be read: expected {', '.join(TYPES)}, got {path.suffix or 'no suffix'}")
+            raise Refused(
+                f"not a mesh that can be read: expected {', '.join(TYPES)}, got {path.suffix or 'no suffix'}"
+            )
         data, painted = read_bytes(path, "mesh_bytes"), textures or colors
         stream: Any = io.BytesIO(data)
         if kind == "glb":
@@ -180,27 +206,50 @@ def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = Fals
             check_limit("parts", data.lower().count(b"endsolid"), "solids")
         elif kind == "obj":  # text of other encodings would be guessed at for a long time
             stream = io.StringIO(_grouped(data.decode("utf-8", "replace"), painted))
-        materials: dict[str, Any] = {} if kind in ("stl", "off") else {"skip_materials": not painted}
+        materials: dict[str, Any] = (
+            {} if kind in ("stl", "off") else {"skip_materials": not painted}
+        )
         resolver: Any = _Folder(path.parent) if painted else None
         # processing would silently drop what is not finite
-        scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, **materials)
+        scene = trimesh.load_scene(
+            stream, file_type=kind, resolver=resolver, process=False, **materials
+        )
         if resolver is not None:
             resolver.report(path)
         drawn = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
-        check_limit("corners", sum(3 * len(getattr(part, "faces", ())) for part in drawn), "corners of triangles")
+        check_limit(
+            "corners",
+            sum(3 * len(getattr(part, "faces", ())) for part in drawn),
+            "corners of triangles",
+        )
         materials_of = [getattr(part.visual, "material", None) for part in drawn]
-        images = [getattr(each, "baseColorTexture", None) or getattr(each, "image", None) for each in materials_of]
-        check_limit("capture_pixels", sum(image.width * image.height for image in images if image), "pixels of textures")
+        images = [
+            getattr(each, "baseColorTexture", None) or getattr(each, "image", None)
+            for each in materials_of
+        ]
+        check_limit(
+            "capture_pixels",
+            sum(image.width * image.height for image in images if image),
+            "pixels of textures",
+        )
         if colors:
-            for part in {id(part): part for part in drawn if isinstance(part, trimesh.Trimesh)}.values():
+            for part in {
+                id(part): part for part in drawn if isinstance(part, trimesh.Trimesh)
+            }.values():
                 _paint(part)
-        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        parts = [
+            part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)
+        ]
         for part in parts:
             if part.vertices.shape[1:] != (3,) or part.faces.shape[1:] != (3,):
-                raise Refused(f"vertices {part.vertices.shape}, faces {part.faces.shape}: expected three numbers for each")
+                raise Refused(
+                    f"vertices {part.vertices.shape}, faces {part.faces.shape}: expected three numbers for each"
+                )
             low, high = int(part.faces.min()), int(part.faces.max())
             if low < 0 or high >= len(part.vertices):
-                raise Refused(f"a face has the corner {low if low < 0 else high}, but there are {len(part.vertices)}")
+                raise Refused(
+                    f"a face has the corner {low if low < 0 else high}, but there are {len(part.vertices)}"
+                )
         return parts
 
 
@@ -221,11 +270,19 @@ def _grouped(text: str, materials: bool) -> str:
     for name, chunk in zip(changes[::2], changes[1::2], strict=True):
         of_material.setdefault(name.strip(), []).extend(_FACES.findall(chunk))
     check_limit("parts", len(of_material), "materials")
-    looks = len(of_material) * text.count("\nv ") // CHEAPER  # trimesh looks at all vertices for each
+    looks = (
+        len(of_material) * text.count("\nv ") // CHEAPER
+    )  # trimesh looks at all vertices for each
     check_limit("corners", looks, f"times {CHEAPER} vertices of {len(of_material)} materials")
-    others = _GROUPS.sub("", "\n".join([begin, *(_FACES.sub("", chunk) for chunk in changes[1::2])]))
+    others = _GROUPS.sub(
+        "", "\n".join([begin, *(_FACES.sub("", chunk) for chunk in changes[1::2])])
+    )
     plain = lambda lines: lines.replace("usemtl", "-")
-    faces = [f"usemtl {plain(name)}\n{plain(''.join(lines))}" for name, lines in of_material.items() if lines]
+    faces = [
+        f"usemtl {plain(name)}\n{plain(''.join(lines))}"
+        for name, lines in of_material.items()
+        if lines
+    ]
     return "\n".join([plain(others), *faces])
 
 
@@ -256,7 +313,9 @@ class _Folder:
             if file.suffix.lower() == ".mtl":
                 return read_bytes(file, "slow_text_bytes")
             data = read_bytes(file, "image_bytes")
-            check_limit("mesh_bytes", sum(map(len, self.read.values())) + len(data), "bytes of textures")
+            check_limit(
+                "mesh_bytes", sum(map(len, self.read.values())) + len(data), "bytes of textures"
+            )
             with image_in(data) as image:
                 image.load()
             return data
@@ -278,13 +337,23 @@ def _paint(mesh: Any) -> None:
     from trimesh.visual import ColorVisuals
 
     count, visual = len(mesh.vertices), mesh.visual
-    colors = visual.material.to_color(visual.uv) if visual.kind == "texture" else visual.vertex_colors
+    colors = (
+        visual.material.to_color(visual.uv) if visual.kind == "texture" else visual.vertex_colors
+    )
     if colors is None or np.shape(colors) not in ((count, 4), (count, 3), (4,)):
         colors = [GREY, GREY, GREY, 255]
-    mesh.visual = ColorVisuals(mesh, vertex_colors=np.broadcast_to(colors, (count, np.shape(colors)[-1])))
+    mesh.visual = ColorVisuals(
+        mesh, vertex_colors=np.broadcast_to(colors, (count, np.shape(colors)[-1]))
+    )
 
 
-HARMLESS_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_mesh_quantization", "KHR_texture_transform", "KHR_xmp")
+HARMLESS_EXTENSIONS = (
+    "KHR_materials_",
+    "KHR_lights_",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+    "KHR_xmp",
+)
 """Beginnings of names of glTF extensions that leave positions and faces where the file has them."""
 
 
@@ -303,10 +372,15 @@ def _check_glb(data: bytes, textures: bool) -> None:
     _check_extensions(content)
     views = [view_of(view, binary) for view in content.get("bufferViews", [])]
     counts = [count_of(accessor) for accessor in content.get("accessors", [])]
-    corners = lambda part: counts[part["attributes"]["POSITION"]] + (3 * counts[part["indices"]] if "indices" in part else 0)
+    corners = lambda part: (
+        counts[part["attributes"]["POSITION"]]
+        + (3 * counts[part["indices"]] if "indices" in part else 0)
+    )
     of_mesh = [sum(map(corners, mesh["primitives"])) for mesh in content.get("meshes", [])]
     drawn = [node["mesh"] for node in content.get("nodes", []) if "mesh" in node]
-    check_limit("corners", max(sum(of_mesh), sum(of_mesh[mesh] for mesh in drawn)), "corners of triangles")
+    check_limit(
+        "corners", max(sum(of_mesh), sum(of_mesh[mesh] for mesh in drawn)), "corners of triangles"
+    )
     parts = [len(mesh["primitives"]) for mesh in content.get("meshes", [])]
     check_limit("parts", max(sum(parts), sum(parts[mesh] for mesh in drawn)), "parts of meshes")
     if textures:

@@ -112,13 +112,17 @@ def set_limits(new: Limits | None) -> None:
 
 def _limits_of_text(text: str) -> Limits:
     changes: dict[str, Any] = {}
-    kinds: dict[str, Any] = {field.name: type(field.default) for field in dataclasses.fields(Limits)}
+    kinds: dict[str, Any] = {
+        field.name: type(field.default) for field in dataclasses.fields(Limits)
+    }
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = part.partition("=")
         try:
             changes[name] = kinds[name](float(value))
         except (KeyError, ValueError, OverflowError):
-            raise ValueError(f"{ENVIRONMENT}: {part!r}: expected NAME=NUMBER with one of {', '.join(kinds)}") from None
+            raise ValueError(
+                f"{ENVIRONMENT}: {part!r}: expected NAME=NUMBER with one of {', '.join(kinds)}"
+            ) from None
     return Limits(**changes)
 
 
@@ -131,7 +135,9 @@ class _Shown(reprlib.Repr):
     def __init__(self) -> None:
         super().__init__()
         self.maxlevel, self.maxdict, self.maxstring, self.maxother = 2, 4, 100, 100
-        self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = self.maxarray = 4
+        self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = (
+            self.maxarray
+        ) = 4
 
     def repr_int(self, x: int, level: int) -> str:
         """Python refuses to write integers of thousands of digits."""
@@ -141,7 +147,11 @@ class _Shown(reprlib.Repr):
         """Of other types: those of numpy that are Python's too as these, else the name of the type."""
         if isinstance(x, str):
             return self.repr_str(str(x), level)
-        return repr(x)[: self.maxother] if x is None or isinstance(x, bool | float) else f"a {type(x).__name__}"
+        return (
+            repr(x)[: self.maxother]
+            if x is None or isinstance(x, bool | float)
+            else f"a {type(x).__name__}"
+        )
 
 
 def shown(value: object) -> str:
@@ -191,14 +201,18 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
         raise raises("", "", error) from error
     except FileNotFoundError as error:
         missing = f"{error.filename or path}: no such file"
-        raise (FileNotFoundError(missing) if raises is FileError else raises("", "", missing)) from error
+        raise (
+            FileNotFoundError(missing) if raises is FileError else raises("", "", missing)
+        ) from error
     except Refused as error:
         raise raises(path, "", error) from error
     except PermissionError as error:
         raise raises(error.filename or path, "", NO_PERMISSION) from error
     except Exception as error:  # readers of damaged files raise some twenty types
         named = str(path) and str(error).startswith(f"{path}: ")
-        raise raises("" if named else path, "", str(error) if named else _why(kind, error)) from error
+        raise raises(
+            "" if named else path, "", str(error) if named else _why(kind, error)
+        ) from error
 
 
 def _why(kind: str, error: Exception) -> str:
@@ -209,7 +223,9 @@ def _why(kind: str, error: Exception) -> str:
     elif isinstance(error, OSError):
         reason = error.strerror or str(error) or type(error).__name__
     else:
-        says_little = isinstance(error, LookupError | AssertionError | AttributeError | TypeError) or not str(error)
+        says_little = isinstance(
+            error, LookupError | AssertionError | AttributeError | TypeError
+        ) or not str(error)
         reason = f"{type(error).__name__} {error}" if says_little else str(error)
     return f"not a readable {kind}: {_one_line(reason, LONGEST_REASON)}"
 
@@ -219,7 +235,10 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
     if amount > (most := getattr(limits(), name)):
         raised, found = "", f"more than {LARGEST_AMOUNT:,}"
         if amount <= LARGEST_AMOUNT:
-            raised, found = f"{ENVIRONMENT}={name}={math.ceil(amount)} raises it; ", f"{math.ceil(amount):,}"
+            raised, found = (
+                f"{ENVIRONMENT}={name}={math.ceil(amount)} raises it; ",
+                f"{math.ceil(amount):,}",
+            )
         raise Refused(f"{found} {unit}: the limit {name} is {most:,} ({raised}docs/security.md)")
 
 
@@ -246,7 +265,9 @@ def read_bytes(path: str | os.PathLike[str], limit: str = "file_bytes") -> bytes
         return file.read()
 
 
-def walk(folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda folder: False) -> Generator[Path]:
+def walk(
+    folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda folder: False
+) -> Generator[Path]:
     """The files in a folder and in the folders in it, but for names that begin with a dot and folders to `skip`.
 
     Each folder is looked at once, however many links lead to it. Links that lead out are not followed, unless the limit
@@ -272,11 +293,15 @@ def walk(folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda f
                 elif not skip(path):
                     if not entry.is_symlink():
                         waiting.append(path)
-                    elif limits().photos_outside or path.resolve().is_relative_to(Path(folder).resolve()):
+                    elif limits().photos_outside or path.resolve().is_relative_to(
+                        Path(folder).resolve()
+                    ):
                         links.append(path)
                     elif not told:
                         told = True
-                        logger.warning("%s: leads out of %s: not followed (%s)", path, folder, OUTSIDE)
+                        logger.warning(
+                            "%s: leads out of %s: not followed (%s)", path, folder, OUTSIDE
+                        )
 
 
 def visible(paths: Iterable[Path]) -> list[Path]:
@@ -308,7 +333,11 @@ def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Pa
         return path
     try:
         contained = path.resolve().is_relative_to(Path(folder).resolve())
-    except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, a loop of links
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # too long, a null character, a loop of links
         raise Refused(f"{name!r} is no path: {error}") from error
     if not contained:
         how = f" ({OUTSIDE})" if photo else ""
@@ -353,7 +382,9 @@ def check_nesting(value: Any) -> None:
         level = [item for items in contents for item in items if isinstance(item, list | dict)]
         if not level:
             return
-    raise Refused(f"not usable: nested too deeply, the limit nesting is {limits().nesting} (docs/security.md)")
+    raise Refused(
+        f"not usable: nested too deeply, the limit nesting is {limits().nesting} (docs/security.md)"
+    )
 
 
 def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:

@@ -23,7 +23,13 @@ from humangs_jax.io.reading import Refused, check_limit, limits, read_bytes, rea
 
 REFUSED = (
     *(pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.INST, pickle.OBJ, pickle.NEWOBJ_EX),
-    *(pickle.EMPTY_SET, pickle.FROZENSET, pickle.ADDITEMS, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER),
+    *(
+        pickle.EMPTY_SET,
+        pickle.FROZENSET,
+        pickle.ADDITEMS,
+        pickle.NEXT_BUFFER,
+        pickle.READONLY_BUFFER,
+    ),
 )
 """Instructions that no pickle of arrays has."""
 LARGEST_KEY = 1 << 31
@@ -51,7 +57,9 @@ class StandIn:
                 self.state.update(part)
 
 
-class RestrictedUnpickler(pickle._Unpickler):  # the one without C: nothing in it is hidden from this class
+class RestrictedUnpickler(
+    pickle._Unpickler
+):  # the one without C: nothing in it is hidden from this class
     """Reads one pickle. names: what the (module, name) of a pickle stands for; what is in no table is refused.
 
     purpose: ends the message of a refusal. Strings of Python 2 are taken for latin1.
@@ -97,10 +105,16 @@ class _Counted:
 
 
 def _checked_key(key: Any) -> Any:
-    if isinstance(key, _Array) and key.state.get("shape") == () and (number := key.to_array().item()) == int(number):
+    if (
+        isinstance(key, _Array)
+        and key.state.get("shape") == ()
+        and (number := key.to_array().item()) == int(number)
+    ):
         key = int(number)  # numpy's numbers of people
     parts = key if type(key) is tuple and len(key) <= 4 else (key,)
-    if not all(type(x) in (str, bytes, bool) or (type(x) is int and abs(x) < LARGEST_KEY) for x in parts):
+    if not all(
+        type(x) in (str, bytes, bool) or (type(x) is int and abs(x) < LARGEST_KEY) for x in parts
+    ):
         raise Refused("a dict with keys other than strings and small integers")
     return key
 
@@ -108,7 +122,9 @@ def _checked_key(key: Any) -> Any:
 def _fill(mapping: Any, items: list[Any]) -> None:
     if type(mapping) is not dict:
         raise Refused("items of what is no dict")
-    mapping.update((_checked_key(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
+    mapping.update(
+        (_checked_key(key), value) for key, value in zip(items[::2], items[1::2], strict=True)
+    )
 
 
 def _set_item(reader: Any) -> None:
@@ -184,7 +200,11 @@ class _Dtype(StandIn):
     @property
     def dtype(self) -> np.dtype | None:
         code, parts = self.state["code"], self.state.get("parts", (3, "|", None, None, None))
-        plain = len(parts) >= 5 and parts[2] is parts[3] is parts[4] is None and parts[1] in ("<", ">", "=", "|")
+        plain = (
+            len(parts) >= 5
+            and parts[2] is parts[3] is parts[4] is None
+            and parts[1] in ("<", ">", "=", "|")
+        )
         if not plain or not isinstance(code, str) or not re.fullmatch(r"[biufcSU?]\d{0,3}", code):
             return None
         try:
@@ -205,7 +225,12 @@ class _Array(StandIn):
     def set_state(self, state: Any) -> None:
         if isinstance(state, tuple) and len(state) == 5:
             _, shape, dtype, columns_first, data = state
-            self.state.update(shape=shape, dtype=dtype, columns_first=columns_first is True or columns_first == 1, data=data)
+            self.state.update(
+                shape=shape,
+                dtype=dtype,
+                columns_first=columns_first is True or columns_first == 1,
+                data=data,
+            )
 
     def to_array(self) -> np.ndarray:
         shape, data = self.state["shape"], self.state["data"]
@@ -214,12 +239,18 @@ class _Array(StandIn):
         if dtype is None or not isinstance(data, bytes):
             raise ValueError("expected numbers, got other objects")
         sizes = shape if isinstance(shape, tuple) else ()
-        if not all(type(n) is int and n >= 0 for n in sizes) or math.prod(sizes) * dtype.itemsize != len(data):
+        if not all(type(n) is int and n >= 0 for n in sizes) or math.prod(
+            sizes
+        ) * dtype.itemsize != len(data):
             raise ValueError(f"shape {shape} of {dtype} does not fit {len(data):,} bytes")
         if not dtype.itemsize:
             raise ValueError(f"expected numbers, got {dtype}")
         columns_first = self.state["columns_first"]
-        return plain_array(data, dtype, sizes[::-1]).T if columns_first else plain_array(data, dtype, sizes)
+        return (
+            plain_array(data, dtype, sizes[::-1]).T
+            if columns_first
+            else plain_array(data, dtype, sizes)
+        )
 
 
 def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Array":
@@ -234,7 +265,11 @@ class _Joblib(StandIn):
     def read(self, read: Callable[[int], bytes]) -> "_Array":
         shape, dtype = self.state.get("shape"), self.state.get("dtype")
         plain = dtype.dtype if isinstance(dtype, _Dtype) else None
-        if plain is None or type(shape) is not tuple or not all(type(n) is int and n >= 0 for n in shape):
+        if (
+            plain is None
+            or type(shape) is not tuple
+            or not all(type(n) is int and n >= 0 for n in shape)
+        ):
             raise Refused("an array of joblib that is not of numbers")
         if self.state.get("numpy_array_alignment_bytes") is not None:
             read(read(1)[0])
@@ -263,22 +298,37 @@ class _Sparse(StandIn):
     def _places(self, count: int) -> list[np.ndarray]:
         """The row and the column of each entry."""
         if self.axis is None:
-            return [_numbers(x) for x in self.state.get("coords") or (self.state["row"], self.state["col"])]
+            return [
+                _numbers(x)
+                for x in self.state.get("coords") or (self.state["row"], self.state["col"])
+            ]
         ends = _numbers(self.state["indptr"]).astype(np.int64, casting="safe")
         steps = np.diff(ends)
-        if ends.ndim != 1 or not len(ends) or ends[0] != 0 or (steps < 0).any() or ends[-1] != count:
+        if (
+            ends.ndim != 1
+            or not len(ends)
+            or ends[0] != 0
+            or (steps < 0).any()
+            or ends[-1] != count
+        ):
             raise ValueError("index pointers that do not count the entries")
         places = [np.repeat(np.arange(len(steps)), steps), _numbers(self.state["indices"])]
         return places[:: 1 if self.axis == 0 else -1]
 
     def to_array(self) -> np.ndarray:
         shape, data = self.state["_shape"], _numbers(self.state["data"])
-        if not (isinstance(shape, tuple) and len(shape) == 2 and all(type(n) is int and n >= 0 for n in shape)):
+        if not (
+            isinstance(shape, tuple)
+            and len(shape) == 2
+            and all(type(n) is int and n >= 0 for n in shape)
+        ):
             raise ValueError("expected a shape of two sizes")
         check_limit("plain_bytes", math.prod(shape) * data.itemsize, "bytes of a sparse matrix")
         where = [x.astype(np.int64, casting="safe") for x in self._places(data.size)]
         for index, size in zip(where, shape, strict=True):
-            if index.shape != data.shape or (index.size and not 0 <= index.min() <= index.max() < size):
+            if index.shape != data.shape or (
+                index.size and not 0 <= index.min() <= index.max() < size
+            ):
                 raise ValueError(f"indices that do not fit the shape {shape}")
         full = np.zeros(shape, data.dtype)
         np.add.at(full, tuple(where), data)
@@ -300,7 +350,11 @@ class _Chumpy(StandIn):
 
 class _ChumpySelection(StandIn):
     def to_array(self) -> np.ndarray:
-        source = self.state["a"].to_array() if isinstance(self.state["a"], _Chumpy) else _numbers(self.state["a"])
+        source = (
+            self.state["a"].to_array()
+            if isinstance(self.state["a"], _Chumpy)
+            else _numbers(self.state["a"])
+        )
         return source.ravel()[_numbers(self.state["idxs"])].reshape(self.state["preferred_shape"])
 
 
@@ -315,12 +369,23 @@ NAMES: dict[tuple[str, str], Any] = {
         for module, name, function in (
             ("multiarray", "_reconstruct", lambda *_: _Array()),
             ("multiarray", "scalar", lambda dtype, data=b"": _made_array((), dtype, False, data)),
-            ("numeric", "_frombuffer", lambda data, dtype, shape, order: _made_array(shape, dtype, order == "F", data)),
+            (
+                "numeric",
+                "_frombuffer",
+                lambda data, dtype, shape, order: _made_array(shape, dtype, order == "F", data),
+            ),
         )
     },
     ("_codecs", "encode"): Call(_encode),
-    **{(module, "_reconstructor"): Call(lambda cls, *_: _instance(cls)) for module in ("copyreg", "copy_reg")},
-    **{(m, name): object for m in ("builtins", "__builtin__") for name in ("object", "dict", "list", "int", "float")},
+    **{
+        (module, "_reconstructor"): Call(lambda cls, *_: _instance(cls))
+        for module in ("copyreg", "copy_reg")
+    },
+    **{
+        (m, name): object
+        for m in ("builtins", "__builtin__")
+        for name in ("object", "dict", "list", "int", "float")
+    },
     ("scipy.sparse", "csc_matrix"): Call(_SparseColumns),
     ("scipy.sparse", "csr_matrix"): Call(_SparseRows),
     ("scipy.sparse", "coo_matrix"): Call(_Sparse),
@@ -330,7 +395,11 @@ NAMES: dict[tuple[str, str], Any] = {
 
 
 def _instance(cls: Any) -> StandIn:
-    if type(cls) is not Call or not isinstance(cls.function, type) or not issubclass(cls.function, StandIn):
+    if (
+        type(cls) is not Call
+        or not isinstance(cls.function, type)
+        or not issubclass(cls.function, StandIn)
+    ):
         raise Refused("refused to make an object of another class")
     return cls.function()
 
@@ -349,7 +418,11 @@ def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarra
     if dtype.kind == "b":
         return array.view(np.uint8) != 0
     array = array.astype(dtype.newbyteorder("="), copy=False)
-    if dtype.kind == "U" and array.size and np.ascontiguousarray(array).reshape(-1).view(np.uint32).max() > 0x10FFFF:
+    if (
+        dtype.kind == "U"
+        and array.size
+        and np.ascontiguousarray(array).reshape(-1).view(np.uint32).max() > 0x10FFFF
+    ):
         raise Refused("strings with characters that do not exist")
     return array
 
@@ -364,7 +437,9 @@ def as_array(value: Any) -> np.ndarray:
             return value.to_array()
         except (KeyError, TypeError, IndexError, AttributeError) as error:
             name = type(value).__name__.strip("_")
-            raise ValueError(f"a {name} object without readable contents ({type(error).__name__})") from error
+            raise ValueError(
+                f"a {name} object without readable contents ({type(error).__name__})"
+            ) from error
     if isinstance(value, list | tuple):
         _check_leaves(value)
     if isinstance(value, np.ndarray | np.generic | int | float | list | tuple):
@@ -382,7 +457,9 @@ def _check_leaves(value: Any) -> None:
         items, depth = waiting.pop()
         left -= len(items)
         if depth > 8 or left < 0:
-            raise ValueError(f"expected an array, got lists that are nested too deeply or of more than {LONGEST_LIST:,}")
+            raise ValueError(
+                f"expected an array, got lists that are nested too deeply or of more than {LONGEST_LIST:,}"
+            )
         for item in items:
             if isinstance(item, list | tuple):
                 waiting.append((item, depth + 1))

@@ -25,7 +25,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from humangs_jax.io.arrays import open_archive, read_header
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked, limits, open_file, read_bytes, reading, shown
+from humangs_jax.io.reading import (
+    Refused,
+    check_limit,
+    check_unpacked,
+    limits,
+    open_file,
+    read_bytes,
+    reading,
+    shown,
+)
 from humangs_jax.io.restricted_pickle import NAMES, Call, RestrictedUnpickler, objects
 
 ZIP_START = b"PK\x03\x04"
@@ -104,7 +113,9 @@ class _Tensor(NamedTuple):
         steps = tuple(stride * data.itemsize for stride in strides)
         view = np.lib.stride_tricks.as_strided(data[offset:], shape, steps, writeable=False)
         array = np.ascontiguousarray(view).reshape(shape)
-        return (array.astype(np.uint32) << 16).view(np.float32) if kind == "BFloat16Storage" else array
+        return (
+            (array.astype(np.uint32) << 16).view(np.float32) if kind == "BFloat16Storage" else array
+        )
 
 
 def _counts(x: Any) -> bool:
@@ -112,7 +123,9 @@ def _counts(x: Any) -> bool:
 
 
 def _rebuild_tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
-    if not (isinstance(storage, _Storage) and _counts((offset,)) and _counts(shape) and _counts(strides)):
+    if not (
+        isinstance(storage, _Storage) and _counts((offset,)) and _counts(shape) and _counts(strides)
+    ):
         raise Refused("a tensor without a storage, or whose offset, shape or strides are no counts")
     if len(shape) != len(strides) or len(shape) > MOST_AXES:
         raise Refused(f"a tensor with {len(shape)} axes and {len(strides)} strides")
@@ -131,7 +144,9 @@ def _ordered_dict(*arguments: Any) -> dict:
     if len(arguments) > 1 or type(pairs) is not list:
         raise Refused("an ordered dict that is made of something else than a list of pairs")
     if not all(type(pair) is list and len(pair) == 2 and type(pair[0]) is str for pair in pairs):
-        raise Refused("an ordered dict that is made of something else than pairs of a name and a value")
+        raise Refused(
+            "an ordered dict that is made of something else than pairs of a name and a value"
+        )
     made = {key: value for key, value in pairs}
     pairs.clear()  # a pickle may name one list many times: each of its instructions makes one item, no more
     return made
@@ -159,8 +174,14 @@ _NAMES: dict[tuple[str, str], Any] = {
 class _TorchUnpickler(RestrictedUnpickler):
     """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it met."""
 
-    def __init__(self, file: Any, names: Mapping = _NAMES, read: Callable[[str], bytes] | None = None) -> None:
-        super().__init__(file, names, "no part of a state dict" if names is _NAMES else "it is not needed to hold arrays")
+    def __init__(
+        self, file: Any, names: Mapping = _NAMES, read: Callable[[str], bytes] | None = None
+    ) -> None:
+        super().__init__(
+            file,
+            names,
+            "no part of a state dict" if names is _NAMES else "it is not needed to hold arrays",
+        )
         self.kinds: dict[str, str] = {}
         self.read_storage = functools.cache(read or {}.__getitem__)
 
@@ -216,7 +237,10 @@ def _of_stream(file: Any, size: int, names: Mapping) -> Any:
 
     unpickler = _TorchUnpickler(file, names, read)
     content, stored = unpickler.load(), _TorchUnpickler(file).load()
-    if not (isinstance(stored, list) and all(isinstance(name, str) and name in unpickler.kinds for name in stored)):
+    if not (
+        isinstance(stored, list)
+        and all(isinstance(name, str) and name in unpickler.kinds for name in stored)
+    ):
         raise Refused("its list of storages names one that no tensor has")
     for name in stored:
         (count,) = struct.unpack("<q", file.read(8))
@@ -233,7 +257,9 @@ def everything(key: str) -> bool:
     return True
 
 
-def read_torch_file(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:
+def read_torch_file(
+    path: str | os.PathLike[str], wanted: Wanted = everything
+) -> tuple[Tensors, int]:
     """The tensors of the state dict in a file whose name is wanted, and how many others there are.
 
     bfloat16 comes as float32, everything else as it is stored.
@@ -259,9 +285,18 @@ def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
     The state dict is what lies under one of `STATE_DICTS`, or else the content itself. What tensors take together is bounded by
     the size of the file. Raises: Refused.
     """
-    label = next((key for key in STATE_DICTS if isinstance(content, dict) and isinstance(content.get(key), dict)), None)
+    label = next(
+        (
+            key
+            for key in STATE_DICTS
+            if isinstance(content, dict) and isinstance(content.get(key), dict)
+        ),
+        None,
+    )
     model = content if label is None else content[label]
-    if not isinstance(model, dict) or (label is None and not any(isinstance(x, _Tensor) for x in model.values())):
+    if not isinstance(model, dict) or (
+        label is None and not any(isinstance(x, _Tensor) for x in model.values())
+    ):
         names = " or ".join(map(repr, STATE_DICTS))
         raise Refused(f"expected a state dict, or a dict with one under {names}")
     if not all(isinstance(key, str) for key in model):
@@ -269,10 +304,14 @@ def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
     chosen = {key: tensor for key, tensor in model.items() if wanted(key)}
     for key, tensor in chosen.items():
         if not isinstance(tensor, _Tensor):
-            raise Refused(f"{label or 'state_dict'}[{shown(key)}] is no tensor but {type(tensor).__name__}")
+            raise Refused(
+                f"{label or 'state_dict'}[{shown(key)}] is no tensor but {type(tensor).__name__}"
+            )
     arrays: Tensors = {}
     left, held = LARGEST_SHARE * size, None
-    for key in sorted(chosen, key=lambda key: chosen[key].storage.name):  # each storage is read once, and one at a time is held
+    for key in sorted(
+        chosen, key=lambda key: chosen[key].storage.name
+    ):  # each storage is read once, and one at a time is held
         tensor = chosen[key]
         if tensor.storage.name != held:
             held = tensor.storage.name
@@ -283,7 +322,9 @@ def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
         except Refused as error:
             raise Refused(f"{key}: {error}") from error
         if left < 0:
-            raise Refused(f"{key}: the tensors take more than {LARGEST_SHARE} times the size of the file")
+            raise Refused(
+                f"{key}: the tensors take more than {LARGEST_SHARE} times the size of the file"
+            )
     return {key: arrays[key] for key in chosen}, len(model) - len(chosen)
 
 
@@ -292,7 +333,11 @@ def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> t
 
     Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for more than tensors.
     """
-    return read_safetensors(path, wanted)[:2] if is_safetensors(path) else read_torch_file(path, wanted)
+    return (
+        read_safetensors(path, wanted)[:2]
+        if is_safetensors(path)
+        else read_torch_file(path, wanted)
+    )
 
 
 def is_safetensors(path: str | os.PathLike[str]) -> bool:
@@ -302,7 +347,9 @@ def is_safetensors(path: str | os.PathLike[str]) -> bool:
     return start[8:] == b"{" and struct.unpack("<Q", start[:8])[0] < 1 << 32
 
 
-def read_safetensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int, dict[str, str]]:
+def read_safetensors(
+    path: str | os.PathLike[str], wanted: Wanted = everything
+) -> tuple[Tensors, int, dict[str, str]]:
     """The tensors whose name is wanted, how many others the file has, and the strings in its header.
 
     Raises: FileNotFoundError; FileError.
@@ -311,7 +358,9 @@ def read_safetensors(path: str | os.PathLike[str], wanted: Wanted = everything) 
 
     with reading(path, "safetensors file"):
         with open_file(path) as start:
-            check_limit("slow_text_bytes", int.from_bytes(start.read(8), "little"), "bytes of a header")
+            check_limit(
+                "slow_text_bytes", int.from_bytes(start.read(8), "little"), "bytes of a header"
+            )
         with safe_open(Path(path), framework="numpy") as file:
             keys = list(file.keys())
             tensors = {key: np.asarray(file.get_tensor(key)) for key in keys if wanted(key)}

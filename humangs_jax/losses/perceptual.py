@@ -127,7 +127,9 @@ def convolutions(slices: Slices) -> Iterator[Conv]:
 
 def channels(slices: Slices) -> tuple[int, ...]:
     """Number of channels of each compared feature map."""
-    return tuple([layer for layer in part if not isinstance(layer, Pool)][-1].outputs for part in slices)
+    return tuple(
+        [layer for layer in part if not isinstance(layer, Pool)][-1].outputs for part in slices
+    )
 
 
 @functools.cache
@@ -153,7 +155,10 @@ def _size_after(layer: Conv | Pool, size: Any) -> Any:
 
 
 def feature_maps(
-    weights: Weights, slices: Slices, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+    weights: Weights,
+    slices: Slices,
+    image: Float[Array, "h w 3"],
+    size: Int[Array, "2"] | None = None,
 ) -> list[tuple[Float[Array, "y x c"], Int[Array, "2"] | None]]:
     """The compared maps of an image whose colors are scaled as the network expects them, each with its size.
 
@@ -164,7 +169,9 @@ def feature_maps(
     """
     height, width, _ = image.shape
     if min(height, width) < (least := smallest_side(slices)):
-        raise ValueError(f"an image of {width} x {height} is too small for this network: {least} pixels a side needed")
+        raise ValueError(
+            f"an image of {width} x {height} is too small for this network: {least} pixels a side needed"
+        )
     maps, x = [], _cleared(image.astype(weights["0"].kernel.dtype), size)
     for part in slices:
         for layer in part:
@@ -187,7 +194,9 @@ def _apply(
     if isinstance(layer, Fire):
         first, *expand = layer.convolutions
         x, size = _apply(weights, first, x, size)
-        return jnp.concatenate([_apply(weights, part, x, size)[0] for part in expand], axis=-1), size
+        return jnp.concatenate(
+            [_apply(weights, part, x, size)[0] for part in expand], axis=-1
+        ), size
     # values are not negative, so a zero beyond the map changes no maximum of a pool
     x = _pool(layer, x) if isinstance(layer, Pool) else _convolve(weights[layer.name], layer, x)
     size = None if size is None else _size_after(layer, size)
@@ -200,7 +209,9 @@ def _convolve(weights: Convolution, layer: Conv, x: Float[Array, "y x c"]) -> Fl
     else:
         stride, padding = (layer.stride,) * 2, [(layer.padding, layer.padding)] * 2
         layout = ("NHWC", "HWIO", "NHWC")
-        y = jax.lax.conv_general_dilated(x[None], weights.kernel, stride, padding, dimension_numbers=layout)
+        y = jax.lax.conv_general_dilated(
+            x[None], weights.kernel, stride, padding, dimension_numbers=layout
+        )
     return jax.nn.relu(y[0] + weights.bias)
 
 
@@ -212,7 +223,9 @@ def _pool(layer: Pool, x: Float[Array, "y x c"]) -> Float[Array, "i j c"]:
     combine = jnp.add if layer.average else _larger
     for axis in (1, 0):
         length = (x.shape[axis] - layer.size) // layer.stride * layer.stride + 1
-        slices = [jax.lax.slice_in_dim(x, i, i + length, layer.stride, axis) for i in range(layer.size)]
+        slices = [
+            jax.lax.slice_in_dim(x, i, i + length, layer.stride, axis) for i in range(layer.size)
+        ]
         x = functools.reduce(combine, slices)
     return x / layer.size**2 if layer.average else x
 
@@ -248,7 +261,10 @@ def _unit(x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
 
 
 def lpips_distances(
-    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+    weights: Lpips,
+    predicted: Float[Array, "h w 3"],
+    target: Float[Array, "h w 3"],
+    size: Int[Array, "2"] | None = None,
 ) -> Float[Array, " _"]:
     """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze. See `lpips`."""
     images = at_least_float32((predicted, target))
@@ -258,12 +274,17 @@ def lpips_distances(
     for head, (x, own), (y, _) in zip(weights.heads, *maps, strict=True):
         x, y = at_least_float32((x, y))
         different = jnp.sum(head * jnp.square(_unit(x) - _unit(y)), axis=-1)
-        distances.append(jnp.mean(different) if own is None else jnp.sum(different) / (own[0] * own[1]))
+        distances.append(
+            jnp.mean(different) if own is None else jnp.sum(different) / (own[0] * own[1])
+        )
     return jnp.stack(distances)
 
 
 def lpips(
-    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+    weights: Lpips,
+    predicted: Float[Array, "h w 3"],
+    target: Float[Array, "h w 3"],
+    size: Int[Array, "2"] | None = None,
 ) -> Scalar:
     """LPIPS (Zhang et al., 2018, version 0.1): distances of unit-length features, weighed per channel by learned heads.
 
@@ -276,7 +297,9 @@ def lpips(
     return jnp.sum(lpips_distances(weights, predicted, target, size))
 
 
-def vgg16_loss(weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
+def vgg16_loss(
+    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
+) -> Scalar:
     """Mean absolute difference of the features of VGG-16, relative to the mean of the target's, averaged over five depths.
 
     weights: of LPIPS "vgg"; its heads are not used. Where `perceptual_loss` wants the weights of the original VGG-19, this one
@@ -286,9 +309,13 @@ def vgg16_loss(weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[A
     if weights.net != "vgg":
         raise ValueError(f"vgg16_loss: expected LPIPS vgg, got {weights.net}")
     images = at_least_float32((predicted, jax.lax.stop_gradient(target)))
-    maps = [[x for x, _ in feature_maps(weights.backbone, VGG16, _scaled(image))] for image in images]
+    maps = [
+        [x for x, _ in feature_maps(weights.backbone, VGG16, _scaled(image))] for image in images
+    ]
     pairs = map(at_least_float32, zip(*maps, strict=True))
-    return jnp.mean(jnp.stack([jnp.mean(absolute(x - y)) / (jnp.mean(y) + EPSILON) for x, y in pairs]))
+    return jnp.mean(
+        jnp.stack([jnp.mean(absolute(x - y)) / (jnp.mean(y) + EPSILON) for x, y in pairs])
+    )
 
 
 MEAN_COLOR = (123.68, 116.779, 103.939)
@@ -303,7 +330,9 @@ class Vgg19:
     weights: Weights
 
 
-def perceptual_errors(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, "6"]:
+def perceptual_errors(
+    vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
+) -> Float[Array, "6"]:
     """Mean absolute differences of the pixels in [0, 255] and of the features of VGG-19, with average pooling, at five depths.
 
     Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the original VGG-19 expect (those of
@@ -315,11 +344,15 @@ def perceptual_errors(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Floa
     images = [255 * image for image in at_least_float32((predicted, target))]
     mean = jnp.asarray(MEAN_COLOR, images[0].dtype)
     maps = [[x for x, _ in feature_maps(vgg.weights, VGG19, image - mean)] for image in images]
-    pairs = zip(*([image, *features] for image, features in zip(images, maps, strict=True)), strict=True)
+    pairs = zip(
+        *([image, *features] for image, features in zip(images, maps, strict=True)), strict=True
+    )
     return jnp.stack([jnp.mean(absolute(x - y)) for x, y in map(at_least_float32, pairs)])
 
 
-def perceptual_loss(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
+def perceptual_loss(
+    vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
+) -> Scalar:
     """The published perceptual loss: the weighted sum of `perceptual_errors`."""
     errors = perceptual_errors(vgg, predicted, target)
     return jnp.sum(errors / jnp.asarray(DIVISORS, errors.dtype)) / 255

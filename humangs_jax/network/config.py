@@ -31,11 +31,17 @@ class Architecture:
         reader, decoder = self.reader, self.decoder
         if isinstance(reader, PixelAlignedReader) and isinstance(decoder, VertexDecoder):
             if decoder.residual_color and not reader.sample_rgb:
-                raise ValueError("decoder.residual_color needs reader.sample_rgb: there is no photo color to correct")
+                raise ValueError(
+                    "decoder.residual_color needs reader.sample_rgb: there is no photo color to correct"
+                )
             if reader.shells and decoder.frame != "normal":
-                raise ValueError('reader.shells lie along the normals: they need decoder.frame = "normal"')
+                raise ValueError(
+                    'reader.shells lie along the normals: they need decoder.frame = "normal"'
+                )
         if len(maps := self._surface_maps) > 1:
-            raise ValueError(f"surface_map: expected one for all parts, got {sorted(map(str, maps))}")
+            raise ValueError(
+                f"surface_map: expected one for all parts, got {sorted(map(str, maps))}"
+            )
 
     @property
     def surface_map(self) -> Any:
@@ -48,10 +54,16 @@ class Architecture:
         return {getattr(part, "surface_map", None) for part in parts} - {None}
 
 
-def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
+def paper_parts(
+    architecture: Architecture,
+) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
     """The three parts of the paper's network. Raises: ValueError if one has been exchanged, naming its class."""
     encoder, reader, decoder = architecture.encoder, architecture.reader, architecture.decoder
-    if isinstance(encoder, PatchTransformer) and isinstance(reader, PixelAlignedReader) and isinstance(decoder, VertexDecoder):
+    if (
+        isinstance(encoder, PatchTransformer)
+        and isinstance(reader, PixelAlignedReader)
+        and isinstance(decoder, VertexDecoder)
+    ):
         return encoder, reader, decoder
     names = ", ".join(type(part).__name__ for part in (encoder, reader, decoder))
     raise ValueError(f"expected the parts of the paper's network, got {names}")
@@ -98,8 +110,12 @@ class HumanGSConfig:
 
     def with_conventions(self, **changes: Any) -> "HumanGSConfig":
         """The same parts under other conventions."""
-        return dataclasses.replace(self, conventions=dataclasses.replace(self.conventions, **changes))
+        return dataclasses.replace(
+            self, conventions=dataclasses.replace(self.conventions, **changes)
+        )
 
     def with_parts(self, **changes: Any) -> "HumanGSConfig":
         """Another network: parts exchanged."""
-        return dataclasses.replace(self, architecture=dataclasses.replace(self.architecture, **changes))
+        return dataclasses.replace(
+            self, architecture=dataclasses.replace(self.architecture, **changes)
+        )

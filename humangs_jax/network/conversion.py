@@ -25,7 +25,12 @@ from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
-from humangs_jax.network.weights import FORMAT, expected_variables, flatten_variables, variables_from_tensors
+from humangs_jax.network.weights import (
+    FORMAT,
+    expected_variables,
+    flatten_variables,
+    variables_from_tensors,
+)
 
 LOSS_PREFIX = "loss_computer."
 """The release also saves its frozen loss networks; they are not part of the network."""
@@ -65,7 +70,9 @@ SAME = Layout(lambda x: x, lambda x: x)
 LINEAR = Layout(lambda x: x.T, lambda x: x.T)
 CONVOLUTION = Layout(lambda x: x.transpose(2, 3, 1, 0), lambda x: x.transpose(3, 2, 0, 1))
 POINTWISE = Layout(lambda x: x[:, :, 0, 0].T, lambda x: x.T[:, :, None, None])
-TRANSPOSED_CONVOLUTION = Layout(lambda x: x.transpose(2, 3, 0, 1), lambda x: x.transpose(2, 3, 0, 1))
+TRANSPOSED_CONVOLUTION = Layout(
+    lambda x: x.transpose(2, 3, 0, 1), lambda x: x.transpose(2, 3, 0, 1)
+)
 CLASS_TOKEN = Layout(lambda x: x[0], lambda x: x[None])
 
 SINGLE_TENSORS = {
@@ -106,7 +113,13 @@ BLOCK_MODULES = {
     "mlp_in": ("mlp.mlp.0", LINEAR),
     "mlp_out": ("mlp.mlp.2", LINEAR),
 }
-FIELDS = {"kernel": "weight", "scale": "weight", "bias": "bias", "mean": "running_mean", "var": "running_var"}
+FIELDS = {
+    "kernel": "weight",
+    "scale": "weight",
+    "bias": "bias",
+    "mean": "running_mean",
+    "var": "running_var",
+}
 
 
 def release_name(path: str) -> tuple[str, Layout]:
@@ -142,7 +155,9 @@ def to_release(variables: Variables) -> StateDict:
 
 def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
     """Shapes of the state dict that the release has for a configuration, without the body's skinning weights."""
-    empty = jax.tree.map(lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), expected_variables(config))
+    empty = jax.tree.map(
+        lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), expected_variables(config)
+    )
     return {key: tensor.shape for key, tensor in to_release(empty).items()}
 
 
@@ -164,18 +179,24 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     missing or has another number of axes.
     """
     if UNSUPPORTED in state:
-        raise ValueError(f"tensor {UNSUPPORTED!r}: the variant with canonical target maps is not supported")
+        raise ValueError(
+            f"tensor {UNSUPPORTED!r}: the variant with canonical target maps is not supported"
+        )
 
     shape = functools.partial(_shape, state)
     has = lambda prefix: any(key.startswith(prefix) for key in state)
     base = published()
     resolution, channels = shape("neural_texture", 4)[2:]
     token_width, patch_numbers = shape("image_tokenizer.1.weight", 2)
-    width = statistics.mode([token_width, *shape("transformer_input_layernorm.weight", 1), *shape("norm.weight", 1)])
+    width = statistics.mode(
+        [token_width, *shape("transformer_input_layernorm.weight", 1), *shape("norm.weight", 1)]
+    )
     per_pixel = PIXEL_CHANNELS + 3 * channels
     patch = max(1, round((patch_numbers / per_pixel) ** 0.5))
     if patch * patch * per_pixel != patch_numbers:
-        raise ValueError(f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels")
+        raise ValueError(
+            f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels"
+        )
     upsampler, output_width = None, None
     if has("upsampler."):
         upsampler = UpsamplerConfig(hidden=shape("upsampler.proj.0.weight", 4)[0])
@@ -197,7 +218,10 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
         upsampler=upsampler,
     )
     decoder = VertexDecoder(
-        hidden=shape("vertex_decoder.trunk.0.weight", 2)[0], tight=1, free=gaussians - 1, skinning_joints=joints
+        hidden=shape("vertex_decoder.trunk.0.weight", 2)[0],
+        tight=1,
+        free=gaussians - 1,
+        skinning_joints=joints,
     )
     size = patch * max(1, base.conventions.image_size // patch)
     conventions = dataclasses.replace(base.conventions, image_size=size)
@@ -225,13 +249,17 @@ def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
     """Width of a head, which is that of its norms, and whether there are norms."""
     if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
         if head_width is None:
-            raise ValueError("no tensor 'transformer_blocks.0.attn.q_norm.weight' tells the width of a head: give it")
+            raise ValueError(
+                "no tensor 'transformer_blocks.0.attn.q_norm.weight' tells the width of a head: give it"
+            )
         if head_width < 1:
             raise ValueError(f"the width of a head must be at least 1, got {head_width}")
         return {"head_width": head_width, "qk_norm": False}
     (found,) = _shape(state, "transformer_blocks.0.attn.q_norm.weight", 1)
     if head_width not in (None, found):
-        raise ValueError(f"tensor 'transformer_blocks.0.attn.q_norm.weight' says heads of {found}, not {head_width}")
+        raise ValueError(
+            f"tensor 'transformer_blocks.0.attn.q_norm.weight' says heads of {found}, not {head_width}"
+        )
     return {"head_width": found, "qk_norm": True}
 
 
@@ -240,14 +268,20 @@ def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
     if missing := sorted(set(expected) - set(state)):
         raise ValueError(f"tensor {missing[0]!r} is missing ({len(missing)} in all)")
     if unknown := sorted(set(state) - set(expected)):
-        raise ValueError(f"tensor {unknown[0]!r} is not part of the published network ({len(unknown)} such tensors)")
+        raise ValueError(
+            f"tensor {unknown[0]!r} is not part of the published network ({len(unknown)} such tensors)"
+        )
     if wrong := [key for key, shape in expected.items() if state[key].shape != shape]:
         found, wanted = state[wrong[0]].shape, expected[wrong[0]]
         raise ValueError(
             f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted} ({len(wrong)} such tensors)"
         )
-    if bad := [key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()]:
-        raise ValueError(f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such tensors)")
+    if bad := [
+        key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()
+    ]:
+        raise ValueError(
+            f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such tensors)"
+        )
 
 
 def load_checkpoint(path: str | os.PathLike[str], head_width: int | None = None) -> Converted:
@@ -273,7 +307,9 @@ def _load_checkpoint(path: str | os.PathLike[str], head_width: int | None) -> Co
     for ours in flatten_variables(expected_variables(config)):
         key, layout = release_name(ours)
         tensors[ours] = layout.from_release(state[key])
-    return Converted(variables_from_tensors(tensors, config, str(path)), config, state[SKINNING_WEIGHTS], skipped)
+    return Converted(
+        variables_from_tensors(tensors, config, str(path)), config, state[SKINNING_WEIGHTS], skipped
+    )
 
 
 def describe(converted: Converted) -> str:

@@ -37,19 +37,27 @@ class TriplaneConfig:
     """Features per texel."""
 
 
-def sample_triplane(texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]) -> Float[Array, "*p 3*c"]:
+def sample_triplane(
+    texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]
+) -> Float[Array, "*p 3*c"]:
     """Features of canonical positions (normalised units): those of plane xy, then xz, then yz."""
     middle = (texture.shape[1] - 1) / 2
-    indices = positions * middle  # from the middle: a third of the rounding of (positions + 1) * middle
+    indices = (
+        positions * middle
+    )  # from the middle: a third of the rounding of (positions + 1) * middle
     planes = zip(texture, map(list, PLANES), strict=True)
-    return jnp.concatenate([sample_bilinear(plane, indices[..., axes], middle) for plane, axes in planes], axis=-1)
+    return jnp.concatenate(
+        [sample_bilinear(plane, indices[..., axes], middle) for plane, axes in planes], axis=-1
+    )
 
 
 def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixels c"]:
     """Cut maps into square patches. Raises ValueError unless the patch size divides both sides."""
     views, height, width, channels = maps.shape
     if height % patch or width % patch:
-        raise ValueError(f"images of {width} x {height} cannot be cut into patches of {patch} x {patch} pixels")
+        raise ValueError(
+            f"images of {width} x {height} cannot be cut into patches of {patch} x {patch} pixels"
+        )
     x = maps.reshape(views, height // patch, patch, width // patch, patch, channels)
     return jnp.swapaxes(x, 2, 3).reshape(-1, patch * patch, channels)
 
@@ -60,9 +68,15 @@ def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
     return Packing(indices, jnp.minimum(jnp.sum(foreground), capacity))
 
 
-def unpack_tokens(tokens: Float[Array, "l d"], packing: Packing, patches: int) -> Float[Array, "p d"]:
+def unpack_tokens(
+    tokens: Float[Array, "l d"], packing: Packing, patches: int
+) -> Float[Array, "p d"]:
     """Tokens back at their patches, zeros elsewhere."""
-    return jnp.zeros((patches, tokens.shape[1]), tokens.dtype).at[packing.indices].set(tokens, mode="drop")
+    return (
+        jnp.zeros((patches, tokens.shape[1]), tokens.dtype)
+        .at[packing.indices]
+        .set(tokens, mode="drop")
+    )
 
 
 class Tokenizer(nn.Module):
@@ -79,7 +93,9 @@ class Tokenizer(nn.Module):
         rgb, rays, positions = jnp.split(patches, (3, 9), axis=-1)
         pixels = jnp.concatenate([2 * rgb - 1, rays, sample_triplane(texture, positions)], axis=-1)
         init = nn.initializers.normal(INIT_STD)
-        dense = nn.Dense(self.width, use_bias=False, dtype=self.dtype, kernel_init=init, name="linear")
+        dense = nn.Dense(
+            self.width, use_bias=False, dtype=self.dtype, kernel_init=init, name="linear"
+        )
         return dense(pixels.reshape(pixels.shape[0], -1))
 
 
@@ -115,18 +131,29 @@ class PatchTransformer(Encoder):
         """See `parts.Encoder`. Raises: ValueError if images and cameras differ in size, or are not made of whole patches."""
         see = encoder_pixels if self.geometry == "rays_and_positions" else photo_pixels
         patches = patchify(see(inputs, run), self.patch_size)
-        views, height, width = len(inputs.images), *(side // self.patch_size for side in inputs.images.shape[1:3])
+        views, height, width = (
+            len(inputs.images),
+            *(side // self.patch_size for side in inputs.images.shape[1:3]),
+        )
         dtype, present = run.runtime.compute_dtype, inputs.view_count
-        packing, dropped, count = None, jnp.zeros((), jnp.int32), None if present is None else present * height * width
+        packing, dropped, count = (
+            None,
+            jnp.zeros((), jnp.int32),
+            None if present is None else present * height * width,
+        )
         if run.tokens == "foreground":
             touched = touched_patches(inputs.foreground, present, self.patch_size)
-            packing = pack_patches(touched, min(run.runtime.token_capacity or len(touched), len(touched)))
+            packing = pack_patches(
+                touched, min(run.runtime.token_capacity or len(touched), len(touched))
+            )
             dropped, count = jnp.sum(touched, dtype=jnp.int32) - packing.count, packing.count
             patches = patches.at[packing.indices].get(mode="fill", fill_value=0)
         features, class_token = self.transformer.width, self.transformer.class_token
         tokens = Tokenizer(features, self.texture, dtype, name="tokenizer")(patches)
         if class_token:
-            first = self.param("class_token", nn.initializers.truncated_normal(INIT_STD), (1, features))
+            first = self.param(
+                "class_token", nn.initializers.truncated_normal(INIT_STD), (1, features)
+            )
             tokens = jnp.concatenate([first.astype(tokens.dtype), tokens])
             count = None if count is None else count + 1
 
@@ -141,7 +168,9 @@ class PatchTransformer(Encoder):
         if self.upsampler is None:
             return Encoding(maps[0], global_token, dropped, packing, self.patch_size)
         real = None if present is None else jnp.arange(views) < present
-        upsampled = Upsampler(self.upsampler, dtype, run.axis_name, name="upsampler")(maps, run.train, real)
+        upsampled = Upsampler(self.upsampler, dtype, run.axis_name, name="upsampler")(
+            maps, run.train, real
+        )
         return Encoding(upsampled, global_token, dropped, packing, self.patch_size)
 
 
@@ -152,11 +181,15 @@ def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]
     """
     height, width = inputs.images.shape[1:3]
     if (inputs.cameras.width, inputs.cameras.height) != (width, height):
-        raise ValueError(f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}")
+        raise ValueError(
+            f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}"
+        )
     unit = subject_unit(inputs.canonical_vertices)
     cameras = inputs.cameras.in_units(unit)
     twice = run.conventions.ray_origins == "twice_normalized"
-    rays = jax.vmap(plucker_rays)(cameras.in_units(unit) if twice else cameras).astype(inputs.images.dtype)
+    rays = jax.vmap(plucker_rays)(cameras.in_units(unit) if twice else cameras).astype(
+        inputs.images.dtype
+    )
     return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
 
 
@@ -172,7 +205,9 @@ def photo_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
     return jnp.concatenate([inputs.images, waves, jnp.zeros_like(inputs.images)], axis=-1)
 
 
-def touched_patches(foreground: Bool[Array, "v h w"], view_count: Int[Array, ""] | None, patch_size: int) -> Bool[Array, " p"]:
+def touched_patches(
+    foreground: Bool[Array, "v h w"], view_count: Int[Array, ""] | None, patch_size: int
+) -> Bool[Array, " p"]:
     """Which patches of all views the foreground touches; views beyond `view_count` are padding."""
     if view_count is not None:
         foreground = foreground & (jnp.arange(len(foreground)) < view_count)[:, None, None]
@@ -180,8 +215,14 @@ def touched_patches(foreground: Bool[Array, "v h w"], view_count: Int[Array, ""]
 
 
 @functools.partial(jax.jit, static_argnames="patch_size")
-def needed_tokens(foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int) -> Int[Array, ""]:
+def needed_tokens(
+    foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int
+) -> Int[Array, ""]:
     """The token capacity that photos need: patches that the foreground touches. Of a batch, the largest."""
     count = lambda *subject: jnp.sum(touched_patches(*subject, patch_size), dtype=jnp.int32)
     batched = foreground.ndim == 4
-    return jnp.max(jax.vmap(count)(foreground, view_count)) if batched else count(foreground, view_count)
+    return (
+        jnp.max(jax.vmap(count)(foreground, view_count))
+        if batched
+        else count(foreground, view_count)
+    )

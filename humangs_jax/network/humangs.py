@@ -81,12 +81,18 @@ def apply_humangs(
     """
     statistics, run = variables.get("batch_stats", {}), config.run(train, axis_name)
     if not (train and statistics):
-        return cast(HumanGSOutputs, network(config.architecture).apply(variables, inputs, run)), statistics
-    outputs, updated = network(config.architecture).apply(variables, inputs, run, mutable=["batch_stats"])
+        return cast(
+            HumanGSOutputs, network(config.architecture).apply(variables, inputs, run)
+        ), statistics
+    outputs, updated = network(config.architecture).apply(
+        variables, inputs, run, mutable=["batch_stats"]
+    )
     return cast(HumanGSOutputs, outputs), cast(Variables, updated)["batch_stats"]
 
 
-def intermediates(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> dict[str, Any]:
+def intermediates(
+    variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig
+) -> dict[str, Any]:
     """What every module of the pass returns, by its path, as "encoder.transformer.block_0", in the order of the pass."""
     found = {}
 
@@ -121,7 +127,9 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     encoder_key, decoder_key = jax.random.split(key)
     inputs = _example_inputs(parts)
     zeros = lambda tree: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
-    after = lambda part, variables, *given: zeros(jax.eval_shape(lambda v: part.apply(v, *given, run), variables))
+    after = lambda part, variables, *given: zeros(
+        jax.eval_shape(lambda v: part.apply(v, *given, run), variables)
+    )
     made = {"encoder": parts.encoder.init(encoder_key, inputs, run)}
     encoding = after(parts.encoder, made["encoder"], inputs)
     made["reader"] = parts.reader.init(jax.random.fold_in(key, 2), encoding, inputs, run)
@@ -143,20 +151,33 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
 @functools.partial(jax.jit, static_argnames="config")
 def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
     """The first part of `apply_humangs`, with the running batch statistics. Raises: as it."""
-    return cast(Encoding, config.architecture.encoder.apply(part_variables(variables, "encoder"), inputs, config.run()))
+    return cast(
+        Encoding,
+        config.architecture.encoder.apply(
+            part_variables(variables, "encoder"), inputs, config.run()
+        ),
+    )
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def read(variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig) -> PyTree:
+def read(
+    variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig
+) -> PyTree:
     """The second part of `apply_humangs`: features of the body. Raises: as it."""
-    return config.architecture.reader.apply(part_variables(variables, "reader"), encoding, inputs, config.run())
+    return config.architecture.reader.apply(
+        part_variables(variables, "reader"), encoding, inputs, config.run()
+    )
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def decode(variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSOutputs:
+def decode(
+    variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig
+) -> HumanGSOutputs:
     """The third part of `apply_humangs`: canonical Gaussians, metric; `dropped_tokens` is 0 (it belongs to the encoding)."""
     own = part_variables(variables, "decoder")
-    return cast(HumanGSOutputs, config.architecture.decoder.apply(own, features, inputs, config.run()))
+    return cast(
+        HumanGSOutputs, config.architecture.decoder.apply(own, features, inputs, config.run())
+    )
 
 
 def part_variables(variables: Variables, part: str) -> Variables:

@@ -36,7 +36,10 @@ PixelGrid = Literal["half_pixel", "mixed"]
 
 
 def texel_indices(
-    pixels: Float[Array, "*p 2"], image_size: tuple[int, int], grid_size: tuple[int, int], convention: PixelGrid
+    pixels: Float[Array, "*p 2"],
+    image_size: tuple[int, int],
+    grid_size: tuple[int, int],
+    convention: PixelGrid,
 ) -> Float[Array, "*p 2"]:
     """Positions in pixels of an image -> texel indices of a grid that covers it; sizes are (width, height)."""
     image, grid = jnp.asarray(image_size, pixels.dtype), jnp.asarray(grid_size, pixels.dtype)
@@ -45,7 +48,9 @@ def texel_indices(
     return pixels / image * (grid - 1)
 
 
-def sample_bilinear(grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0) -> Float[Array, "*p c"]:
+def sample_bilinear(
+    grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0
+) -> Float[Array, "*p c"]:
     """Bilinear interpolation between texel centres; texels outside of the grid count as zeros.
 
     origin: the texel index, in both axes, that `indices` are relative to; counted from the middle, float32 positions
@@ -56,7 +61,9 @@ def sample_bilinear(grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], 
     size = jnp.asarray([width, height], indices.dtype)
     absolute = indices + origin
     inside = jnp.all((absolute > -1) & (absolute < size), axis=-1, keepdims=True)
-    corner = jnp.floor(jnp.where(inside, absolute, -1.0))  # outside: weight one on a texel that does not exist
+    corner = jnp.floor(
+        jnp.where(inside, absolute, -1.0)
+    )  # outside: weight one on a texel that does not exist
     fraction = jnp.where(inside, indices, corner - origin) - (corner - origin)
     x0, y0 = jnp.moveaxis(corner.astype(jnp.int32), -1, 0)
     rows = grid.reshape(height * width, channels)
@@ -66,7 +73,9 @@ def sample_bilinear(grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], 
         for dx in (0, 1):
             x, y = x0 + dx, y0 + dy
             exists = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            weight = (fraction[..., 0] if dx else 1 - fraction[..., 0]) * (fraction[..., 1] if dy else 1 - fraction[..., 1])
+            weight = (fraction[..., 0] if dx else 1 - fraction[..., 0]) * (
+                fraction[..., 1] if dy else 1 - fraction[..., 1]
+            )
             texel = rows.at[jnp.where(exists, y * width + x, 0)].get(mode="promise_in_bounds")
             total = total + jnp.where(exists, weight, 0.0)[..., None] * texel
     return total
@@ -109,7 +118,11 @@ def sample_neighborhoods(
     for i in range(KERNEL + 1):
         row = [texel(i, j) for j in range(KERNEL + 1)]
         across.append([first[:, :1] * row[b] + second[:, :1] * row[b + 1] for b in range(KERNEL)])
-    taps = [first[:, 1:] * across[a][b] + second[:, 1:] * across[a + 1][b] for a in range(KERNEL) for b in range(KERNEL)]
+    taps = [
+        first[:, 1:] * across[a][b] + second[:, 1:] * across[a + 1][b]
+        for a in range(KERNEL)
+        for b in range(KERNEL)
+    ]
     return jnp.concatenate(taps, axis=-1), jnp.prod(first + second, axis=-1)
 
 
@@ -124,21 +137,29 @@ def convolve_neighborhoods(
     coverages.
     """
     x, kernel = promote_dtype(neighborhoods, kernel, dtype=dtype)
-    products = jnp.matmul(x, kernel.reshape(-1, kernel.shape[-1]), preferred_element_type=coverages.dtype)
+    products = jnp.matmul(
+        x, kernel.reshape(-1, kernel.shape[-1]), preferred_element_type=coverages.dtype
+    )
     return products + coverages[:, None] * bias
 
 
-def convolve(x: Float[Array, "v h w c"], kernel: Float[Array, "k k c d"]) -> Float[Array, "v h w d"]:
+def convolve(
+    x: Float[Array, "v h w c"], kernel: Float[Array, "k k c d"]
+) -> Float[Array, "v h w d"]:
     """Every pixel's 3x3 neighbourhood, zeros outside of the map, times the kernel."""
     return lax.platform_dependent(x, kernel, cpu=_convolve_on_cpu, default=_convolve)
 
 
-def _convolve(x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]) -> Float[Array, "v h w d"]:
+def _convolve(
+    x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]
+) -> Float[Array, "v h w d"]:
     return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=LAYOUT)
 
 
 @jax.custom_vjp
-def _convolve_on_cpu(x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]) -> Float[Array, "v h w d"]:
+def _convolve_on_cpu(
+    x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]
+) -> Float[Array, "v h w d"]:
     return _convolve(x, kernel)
 
 
@@ -149,13 +170,16 @@ def _forward(
 
 
 def _backward(
-    residuals: tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]], cotangent: Float[Array, "v h w d"]
+    residuals: tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]],
+    cotangent: Float[Array, "v h w d"],
 ) -> tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]]:
     x, kernel = residuals
     x_gradient = _convolve(cotangent, jnp.swapaxes(kernel[::-1, ::-1], 2, 3))
     # channels of x are the batch, views are what is contracted, the cotangent's pixels are the window
     maps, window = jnp.transpose(x, (3, 1, 2, 0)), jnp.transpose(cotangent, (1, 2, 0, 3))
-    kernel_gradient = lax.conv_general_dilated(maps, window, (1, 1), [(1, 1), (1, 1)], dimension_numbers=LAYOUT)
+    kernel_gradient = lax.conv_general_dilated(
+        maps, window, (1, 1), [(1, 1), (1, 1)], dimension_numbers=LAYOUT
+    )
     return x_gradient, jnp.transpose(kernel_gradient, (1, 2, 0, 3))
 
 
@@ -171,7 +195,9 @@ class Convolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w d"]:
-        kernel = self.param("kernel", self.kernel_init, (KERNEL, KERNEL, x.shape[-1], self.features))
+        kernel = self.param(
+            "kernel", self.kernel_init, (KERNEL, KERNEL, x.shape[-1], self.features)
+        )
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         x, kernel, bias = promote_dtype(x, kernel, bias, dtype=self.dtype)
         return convolve(x, kernel) + bias

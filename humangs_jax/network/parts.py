@@ -176,7 +176,9 @@ class HumanGSOutputs:
     gaussians: Gaussians
     tight_offsets: Float[Array, "n t 3"] | None = None
     skinning_offsets: Float[Array, "g j"] | None = None
-    dropped_tokens: Int[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    dropped_tokens: Int[Array, ""] = dataclasses.field(
+        default_factory=lambda: jnp.zeros((), jnp.int32)
+    )
     skinning_weights: Float[Array, "g j"] | None = None
     scene: PyTree = None
 
@@ -266,7 +268,12 @@ class Driver(Part, nn.Module):
 
     @nn.nowrap
     def show(
-        self, variables: Variables, config: PyTree, inputs: PyTree, targets: PyTree, background: float
+        self,
+        variables: Variables,
+        config: PyTree,
+        inputs: PyTree,
+        targets: PyTree,
+        background: float,
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
         """Images and alpha of the person of one capture in the views of another, for evaluations. variables, config: the
         network's.

@@ -27,7 +27,15 @@ from humangs_jax.network.maps import (
     sample_neighborhoods,
     texel_indices,
 )
-from humangs_jax.network.parts import Encoding, HumanGSInputs, Pass, Reader, Shells, VertexFeatures, subject_unit
+from humangs_jax.network.parts import (
+    Encoding,
+    HumanGSInputs,
+    Pass,
+    Reader,
+    Shells,
+    VertexFeatures,
+    subject_unit,
+)
 from humangs_jax.network.upsampler import KAIMING
 
 DEPTH_EPSILON = 1e-6
@@ -60,14 +68,22 @@ class PixelAlignedReader(Reader):
         super().__post_init__()
         ascending = all(a < b for a, b in itertools.pairwise(self.shells))
         if not (ascending and all(0 <= x < math.inf for x in self.shells)):
-            raise ValueError(f"shells {self.shells}: expected ascending distances, finite and at least 0")
+            raise ValueError(
+                f"shells {self.shells}: expected ascending distances, finite and at least 0"
+            )
 
     @nn.compact
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
-        grid, unit, maps = run.conventions.pixel_grid, subject_unit(inputs.canonical_vertices), encoding.maps
+        grid, unit, maps = (
+            run.conventions.pixel_grid,
+            subject_unit(inputs.canonical_vertices),
+            encoding.maps,
+        )
         cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
-        pixels, visible = project_and_test(cameras, vertices, inputs.depth_maps, inputs.present, grid)
+        pixels, visible = project_and_test(
+            cameras, vertices, inputs.depth_maps, inputs.present, grid
+        )
         pooled = visible if run.conventions.pool == "visible" else inputs.present[:, None]
         weights = jnp.broadcast_to(pooled, visible.shape).astype(pixels.dtype)
         size = (cameras.width, cameras.height)
@@ -77,7 +93,9 @@ class PixelAlignedReader(Reader):
         mean = lambda sums: jnp.einsum("n...,n->n...", sums, 1 / counts, precision=transform.EXACT)
         local = jax.tree.map(mean, sum_over_views(read, maps, indices, weights))
         if self.output_width is not None:
-            kernel = self.param("kernel", KAIMING, (KERNEL, KERNEL, maps.shape[-1], self.output_width))
+            kernel = self.param(
+                "kernel", KAIMING, (KERNEL, KERNEL, maps.shape[-1], self.output_width)
+            )
             bias = self.param("bias", nn.initializers.zeros, (self.output_width,))
             local = convolve_neighborhoods(*local, kernel, bias, run.runtime.compute_dtype)
         colors = fraction = shells = None
@@ -86,10 +104,22 @@ class PixelAlignedReader(Reader):
             fraction = (jnp.sum(visible, axis=0) / jnp.sum(inputs.present)).astype(pixels.dtype)
         if self.shells:
             if inputs.posed_normals is None:
-                raise ValueError("reader.shells needs posed_normals of the inputs, see `prepare_inputs`")
-            photos, points = (inputs.images, inputs.foreground, inputs.depth_maps), (vertices, inputs.posed_normals)
+                raise ValueError(
+                    "reader.shells needs posed_normals of the inputs, see `prepare_inputs`"
+                )
+            photos, points = (
+                (inputs.images, inputs.foreground, inputs.depth_maps),
+                (vertices, inputs.posed_normals),
+            )
             shells = sample_shells(*photos, cameras, *points, self.shells, inputs.present, grid)
-        return VertexFeatures(local, encoding.global_token, colors, fraction, shells=shells, normals=inputs.canonical_normals)
+        return VertexFeatures(
+            local,
+            encoding.global_token,
+            colors,
+            fraction,
+            shells=shells,
+            normals=inputs.canonical_normals,
+        )
 
 
 def project_and_test(
@@ -101,11 +131,15 @@ def project_and_test(
 ) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
     """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees none."""
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
-    see = lambda p, z, surface: visible_vertices(p, z, surface, (cameras.width, cameras.height), grid)
+    see = lambda p, z, surface: visible_vertices(
+        p, z, surface, (cameras.width, cameras.height), grid
+    )
     return pixels, jax.vmap(see)(pixels, depths, depth_maps) & present[:, None]
 
 
-def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
+def project_vertices(
+    camera: Camera, vertices: Float[Array, "n 3"]
+) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
     """Pixel positions and depths z of one camera; finite, also in gradients, for vertices in its plane or behind."""
     p = transform.apply(camera.cam_from_world, vertices)
     depth = p[:, 2]
@@ -156,7 +190,10 @@ def sum_over_views(
 
 
 def photo_colors(
-    images: Float[Array, "v h w 3"], pixels: Float[Array, "v n 2"], visible: Bool[Array, "v n"], grid: PixelGrid
+    images: Float[Array, "v h w 3"],
+    pixels: Float[Array, "v n 2"],
+    visible: Bool[Array, "v n"],
+    grid: PixelGrid,
 ) -> Float[Array, "n 3"]:
     """Mean photo color over the views that see each vertex, grey where none does."""
     size = (images.shape[2], images.shape[1])
@@ -198,7 +235,9 @@ def sample_shells(
         mask = mask[..., None].astype(image.dtype)  # the color of the background is not used
         read = sample_bilinear(jnp.concatenate([image * mask, mask], axis=-1), indices)
         surface = sample_nearest(depth_map, indices)
-        framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)
+        framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (
+            depths > 0
+        )
         visible = framed & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE))
         towards = camera.center - points
         distance = jnp.sqrt(jnp.maximum(jnp.sum(towards**2, axis=-1), SQUARED_DISTANCE_EPSILON))
@@ -206,7 +245,9 @@ def sample_shells(
         weight = jnp.where(visible, jnp.maximum(facing, 0), 0)
         return read[:, :3], read[:, 3], weight, framed
 
-    colors, masks, weights, framed = jax.vmap(view)(images, foreground, depth_maps, cameras, vertices, normals)
+    colors, masks, weights, framed = jax.vmap(view)(
+        images, foreground, depth_maps, cameras, vertices, normals
+    )
     framed, weights = framed & present[:, None], weights * present[:, None]
     total = jnp.sum(weights * masks, axis=0)
     sums = jnp.einsum("vpc,vp->pc", colors, weights, precision=transform.EXACT)

@@ -4,7 +4,15 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from humangs_jax.core.configuration import Edge, InputSide, Length, Room, Vertices, configuration, knob
+from humangs_jax.core.configuration import (
+    Edge,
+    InputSide,
+    Length,
+    Room,
+    Vertices,
+    configuration,
+    knob,
+)
 from humangs_jax.network.maps import PixelGrid
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
@@ -26,7 +34,12 @@ class Runtime:
         measured=MEASURED,
     )
     """Patches that become tokens: "all", those that the "foreground" touches, or None: as the weights were trained."""
-    token_capacity: Room = knob(0, cost="tokens beyond it are dropped and counted", gain="time and memory", measured=MEASURED)
+    token_capacity: Room = knob(
+        0,
+        cost="tokens beyond it are dropped and counted",
+        gain="time and memory",
+        measured=MEASURED,
+    )
     """Slots for foreground tokens over all views, 0: room for all patches. `reconstruct` and `stack_captures` fit it to the
     photos; in training it is for the largest number of photos, see `training.forward.token_share`."""
     dtype: ComputeType = knob(
@@ -37,10 +50,18 @@ class Runtime:
     )
     """Of the encoder's products; parameters, norms, softmax statistics and the decoder stay float32 at least."""
     attention: Literal["auto"] | AttentionKernel = knob(
-        "auto", cost="none", gain="chunked: a third of the time on CPUs, memory linear in tokens", measured=MEASURED
+        "auto",
+        cost="none",
+        gain="chunked: a third of the time on CPUs, memory linear in tokens",
+        measured=MEASURED,
     )
     """See `network.transformer`."""
-    scan: bool = knob(False, cost="a copy of the blocks' parameters", gain="compile time on TPU and GPU", measured=MEASURED)
+    scan: bool = knob(
+        False,
+        cost="a copy of the blocks' parameters",
+        gain="compile time on TPU and GPU",
+        measured=MEASURED,
+    )
     """Run the blocks as one compiled loop. Their parameters are copied side by side in every call (12 layers of 768: 340 MB)."""
     remat: Literal["none", "full", "dots"] = knob(
         "none", cost="a third more arithmetic", gain="memory of training", measured=MEASURED
@@ -56,11 +77,16 @@ class Runtime:
     )
     """Metres to which edges of the body are split beyond what the weights were trained with, None for no more."""
     body_vertices: Vertices | None = knob(
-        None, cost="detail of the body", gain="Gaussians and the time of a frame in proportion", measured=TRADE
+        None,
+        cost="detail of the body",
+        gain="Gaussians and the time of a frame in proportion",
+        measured=TRADE,
     )
     """Vertices to which the body is decimated, fewer than the weights were trained with, None for no fewer. Gaussians shrink or
     grow with the distance between vertices, so that they cover as much as before."""
-    image_size: InputSide | None = knob(None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE)
+    image_size: InputSide | None = knob(
+        None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE
+    )
     """Side of the photos in pixels, a multiple of the patch size; None: as the weights were trained."""
     crop: bool = knob(
         False,
@@ -125,10 +151,16 @@ class Conventions:
     """Metres that a pixel of the training images shows of the person, if their low-pass is to be part of the scales
     (`Gaussians.low_pass`); None: it stays with the renderer."""
     body_vertices: Vertices | None = knob(
-        None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
+        None,
+        cost="detail of the body",
+        gain="Gaussians, reads and decoding in proportion",
+        measured=EVALUATION,
     )
     """Number of vertices to which bodies are decimated; None: they are not."""
     longest_edge: Edge | None = knob(
-        None, cost="Gaussians grow as it shrinks", gain="detail where the body is coarse", measured=EVALUATION
+        None,
+        cost="Gaussians grow as it shrinks",
+        gain="detail where the body is coarse",
+        measured=EVALUATION,
     )
     """Metres to which their edges are split afterwards; None: they are not."""

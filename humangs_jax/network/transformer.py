@@ -60,7 +60,9 @@ def chunked_attention(
     blocks = -(-length // query_chunk)
     block = -(-length // blocks)
     q, k, v = (jnp.swapaxes(x, 0, 1) for x in (q * width**-0.5, k, v))
-    q = jnp.pad(q, ((0, 0), (0, blocks * block - length), (0, 0))).reshape(heads, blocks, block, width)
+    q = jnp.pad(q, ((0, 0), (0, blocks * block - length), (0, 0))).reshape(
+        heads, blocks, block, width
+    )
     statistics = jnp.promote_types(q.dtype, jnp.float32)
     absent = None if count is None else jnp.arange(k.shape[1]) >= count
 
@@ -71,8 +73,12 @@ def chunked_attention(
             logits = jnp.where(absent, jnp.finfo(statistics).min, logits)
         weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
         total = jnp.sum(weights, axis=-1, keepdims=True)
-        out = jnp.einsum("qk,ke->qe", weights.astype(values.dtype), values, preferred_element_type=statistics)
-        return (out / total).astype(values.dtype)  # dividing the sum spares a pass over the L x L weights
+        out = jnp.einsum(
+            "qk,ke->qe", weights.astype(values.dtype), values, preferred_element_type=statistics
+        )
+        return (out / total).astype(
+            values.dtype
+        )  # dividing the sum spares a pass over the L x L weights
 
     def attend_head(head):
         queries, keys, values = head
@@ -94,7 +100,9 @@ def attention(
     if resolved == "chunked":
         return chunked_attention(q, k, v, count)
     lengths = None if count is None else count.astype(jnp.int32)[None]
-    out = jax.nn.dot_product_attention(q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved)
+    out = jax.nn.dot_product_attention(
+        q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved
+    )
     return out[0]
 
 
@@ -107,10 +115,14 @@ class Attention(nn.Module):
     kernel_init: Any
 
     @nn.compact
-    def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
+    def __call__(
+        self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None
+    ) -> Float[Array, "l d"]:
         length, width = tokens.shape
         heads, dtype = width // self.head_width, self.runtime.compute_dtype
-        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name)
+        dense = lambda features, name: nn.Dense(
+            features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name
+        )
         qkv = checkpoint_name(dense(3 * width, "qkv")(tokens), PRODUCT)
         qkv = qkv.reshape(length, 3, heads, self.head_width)
         q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
@@ -146,12 +158,16 @@ class TransformerConfig:
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
         if self.width % self.head_width:
-            raise ValueError(f"width {self.width} is not a multiple of head_width {self.head_width}")
+            raise ValueError(
+                f"width {self.width} is not a multiple of head_width {self.head_width}"
+            )
 
 
 def layer_norm(dtype: Any, name: str, use_bias: bool = False) -> nn.LayerNorm:
     """The LayerNorm of the published network; the two-pass variance does not cancel."""
-    return nn.LayerNorm(epsilon=NORM_EPSILON, use_bias=use_bias, use_fast_variance=False, dtype=dtype, name=name)
+    return nn.LayerNorm(
+        epsilon=NORM_EPSILON, use_bias=use_bias, use_fast_variance=False, dtype=dtype, name=name
+    )
 
 
 class Block(nn.Module):
@@ -162,12 +178,18 @@ class Block(nn.Module):
     index: int
 
     @nn.compact
-    def __call__(self, x: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
+    def __call__(
+        self, x: Float[Array, "l d"], count: Int[Array, ""] | None = None
+    ) -> Float[Array, "l d"]:
         config, dtype = self.config, self.runtime.compute_dtype
         init = nn.initializers.normal(INIT_STD / (2 * (self.index + 1)) ** 0.5)
-        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=init, name=name)
+        dense = lambda features, name: nn.Dense(
+            features, use_bias=False, dtype=dtype, kernel_init=init, name=name
+        )
         normed = layer_norm(dtype, "norm1")(x)
-        x = x + Attention(config.head_width, config.qk_norm, self.runtime, init, name="attention")(normed, count)
+        x = x + Attention(config.head_width, config.qk_norm, self.runtime, init, name="attention")(
+            normed, count
+        )
         hidden = dense(config.mlp_ratio * config.width, "mlp_in")(layer_norm(dtype, "norm2")(x))
         hidden = checkpoint_name(hidden, PRODUCT)
         return x + dense(config.width, "mlp_out")(jax.nn.gelu(hidden, approximate=False))
@@ -180,7 +202,9 @@ class Transformer(nn.Module):
     runtime: Runtime
 
     @nn.compact
-    def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> list[Float[Array, "l d"]]:
+    def __call__(
+        self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None
+    ) -> list[Float[Array, "l d"]]:
         config, runtime = self.config, self.runtime
         x = layer_norm(runtime.compute_dtype, "input_norm")(tokens)
         x = x.astype(jnp.promote_types(x.dtype, jnp.float32))
@@ -189,7 +213,11 @@ class Transformer(nn.Module):
             x, collected = self._scan_blocks(x, count, quarters)
         else:
             collected = []
-            block_class = Block if runtime.remat == "none" else nn.remat(Block, policy=_POLICIES[runtime.remat])
+            block_class = (
+                Block
+                if runtime.remat == "none"
+                else nn.remat(Block, policy=_POLICIES[runtime.remat])
+            )
             for index in range(config.layers):
                 x = block_class(config, runtime, index, name=f"block_{index}")(x, count)
                 if index + 1 in quarters:
@@ -204,7 +232,10 @@ class Transformer(nn.Module):
         block = Block(config, self.runtime, 0, parent=None)
         blocks = [self.variables["params"][f"block_{index}"] for index in range(config.layers)]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *blocks)
-        slots = [quarters.index(i + 1) if i + 1 in quarters else len(quarters) for i in range(config.layers)]
+        slots = [
+            quarters.index(i + 1) if i + 1 in quarters else len(quarters)
+            for i in range(config.layers)
+        ]
 
         def step(carry, layer):
             x, kept = carry

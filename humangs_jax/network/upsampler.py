@@ -79,7 +79,10 @@ class Upsampler(nn.Module):
 
     @nn.compact
     def __call__(
-        self, maps: list[Float[Array, "v h w d"]], train: bool = False, present: Bool[Array, " v"] | None = None
+        self,
+        maps: list[Float[Array, "v h w d"]],
+        train: bool = False,
+        present: Bool[Array, " v"] | None = None,
     ) -> Float[Array, "v 4*h 4*w c"]:
         """present: views that count in the batch statistics; None: all."""
         hidden = self.config.hidden
@@ -100,8 +103,13 @@ class Upsampler(nn.Module):
         def convolution(features, name):
             return Convolution(features, KAIMING, self.dtype, name=name)
 
-        projected = [nn.Dense(hidden, dtype=self.dtype, kernel_init=KAIMING, name=f"project_{i}")(x) for i, x in enumerate(maps)]
-        x = norm_relu(convolution(2 * hidden, "fuse")(jnp.concatenate(projected, axis=-1)), "fuse_norm")
+        projected = [
+            nn.Dense(hidden, dtype=self.dtype, kernel_init=KAIMING, name=f"project_{i}")(x)
+            for i, x in enumerate(maps)
+        ]
+        x = norm_relu(
+            convolution(2 * hidden, "fuse")(jnp.concatenate(projected, axis=-1)), "fuse_norm"
+        )
         x = norm_relu(UpConvolution(hidden, self.dtype, name="up1")(x), "up1_norm")
         x = norm_relu(convolution(hidden, "conv1")(x), "conv1_norm")
         return norm_relu(UpConvolution(hidden // 2, self.dtype, name="up2")(x), "up2_norm")

@@ -18,7 +18,14 @@ from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
-from humangs_jax.network.parts import Decoder, HumanGSInputs, HumanGSOutputs, Pass, VertexFeatures, subject_unit
+from humangs_jax.network.parts import (
+    Decoder,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    VertexFeatures,
+    subject_unit,
+)
 from humangs_jax.network.reader import on_the_person
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -52,7 +59,10 @@ class VertexDecoder(Decoder):
     tight: Annotated[int, Range(0, 256)] = 1
     """Gaussians per vertex whose offsets a loss keeps small; K = tight + free."""
     free: Annotated[int, Range(0, 256)] = knob(
-        4, cost="detail: K = tight + free", gain="drawing in proportion to K", measured="evaluation.md"
+        4,
+        cost="detail: K = tight + free",
+        gain="drawing in proportion to K",
+        measured="evaluation.md",
     )
     """Gaussians per vertex without such a loss."""
     skinning_joints: Few | None = None
@@ -79,14 +89,20 @@ class VertexDecoder(Decoder):
         return self.tight + self.free
 
     @nn.compact
-    def __call__(self, features: VertexFeatures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, features: VertexFeatures, inputs: HumanGSInputs, run: Pass
+    ) -> HumanGSOutputs:
         """Gaussians of the n vertices, vertex-major, metres. Raises ValueError for features that lack the normals."""
         if self.frame == "normal" and features.normals is None:
-            raise ValueError('decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`')
+            raise ValueError(
+                'decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`'
+            )
         unit, shells = subject_unit(inputs.canonical_vertices), features.shells
         canonical = inputs.canonical_vertices / unit
         entering = features if self.frame == "normal" else replace(features, normals=None)
-        raw = self._heads(decoder_input(entering, canonical), 0 if shells is None else len(shells.distances))
+        raw = self._heads(
+            decoder_input(entering, canonical), 0 if shells is None else len(shells.distances)
+        )
         made = activate(raw, self, features)
         if run.conventions.pixels == "person" and shells is not None:
             # where the body is wider than the person, all photos show the background
@@ -112,11 +128,15 @@ class VertexDecoder(Decoder):
         k = self.gaussians_per_vertex
 
         def hidden_layer(x, name):
-            return jax.nn.relu(nn.Dense(self.hidden, kernel_init=nn.initializers.normal(INIT_STD), name=name)(x))
+            return jax.nn.relu(
+                nn.Dense(self.hidden, kernel_init=nn.initializers.normal(INIT_STD), name=name)(x)
+            )
 
         def head(x, name, bias, kernel_init):
             bias_init = lambda key, shape, dtype=jnp.float32: jnp.tile(jnp.asarray(bias, dtype), k)
-            last = nn.Dense(k * len(bias), kernel_init=kernel_init, bias_init=bias_init, name=f"{name}_out")
+            last = nn.Dense(
+                k * len(bias), kernel_init=kernel_init, bias_init=bias_init, name=f"{name}_out"
+            )
             return last(hidden_layer(x, f"{name}_hidden")).reshape(x.shape[0], k, len(bias))
 
         x = hidden_layer(hidden_layer(x, "trunk_0"), "trunk_1")
@@ -129,7 +149,9 @@ class VertexDecoder(Decoder):
         if shells:
             chosen = head(x, "shells", [INITIAL_SHELL] + [0.0] * (shells - 1), small)
         geometry = head(x, "geometry", [0.0] * 3 + list(quaternion.IDENTITY) + scales, small)
-        return RawGaussians(geometry, head(x, "appearance", [0.0] * 3 + [INITIAL_OPACITY], small), joints, chosen)
+        return RawGaussians(
+            geometry, head(x, "appearance", [0.0] * 3 + [INITIAL_OPACITY], small), joints, chosen
+        )
 
 
 @pytree_dataclass
@@ -174,7 +196,9 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
     vertices = canonical.shape[0]
     parts = [features.local]
     if features.global_token is not None:
-        parts.append(jnp.broadcast_to(features.global_token, (vertices, features.global_token.shape[0])))
+        parts.append(
+            jnp.broadcast_to(features.global_token, (vertices, features.global_token.shape[0]))
+        )
     parts.append(positional_encoding(canonical))
     if features.photo_colors is not None:
         assert features.visible_fraction is not None  # it comes with the colors
@@ -182,7 +206,12 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
     if features.normals is not None:
         parts.append(features.normals)
     if (shells := features.shells) is not None:
-        parts += [(2 * shells.colors - 1).reshape(vertices, -1), shells.seen, shells.inside, shells.hull]
+        parts += [
+            (2 * shells.colors - 1).reshape(vertices, -1),
+            shells.seen,
+            shells.inside,
+            shells.hull,
+        ]
     return jnp.concatenate(parts, axis=-1)
 
 
@@ -193,7 +222,9 @@ def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
     return quaternion.multiply(quaternion.between(oblique, normals), upright)
 
 
-def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None) -> VertexGaussians:
+def activate(
+    raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None
+) -> VertexGaussians:
     """Quaternion normalised, scale softplus, color and opacity sigmoid, offset bounded if so configured.
 
     With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along the normal and the mean
@@ -204,7 +235,11 @@ def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures 
     if config.offset_scale is not None:
         offsets = config.offset_scale * jnp.tanh(offsets / config.offset_scale)
     colors, opacities = raw.appearance[..., :3], raw.appearance[..., 3]
-    seen = None if features is None or features.photo_colors is None else features.photo_colors[:, None]
+    seen = (
+        None
+        if features is None or features.photo_colors is None
+        else features.photo_colors[:, None]
+    )
     if raw.shells is not None:
         assert features is not None and features.shells is not None  # where the logits come from
         shells, chosen = features.shells, jax.nn.softmax(raw.shells, axis=-1)
@@ -213,13 +248,17 @@ def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures 
     if config.frame == "normal":
         assert features is not None and features.normals is not None  # such a network is given them
         frames = normal_frames(features.normals)[:, None]
-        offsets = jnp.einsum("nkij,nkj->nki", quaternion.to_matrix(frames), offsets, precision=EXACT)
+        offsets = jnp.einsum(
+            "nkij,nkj->nki", quaternion.to_matrix(frames), offsets, precision=EXACT
+        )
         quats = quaternion.multiply(frames, quats)
     if config.residual_color:
         if seen is None:
             raise ValueError("decoder.residual_color needs a reader that gives photo_colors")
         colors = colors + inverse_sigmoid(seen, COLOR_MARGIN)
-    return VertexGaussians(offsets, quats, jax.nn.softplus(scales), jax.nn.sigmoid(opacities), jax.nn.sigmoid(colors))
+    return VertexGaussians(
+        offsets, quats, jax.nn.softplus(scales), jax.nn.sigmoid(opacities), jax.nn.sigmoid(colors)
+    )
 
 
 def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[Array, "n k"]:

@@ -69,7 +69,9 @@ def save_weights(
         for key, tensor in tensors.items():
             if np.abs(tensor).max(initial=0) > np.finfo(np.float16).max:
                 raise ValueError(f"{key}: overflows float16; store it as float32")
-    recorded = {name: config_to_json(getattr(config, name)) for name in ("architecture", "conventions")}
+    recorded = {
+        name: config_to_json(getattr(config, name)) for name in ("architecture", "conventions")
+    }
     stored = {key: np.ascontiguousarray(x, np.dtype(dtype)) for key, x in tensors.items()}
     metadata = {"format": FORMAT, "version": VERSION, **recorded}
     write_bytes(path, save(stored, metadata | {"checksum": checksum(stored, *recorded.values())}))
@@ -96,7 +98,9 @@ def load_weights(path: str | os.PathLike[str] | None = None) -> tuple[Variables,
     if path is None:
         with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
             if not shipped.exists():
-                raise FileNotFoundError("this installation ships no weights: give the path of a weights file")
+                raise FileNotFoundError(
+                    "this installation ships no weights: give the path of a weights file"
+                )
             return load_weights(shipped)
     if not Path(path).is_file():
         raise FileNotFoundError(f"no weights file {path}")
@@ -108,7 +112,9 @@ def _load_weights(path: str | os.PathLike[str]) -> tuple[Variables, HumanGSConfi
     tensors, _, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
-        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r}; found {found}")
+        raise ValueError(
+            f"{path}: expected header format {FORMAT!r}, version {VERSION!r}; found {found}"
+        )
     try:
         config = HumanGSConfig(
             config_from_json(Architecture, metadata.get("architecture", "")),
@@ -122,11 +128,15 @@ def _load_weights(path: str | os.PathLike[str]) -> tuple[Variables, HumanGSConfi
     return variables, config
 
 
-def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:
+def variables_from_tensors(
+    tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str
+) -> Variables:
     """Float32 variables from flat tensors keyed by path; ValueError naming the key unless they are exactly those."""
     expected = expected_variables(config)
     arrays = _check(tensors, expected, where)
-    return jax.tree.unflatten(jax.tree.structure(expected), [jnp.asarray(x, jnp.float32) for x in arrays.values()])
+    return jax.tree.unflatten(
+        jax.tree.structure(expected), [jnp.asarray(x, jnp.float32) for x in arrays.values()]
+    )
 
 
 def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
@@ -135,12 +145,16 @@ def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[st
     if missing := sorted(set(expected) - set(tensors)):
         raise ValueError(f"{where}: tensor {missing[0]!r} is missing ({len(missing)} in all)")
     if unknown := sorted(set(tensors) - set(expected)):
-        raise ValueError(f"{where}: tensor {unknown[0]!r} is unknown to this configuration ({len(unknown)} in all)")
+        raise ValueError(
+            f"{where}: tensor {unknown[0]!r} is unknown to this configuration ({len(unknown)} in all)"
+        )
     arrays = {}
     for key, leaf in expected.items():
         array = np.asarray(tensors[key])
         if array.shape != leaf.shape:
-            raise ValueError(f"{where}: tensor {key!r} has shape {array.shape}, the configuration wants {leaf.shape}")
+            raise ValueError(
+                f"{where}: tensor {key!r} has shape {array.shape}, the configuration wants {leaf.shape}"
+            )
         if not np.isfinite(array).all():
             raise ValueError(f"{where}: tensor {key!r} holds numbers that are not finite")
         arrays[key] = array

@@ -10,10 +10,30 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import hair, surfaces, tailoring
-from humangs_jax.people.anatomy import FLOOR, HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE, Anatomy, Vector
+from humangs_jax.people.anatomy import (
+    FLOOR,
+    HEAD,
+    LEFT_ANKLE,
+    LEFT_EYE,
+    NECK,
+    RIGHT_EYE,
+    Anatomy,
+    Vector,
+)
 from humangs_jax.people.fabrics import Fabric, Material, Spots, band, color, mix
 from humangs_jax.people.outfits import Garment
-from humangs_jax.people.surfaces import Faces, Field, Points, Surface, circle, grid_faces, join, ripples, sweep, unit
+from humangs_jax.people.surfaces import (
+    Faces,
+    Field,
+    Points,
+    Surface,
+    circle,
+    grid_faces,
+    join,
+    ripples,
+    sweep,
+    unit,
+)
 
 RING, COLUMNS = 40, 32
 """Points of a ring around neck or head; of a ring of a shoe."""
@@ -21,7 +41,9 @@ AZIMUTH = circle(RING)
 SIDEWAYS, UP, FORWARD = np.eye(3)
 
 
-def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float) -> list[tuple[Surface, Material]]:
+def build(
+    rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float
+) -> list[tuple[Surface, Material]]:
     """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk, metres."""
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
     hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
@@ -45,7 +67,9 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
 
 
 def _painted(dye: Vector, sheen: float) -> Material:
-    return Material(lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)), sheen=sheen)
+    return Material(
+        lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)), sheen=sheen
+    )
 
 
 def _panelled(fabric: Fabric, s: Spots) -> Points:
@@ -66,7 +90,11 @@ Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
 
 def neck_ring(anatomy: Anatomy, lift: float) -> Ring:
     """Around the neck at a lift above the crew neckline."""
-    return _ring(anatomy, np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02, -0.005)
+    return _ring(
+        anatomy,
+        np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02,
+        -0.005,
+    )
 
 
 def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> Ring:
@@ -90,9 +118,14 @@ def _followed(
     closed: bool = True,
 ) -> Surface:
     """A swept tube that moves with the skin nearest to it; its template coordinates are its own, around its middle."""
-    (x, y, _), (vertices, faces) = anatomy.skin.template.T, sweep(path, across, widths, columns, closed)
+    (x, y, _), (vertices, faces) = (
+        anatomy.skin.template.T,
+        sweep(path, across, widths, columns, closed),
+    )
     candidates = np.flatnonzero((np.abs(x) < 0.2) & (y > -0.35) & (y < 0.2))
-    weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, candidates), faces, 6)
+    weights = tailoring.smooth_weights(
+        tailoring.nearest_weights(anatomy, vertices, candidates), faces, 6
+    )
     around_middle = vertices - [0, anatomy.joints[NECK, 1] - 0.19, 0]
     return Surface(vertices, faces, weights).painted(around_middle, around_middle, 0.12)
 
@@ -100,7 +133,9 @@ def _followed(
 def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
     """A hood: over the head, or lying in folds around the neck and on the upper back."""
     if up:
-        return hair.falling_tube(rng, anatomy, 0.034, 0.1, _face_opening(0.31, 1.05, 0.096), wave=0.004, ends=0.1)
+        return hair.falling_tube(
+            rng, anatomy, 0.034, 0.1, _face_opening(0.31, 1.05, 0.096), wave=0.004, ends=0.1
+        )
     ring, outwards = neck_ring(anatomy, -0.012)
     behind = 0.5 - 0.5 * np.cos(AZIMUTH)  # 0 in front, 1 at the nape
     thick = 0.010 + 0.020 * behind + 0.016 * behind**4
@@ -111,12 +146,18 @@ def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
     return _followed(anatomy, path, UP + 0.5 * outwards * behind[:, None] ** 3, rolls, 12)
 
 
-def _face_opening(middle: float, half_width: float, half_height: float) -> Callable[[Field, Field], Field]:
+def _face_opening(
+    middle: float, half_width: float, half_height: float
+) -> Callable[[Field, Field], Field]:
     """Azimuths and heights -> positive outside of an oval around the face."""
-    return lambda sides, height: ((sides / half_width) ** 2 + ((height - middle) / half_height) ** 2 - 1) * 0.05
+    return lambda sides, height: (
+        ((sides / half_width) ** 2 + ((height - middle) / half_height) ** 2 - 1) * 0.05
+    )
 
 
-def scarf(rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: float, ease: float) -> Surface:
+def scarf(
+    rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: float, ease: float
+) -> Surface:
     """Two turns around the neck; tails: metres that its ends hang down in front, 0 for none."""
     parts = []
     for turn, lift in enumerate((-0.004, 0.022)):
@@ -134,7 +175,13 @@ def scarf(rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: f
 
 
 def _tail(
-    rng: np.random.Generator, anatomy: Anatomy, start: Vector, side: int, length: float, thickness: float, ease: float
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    start: Vector,
+    side: int,
+    length: float,
+    thickness: float,
+    ease: float,
 ) -> Surface:
     rows = max(5, int(length / 0.03))
     y = np.linspace(start[1] + 0.01, start[1] - length, rows)
@@ -149,14 +196,22 @@ def _tail(
 
 
 def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points) -> Surface:
-    return surfaces.rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(template, template, 0.09)
+    return surfaces.rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(
+        template, template, 0.09
+    )
 
 
 def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
     """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat outwards."""
-    template, size, closed = anatomy.skin.template, garment.sizes["brim"], garment.kind == "brim_hat"
+    template, size, closed = (
+        anatomy.skin.template,
+        garment.sizes["brim"],
+        garment.kind == "brim_hat",
+    )
     no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
-    ring, out = _ring(anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2])
+    ring, out = _ring(
+        anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2]
+    )
     if closed:
         start, widths = ring + out * 0.012, size * (1 + 0.12 * np.cos(AZIMUTH))
         droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
@@ -196,21 +251,40 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
         x, y = side * apart * 1.06 + half * radius * c, middle[1] - 0.004 + tall * radius * s
         path = np.stack([x, y, front - 9.0 * np.abs(x) ** 2.0 * 0.6], -1)
         parts.append(sweep(path, FORWARD, wire, 6, closed=True))
-        hinge = np.asarray([side * (apart * 1.06 + half), middle[1] + 0.006, front - 9.0 * (apart + half) ** 2 * 0.6])
+        hinge = np.asarray(
+            [
+                side * (apart * 1.06 + half),
+                middle[1] + 0.006,
+                front - 9.0 * (apart + half) ** 2 * 0.6,
+            ]
+        )
         on_ear = vertices[ear & (template[:, 0] * side > 0)]
-        hook = np.median(on_ear, 0) + np.asarray([side * 0.004, 0.006, 0]) if len(on_ear) else hinge - [0, 0, 0.09]
+        hook = (
+            np.median(on_ear, 0) + np.asarray([side * 0.004, 0.006, 0])
+            if len(on_ear)
+            else hinge - [0, 0, 0.09]
+        )
         line = hinge + np.linspace(0, 1, 6)[:, None] * (hook - hinge)
-        parts.append(sweep(np.concatenate([line, [hook + np.asarray([0, -0.014, -0.014])]]), UP, 1.1 * wire, 6))
+        parts.append(
+            sweep(
+                np.concatenate([line, [hook + np.asarray([0, -0.014, -0.014])]]), UP, 1.1 * wire, 6
+            )
+        )
         if dark:
             inner = np.concatenate([[path.mean(0) + np.asarray([0, 0, 0.002])], path])
             fan = np.stack([np.zeros(28, int), 1 + np.arange(28), 1 + (np.arange(28) + 1) % 28], -1)
             lenses.append((inner.astype(np.float32), fan.astype(np.int32)))
     across, flat = np.linspace(-1, 1, 7), np.full(7, front + 0.002)
-    bridge = np.stack([(apart * 1.06 - half) * across, middle[1] + 0.004 + 0.003 * (1 - across**2), flat], -1)
+    bridge = np.stack(
+        [(apart * 1.06 - half) * across, middle[1] + 0.004 + 0.003 * (1 - across**2), flat], -1
+    )
     parts.append(sweep(bridge, UP, wire, 6))
     glass = (lenses, _painted(color(0.08, 0.3, 0.06), 0.7))
     made = [(parts, _painted(garment.fabric.base, 0.4)), *([glass] if dark else [])]
-    return [(join([_on_head(anatomy, v, f, v - middle) for v, f in pieces]), material) for pieces, material in made]
+    return [
+        (join([_on_head(anatomy, v, f, v - middle) for v, f in pieces]), material)
+        for pieces, material in made
+    ]
 
 
 def necklace(anatomy: Anatomy, length: float) -> Surface:
@@ -231,14 +305,18 @@ def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
         near = (np.abs(x) < 0.1) & (y > -0.2) & (y < 0.08) & (z < -0.05)
         half, turn = np.asarray([0.145, 0.21, 0.075]) * size, np.pi
         height = float(tailoring.rest_height(anatomy, np.asarray([0.10]))[0]) - half[1]
-        behind = anatomy.trunk.radius(height + np.linspace(-0.6, 0.8, 9) * half[1], np.full(9, np.pi)).max()
+        behind = anatomy.trunk.radius(
+            height + np.linspace(-0.6, 0.8, 9) * half[1], np.full(9, np.pi)
+        ).max()
         center = np.asarray([0, height, -behind - ease - half[2] - 0.004])
     else:
         side = garment.sizes["side"]
         near = (x * side > 0.1) & (x * side < 0.24) & (np.abs(y + 0.22) < 0.05)
         half, turn = np.asarray([0.15, 0.11, 0.05]) * size, side * 1.75
         height = float(tailoring.rest_height(anatomy, np.asarray([-0.29]))[0]) - 0.75 * half[1]
-        around = anatomy.hips_and_legs.radius(height + np.linspace(-0.3, 1, 7) * half[1], np.full(7, turn))
+        around = anatomy.hips_and_legs.radius(
+            height + np.linspace(-0.3, 1, 7) * half[1], np.full(7, turn)
+        )
         reach = around.mean() + ease + half[2] + 0.008
         center = np.asarray([reach * np.sin(turn), height, reach * np.cos(turn)])
     directions, faces = surfaces.ball(14, 24)
@@ -259,24 +337,37 @@ def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) 
     own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
     points = anatomy.skin.vertices[own]
     floor = points[:, 1].min()
-    shaft = np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1)) if height > 0.1 else [height]
+    shaft = (
+        np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1))
+        if height > 0.1
+        else [height]
+    )
     low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
     levels = floor + np.concatenate([low[low < height - 0.004], shaft])
     # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices
-    thin, thick = (surfaces.boundaries(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
+    thin, thick = (
+        surfaces.boundaries(points[:, 1], points[:, [0, 2]], levels, None, window)
+        for window in (0.012, 0.03)
+    )
     shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
     pairs = (thin.centers, thick.centers), (thin.radii, surfaces.blurred(thick, 2).radii)
     shape = surfaces.Boundaries(levels, *(a + (b - a) * shin for a, b in pairs))
     shape = surfaces.hanging(shape, 0.6)  # the sole is as wide as what is above it
     below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
-    rows = [(floor + y, 0, extra) for y, extra in below] + [(level, i + 1, 0.0) for i, level in enumerate(levels[1:])]
+    rows = [(floor + y, 0, extra) for y, extra in below] + [
+        (level, i + 1, 0.0) for i, level in enumerate(levels[1:])
+    ]
     rings = []
     for y, i, extra in rows:
         radius = shape.radius(np.full(COLUMNS, levels[i]), circle(COLUMNS)) + ease + extra
         radius = radius if rings else 0 * radius
-        rings.append(surfaces.around(radius, circle(COLUMNS), np.full(COLUMNS, y), shape.centers[i]))
+        rings.append(
+            surfaces.around(radius, circle(COLUMNS), np.full(COLUMNS, y), shape.centers[i])
+        )
     vertices = np.concatenate(rings).astype(np.float32)
     faces = np.ascontiguousarray(grid_faces(len(rows), COLUMNS, closed=True)[:, ::-1])
     weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, own), faces, 3)
     local = vertices - np.where([True, False, True], anatomy.joints[LEFT_ANKLE + side], floor)
-    return surfaces.turn_in_hems(Surface(vertices, faces, weights).painted(local, local, 0.06), 0.01)
+    return surfaces.turn_in_hems(
+        Surface(vertices, faces, weights).painted(local, local, 0.06), 0.01
+    )

@@ -12,14 +12,34 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.people.surfaces import Boundaries, Faces, Field, Points, Surface, blurred, boundaries, vertex_normals
+from humangs_jax.people.surfaces import (
+    Boundaries,
+    Faces,
+    Field,
+    Points,
+    Surface,
+    blurred,
+    boundaries,
+    vertex_normals,
+)
 
 Rotations = Float[np.ndarray, "j 3"]
 """Rotation vectors of all joints, relative to their parents."""
 Vector = Float[np.ndarray, "3"]
 Matrix = Float[np.ndarray, "3 3"]
 
-PELVIS, LEFT_HIP, RIGHT_HIP, SPINE1, LEFT_KNEE, RIGHT_KNEE, SPINE2, LEFT_ANKLE, RIGHT_ANKLE, SPINE3 = range(10)
+(
+    PELVIS,
+    LEFT_HIP,
+    RIGHT_HIP,
+    SPINE1,
+    LEFT_KNEE,
+    RIGHT_KNEE,
+    SPINE2,
+    LEFT_ANKLE,
+    RIGHT_ANKLE,
+    SPINE3,
+) = range(10)
 LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
 LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
 LEFT_EYE, RIGHT_EYE, LEFT_HAND, RIGHT_HAND, JOINTS = 23, 24, 25, 40, 55
@@ -75,7 +95,9 @@ def rotation_vector(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-1])
 
 
-def between(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"], t: float) -> Float[np.ndarray, "*n 3"]:
+def between(
+    a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"], t: float
+) -> Float[np.ndarray, "*n 3"]:
     """Rotation vectors on the way from a to b, the shortest one, t in [0, 1]."""
     first = rotation_matrix(a)
     step = rotation_vector(np.swapaxes(first, -1, -2) @ rotation_matrix(b))
@@ -87,13 +109,17 @@ def turned(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Matrix:
     return rotation_matrix(np.asarray([x, y, z], float))
 
 
-def joint_positions(build: Build, rotations: Rotations) -> tuple[Float[np.ndarray, "j 3 3"], Rotations]:
+def joint_positions(
+    build: Build, rotations: Rotations
+) -> tuple[Float[np.ndarray, "j 3 3"], Rotations]:
     """World rotations (j, 3, 3) and positions (j, 3) of all joints for rotation vectors (j, 3)."""
     world, positions = rotation_matrix(rotations), np.array(build.joints, np.float64)
     for j, parent in enumerate(build.parents):
         if parent >= 0:  # parents come before their children
             world[j] = world[parent] @ world[j]
-            positions[j] = positions[parent] + world[parent] @ (build.joints[j] - build.joints[parent])
+            positions[j] = positions[parent] + world[parent] @ (
+                build.joints[j] - build.joints[parent]
+            )
     return world, positions
 
 
@@ -125,7 +151,10 @@ class Foot:
 
 Feet = tuple[Foot, ...]
 """The left and the right one."""
-LEGS = ((LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT), (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT))
+LEGS = (
+    (LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT),
+    (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT),
+)
 
 
 def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
@@ -141,7 +170,9 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
     return np.asarray([foot.x, foot.lift, foot.z]) + pivot + orientation @ offset, orientation
 
 
-def highest_pelvis(build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = REACH) -> float:
+def highest_pelvis(
+    build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = REACH
+) -> float:
     """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach their feet."""
     heights = []
     for side, foot in enumerate(feet):
@@ -164,9 +195,14 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
         hip, knee, ankle, ball = LEGS[side]
         target, orientation = ankle_of(build, side, foot)
         start = pelvis + turn @ (build.joints[hip] - build.joints[PELVIS])
-        thigh, shin = build.joints[knee] - build.joints[hip], build.joints[ankle] - build.joints[knee]
+        thigh, shin = (
+            build.joints[knee] - build.joints[hip],
+            build.joints[ankle] - build.joints[knee],
+        )
         bend = _knee_angle(thigh, shin, float(np.linalg.norm(target - start)))
-        across = turn[:, 0] + orientation[:, 0]  # knees point between where the pelvis and where the foot looks
+        across = (
+            turn[:, 0] + orientation[:, 0]
+        )  # knees point between where the pelvis and where the foot looks
         chain = thigh + turned(x=bend) @ shin
         upper = _frame(target - start, across) @ _frame(chain, np.asarray([1.0, 0.0, 0.0])).T
         lower = upper @ turned(x=bend)
@@ -182,7 +218,9 @@ def _knee_angle(thigh: Vector, shin: Vector, distance: float) -> float:
     """The knee's angle at which hip and ankle are at the given distance."""
     wanted = 0.5 * (distance**2 - thigh @ thigh - shin @ shin) - thigh[0] * shin[0]
     cosine, sine = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
-    return float(np.arctan2(sine, cosine) + np.arccos(np.clip(wanted / np.hypot(cosine, sine), -1, 1)))
+    return float(
+        np.arctan2(sine, cosine) + np.arccos(np.clip(wanted / np.hypot(cosine, sine), -1, 1))
+    )
 
 
 def _frame(direction: Vector, across: Vector) -> Matrix:
@@ -254,7 +292,9 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
     """(n, 4) cloth coordinates around the axis of the nearer leg, from the waist down: trousers, sewn along the middle."""
     x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])
-    leg = np.stack([x - np.where(x < 0, -1.0, 1.0) * knee, y, z + 0.01, np.full_like(x, LEG_GIRTH)], -1)
+    leg = np.stack(
+        [x - np.where(x < 0, -1.0, 1.0) * knee, y, z + 0.01, np.full_like(x, LEG_GIRTH)], -1
+    )
     return leg.astype(np.float32)
 
 
@@ -271,7 +311,9 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
     result[on_leg] = leg_coordinates(template[on_leg])
     x, y, z = template[on_arm].T
     around = np.where(x < 0, -1.0, 1.0) * (y - ARM_HEIGHT)
-    result[on_arm] = np.stack([around, ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, ARM_GIRTH)], -1)
+    result[on_arm] = np.stack(
+        [around, ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, ARM_GIRTH)], -1
+    )
     return result
 
 
@@ -284,7 +326,14 @@ def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Fie
     return template, cloth_coordinates(template), arm, leg_membership(template)
 
 
-def measure(vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple) -> Anatomy:
+def measure(
+    vertices: Points,
+    joints: np.ndarray,
+    template: Points,
+    faces: Faces,
+    weights: np.ndarray,
+    parents: tuple,
+) -> Anatomy:
     """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
@@ -301,10 +350,20 @@ def measure(vertices: Points, joints: np.ndarray, template: Points, faces: Faces
     for offset, side in enumerate((1, -1)):
         line = joints[[LEFT_ANKLE + offset, LEFT_KNEE + offset, LEFT_HIP + offset]]
         centers = np.stack([np.interp(levels, line[:, 1], line[:, i]) for i in (0, 2)], -1)
-        own = vertices[(template[:, 0] * side > 0.004) & (template[:, 1] < CROTCH + 0.1) & (template[:, 1] > -1.15)]
+        own = vertices[
+            (template[:, 0] * side > 0.004)
+            & (template[:, 1] < CROTCH + 0.1)
+            & (template[:, 1] > -1.15)
+        ]
         legs.append(blurred(boundaries(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
         line = joints[[LEFT_SHOULDER + offset, LEFT_WRIST + offset]]
         centers = np.stack([np.interp(along, np.abs(line[:, 0]), line[:, i]) for i in (1, 2)], -1)
-        own = vertices[(template[:, 0] * side > 0.2) & (template[:, 1] > -0.05) & (np.abs(template[:, 0]) < 0.68)]
+        own = vertices[
+            (template[:, 0] * side > 0.2)
+            & (template[:, 1] > -0.05)
+            & (np.abs(template[:, 0]) < 0.68)
+        ]
         arms.append(blurred(boundaries(np.abs(own[:, 0]), own[:, [1, 2]], along, centers, 0.025)))
-    return Anatomy(skin, joints, parents, arm, leg, blurred(torso), blurred(hips), tuple(legs), tuple(arms))
+    return Anatomy(
+        skin, joints, parents, arm, leg, blurred(torso), blurred(hips), tuple(legs), tuple(arms)
+    )

@@ -74,7 +74,9 @@ class BakedSubject:
     slopes: UInt8[np.ndarray, "t t 3"]
 
 
-def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1) -> BakedSubject:
+def bake_subject(
+    subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1
+) -> BakedSubject:
     """The textures of a subject, texture_size texels a side, each the mean of samples x samples points.
 
     No chart of the atlas is across two materials; faces (of people) are in finer detail.
@@ -89,14 +91,23 @@ def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: i
     covered = ids >= 0
     albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
     values = np.zeros((*ids.shape, 7), np.float32)
-    values[covered] = np.concatenate([albedo, slopes, np.ones((len(albedo), 1), np.float32)], axis=1)
+    values[covered] = np.concatenate(
+        [albedo, slopes, np.ones((len(albedo), 1), np.float32)], axis=1
+    )
     sums = values.reshape(texture_size, samples, texture_size, samples, 7).sum((1, 3))
     filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), sums[..., 6] > 0)
-    albedo, slopes = 255 * np.clip(filled[..., :3], 0, 1), np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127)
-    return BakedSubject(atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8))
+    albedo, slopes = (
+        255 * np.clip(filled[..., :3], 0, 1),
+        np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127),
+    )
+    return BakedSubject(
+        atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8)
+    )
 
 
-def strongest_joints(weights: Float[np.ndarray, "n j"], count: int) -> tuple[np.ndarray, np.ndarray]:
+def strongest_joints(
+    weights: Float[np.ndarray, "n j"], count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The `count` joints (n, k) of most weight of each vertex, strongest first, and their weights (n, k) scaled to sum 1."""
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
@@ -121,13 +132,20 @@ def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 204
         "glb": PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0),
     }
     known = {"betas": subject.betas, "rotations": posed.rotations, "translation": posed.translation}
-    known = {"seed": subject.seed, "lit": True} | {name: value.tolist() for name, value in known.items()}
+    known = {"seed": subject.seed, "lit": True} | {
+        name: value.tolist() for name, value in known.items()
+    }
 
     def write(temporary: Path):
         temporary.mkdir()
         for kind, material in materials.items():
             visual = TextureVisuals(uv=baked.atlas.uvs, material=material)
-            mesh = trimesh.Trimesh(posed.vertices[baked.atlas.vertices], baked.atlas.faces, visual=visual, process=False)
+            mesh = trimesh.Trimesh(
+                posed.vertices[baked.atlas.vertices],
+                baked.atlas.faces,
+                visual=visual,
+                process=False,
+            )
             mesh.export(temporary / f"{SCAN}.{kind}")
         write_json(temporary / PARAMETERS, known, indent=None)
 
@@ -227,11 +245,15 @@ def build_bank(
     if not seeds:
         raise ValueError("no seeds")
     _check_range(seeds, split)
-    make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count, displaced=displaced)
+    make = functools.partial(
+        _person, texture_size=texture_size, pose_count=pose_count, displaced=displaced
+    )
     if processes == 1:
         made = ((i, make(seed, body)) for i, seed in enumerate(seeds))
     else:
-        made = in_processes(make, {i: (seed,) for i, seed in enumerate(seeds)}, processes, _shipped_body)
+        made = in_processes(
+            make, {i: (seed,) for i, seed in enumerate(seeds)}, processes, _shipped_body
+        )
     people = dict(bar(made, total=len(seeds), desc="bank", shown=progress))
     return _stacked([people[i] for i in range(len(seeds))], body, split)
 
@@ -249,7 +271,9 @@ def load_bank(path: str | Path) -> PeopleBank:
         if str(arrays.get("format")) != FORMAT:
             raise ValueError(f"{path}: not a bank of people")
         if (version := int(arrays["version"])) != VERSION:
-            raise ValueError(f"{path}: a bank of version {version}; this program reads version {VERSION}")
+            raise ValueError(
+                f"{path}: a bank of version {version}; this program reads version {VERSION}"
+            )
         if missing := {*_ARRAYS, *_STATIC} - set(arrays):
             raise ValueError(f"{path}: a bank without {sorted(missing)}")
         _check_arrays(arrays)
@@ -270,12 +294,21 @@ def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
     for name in _ARRAYS:
         dimensions = PeopleBank.__annotations__[name].dim_str.split()
         if arrays[name].ndim != len(dimensions):
-            raise Refused(f"{name}: expected shape ({', '.join(dimensions)}), got {arrays[name].shape}")
+            raise Refused(
+                f"{name}: expected shape ({', '.join(dimensions)}), got {arrays[name].shape}"
+            )
         for dimension, size in zip(dimensions, arrays[name].shape, strict=True):
             if sizes.setdefault(dimension, int(dimension) if dimension.isdigit() else size) != size:
-                raise Refused(f"{name}: expected {dimension} = {sizes[dimension]}, got shape {arrays[name].shape}")
+                raise Refused(
+                    f"{name}: expected {dimension} = {sizes[dimension]}, got shape {arrays[name].shape}"
+                )
         check_array(name, arrays[name], arrays[name].shape)
-    bounds = {"faces": sizes["n"], "joint_ids": sizes["j"], "nearest": sizes["q"], "face_pieces": sizes["m"]}
+    bounds = {
+        "faces": sizes["n"],
+        "joint_ids": sizes["j"],
+        "nearest": sizes["q"],
+        "face_pieces": sizes["m"],
+    }
     for name, bound in bounds.items():
         check_indices(name, arrays[name], arrays[name].shape, bound)
     check_joints(arrays["parents"].tolist(), [""] * sizes["j"])
@@ -285,7 +318,9 @@ def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
 def _check_range(seeds: Sequence[int], split: str, where: str = "") -> None:
     for seed in seeds:
         if split_of(seed) != split:
-            raise ValueError(f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+            raise ValueError(
+                f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'"
+            )
 
 
 @functools.cache
@@ -294,21 +329,36 @@ def _shipped_body() -> BodyModel:
 
 
 def _person(
-    seed: int, body: BodyModel | None = None, *, texture_size: int, pose_count: int, displaced: BodyModel | None
+    seed: int,
+    body: BodyModel | None = None,
+    *,
+    texture_size: int,
+    pose_count: int,
+    displaced: BodyModel | None,
 ) -> dict[str, np.ndarray]:
     """One subject's share of the bank, unpadded: name -> array."""
     subject = make_subject(seed, _shipped_body() if body is None else body)
-    baked = bake_subject(subject, texture_size, 2 if texture_size <= 512 else 1)  # fine patterns on coarse texels
+    baked = bake_subject(
+        subject, texture_size, 2 if texture_size <= 512 else 1
+    )  # fine patterns on coarse texels
     surface, atlas, materials = subject.surface, baked.atlas, subject.materials
     if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
-        raise ValueError(f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many")
+        raise ValueError(
+            f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many"
+        )
     u, v = np.moveaxis(atlas.uvs[atlas.faces], -1, 0)
-    pad = lambda values, kind: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
+    pad = lambda values, kind: np.pad(
+        np.asarray(values), (0, MOST_MATERIALS - len(materials))
+    ).astype(kind)
     identities = [id(material) for material in materials]
     generators = (np.random.default_rng([seed, POSE_STREAM, i]) for i in range(pose_count))
-    rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
+    rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(
+        np.float32
+    )
     places = np.stack([joint_positions(subject.build, r.astype(np.float64))[1] for r in rotations])
-    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1)  # of each pose from the others
+    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(
+        -1
+    )  # of each pose from the others
     joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     return {
         "seeds": np.asarray(seed, np.int32),
@@ -328,21 +378,34 @@ def _person(
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
         "nearest": np.argmin(away + 1e9 * np.eye(pose_count), axis=1).astype(np.int32),
-        "displacements": np.zeros((0, 3), np.float16) if displaced is None else to_silhouettes(subject, displaced, rotations[0]),
+        "displacements": np.zeros((0, 3), np.float16)
+        if displaced is None
+        else to_silhouettes(subject, displaced, rotations[0]),
     }
 
 
-def to_silhouettes(subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "b 3"]:
+def to_silhouettes(
+    subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, "b 3"]:
     """The displacement of a body to what `SILHOUETTES` cameras around the dressed person see in a pose, metres."""
     rng, nowhere = np.random.default_rng([subject.seed, SILHOUETTE_STREAM]), np.zeros(3, np.float32)
     vertices = subject.posed_vertices(rotations, nowhere)
     cameras = cameras_around(rng, vertices, spread_azimuths(rng, SILHOUETTES), SILHOUETTE_SIDE)
-    pixels = np.asarray(jax.vmap(project, in_axes=(0, None))(cameras, jnp.asarray(vertices, jnp.float32))[0])
-    masks = np.stack([silhouette(view, subject.surface.faces, (SILHOUETTE_SIDE, SILHOUETTE_SIDE)) for view in pixels])
+    pixels = np.asarray(
+        jax.vmap(project, in_axes=(0, None))(cameras, jnp.asarray(vertices, jnp.float32))[0]
+    )
+    masks = np.stack(
+        [
+            silhouette(view, subject.surface.faces, (SILHOUETTE_SIDE, SILHOUETTE_SIDE))
+            for view in pixels
+        ]
+    )
     frames, names = np.zeros(SILHOUETTES, int), tuple(map(str, range(SILHOUETTES)))
     poses = jax.tree.map(lambda x: x[None], BodyPose(jnp.asarray(rotations), jnp.asarray(nowhere)))
     images = np.broadcast_to(masks[..., None], (*masks.shape, 3))
-    return displacement(body, Capture(images, masks, cameras, frames, body, subject.betas, poses, names)).astype(np.float16)
+    return displacement(
+        body, Capture(images, masks, cameras, frames, body, subject.betas, poses, names)
+    ).astype(np.float16)
 
 
 def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: str) -> PeopleBank:
@@ -356,12 +419,22 @@ def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: st
             return np.concatenate([array, np.repeat(array[:1], vertices - len(array), axis=0)])
         return array
 
-    fields: dict[str, Any] = {name: jnp.asarray(np.stack([padded(name, p[name]) for p in people])) for name in _ARRAYS}
-    return PeopleBank(**fields, parents=body.parents, mirrored_joints=mirrored_joints(body.joint_names), split=split)
+    fields: dict[str, Any] = {
+        name: jnp.asarray(np.stack([padded(name, p[name]) for p in people])) for name in _ARRAYS
+    }
+    return PeopleBank(
+        **fields,
+        parents=body.parents,
+        mirrored_joints=mirrored_joints(body.joint_names),
+        split=split,
+    )
 
 
 def mirrored_joints(names: tuple[str, ...]) -> tuple[int, ...]:
     """For each joint the one on the other side; joints in the middle are their own."""
     other = {"left": "right", "right": "left"}
-    swapped = [f"{other[n.split('_')[0]]}_{n.split('_', 1)[1]}" if n.split("_")[0] in other else n for n in names]
+    swapped = [
+        f"{other[n.split('_')[0]]}_{n.split('_', 1)[1]}" if n.split("_")[0] in other else n
+        for n in names
+    ]
     return tuple(names.index(name) for name in swapped)

@@ -40,7 +40,9 @@ class Spots:
         """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the middle, back and front apart."""
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
-        flat = np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1) * self._on_trunk  # 0 where the cloth hangs
+        flat = (
+            np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1) * self._on_trunk
+        )  # 0 where the cloth hangs
         x = self.cloth[:, 0]
         across = np.where(self.template[:, 2] > SHOULDER_RIDGE, x, np.sign(x) * np.pi * girth - x)
         return turned + flat * (across - turned)
@@ -54,7 +56,9 @@ class Spots:
     @property
     def _on_trunk(self) -> Bool[np.ndarray, " n"]:
         """(n,) whether this is cloth of a trunk, inside of the armholes."""
-        return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < SAME_GIRTH) & (np.abs(self.template[:, 0]) <= ARMHOLE)
+        return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < SAME_GIRTH) & (
+            np.abs(self.template[:, 0]) <= ARMHOLE
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +73,9 @@ class Material:
 
 def color(hue: float, saturation: float, value: float) -> Vector:
     """(3,) linear-as-given RGB."""
-    return np.asarray(colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32)
+    return np.asarray(
+        colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32
+    )
 
 
 DYES = {
@@ -83,7 +89,12 @@ DYES = {
 
 
 def _color_of(rng: np.random.Generator, ranges: Iterable[Sequence[float | int]]) -> Vector:
-    return color(*(rng.uniform(values[0], values[1]) if len(values) == 2 else rng.choice(values) for values in ranges))
+    return color(
+        *(
+            rng.uniform(values[0], values[1]) if len(values) == 2 else rng.choice(values)
+            for values in ranges
+        )
+    )
 
 
 def random_color(rng: np.random.Generator) -> Vector:
@@ -105,7 +116,9 @@ def mix(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Fi
     return a + (b - a) * amount[:, None]
 
 
-def band(x: Field, low: float | int | Field, high: float | int | Field, soft: float = 0.0015) -> Field:
+def band(
+    x: Field, low: float | int | Field, high: float | int | Field, soft: float = 0.0015
+) -> Field:
     """1 between low and high (metres), with soft edges."""
     return np.clip((x - low) / soft + 0.5, 0, 1) * np.clip((high - x) / soft + 0.5, 0, 1)
 
@@ -161,7 +174,11 @@ PATTERN_RULES = (
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
     """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly so."""
     plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
-    odds = plain_ones if rng.random() < plainness else {name: share for name, (share, _) in PATTERNS.items() if share}
+    odds = (
+        plain_ones
+        if rng.random() < plainness
+        else {name: share for name, (share, _) in PATTERNS.items() if share}
+    )
     pattern = choice(rng, odds)
     base = _dye(rng, kind)
     for kinds, usual, odds, kept in PATTERN_RULES:
@@ -198,7 +215,9 @@ def plain(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> P
     return base * (1 + 0.03 * Ripples(rng, 0.12)(s.cloth[:, :3]))[:, None]
 
 
-def stripes(s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upright: bool = False) -> Points:
+def stripes(
+    s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upright: bool = False
+) -> Points:
     """Stripes around (or, upright, along) the limb."""
     period, share = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09]), rng.uniform(0.25, 0.6)
     return mix(base, other, _lines(s.around if upright else s.along, period, share * period))
@@ -207,7 +226,11 @@ def stripes(s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upr
 def checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Gingham, or tartan with thin lines of a third dye."""
     period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
-    result = mix(base, other, 0.5 * (_lines(s.around, period, period / 2) + _lines(s.along, period, period / 2)))
+    result = mix(
+        base,
+        other,
+        0.5 * (_lines(s.around, period, period / 2) + _lines(s.along, period, period / 2)),
+    )
     lines = np.maximum(_lines(s.around, period, 0.004, 0.25), _lines(s.along, period, 0.004, 0.25))
     return mix(result, third, 0.7 * lines) if tartan else result
 
@@ -231,7 +254,11 @@ def flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
     r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
     petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
     dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
-    return mix(mix(base, dye, petals), np.asarray([0.85, 0.75, 0.3], np.float32), band(r, -1, period * 0.07, 0.002))
+    return mix(
+        mix(base, dye, petals),
+        np.asarray([0.85, 0.75, 0.3], np.float32),
+        band(r, -1, period * 0.07, 0.002),
+    )
 
 
 def mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
@@ -255,16 +282,29 @@ def denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> P
     """Faded on the front of the thighs and at creases, grained along the thread."""
     cloud, seed = Ripples(rng, 0.15), _seed(rng)
     fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
-    front = np.clip(s.cloth[:, 2] / 0.08, 0, 1) * np.exp(-(((s.along + 0.6) / 0.14) ** 2)) * (s.cloth[:, 3] < 0.14)
+    front = (
+        np.clip(s.cloth[:, 2] / 0.08, 0, 1)
+        * np.exp(-(((s.along + 0.6) / 0.14) ** 2))
+        * (s.cloth[:, 3] < 0.14)
+    )
     crease = np.clip(np.abs(_grain(s, 0.09, 0.022, seed + 1) - 0.5) * 8, 0, 1)
-    worn = np.exp(-(((s.along + 0.47) / 0.05) ** 2)) + 0.5 * np.exp(-(((s.along + 0.78) / 0.06) ** 2))
-    bright = 1 + 0.07 * cloud(s.cloth[:, :3]) + fade * front + 0.14 * (_grain(s, 0.003, 0.016, seed) - 0.5)
+    worn = np.exp(-(((s.along + 0.47) / 0.05) ** 2)) + 0.5 * np.exp(
+        -(((s.along + 0.78) / 0.06) ** 2)
+    )
+    bright = (
+        1
+        + 0.07 * cloud(s.cloth[:, :3])
+        + fade * front
+        + 0.14 * (_grain(s, 0.003, 0.016, seed) - 0.5)
+    )
     result = base * (bright + 0.5 * fade * worn * (1 - crease))[:, None]
     if not holes:
         return result
     at = ((s.along + 0.72) / 0.03) ** 2 + (s.around / 0.05) ** 2
     frayed = band(at + 0.6 * _grain(s, 0.02, 0.004, seed + 2), -1, 0.8, 0.2)
-    return mix(result, np.asarray([0.75, 0.74, 0.72], np.float32), 0.8 * frayed * (s.cloth[:, 2] > 0))
+    return mix(
+        result, np.asarray([0.75, 0.74, 0.72], np.float32), 0.8 * frayed * (s.cloth[:, 2] > 0)
+    )
 
 
 CAMOUFLAGES = np.asarray([
@@ -291,7 +331,11 @@ def camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector
 
 def herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Zigzags of slanted threads."""
-    period, pitch, share = rng.choice([0.03, 0.045]), rng.choice([0.008, 0.012]), rng.uniform(0.35, 0.7)
+    period, pitch, share = (
+        rng.choice([0.03, 0.045]),
+        rng.choice([0.008, 0.012]),
+        rng.uniform(0.35, 0.7),
+    )
     side = np.abs((s.around / period) % 2 - 1) * period
     return mix(base, base + share * (other - base), _lines(s.along + side, pitch, 0.5 * pitch))
 
@@ -314,13 +358,19 @@ def dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
         return mix(base, other, np.clip((s.along + 0.05 * wobble - level) / wide + 0.5, 0, 1))
     r = np.sqrt(s.around**2 + (s.along + 0.1) ** 2) + 0.06 * wobble
     twist = (r / 0.13 + np.arctan2(s.around, s.along + 0.1) / np.pi) % 1
-    return mix(mix(base, other, np.clip(np.abs(twist - 0.5) * 4 - 0.5, 0, 1)), third, band(twist, 0.4, 0.6, 0.15))
+    return mix(
+        mix(base, other, np.clip(np.abs(twist - 0.5) * 4 - 0.5, 0, 1)),
+        third,
+        band(twist, 0.4, 0.6, 0.15),
+    )
 
 
 def tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Woven in two threads of nearly one color."""
     seed, share = _seed(rng), rng.uniform(0.08, 0.25)
-    return mix(base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2)
+    return mix(
+        base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2
+    )
 
 
 def cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
@@ -336,7 +386,9 @@ def cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector)
 def color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """A chest (or thigh) in another dye, with a line between."""
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
-    return mix(mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level))
+    return mix(
+        mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level)
+    )
 
 
 PATTERNS: dict[str, tuple[float, Callable]] = {

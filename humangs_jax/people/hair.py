@@ -10,9 +10,29 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.people import surfaces
-from humangs_jax.people.anatomy import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3, Anatomy, Vector, smoothstep
+from humangs_jax.people.anatomy import (
+    HEAD,
+    LEFT_EYE,
+    NECK,
+    RIGHT_EYE,
+    SPINE3,
+    Anatomy,
+    Vector,
+    smoothstep,
+)
 from humangs_jax.people.outfits import HEADWEAR, drawn, row
-from humangs_jax.people.surfaces import Field, Points, Surface, around, blurred, boundaries, cut, rigid, ripples, smooth
+from humangs_jax.people.surfaces import (
+    Field,
+    Points,
+    Surface,
+    around,
+    blurred,
+    boundaries,
+    cut,
+    rigid,
+    ripples,
+    smooth,
+)
 from humangs_jax.people.tailoring import finished, nearest_weights
 
 CUTS = {
@@ -25,7 +45,12 @@ CUTS = {
 NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
 """Cuts that no headwear fits over."""
 LONG_CUTS = ("bob", "long")
-SHELLS = {"curly": (0.3, 0.035, 0), "afro": (0.1, 0.05, 0), "quiff": (0.2, 0.05, 1), "short": (0.22, 0.035, 1)}
+SHELLS = {
+    "curly": (0.3, 0.035, 0),
+    "afro": (0.1, 0.05, 0),
+    "quiff": (0.2, 0.05, 1),
+    "short": (0.22, 0.035, 1),
+}
 """Of hair on the scalp: height of its bumps as a share of the thickness, their width in metres, 1 if it is parted."""
 TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
 """Range of their lengths; distance of the knots, metres."""
@@ -66,12 +91,28 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
     thickness = min(thickness, 0.010) if headwear else thickness
     bottom = rng.uniform(0.15, 0.2) if cut == "bob" else rng.uniform(-0.17, 0.1)
     wave = rng.choice([rng.uniform(0.002, 0.004), rng.uniform(0.006, 0.014)], p=[0.55, 0.45])
-    receding = rng.uniform(-0.004, 0.012 + 0.012 * (years > 45)) if male else rng.uniform(-0.006, 0.004)
+    receding = (
+        rng.uniform(-0.004, 0.012 + 0.012 * (years > 45)) if male else rng.uniform(-0.006, 0.004)
+    )
     beard = drawn(rng, BEARDS) if male and years > 17 else "none"
     long = 0.35 if rng.random() < 0.8 else 1.0
     fringe, side = drawn(rng, FRINGES), float(rng.choice([-1, 1]))
-    beard_length, grain = rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016), rng.uniform(0.5, 0.95)
-    return Haircut(cut, fringe, side, float(thickness), bottom, float(wave), receding, beard, beard_length, grain)
+    beard_length, grain = (
+        rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016),
+        rng.uniform(0.5, 0.95),
+    )
+    return Haircut(
+        cut,
+        fringe,
+        side,
+        float(thickness),
+        bottom,
+        float(wave),
+        receding,
+        beard,
+        beard_length,
+        grain,
+    )
 
 
 SKULL = np.asarray([0.0, 0.345, 0.02])
@@ -97,17 +138,27 @@ FRINGE_LINES = {
 """Signed azimuths and heights above which longer hair covers the face: blunt, parted in the middle, combed to the right."""
 
 
-def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0) -> list[Surface]:
+def style(
+    rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0
+) -> list[Surface]:
     """The surfaces of a haircut, beard included, over clothes that are `over` metres from the skin."""
     kind, parts = haircut.cut, []
     if kind in LONG_CUTS:
         opening, wave = fringe(rng, haircut), haircut.wave
-        parts.append(falling_tube(rng, anatomy, haircut.thickness, haircut.bottom, opening, wave=wave, over=over))
+        parts.append(
+            falling_tube(
+                rng, anatomy, haircut.thickness, haircut.bottom, opening, wave=wave, over=over
+            )
+        )
     elif kind not in ("buzz", "bald"):
         bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
         quiff = rng.uniform(0.012, 0.026) if kind == "quiff" else 0.0
         side, shift = haircut.side * parted, haircut.receding
-        parts.append(scalp_shell(rng, anatomy, haircut.thickness, bumps, size, shift=shift, quiff=quiff, side=side))
+        parts.append(
+            scalp_shell(
+                rng, anatomy, haircut.thickness, bumps, size, shift=shift, quiff=quiff, side=side
+            )
+        )
     if kind in TAILS:
         length, knots = TAILS[kind]
         parts.append(tail(rng, anatomy, rng.uniform(*length), knots))
@@ -130,7 +181,11 @@ def fringe(rng: np.random.Generator, haircut: Haircut) -> Opening:
     def above(azimuths, height):
         a = azimuths * haircut.side
         waves = zip((0.0035, 0.0025, 0.003), (23, 41, 9), phase, strict=True)
-        return height - np.interp(a, angles, heights) - sum(size * np.sin(n * a + p) for size, n, p in waves)
+        return (
+            height
+            - np.interp(a, angles, heights)
+            - sum(size * np.sin(n * a + p) for size, n, p in waves)
+        )
 
     return above
 
@@ -143,7 +198,9 @@ def ears(template: Points) -> np.ndarray:
 
 def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
     """(n,) height above a hairline; strongly negative away from the head."""
-    azimuths = np.abs(np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2]))  # 0 in front, pi at the nape
+    azimuths = np.abs(
+        np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2])
+    )  # 0 in front, pi at the nape
     above = template[:, 1] - np.interp(azimuths, *line) - shift
     return np.where((template[:, 1] > 0.2) & (np.abs(template[:, 0]) < 0.12), above, -1.0)
 
@@ -166,7 +223,10 @@ def scalp_shell(
     side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge that stands off.
     """
     template = anatomy.skin.template
-    above, rim = above_line(template, CAP_LINE if hat else SHORT_LINE, shift), 0.011 if hat else 0.0025
+    above, rim = (
+        above_line(template, CAP_LINE if hat else SHORT_LINE, shift),
+        0.011 if hat else 0.0025,
+    )
     if not hat:
         above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
     surface = cut(anatomy.skin.with_attributes(above=above), above)
@@ -179,7 +239,11 @@ def scalp_shell(
     top = smoothstep(0.385, 0.425, y)
     if side:
         parting = np.exp(-(((x - side * 0.035) / 0.009) ** 2)) * top * (z > -0.02)
-        grown = grown * (1 - 0.55 * parting) * (1 + 0.25 * top * np.clip(-side * (x - side * 0.035) / 0.06, -1, 1))
+        grown = (
+            grown
+            * (1 - 0.55 * parting)
+            * (1 + 0.25 * top * np.clip(-side * (x - side * 0.035) / 0.06, -1, 1))
+        )
     points = base + grown[:, None] * normals
     raised = quiff * smoothstep(0.02, 0.085, z) * smoothstep(0.375, 0.41, y)
     points = points + raised[:, None] * np.asarray([0.0, 0.95, 0.35])
@@ -206,7 +270,9 @@ def falling_tube(
     to_rest, center = _skull(anatomy)
     scale = 1 + thickness / 0.09
     ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
-    head = (template[:, 1] > 0.24) & (np.abs(template[:, 0]) < 0.1) & ~ears & (template[:, 2] < 0.125)
+    head = (
+        (template[:, 1] > 0.24) & (np.abs(template[:, 0]) < 0.1) & ~ears & (template[:, 2] < 0.125)
+    )
     levels = np.concatenate([np.arange(-0.3, 0.24, 0.02), np.linspace(0.24, CROWN - 0.0015, 24)])
     spine = np.repeat(center[None, [0, 2]], len(levels), 0)
     points = skin.vertices[head]
@@ -223,7 +289,9 @@ def falling_tube(
     height = to_rest(row_height)
     inner = center[1] + (height - center[1]) / scale
     brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
-    vault = np.sqrt(np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1))  # the dome above the brim
+    vault = np.sqrt(
+        np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1)
+    )  # the dome above the brim
     radius = scale * vault * falling.radius(np.minimum(inner, brim), angle)
     on_back = back.radius(height, angle) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)
     radius = np.maximum(radius, on_back * (row_height < 0.24))
@@ -239,7 +307,9 @@ def falling_tube(
     surface = Surface(vertices, faces, _falling_weights(anatomy, vertices, row_height))
     surface = surface.painted(flat, flat - np.asarray([0, 0, 0.02], np.float32), 0.09)
     surface = cut(surface, np.minimum(opening(signed, row_height), row_height - hem))
-    return finished(surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 2, 0.008)
+    return finished(
+        surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 2, 0.008
+    )
 
 
 def bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
@@ -257,7 +327,9 @@ def tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float
     rows, columns = 40 if knots else 16, 14
     t = np.linspace(0, 1, rows)
     sway = 0.012 * np.sin(3 * t + rng.uniform(0, 6)) * t
-    line = start + np.stack([sway, -length * t**1.3, -0.05 * np.sin(np.pi * np.minimum(t * 1.6, 1) / 1.3) - 0.01], -1)
+    line = start + np.stack(
+        [sway, -length * t**1.3, -0.05 * np.sin(np.pi * np.minimum(t * 1.6, 1) / 1.3) - 0.01], -1
+    )
     radius = np.interp(t, [0, 0.12, 0.4, 0.8, 1], [0.016, 0.026, 0.030, 0.020, 0.004])
     if knots:
         radius = 0.85 * radius * (1 + 0.22 * np.cos(2 * np.pi * length * t / knots))
@@ -321,7 +393,9 @@ def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
     return to_rest, np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
 
 
-def _falling_weights(anatomy: Anatomy, vertices: Points, template_y: Field) -> Float[np.ndarray, "n j"]:
+def _falling_weights(
+    anatomy: Anatomy, vertices: Points, template_y: Field
+) -> Float[np.ndarray, "n j"]:
     """Weights of the head above the jaw, blending into those of the nearest skin further down."""
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.15) & (y > -0.3) & (y < 0.26))[::2]

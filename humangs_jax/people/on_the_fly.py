@@ -73,14 +73,20 @@ class OnTheFlyConfig:
     """Of examples: their body is displaced to the silhouettes of the clothes, and they are not mirrored."""
     depths: bool = False
     """Also of every view."""
-    views_at_once: Few = knob(1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md")
+    views_at_once: Few = knob(
+        1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
+    )
     """Views drawn side by side: 1 suits CPUs, all of them accelerators."""
-    pixels_per_step: Slots = knob(1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md")
+    pixels_per_step: Slots = knob(
+        1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
+    )
     """Of the person, that are colored at a time: few for CPUs, whole images for accelerators."""
 
     def __post_init__(self):
         if max(self.view_counts, default=0) > self.input_views:
-            raise ValueError(f"view_counts {self.view_counts}: expected at most input_views, {self.input_views}")
+            raise ValueError(
+                f"view_counts {self.view_counts}: expected at most input_views, {self.input_views}"
+            )
 
 
 ON_THE_FLY = OnTheFlyConfig()
@@ -105,17 +111,24 @@ class Scene:
 
 
 def on_the_fly_example(
-    bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: Int[Array, ""] | int | None = None
+    bank: PeopleBank,
+    key: Key,
+    config: OnTheFlyConfig = ON_THE_FLY,
+    person: Int[Array, ""] | int | None = None,
 ) -> Example:
     """Views of a person of the bank: inputs and targets. person: its number in the bank; None: the key chooses.
 
     Raises: ValueError for a `displaced_share` of a bank that has none.
     """
     if config.displaced_share and not bank.displacements.shape[1]:
-        raise ValueError("displaced_share: the bank has no displacements: expected one of build_bank(displaced=body)")
+        raise ValueError(
+            "displaced_share: the bank has no displacements: expected one of build_bank(displaced=body)"
+        )
     numbers = _draw_numbers(bank, key, config)
     if person is not None:
-        numbers["person"] = jnp.asarray(person + 0.5) / bank.people  # which `pick` takes for this one
+        numbers["person"] = (
+            jnp.asarray(person + 0.5) / bank.people
+        )  # which `pick` takes for this one
     scene = scene_from(numbers, bank)
     count = None
     if config.view_counts:
@@ -125,32 +138,48 @@ def on_the_fly_example(
     if config.input_size == config.target_size:  # one loop over all views: half of the compilation
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
         views = _views(bank, scene, both, config, config.input_size)
-        parts = [_some(views, part) for part in (slice(config.input_views), slice(config.input_views, None))]
+        parts = [
+            _some(views, part)
+            for part in (slice(config.input_views), slice(config.input_views, None))
+        ]
     else:
         sizes = config.input_size, config.target_size
-        parts = [_views(bank, scene, plan, config, size) for plan, size in zip(plans, sizes, strict=True)]
+        parts = [
+            _views(bank, scene, plan, config, size) for plan, size in zip(plans, sizes, strict=True)
+        ]
     flipped = numbers["mirrored"] < config.mirrored_share
     if config.displaced_share:
         displaced = jax.random.uniform(jax.random.fold_in(key, DISPLACED)) < config.displaced_share
         flipped &= ~displaced
     choose = lambda a, b: jnp.where(flipped, a, b)
-    inputs, targets = (jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts)
+    inputs, targets = (
+        jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts
+    )
     if config.displaced_share:
         moved = bank.displacements[scene.person].astype(inputs.images.dtype)
         inputs = replace(inputs, displacement=jnp.where(displaced, moved, 0))
     return Example(replace(inputs, view_count=count), targets)
 
 
-def _draw_numbers(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> dict[str, Float[Array, "..."]]:
+def _draw_numbers(
+    bank: PeopleBank, key: Key, config: OnTheFlyConfig
+) -> dict[str, Float[Array, "..."]]:
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
-    shapes = {"person": (), "poses": (POSES, 2), "lights": (surroundings.LIGHT_NUMBERS,), "dyed": ()}
+    shapes = {
+        "person": (),
+        "poses": (POSES, 2),
+        "lights": (surroundings.LIGHT_NUMBERS,),
+        "dyed": (),
+    }
     shapes |= {"dyes": (4, bank.groups.shape[1]), "mirrored": (), "mixed": ()}
     for name, count in (("input", config.input_views), ("target", config.target_views)):
         shapes |= {f"{name}_azimuths": (2 + 2 * count,), f"{name}_poses": (count,)}
         shapes |= {f"{name}_cameras": (count, surroundings.CAMERA_NUMBERS)}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
     parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
-    return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
+    return {
+        name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)
+    }
 
 
 def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
@@ -158,9 +187,14 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
     person = pick(numbers["person"], bank.people)
     faces = bank.faces[person].astype(jnp.int32)
     which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
-    poses, nearest = bank.rotations[person, which], bank.rotations[person, bank.nearest[person, which]]
+    poses, nearest = (
+        bank.rotations[person, which],
+        bank.rotations[person, bank.nearest[person, which]],
+    )
     rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
-    dyes = surroundings.dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
+    dyes = surroundings.dyes_from(
+        numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person]
+    )
     dyes = jnp.where(numbers["dyed"] < DYED_SHARE, dyes, jnp.eye(3))
     lights = surroundings.lights_from(numbers["lights"])
 
@@ -179,47 +213,72 @@ def pose_person(
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
     """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the translation (3,)."""
     nowhere = jnp.zeros(3, rotations.dtype)
-    transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[:, :3].reshape(-1, 12)
-    ids, weights = bank.joint_ids[person].astype(jnp.int32), bank.joint_weights[person].astype(rotations.dtype)
+    transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[
+        :, :3
+    ].reshape(-1, 12)
+    ids, weights = (
+        bank.joint_ids[person].astype(jnp.int32),
+        bank.joint_weights[person].astype(rotations.dtype),
+    )
     weights = weights / weights.sum(-1, keepdims=True)  # they are stored in few bits
-    blended = jnp.asarray(sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1])))
+    blended = jnp.asarray(
+        sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1]))
+    )
     x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
     nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
     # written out: matrix products are of low precision on GPU and TPU
     vertices = blended[:, 0::4] * x + blended[:, 1::4] * y + blended[:, 2::4] * z + blended[:, 3::4]
     normals = blended[:, 0::4] * nx + blended[:, 1::4] * ny + blended[:, 2::4] * nz
     translation = nowhere.at[1].set(-vertices[:, 1].min())
-    return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
+    return (
+        vertices + translation,
+        normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9),
+        translation,
+    )
 
 
-def _plans(numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None) -> tuple[Plan, Plan]:
+def _plans(
+    numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None
+) -> tuple[Plan, Plan]:
     """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,).
 
     count: of the inputs; after them the last one is repeated. None: all.
     """
-    azimuths = surroundings.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share, count)
+    azimuths = surroundings.azimuths_from(
+        numbers["input_azimuths"], config.jitter, config.scattered_share, count
+    )
     own, other = (pick(numbers[name], POSES) for name in ("input_poses", "target_poses"))
     own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
     anywhere = surroundings.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
     close = jnp.full(config.target_views, CLOSE_SHARE)
     inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
     if count is not None:
-        inputs = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(config.input_views), count - 1)], inputs)
+        inputs = jax.tree.map(
+            lambda x: x[jnp.minimum(jnp.arange(config.input_views), count - 1)], inputs
+        )
     return inputs, (numbers["target_cameras"], anywhere, other, close)
 
 
-def _views(bank: PeopleBank, scene: Scene, plan: Plan, config: OnTheFlyConfig, size: int) -> SubjectViews:
+def _views(
+    bank: PeopleBank, scene: Scene, plan: Plan, config: OnTheFlyConfig, size: int
+) -> SubjectViews:
     """Views of some of the scene's poses."""
 
     def view(plan):
         u, azimuth, pose, close_share = plan
-        camera = surroundings.camera_from(u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size)
+        camera = surroundings.camera_from(
+            u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size
+        )
         return *draw_view(bank, scene, pose, camera, config), camera
 
     poses = plan[2]
     batch = None if config.views_at_once == 1 else min(config.views_at_once, len(poses))
     images, masks, depths, found = lax.map(view, plan, batch_size=batch)
-    rotations, translations, betas = scene.rotations[poses], scene.translations[poses], bank.betas[scene.person]
+    rotations, translations, betas = (
+        scene.rotations[poses],
+        scene.translations[poses],
+        bank.betas[scene.person],
+    )
     depths = depths if config.depths else None
     return SubjectViews(images, masks, found, rotations, translations, betas, depths=depths)
 
@@ -230,7 +289,11 @@ def _some(views: SubjectViews, part: slice) -> SubjectViews:
 
 
 def draw_view(
-    bank: PeopleBank, scene: Scene, pose: Int[Array, ""], camera: Camera, config: OnTheFlyConfig = ON_THE_FLY
+    bank: PeopleBank,
+    scene: Scene,
+    pose: Int[Array, ""],
+    camera: Camera,
+    config: OnTheFlyConfig = ON_THE_FLY,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
     """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1], and (h, w) mean z of what
     is covered, metres, 0 in the background.
@@ -239,7 +302,9 @@ def draw_view(
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
     fragments = rasterize_mesh(vertices, faces, fine)
     behind = surroundings.seen_from_behind(vertices, faces, camera.center)
-    colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
+    colors = _light_pixels(
+        bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step
+    )
     covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
     z = _box_average(fragments.depth.reshape(-1, 1) * covered, camera)[..., 0]
     coverage = _box_average(covered, camera)[..., 0]
@@ -254,7 +319,12 @@ def _box_average(samples: Float[Array, "samples c"], camera: Camera) -> Float[Ar
 
 
 def _light_pixels(
-    bank: PeopleBank, scene: Scene, corners: Float[Array, "f 15"], behind: Bool[Array, " f"], fragments: Fragments, step: int
+    bank: PeopleBank,
+    scene: Scene,
+    corners: Float[Array, "f 15"],
+    behind: Bool[Array, " f"],
+    fragments: Fragments,
+    step: int,
 ) -> Float[Array, "hw 3"]:
     """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at a time."""
     ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
@@ -263,18 +333,27 @@ def _light_pixels(
     step = min(step, count)
     place = jnp.where(covered, cumsum(covered.astype(jnp.int32)) - 1, count)
     # the numbers of the covered pixels in order; steps may reach beyond their end, where "no pixel" is
-    listed = jnp.full(-(-count // step) * step, count, jnp.int32).at[place].set(jnp.arange(count), mode="drop")
+    listed = (
+        jnp.full(-(-count // step) * step, count, jnp.int32)
+        .at[place]
+        .set(jnp.arange(count), mode="drop")
+    )
     total = jnp.sum(covered, dtype=jnp.int32)
 
     def light(state):
         start, colors = state
         pixels = lax.dynamic_slice_in_dim(listed, start, step)
-        face, weight = jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0), weights[pixels]
+        face, weight = (
+            jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0),
+            weights[pixels],
+        )
         lit = _color_points(bank, scene, corners[face], face, weight, behind[face])
         return start + step, colors.at[pixels].set(lit, mode="drop")
 
     blank = jnp.full((count, 3), BACKGROUND, weights.dtype)
-    return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[1]
+    return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[
+        1
+    ]
 
 
 def _color_points(
@@ -289,7 +368,9 @@ def _color_points(
     person = scene.person
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
     uv = bank.uvs[person, faces].astype(weights.dtype)
-    painted = _sample(bank.texture, person, (wa * uv[:, 0] + wb * uv[:, 1] + wc * uv[:, 2]) / UV_STEPS)
+    painted = _sample(
+        bank.texture, person, (wa * uv[:, 0] + wb * uv[:, 1] + wc * uv[:, 2]) / UV_STEPS
+    )
     pieces = bank.face_pieces[person, faces].astype(jnp.int32)
     dye = scene.dyes[pieces]
     albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
@@ -298,7 +379,9 @@ def _color_points(
     return surroundings.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
-def _sample(texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]) -> Float[Array, "p 6"]:
+def _sample(
+    texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]
+) -> Float[Array, "p 6"]:
     """(p, 6) texture of a person at (p, 2) places in [0, 1], v down, bilinear; bytes as floats."""
     size = texture.shape[1]
     at = jnp.clip(at * size - 0.5, 0, size - 1)
@@ -370,7 +453,9 @@ class GeneratedSource:
 
     def _person(self, seed: int, index: int) -> int:
         people = SPLITS[self.split]
-        return people[int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(len(people)))]
+        return people[
+            int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(len(people)))
+        ]
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
         """See `Source`."""
@@ -420,14 +505,18 @@ class EachPerson:
         return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
 
 
-def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: int | None = None) -> Example:
+def jitted_example(
+    bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: int | None = None
+) -> Example:
     """`on_the_fly_example`, compiled once per configuration and shape of the bank; with `CPU_COMPILER_OPTIONS` on a CPU."""
     return _compiled()(bank, key, config=config, person=person)
 
 
 @functools.cache
 def _compiled() -> Callable[..., Example]:
-    return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=compiler_options())
+    return jax.jit(
+        on_the_fly_example, static_argnames="config", compiler_options=compiler_options()
+    )
 
 
 def person_drawn(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> int:

@@ -15,14 +15,36 @@ from humangs_jax.people.anatomy import WRIST
 from humangs_jax.people.fabrics import Fabric, sample_fabric
 from humangs_jax.people.surfaces import choice
 
-TOPS = ("tank", "tee", "longsleeve", "polo", "shirt", "blouse", "sweater", "turtleneck", "hoodie", "jersey")
+TOPS = (
+    "tank",
+    "tee",
+    "longsleeve",
+    "polo",
+    "shirt",
+    "blouse",
+    "sweater",
+    "turtleneck",
+    "hoodie",
+    "jersey",
+)
 OUTER = ("jacket", "denim_jacket", "blazer", "cardigan", "vest", "puffer", "coat", "hooded_jacket")
 BOTTOMS = ("jeans", "chinos", "slim", "wide", "shorts", "cropped", "track", "leggings", "cargo")
 SKIRTS = ("short_skirt", "long_skirt", "pleated_skirt")
 DRESSES = ("short_dress", "long_dress", "shirt_dress")
 HEADWEAR = ("beanie", "cap", "brim_hat", "headscarf")
 SHOES = ("sneakers", "flats", "sandals", "ankle_boots", "boots")
-EXTRAS = ("scarf", "belt", "tie", "glasses", "sunglasses", "backpack", "shoulder_bag", "socks", "necklace", "watch")
+EXTRAS = (
+    "scarf",
+    "belt",
+    "tie",
+    "glasses",
+    "sunglasses",
+    "backpack",
+    "shoulder_bag",
+    "socks",
+    "necklace",
+    "watch",
+)
 KINDS = TOPS + OUTER + BOTTOMS + SKIRTS + DRESSES + HEADWEAR + SHOES + EXTRAS
 
 
@@ -57,7 +79,9 @@ class Style:
     tucked: float = 0.22
     skirt: float = 0.12
     scarf: float = 0.1
-    headwear: Odds = dataclasses.field(default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05})
+    headwear: Odds = dataclasses.field(
+        default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05}
+    )
     no_sunglasses: float = 0.96
 
 
@@ -114,7 +138,9 @@ def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
     if isinstance(specification, Mapping):
         return choice(rng, specification)
     if isinstance(specification, OneOf):
-        return rng.choice([drawn(rng, option, **named) for option in specification.options], p=specification.odds)
+        return rng.choice(
+            [drawn(rng, option, **named) for option in specification.options], p=specification.odds
+        )
     return named.get(specification, specification)
 
 
@@ -135,7 +161,14 @@ NECKS = {
     "other": {"crew": 6, "vee": 2, "scoop": 0.6},
 }  # fmt: skip
 MENS_NECKS = NECKS | {"other": {"crew": 6, "vee": 2, "scoop": 0}}
-PLAIN_TOPS = {"tee": 0.5, "sweater": 0.4, "turtleneck": 0.65, "hoodie": 0.65, "shirt": 0.35, "tank": 0.55}
+PLAIN_TOPS = {
+    "tee": 0.5,
+    "sweater": 0.4,
+    "turtleneck": 0.65,
+    "hoodie": 0.65,
+    "shirt": 0.35,
+    "tank": 0.55,
+}
 """How often tops are in one dye; the others: 0.35."""
 TOP_DETAILS = (
     ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5), ("number", ("jersey",), 1), ("zip", ("hoodie",), 0.4),
@@ -180,7 +213,13 @@ def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[G
     return tuple(worn)
 
 
-def _made(rng: np.random.Generator, kind: str, plainness: float, details: Iterable[str] = (), **sizes: float) -> Garment:
+def _made(
+    rng: np.random.Generator,
+    kind: str,
+    plainness: float,
+    details: Iterable[str] = (),
+    **sizes: float,
+) -> Garment:
     """A garment in a random fabric."""
     return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
 
@@ -193,19 +232,40 @@ def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> 
     waist = rng.uniform(-0.235, -0.212)
     top = _top(rng, name, kind, male, waist, tucked, outer)
     skirted = not male and rng.random() < style.skirt
-    lower = _skirt(rng, waist, tucked) if skirted else _trousers(rng, style, male, waist, tucked, top)
+    lower = (
+        _skirt(rng, waist, tucked) if skirted else _trousers(rng, style, male, waist, tucked, top)
+    )
     if "open" in top.details:
-        below = {"sleeve": rng.uniform(0.14, 0.36), "bottom": top.sizes["bottom"] + 0.012, "loose": 0.0, "depth": 0.05}
+        below = {
+            "sleeve": rng.uniform(0.14, 0.36),
+            "bottom": top.sizes["bottom"] + 0.012,
+            "loose": 0.0,
+            "depth": 0.05,
+        }
         return [_made(rng, "tee", 0.7, {"crew"}, **below), lower, top]
     return [top, lower]
 
 
-def _top(rng: np.random.Generator, style: str, kind: str, male: bool, waist: float, tucked: bool, outer: bool) -> Garment:
+def _top(
+    rng: np.random.Generator,
+    style: str,
+    kind: str,
+    male: bool,
+    waist: float,
+    tucked: bool,
+    outer: bool,
+) -> Garment:
     long, short = WRIST - rng.uniform(0.0, 0.035), rng.uniform(0.27, 0.40)
     sleeve = row(rng, SLEEVES, kind, long=long, short=short)
     details = {row(rng, MENS_NECKS if male else NECKS, kind)}
     cropped = not male and not tucked and rng.random() < 0.08
-    bottom = waist - 0.03 if tucked else rng.uniform(-0.22, -0.2) if cropped else rng.uniform(-0.385, -0.30)
+    bottom = (
+        waist - 0.03
+        if tucked
+        else rng.uniform(-0.22, -0.2)
+        if cropped
+        else rng.uniform(-0.385, -0.30)
+    )
     wide = kind not in ("tank", "tee", "longsleeve", "turtleneck")
     loose = rng.uniform(0.25, 1.0) if wide else rng.uniform(0.0, 1.0) ** 1.3
     if kind == "hoodie":
@@ -218,48 +278,96 @@ def _top(rng: np.random.Generator, style: str, kind: str, male: bool, waist: flo
             details.add(detail)
     if tucked:
         details.add("tucked")
-    sleeve, loose = float(min(sleeve, WRIST - 0.01) if outer else sleeve), min(loose, 0.2) if outer or tucked else loose
+    sleeve, loose = (
+        float(min(sleeve, WRIST - 0.01) if outer else sleeve),
+        min(loose, 0.2) if outer or tucked else loose,
+    )
     plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
     depth = rng.uniform(0.04, 0.095)
-    return _made(rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth)
+    return _made(
+        rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth
+    )
 
 
-def _trousers(rng: np.random.Generator, style: Style, male: bool, waist: float, tucked: bool, top: Garment) -> Garment:
+def _trousers(
+    rng: np.random.Generator, style: Style, male: bool, waist: float, tucked: bool, top: Garment
+) -> Garment:
     kind = drawn(rng, style.bottoms)
     if kind == "leggings" and male and rng.random() < 0.7:
         kind = "shorts"
     end = row(rng, LEG_ENDS | {"shorts": (-0.77, -0.62)} if male else LEG_ENDS, kind)
     width, loose = row(rng, LEG_WIDTHS, kind), row(rng, LEG_LOOSENESS, kind)
-    upper = waist if tucked or top.sizes["bottom"] > -0.25 else max(top.sizes["bottom"] + 0.06, waist - 0.2)
-    details = {"pockets"} if kind not in ("track", "leggings") else {"side_stripe"} if rng.random() < 0.6 else set()
+    upper = (
+        waist
+        if tucked or top.sizes["bottom"] > -0.25
+        else max(top.sizes["bottom"] + 0.06, waist - 0.2)
+    )
+    details = (
+        {"pockets"}
+        if kind not in ("track", "leggings")
+        else {"side_stripe"}
+        if rng.random() < 0.6
+        else set()
+    )
     if rng.random() < 0.15 and kind in ("jeans", "chinos") and not male:
         end = rng.uniform(-1.12, -1.05)
     if kind == "jeans" and rng.random() < 0.25:
         details.add("turn_up")
-    sizes = {"top": upper, "end": end, "width": float(width), "loose": loose, "waist": waist, "tucked": float(tucked)}
+    sizes = {
+        "top": upper,
+        "end": end,
+        "width": float(width),
+        "loose": loose,
+        "waist": waist,
+        "tucked": float(tucked),
+    }
     return _made(rng, kind, 0.75, details, **sizes)
 
 
 def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
     kind = drawn(rng, {"short_skirt": 3, "pleated_skirt": 1.5, "long_skirt": 2})
     end = rng.uniform(-1.1, -0.84) if kind == "long_skirt" else rng.uniform(-0.76, -0.57)
-    flare = rng.uniform(0.0, 0.05) if rng.random() < 0.35 and kind != "pleated_skirt" else rng.uniform(0.05, 0.16)
-    sizes = {"top": waist, "end": end, "flare": flare, "waist": waist, "tucked": float(tucked), **_pleats(rng, kind)}
+    flare = (
+        rng.uniform(0.0, 0.05)
+        if rng.random() < 0.35 and kind != "pleated_skirt"
+        else rng.uniform(0.05, 0.16)
+    )
+    sizes = {
+        "top": waist,
+        "end": end,
+        "flare": flare,
+        "waist": waist,
+        "tucked": float(tucked),
+        **_pleats(rng, kind),
+    }
     return _made(rng, kind, 0.35, (), **sizes)
 
 
 def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
-    count, depth = ((14, 24), (0.008, 0.014)) if kind == "pleated_skirt" else ((4, 10), (0.004, 0.016))
+    count, depth = (
+        ((14, 24), (0.008, 0.014)) if kind == "pleated_skirt" else ((4, 10), (0.004, 0.016))
+    )
     return {"pleats": float(rng.integers(*count)), "depth": rng.uniform(*depth)}
 
 
 def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
     kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
     end = rng.uniform(-1.14, -0.85) if kind == "long_dress" else rng.uniform(-0.78, -0.56)
-    sleeve = float(drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25))))
+    sleeve = float(
+        drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25)))
+    )
     neck = "collar" if kind == "shirt_dress" else drawn(rng, {"crew": 1, "vee": 1.3, "scoop": 1.3})
-    sizes = {"sleeve": sleeve, "waist": rng.uniform(-0.235, -0.165), "end": end, "flare": rng.uniform(0.015, 0.17)}
-    sizes |= {"depth": rng.uniform(0.04, 0.1), "loose": 0.1 if outer else rng.uniform(0.0, 0.4), **_pleats(rng, kind)}
+    sizes = {
+        "sleeve": sleeve,
+        "waist": rng.uniform(-0.235, -0.165),
+        "end": end,
+        "flare": rng.uniform(0.015, 0.17),
+    }
+    sizes |= {
+        "depth": rng.uniform(0.04, 0.1),
+        "loose": 0.1 if outer else rng.uniform(0.0, 0.4),
+        **_pleats(rng, kind),
+    }
     return [_made(rng, kind, 0.3, [neck, "sash"] if rng.random() < 0.35 else [neck], **sizes)]
 
 
@@ -275,20 +383,29 @@ def _outer(rng: np.random.Generator, style: Style, worn: Sequence[Garment]) -> G
         if not is_open and rng.random() < 0.4:
             details.add("sash")
     sizes = {"sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035), "bottom": bottom}
-    sizes |= {"gap": rng.uniform(0.012, 0.05) if is_open else -1.0, "spread": rng.uniform(0.05, 0.35)}
+    sizes |= {
+        "gap": rng.uniform(0.012, 0.05) if is_open else -1.0,
+        "spread": rng.uniform(0.05, 0.35),
+    }
     sizes |= {"flare": rng.uniform(0.02, 0.1), "loose": rng.uniform(0.2, 1.0)}
     if kind == "vest":
         sizes["sleeve"] = rng.uniform(0.145, 0.165)
     coat = _made(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72, details, **sizes)
-    suited = [g.fabric for g in worn if g.kind in ("chinos", "slim", "wide")] if kind == "blazer" else []
+    suited = (
+        [g.fabric for g in worn if g.kind in ("chinos", "slim", "wide")] if kind == "blazer" else []
+    )
     return dataclasses.replace(coat, fabric=suited[0]) if suited and rng.random() < 0.55 else coat
 
 
-def _shoes(rng: np.random.Generator, style: Style, male: bool, worn: Sequence[Garment]) -> list[Garment]:
+def _shoes(
+    rng: np.random.Generator, style: Style, male: bool, worn: Sequence[Garment]
+) -> list[Garment]:
     lower = next(g for g in worn if g.kind in BOTTOMS + SKIRTS + DRESSES)
     kind = drawn(rng, style.shoes)
     covered = lower.kind in BOTTOMS and lower.sizes["end"] < -1.0
-    narrow = not covered or (lower.kind in ("slim", "leggings", "jeans") and lower.sizes["width"] <= 0.01)
+    narrow = not covered or (
+        lower.kind in ("slim", "leggings", "jeans") and lower.sizes["width"] <= 0.01
+    )
     if kind == "boots" and (male or not narrow):
         kind = "ankle_boots"
     height, sole = row(rng, SHAFTS, kind), row(rng, SOLES, kind)
@@ -296,24 +413,39 @@ def _shoes(rng: np.random.Generator, style: Style, male: bool, worn: Sequence[Ga
     if kind in ("sneakers", "ankle_boots") and not covered and rng.random() < 0.75:
         tall = drawn(rng, OneOf(((0.1, 0.17), (0.2, 0.4)), (0.75, 0.25)))
         result.append(_made(rng, "socks", 0.7, height=max(float(tall), height + 0.02)))
-    return [*result, _made(rng, kind, 0.9, height=float(height), sole=float(sole), over=float(kind == "boots"))]
+    return [
+        *result,
+        _made(rng, kind, 0.9, height=float(height), sole=float(sole), over=float(kind == "boots")),
+    ]
 
 
-def _fastened(rng: np.random.Generator, style: str, male: bool, worn: Sequence[Garment]) -> list[Garment]:
+def _fastened(
+    rng: np.random.Generator, style: str, male: bool, worn: Sequence[Garment]
+) -> list[Garment]:
     """Belt and tie: worn below what is worn outside."""
     result = []
     trousers = next((g for g in worn if g.kind in BOTTOMS), None)
-    belted = trousers is not None and trousers.sizes["tucked"] and trousers.kind not in ("track", "leggings")
+    belted = (
+        trousers is not None
+        and trousers.sizes["tucked"]
+        and trousers.kind not in ("track", "leggings")
+    )
     if belted and rng.random() < 0.7:
         top = trousers.sizes["waist"] - 0.004
         result.append(_made(rng, "belt", 1.0, top=top, width=rng.uniform(0.028, 0.042)))
-    collared = any("collar" in g.details and g.kind == "shirt" and "open" not in g.details for g in worn)
+    collared = any(
+        "collar" in g.details and g.kind == "shirt" and "open" not in g.details for g in worn
+    )
     if style == "formal" and male and collared and rng.random() < 0.55:
-        result.append(_made(rng, "tie", 0.3, length=rng.uniform(0.3, 0.36), width=rng.uniform(0.018, 0.032)))
+        result.append(
+            _made(rng, "tie", 0.3, length=rng.uniform(0.3, 0.36), width=rng.uniform(0.018, 0.032))
+        )
     return result
 
 
-def _extras(rng: np.random.Generator, style: Style, male: bool, years: float, worn: Sequence[Garment]) -> list[Garment]:
+def _extras(
+    rng: np.random.Generator, style: Style, male: bool, years: float, worn: Sequence[Garment]
+) -> list[Garment]:
     kinds = {g.kind for g in worn}
     hooded = any("hood_up" in g.details for g in worn)
     result: list[Garment] = []
@@ -323,18 +455,40 @@ def _extras(rng: np.random.Generator, style: Style, male: bool, years: float, wo
         kinds.add(kind)
 
     if not hooded and rng.random() < style.scarf:
-        put("scarf", 0.35, thickness=rng.uniform(0.022, 0.038), tails=rng.choice([0.0, rng.uniform(0.15, 0.4)]))
+        put(
+            "scarf",
+            0.35,
+            thickness=rng.uniform(0.022, 0.038),
+            tails=rng.choice([0.0, rng.uniform(0.15, 0.4)]),
+        )
     left = rng.random()
     for kind, odds in (style.headwear if male else {**style.headwear, "headscarf": 0.06}).items():
         if left < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
-            put(kind, 0.8, brim=rng.uniform(0.045, 0.085), backwards=float(kind == "cap" and rng.random() < 0.12))
+            put(
+                kind,
+                0.8,
+                brim=rng.uniform(0.045, 0.085),
+                backwards=float(kind == "cap" and rng.random() < 0.12),
+            )
             break
         left -= odds
     eyes = rng.random()
     if eyes < 0.2 + 0.15 * (years > 50):
-        put("glasses", 1.0, size=rng.uniform(0.85, 1.2), squareness=rng.uniform(2, 6), wire=rng.uniform(0.0011, 0.0028))
+        put(
+            "glasses",
+            1.0,
+            size=rng.uniform(0.85, 1.2),
+            squareness=rng.uniform(2, 6),
+            wire=rng.uniform(0.0011, 0.0028),
+        )
     elif eyes > style.no_sunglasses:
-        put("sunglasses", 1.0, size=rng.uniform(1.0, 1.3), squareness=rng.uniform(2, 5), wire=rng.uniform(0.0015, 0.003))
+        put(
+            "sunglasses",
+            1.0,
+            size=rng.uniform(1.0, 1.3),
+            squareness=rng.uniform(2, 5),
+            wire=rng.uniform(0.0015, 0.003),
+        )
     carried = rng.random()
     if carried < 0.09 and "headscarf" not in kinds:
         put("backpack", 0.7, size=rng.uniform(0.8, 1.15))

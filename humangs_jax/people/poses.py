@@ -49,7 +49,9 @@ def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rot
     """Set legs and pelvis in `rotations`, keeping the pelvis's heading; returns the stance."""
     heading, width = rotations[kin.PELVIS, 1], build.hip_width / build.leg
     for _ in range(TRIES):
-        stance = STANCES[choice(rng, {name: odds for name, (odds, _) in STANCES.items()})][1](rng, width)
+        stance = STANCES[choice(rng, {name: odds for name, (odds, _) in STANCES.items()})][1](
+            rng, width
+        )
         _, missed = take_stance(build, rotations, heading, stance)
         if missed < 1e-6 and kin.excess(rotations, tuple(j for leg in kin.LEGS for j in leg)) < 0:
             return stance
@@ -58,12 +60,16 @@ def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rot
     return stance
 
 
-def take_stance(build: kin.Build, rotations: kin.Rotations, heading: float, stance: Stance) -> tuple[kin.Vector, float]:
+def take_stance(
+    build: kin.Build, rotations: kin.Rotations, heading: float, stance: Stance
+) -> tuple[kin.Vector, float]:
     """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error of the two feet, metres."""
     turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
     feet = in_world(stance.feet, build.leg, heading)
-    pelvis = np.asarray([0.0, kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg, 0.0])
+    pelvis = np.asarray(
+        [0.0, kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg, 0.0]
+    )
     return pelvis, kin.place_feet(build, rotations, pelvis, feet)
 
 
@@ -88,7 +94,11 @@ def _pair(
     feet = []
     for sign in (1, -1):
         x = sign * (width + rng.uniform(*spread))
-        feet.append(kin.Foot(x, 0.08 + rng.choice([-1, 1]) * rng.uniform(*apart), sign * rng.uniform(*turn_out)))
+        feet.append(
+            kin.Foot(
+                x, 0.08 + rng.choice([-1, 1]) * rng.uniform(*apart), sign * rng.uniform(*turn_out)
+            )
+        )
     return feet
 
 
@@ -102,27 +112,47 @@ def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
     shift = rng.uniform(0.4, 1.0) * width * sign  # the standing foot comes below the pelvis
     feet = [dataclasses.replace(foot, x=foot.x + shift) for foot in feet]
     z = feet[relaxed].z + rng.uniform(0.0, 0.28)
-    pitch, yaw = rng.choice([0.0, rng.uniform(0.1, 0.5)]), feet[relaxed].yaw + sign * rng.uniform(0, 0.3)
+    pitch, yaw = (
+        rng.choice([0.0, rng.uniform(0.1, 0.5)]),
+        feet[relaxed].yaw + sign * rng.uniform(0, 0.3),
+    )
     feet[relaxed] = dataclasses.replace(feet[relaxed], z=z, pitch=pitch, yaw=yaw)
     return Stance(tuple(feet), sink=rng.uniform(0.0, 0.01), roll=-sign * rng.uniform(0.03, 0.12))
 
 
 def _stride(rng: np.random.Generator, width: float) -> Stance:
-    feet, front = _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2)), int(rng.integers(2))
+    feet, front = (
+        _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2)),
+        int(rng.integers(2)),
+    )
     length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
-    feet[front] = dataclasses.replace(feet[front], z=0.08 + share * length, pitch=-rng.uniform(0, 0.3) * (length > 0.4))
+    feet[front] = dataclasses.replace(
+        feet[front], z=0.08 + share * length, pitch=-rng.uniform(0, 0.3) * (length > 0.4)
+    )
     rear = rng.uniform(0.3, 0.7) * min(1.0, length / 0.5)
-    feet[1 - front] = dataclasses.replace(feet[1 - front], z=0.08 - (1 - share) * length, pitch=rear)
-    return Stance(tuple(feet), sink=rng.uniform(0.0, 0.04), tilt=rng.uniform(0, 0.08), lean=rng.uniform(0, 0.1))
+    feet[1 - front] = dataclasses.replace(
+        feet[1 - front], z=0.08 - (1 - share) * length, pitch=rear
+    )
+    return Stance(
+        tuple(feet),
+        sink=rng.uniform(0.0, 0.04),
+        tilt=rng.uniform(0, 0.08),
+        lean=rng.uniform(0, 0.1),
+    )
 
 
 def _wide(rng: np.random.Generator, width: float) -> Stance:
     feet = _pair(rng, width, spread=(0.12, 0.35), turn_out=(0.05, 0.5))
-    return Stance(tuple(feet), sink=rng.choice([0.0, rng.uniform(0, 0.15)]), roll=rng.normal(0, 0.03))
+    return Stance(
+        tuple(feet), sink=rng.choice([0.0, rng.uniform(0, 0.15)]), roll=rng.normal(0, 0.03)
+    )
 
 
 def _squat(rng: np.random.Generator, width: float) -> Stance:
-    depth, feet = rng.uniform(0.08, 0.42), _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6))
+    depth, feet = (
+        rng.uniform(0.08, 0.42),
+        _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6)),
+    )
     heels = rng.uniform(0.2, 0.6) if depth > 0.3 else 0.0
     feet = [dataclasses.replace(foot, pitch=heels, z=foot.z + 0.06) for foot in feet]
     return Stance(tuple(feet), sink=depth, tilt=0.6 * depth, lean=1.4 * depth)
@@ -131,15 +161,27 @@ def _squat(rng: np.random.Generator, width: float) -> Stance:
 def _lunge(rng: np.random.Generator, width: float) -> Stance:
     feet, front = _pair(rng, width, turn_out=(-0.05, 0.2)), int(rng.integers(2))
     feet[front] = dataclasses.replace(feet[front], z=rng.uniform(0.4, 0.7))
-    feet[1 - front] = dataclasses.replace(feet[1 - front], z=-rng.uniform(0.4, 0.75), pitch=rng.uniform(0.55, 0.85))
-    return Stance(tuple(feet), sink=rng.uniform(0.05, 0.3), tilt=rng.uniform(0, 0.15), lean=rng.uniform(-0.1, 0.3))
+    feet[1 - front] = dataclasses.replace(
+        feet[1 - front], z=-rng.uniform(0.4, 0.75), pitch=rng.uniform(0.55, 0.85)
+    )
+    return Stance(
+        tuple(feet),
+        sink=rng.uniform(0.05, 0.3),
+        tilt=rng.uniform(0, 0.15),
+        lean=rng.uniform(-0.1, 0.3),
+    )
 
 
 def _side_lunge(rng: np.random.Generator, width: float) -> Stance:
     feet, bent = _pair(rng, width, spread=(0.2, 0.4), turn_out=(0.1, 0.5)), int(rng.integers(2))
     sign = 1 if bent == 0 else -1
     feet = [dataclasses.replace(foot, x=foot.x - sign * rng.uniform(0.1, 0.3)) for foot in feet]
-    return Stance(tuple(feet), sink=rng.uniform(0.02, 0.2), tilt=rng.uniform(0.05, 0.2), lean=rng.uniform(0, 0.3))
+    return Stance(
+        tuple(feet),
+        sink=rng.uniform(0.02, 0.2),
+        tilt=rng.uniform(0.05, 0.2),
+        lean=rng.uniform(0, 0.3),
+    )
 
 
 def _one_leg(rng: np.random.Generator, width: float) -> Stance:
@@ -220,7 +262,12 @@ def draw_goal(rng: np.random.Generator) -> str:
 
 
 def bend_arm(
-    rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations, goal: str, side: int, other_arm: bool = False
+    rng: np.random.Generator,
+    build: kin.Build,
+    rotations: kin.Rotations,
+    goal: str,
+    side: int,
+    other_arm: bool = False,
 ) -> float:
     """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk, head and legs must be set.
 
@@ -229,14 +276,18 @@ def bend_arm(
     matrix, vector = kin.rotation_matrix, kin.rotation_vector
     collar, shoulder, elbow, wrist = ARMS[side]
     mirror, n, wanted = np.ones(3) if side == 0 else kin.MIRROR, CANDIDATES, GOALS[goal]
-    rotations[collar] = np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
+    rotations[collar] = (
+        np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
+    )
     down, forward, twist, flex, pronation = np.zeros((5, n, 3))
     down[:, 2] = rng.uniform(*wanted.raised, n)
     forward[:, 1] = -rng.uniform(*wanted.forward, n)
     twist[:, 0] = rng.uniform(-1.0, 0.8, n)
     flex[:, 1] = -rng.uniform(*wanted.flexed, n)
     pronation[:, 0] = rng.uniform(-0.4, 0.5)
-    about_both = np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1)  # a hanging arm swings about the axis of both shoulders
+    about_both = np.stack(
+        [forward[:, 1], down[:, 1], down[:, 2]], 1
+    )  # a hanging arm swings about the axis of both shoulders
     swing = matrix(about_both) if goal == "hang" else matrix(forward) @ matrix(down)
     upper = vector(swing @ matrix(twist)) * mirror
     lower = vector(matrix(flex) @ matrix(pronation)) * mirror
@@ -252,7 +303,9 @@ def bend_arm(
     capsules = _body_capsules(build, world, positions)
     if other_arm:
         capsules += _arm_capsules(build, positions, 1 - side)
-    clear = np.min([_clearance(build, capsules, points) for points in _along(elbows, wrists)], axis=0)
+    clear = np.min(
+        [_clearance(build, capsules, points) for points in _along(elbows, wrists)], axis=0
+    )
     beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
     cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
     best = int(np.argmin(cost))
@@ -267,18 +320,24 @@ def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
     body, worst = _body_capsules(build, world, positions), np.inf
     for side, (_, _, elbow, wrist) in enumerate(ARMS):
         points = np.stack(_along(positions[elbow], positions[wrist]))
-        worst = min(worst, _clearance(build, body + _arm_capsules(build, positions, 1 - side), points).min())
+        worst = min(
+            worst, _clearance(build, body + _arm_capsules(build, positions, 1 - side), points).min()
+        )
     return float(worst)
 
 
-def _body_capsules(build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations) -> list[Capsule]:
+def _body_capsules(
+    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations
+) -> list[Capsule]:
     """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
     sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
     top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
     head = positions[kin.HEAD] + world[kin.HEAD] @ np.asarray([0, 0.09, 0.03])
     capsules = [(head, head, HEAD_RADIUS)]
     for s in (-1.0, 0.0, 1.0):
-        capsules.append((positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius))
+        capsules.append(
+            (positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius)
+        )
     for hip, knee, ankle, _ in kin.LEGS:
         capsules.append((positions[hip], positions[knee], build.thigh_radius))
         capsules.append((positions[knee], positions[ankle], build.shin_radius))
@@ -292,7 +351,9 @@ def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list
     return [(shoulder, elbow, radius), (elbow, wrist + HAND_LENGTH * (wrist - elbow), radius)]
 
 
-def _clearance(build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def _clearance(
+    build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
     """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
     distances = []
     for a, b, radius in capsules:
@@ -302,7 +363,9 @@ def _clearance(build: kin.Build, capsules: list[Capsule], points: Float[np.ndarr
     return np.min(distances, axis=0) - build.arm_radius
 
 
-def _along(elbows: Float[np.ndarray, "*n 3"], wrists: Float[np.ndarray, "*n 3"]) -> list[Float[np.ndarray, "*n 3"]]:
+def _along(
+    elbows: Float[np.ndarray, "*n 3"], wrists: Float[np.ndarray, "*n 3"]
+) -> list[Float[np.ndarray, "*n 3"]]:
     """Points of the forearm and the hand that must not touch the body."""
     tips = wrists + HAND_LENGTH * (wrists - elbows)
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
@@ -328,7 +391,10 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
     """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
     first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
     goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
-    blends = ((1 - t) * np.asarray(a) + t * np.asarray(b) for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True))
+    blends = (
+        (1 - t) * np.asarray(a) + t * np.asarray(b)
+        for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True)
+    )
     _, curls, spread, thumb = blends
     thumb = thumb + rng.normal(0, 0.08)
     for finger, (place, splay) in enumerate(FINGERS):
@@ -360,7 +426,9 @@ def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotation
     return kin.limited(rotations)
 
 
-def bend_trunk(rng: np.random.Generator, rotations: kin.Rotations, lean: float, roll: float) -> None:
+def bend_trunk(
+    rng: np.random.Generator, rotations: kin.Rotations, lean: float, roll: float
+) -> None:
     """Set spine, neck and head in `rotations`.
 
     lean: how far the trunk bends forward, about. roll: of the pelvis, left side up, which the spine evens out.

@@ -19,12 +19,30 @@ from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people import complexion, hair, surroundings, wardrobe
-from humangs_jax.people.anatomy import BODY, LEFT_KNEE, Anatomy, Build, Rotations, Vector, joint_positions, measure
+from humangs_jax.people.anatomy import (
+    BODY,
+    LEFT_KNEE,
+    Anatomy,
+    Build,
+    Rotations,
+    Vector,
+    joint_positions,
+    measure,
+)
 from humangs_jax.people.complexion import Complexion, sample_complexion
 from humangs_jax.people.fabrics import Material, Spots
 from humangs_jax.people.hair import Haircut, sample_haircut
 from humangs_jax.people.outfits import Garment, sample_outfit
-from humangs_jax.people.surfaces import Faces, Field, Folds, Points, Surface, compact, join, vertex_normals
+from humangs_jax.people.surfaces import (
+    Faces,
+    Field,
+    Folds,
+    Points,
+    Surface,
+    compact,
+    join,
+    vertex_normals,
+)
 from humangs_jax.people.surroundings import Lights, sample_lights
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
@@ -68,7 +86,9 @@ def seeds_of(split: str, first: int, count: int) -> range:
     """`count` seeds of a split from its `first`-th on. Raises ValueError if they reach beyond the split."""
     people = SPLITS[split]
     if first < 0 or count < 1 or first + count > len(people):
-        raise ValueError(f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has {len(people)}")
+        raise ValueError(
+            f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has {len(people)}"
+        )
     return people[first : first + count]
 
 
@@ -118,16 +138,23 @@ class Person:
 def describe(seed: int, body: BodyModel) -> Person:
     """The person of a seed, unbuilt."""
     rng = np.random.default_rng([seed, 0])
-    male, years = bool(rng.random() < 0.5), float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
+    male, years = (
+        bool(rng.random() < 0.5),
+        float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS)),
+    )
     betas, stature = sample_shape(rng, body, male, years)
     garments = sample_outfit(np.random.default_rng([seed, 11]), male, years)
     complexion = sample_complexion(np.random.default_rng([seed, 12]), male, years)
-    haircut = sample_haircut(np.random.default_rng([seed, 13]), male, years, {g.kind for g in garments})
+    haircut = sample_haircut(
+        np.random.default_rng([seed, 13]), male, years, {g.kind for g in garments}
+    )
     lights = sample_lights(np.random.default_rng([seed, 14]))
     return Person(seed, betas, male, years, stature, complexion, haircut, garments, lights)
 
 
-def sample_shape(rng: np.random.Generator, body: BodyModel, male: bool, years: float) -> tuple[np.ndarray, float]:
+def sample_shape(
+    rng: np.random.Generator, body: BodyModel, male: bool, years: float
+) -> tuple[np.ndarray, float]:
     """(s,) shape coefficients and the stature in metres that they give."""
     at = {name: i for i, name in enumerate(body.shape_names)}
     betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * SHAPE_STD
@@ -139,10 +166,14 @@ def sample_shape(rng: np.random.Generator, body: BodyModel, male: bool, years: f
     mean, std = HEIGHTS[male]
     youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
     tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
-    wanted = np.clip(mean - youth + std * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN)
+    wanted = np.clip(
+        mean - youth + std * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN
+    )
     *_, stature, gains = _host_arrays(body)
     lengths = [at[name] for name in LENGTHS]
-    betas[lengths] += (wanted - (stature + gains @ betas)) * gains[lengths] / (gains[lengths] @ gains[lengths])
+    betas[lengths] += (
+        (wanted - (stature + gains @ betas)) * gains[lengths] / (gains[lengths] @ gains[lengths])
+    )
     return betas.astype(np.float32), float(wanted)
 
 
@@ -198,14 +229,27 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
     hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk, hooded)
     skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
     skin = compact(skin, ~removed[skin.faces].all(1))
-    skin_material = complexion.skin_material(np.random.default_rng([seed, 22]), person.complexion, person.haircut)
+    skin_material = complexion.skin_material(
+        np.random.default_rng([seed, 22]), person.complexion, person.haircut
+    )
     eyes = wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(person.complexion))
     pieces = [wardrobe.Piece(skin, skin_material), eyes, *outfit.pieces, *hairs]
-    surface, materials = join([piece.surface for piece in pieces]), tuple(piece.material for piece in pieces)
-    cover = np.pad(skin.attributes["cover"], (0, len(surface.vertices) - len(skin.vertices)), constant_values=-1.0)
-    ids = np.repeat(np.arange(len(pieces), dtype=np.int32), [len(piece.surface.faces) for piece in pieces])
+    surface, materials = (
+        join([piece.surface for piece in pieces]),
+        tuple(piece.material for piece in pieces),
+    )
+    cover = np.pad(
+        skin.attributes["cover"],
+        (0, len(surface.vertices) - len(skin.vertices)),
+        constant_values=-1.0,
+    )
+    ids = np.repeat(
+        np.arange(len(pieces), dtype=np.int32), [len(piece.surface.faces) for piece in pieces]
+    )
     build = _build(anatomy, surface)
-    return SyntheticSubject(seed, person.betas, surface, ids, materials, person.lights, build, cover, person)
+    return SyntheticSubject(
+        seed, person.betas, surface, ids, materials, person.lights, build, cover, person
+    )
 
 
 _HOST: dict[int, tuple] = {}
@@ -213,23 +257,38 @@ _HOST: dict[int, tuple] = {}
 
 def _host_arrays(
     body: BodyModel,
-) -> tuple[Points, Int[np.ndarray, "f 3"], Float[np.ndarray, "n j"], float, Float[np.ndarray, " s"]]:
+) -> tuple[
+    Points, Int[np.ndarray, "f 3"], Float[np.ndarray, "n j"], float, Float[np.ndarray, " s"]
+]:
     """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds. Kept for the body used last."""
     if id(body) not in _HOST:
-        template, faces, weights = (np.asarray(a) for a in (body.template, body.faces, body.skinning_weights))
+        template, faces, weights = (
+            np.asarray(a) for a in (body.template, body.faces, body.skinning_weights)
+        )
         top, bottom = np.argmax(template[:, 1]), np.argmin(template[:, 1])
         directions = np.asarray(body.shape_directions)
         gains = (directions[top, 1] - directions[bottom, 1]).astype(float)
         _HOST.clear()
-        _HOST[id(body)] = (body, template, faces, weights, float(template[top, 1] - template[bottom, 1]), gains)
+        _HOST[id(body)] = (
+            body,
+            template,
+            faces,
+            weights,
+            float(template[top, 1] - template[bottom, 1]),
+            gains,
+        )
     return _HOST[id(body)][1:]
 
 
-def _hair(rng: np.random.Generator, anatomy: Anatomy, person: Person, over: float, hooded: bool) -> list[wardrobe.Piece]:
+def _hair(
+    rng: np.random.Generator, anatomy: Anatomy, person: Person, over: float, hooded: bool
+) -> list[wardrobe.Piece]:
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
     haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut
-    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)]
+    pieces = [
+        wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)
+    ]
     hat = any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments)
     if hat and pieces and not hooded:  # the scalp's; tails, buns and beards hang out
         hidden = hair.above_line(pieces[0].surface.template, hair.CAP_LINE) > 0.008
@@ -241,11 +300,24 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
     """Radii of the dressed body for the pose prior."""
     chest = anatomy.trunk.radii[(anatomy.trunk.levels > -0.35) & (anatomy.trunk.levels < 0.0)]
     depth = float(np.median(0.5 * (chest[:, 0] + chest[:, chest.shape[1] // 2])))
-    thigh = float(np.median(anatomy.legs[0].radii[(anatomy.legs[0].levels > -0.65) & (anatomy.legs[0].levels < -0.5)]))
+    thigh = float(
+        np.median(
+            anatomy.legs[0].radii[
+                (anatomy.legs[0].levels > -0.65) & (anatomy.legs[0].levels < -0.5)
+            ]
+        )
+    )
     low = surface.vertices[(surface.vertices[:, 1] < -0.5) & (surface.vertices[:, 1] > -0.9)]
-    spread = float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2  # wide skirts keep the hands away
+    spread = (
+        float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2
+    )  # wide skirts keep the hands away
     leg_line = float(np.abs(anatomy.joints[LEFT_KNEE, 0]))
-    radii = depth + 0.015, max(thigh + 0.02, spread - leg_line), max(0.07, spread - leg_line - 0.02), 0.035
+    radii = (
+        depth + 0.015,
+        max(thigh + 0.02, spread - leg_line),
+        max(0.07, spread - leg_line - 0.02),
+        0.035,
+    )
     return Build(anatomy.joints.astype(np.float64), anatomy.parents, *radii)
 
 
@@ -258,7 +330,10 @@ VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 
-_shaded_vertices, _seen_from_behind = jax.jit(surroundings.shaded_vertices), jax.jit(surroundings.seen_from_behind)
+_shaded_vertices, _seen_from_behind = (
+    jax.jit(surroundings.shaded_vertices),
+    jax.jit(surroundings.seen_from_behind),
+)
 _light_points = jax.jit(surroundings.light_points)
 Image = Float[np.ndarray, "h w 3"]
 Map = Float[np.ndarray, "h w"]
@@ -282,19 +357,29 @@ class PosedSubject:
     lit: Field
 
 
-def pose_subject(subject: SyntheticSubject, rotations: Rotations, translation: Vector) -> PosedSubject:
+def pose_subject(
+    subject: SyntheticSubject, rotations: Rotations, translation: Vector
+) -> PosedSubject:
     """Skin the mesh and gather what its shading needs."""
     faces, count = subject.surface.faces, len(subject.surface.vertices)
     vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
     normals = vertex_normals(vertices, faces)
-    shades = _shaded_vertices(padded(vertices, faces)[0], padded(normals, faces)[0], subject.lights.directions[0])
-    return PosedSubject(subject, rotations, translation, vertices, normals, *(np.asarray(x)[:count] for x in shades))
+    shades = _shaded_vertices(
+        padded(vertices, faces)[0], padded(normals, faces)[0], subject.lights.directions[0]
+    )
+    return PosedSubject(
+        subject, rotations, translation, vertices, normals, *(np.asarray(x)[:count] for x in shades)
+    )
 
 
-def padded(vertices: Points, faces: Faces) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
+def padded(
+    vertices: Points, faces: Faces
+) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
     """A mesh with repeated vertices and faces without area up to the next step of sizes."""
     spare_vertices, spare_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
-    vertices = np.concatenate([vertices, np.repeat(vertices[:1], spare_vertices, axis=0)]).astype(np.float32)
+    vertices = np.concatenate([vertices, np.repeat(vertices[:1], spare_vertices, axis=0)]).astype(
+        np.float32
+    )
     return jnp.asarray(vertices), jnp.asarray(np.pad(faces, ((0, spare_faces), (0, 0))))
 
 
@@ -316,7 +401,12 @@ def render_view(posed: PosedSubject, camera: Camera, background: float = 1.0) ->
 
 
 def light_points(
-    posed: PosedSubject, face_ids: Ids, weights: Values, albedo: Values, slopes: Values, eye: Array | None = None
+    posed: PosedSubject,
+    face_ids: Ids,
+    weights: Values,
+    albedo: Values,
+    slopes: Values,
+    eye: Array | None = None,
 ) -> Values:
     """Colors (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the weights of the corners.
 
@@ -327,12 +417,21 @@ def light_points(
     behind = np.zeros(len(faces), bool)
     if eye is not None:
         behind = np.asarray(_seen_from_behind(*padded(posed.vertices, faces), eye))
-    sheen = np.asarray([material.sheen for material in subject.materials], np.float32)[subject.face_materials]
+    sheen = np.asarray([material.sheen for material in subject.materials], np.float32)[
+        subject.face_materials
+    ]
     colors = [np.zeros((0, 3), np.float32)]
     for start in range(0, len(face_ids), POINT_STEP):
         part = slice(start, start + POINT_STEP)
         ids = face_ids[part]
-        points = values[faces[ids]].reshape(-1, 15), weights[part], behind[ids], albedo[part], slopes[part], sheen[ids]
+        points = (
+            values[faces[ids]].reshape(-1, 15),
+            weights[part],
+            behind[ids],
+            albedo[part],
+            slopes[part],
+            sheen[ids],
+        )
         full = (np.pad(x, [(0, POINT_STEP - len(ids))] + [(0, 0)] * (x.ndim - 1)) for x in points)
         colors.append(np.asarray(_light_points(subject.lights, *full))[: len(ids)])
     return np.concatenate(colors)
@@ -350,7 +449,10 @@ def spots_at(subject: SyntheticSubject, face_ids: Ids, weights: Values) -> Spots
 def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Values, Values]:
     """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted folds."""
     material_ids = subject.face_materials[face_ids]
-    albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)
+    albedo, slope = (
+        np.empty((len(face_ids), 3), np.float32),
+        np.zeros((len(face_ids), 3), np.float32),
+    )
     for k in np.unique(material_ids):
         material, chosen = subject.materials[k], np.flatnonzero(material_ids == k)
         own = Spots(spots.cloth[chosen], spots.template[chosen])

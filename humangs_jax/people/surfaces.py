@@ -52,12 +52,20 @@ class Folds:
     upright: all of them run along y.
     """
 
-    def __init__(self, rng: np.random.Generator, wavelength: float = 0.09, directions: int = 6, upright: bool = False):
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        wavelength: float = 0.09,
+        directions: int = 6,
+        upright: bool = False,
+    ):
         tilt = rng.uniform(*((1.25, 1.57) if upright else (0.5, 1.5)), directions)
         turn = rng.uniform(0, 2 * np.pi, directions)
         k = np.stack([np.sin(tilt) * np.cos(turn), np.cos(tilt), np.sin(tilt) * np.sin(turn)], -1)
         self.directions = k.astype(np.float32)
-        self.k = (k * (2 * np.pi / wavelength * rng.uniform(0.6, 1.4, (directions, 1)))).astype(np.float32)
+        self.k = (k * (2 * np.pi / wavelength * rng.uniform(0.6, 1.4, (directions, 1)))).astype(
+            np.float32
+        )
         self.phase = rng.uniform(0, 2 * np.pi, directions).astype(np.float32)
         self.warp = Ripples(rng, 3 * wavelength)
         self.patches = [Ripples(rng, 4 * wavelength) for _ in range(directions)]
@@ -66,10 +74,14 @@ class Folds:
         """(n, 3) slopes at (n, 3) points, about 1 on the flanks of a crease, 0 between patches."""
         points = points.astype(np.float32)
         total, warp = np.zeros_like(points), 3.0 * self.warp(points)
-        for k, direction, phase, patch in zip(self.k, self.directions, self.phase, self.patches, strict=True):
+        for k, direction, phase, patch in zip(
+            self.k, self.directions, self.phase, self.patches, strict=True
+        ):
             angle = points @ k + phase + warp
             crest = np.sin(angle)
-            flank = np.cos(angle) * crest / np.sqrt(crest * crest + 0.15)  # of a ridge |sin| with a rounded top
+            flank = (
+                np.cos(angle) * crest / np.sqrt(crest * crest + 0.15)
+            )  # of a ridge |sin| with a rounded top
             total += (np.clip(patch(points) - 0.3, 0, 1) * flank)[:, None] * direction
         return total
 
@@ -93,10 +105,14 @@ def lattice(points: np.ndarray, seed: int) -> np.ndarray:
 def hashed(cells: np.ndarray, seed: int) -> np.ndarray:
     """(n,) uniform [0, 1) numbers of integer cells (n, d), the same for the same cell and seed."""
     primes = np.asarray([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint64)[: cells.shape[1]]
-    mixed = (cells.astype(np.uint64) * primes).sum(-1, dtype=np.uint64) + np.uint64(seed * 0x27D4EB2F & 0xFFFFFFFF)
+    mixed = (cells.astype(np.uint64) * primes).sum(-1, dtype=np.uint64) + np.uint64(
+        seed * 0x27D4EB2F & 0xFFFFFFFF
+    )
     mixed = (mixed ^ (mixed >> np.uint64(15))) * np.uint64(0x2C1B3C6D) & np.uint64(0xFFFFFFFF)
     mixed = (mixed ^ (mixed >> np.uint64(12))) * np.uint64(0x297A2D39) & np.uint64(0xFFFFFFFF)
-    return ((mixed ^ (mixed >> np.uint64(15))) & np.uint64(0xFFFFFF)).astype(np.float32) / np.float32(1 << 24)
+    return ((mixed ^ (mixed >> np.uint64(15))) & np.uint64(0xFFFFFF)).astype(
+        np.float32
+    ) / np.float32(1 << 24)
 
 
 # Surfaces -------------------------------------------------------------------------------------------------------------
@@ -127,7 +143,9 @@ class Surface:
     def mapped(self, function: Callable[[np.ndarray], np.ndarray], faces: np.ndarray) -> "Surface":
         """Other faces, and one function of every array over the vertices."""
         attributes = {name: function(value) for name, value in self.attributes.items()}
-        return Surface(function(self.vertices), faces.astype(np.int32), function(self.weights), attributes)
+        return Surface(
+            function(self.vertices), faces.astype(np.int32), function(self.weights), attributes
+        )
 
     def with_attributes(self, **attributes: np.ndarray) -> "Surface":
         """The same surface with more (or other) attributes."""
@@ -151,9 +169,13 @@ def vertex_normals(vertices: Points, faces: Faces) -> Points:
     return unit(vertex_crosses(vertices, faces).astype(np.float32))
 
 
-def scatter_add(indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int) -> np.ndarray:
+def scatter_add(
+    indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int
+) -> np.ndarray:
     """Sums of the rows of `values` (m, c) that share an index, (count, c) float32."""
-    columns = [np.bincount(indices, weights=values[:, c], minlength=count) for c in range(values.shape[1])]
+    columns = [
+        np.bincount(indices, weights=values[:, c], minlength=count) for c in range(values.shape[1])
+    ]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
@@ -173,7 +195,10 @@ def smooth(values: Values, faces: Faces, iterations: int, keep_hems: bool = Fals
     """
     count = len(values)
     edges = edges_of(faces)
-    source, target = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
+    source, target = (
+        np.concatenate([edges[:, 0], edges[:, 1]]),
+        np.concatenate([edges[:, 1], edges[:, 0]]),
+    )
     if keep_hems:
         hems = boundary_edges(faces)
         inner = ~np.isin(target, hems)
@@ -214,7 +239,9 @@ def cut(surface: Surface, field: Field) -> Surface:
     pairs, inverse = np.unique(cuts, axis=0, return_inverse=True)
     on_ab, on_ac = np.split((inverse.reshape(-1) + len(surface.vertices)).astype(np.int32), 2)
     kept_tip = np.stack([a, on_ab, on_ac], 1)[~base]
-    kept_base = np.concatenate([np.stack([on_ab, b, c], 1)[base], np.stack([on_ab, c, on_ac], 1)[base]])
+    kept_base = np.concatenate(
+        [np.stack([on_ab, b, c], 1)[base], np.stack([on_ab, c, on_ac], 1)[base]]
+    )
     f0, f1 = field[pairs[:, 0]], field[pairs[:, 1]]
     t = (f0 / (f0 - f1)).astype(np.float32)
 
@@ -233,7 +260,9 @@ def join(surfaces: list[Surface]) -> Surface:
     names = set.intersection(*(set(s.attributes) for s in surfaces))
     return Surface(
         np.concatenate([s.vertices for s in surfaces]),
-        np.concatenate([s.faces + offset for s, offset in zip(surfaces, offsets, strict=True)]).astype(np.int32),
+        np.concatenate(
+            [s.faces + offset for s, offset in zip(surfaces, offsets, strict=True)]
+        ).astype(np.int32),
         np.concatenate([s.weights for s in surfaces]),
         {name: np.concatenate([s.attributes[name] for s in surfaces]) for name in names},
     )
@@ -258,34 +287,52 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
     Counter-clockwise seen from the side where columns run to the right and rows run down.
     """
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns if closed else columns - 1), indexing="ij")
+    row, column = np.meshgrid(
+        np.arange(rows - 1), np.arange(columns if closed else columns - 1), indexing="ij"
+    )
     right = (column + 1) % columns
     a, b = row * columns + column, row * columns + right
     c, d = (row + 1) * columns + column, (row + 1) * columns + right
-    return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
+    return (
+        np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)])
+        .reshape(-1, 3)
+        .astype(np.int32)
+    )
 
 
 def ball(rows: int, columns: int) -> tuple[Points, Faces]:
     """Unit vectors on a grid of polar angles (from +y) and azimuths (from +z), and its faces."""
-    down, azimuth, faces = tube(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns)
+    down, azimuth, faces = tube(
+        np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns
+    )
     return around(np.sin(down), azimuth, np.cos(down)), faces
 
 
-def tube(levels: Float[np.ndarray, " r"], angles: Float[np.ndarray, " c"]) -> tuple[Field, Field, Faces]:
+def tube(
+    levels: Float[np.ndarray, " r"], angles: Float[np.ndarray, " c"]
+) -> tuple[Field, Field, Faces]:
     """The level and the angle of every vertex (n,) of a tube, row by row, and its faces."""
     faces = grid_faces(len(levels), len(angles), closed=True)
     return np.repeat(levels, len(angles)), np.tile(angles, len(levels)), faces
 
 
 def sweep(
-    path: np.ndarray, across: np.ndarray, widths: np.ndarray | float, columns: int = 10, closed: bool = False
+    path: np.ndarray,
+    across: np.ndarray,
+    widths: np.ndarray | float,
+    columns: int = 10,
+    closed: bool = False,
 ) -> tuple[Points, Faces]:
     """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
 
     across: (3,) or (m, 3) along the first half axis, made normal to the path. widths: half axes, metres; one, or (m, 1 or 2).
     closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
     """
-    tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0)) if closed else unit(np.gradient(path, axis=0))
+    tangent = (
+        unit(np.roll(path, -1, 0) - np.roll(path, 1, 0))
+        if closed
+        else unit(np.gradient(path, axis=0))
+    )
     first = unit(across - np.sum(across * tangent, -1, keepdims=True) * tangent)
     second, widths = np.cross(tangent, first), np.broadcast_to(widths, (len(path), 2))
     c, s = np.cos(circle(columns))[None, :, None], np.sin(circle(columns))[None, :, None]
@@ -301,9 +348,13 @@ def circle(count: int) -> Field:
     return np.arange(count) * (2 * np.pi / count)
 
 
-def around(radius: Field | float | int, angle: Field, height: Field, center: np.ndarray | tuple = (0, 0)) -> Points:
+def around(
+    radius: Field | float | int, angle: Field, height: Field, center: np.ndarray | tuple = (0, 0)
+) -> Points:
     """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x, z)."""
-    return np.stack([center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1)
+    return np.stack(
+        [center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1
+    )
 
 
 ANGLES, EMPTY = 48, 1e-3
@@ -324,11 +375,15 @@ class Boundaries:
 
     def center(self, level: np.ndarray) -> np.ndarray:
         """(n, 2) centre of the slice at each position along the axis."""
-        return np.stack([np.interp(level, self.levels, self.centers[:, i]) for i in range(2)], -1).astype(np.float32)
+        return np.stack(
+            [np.interp(level, self.levels, self.centers[:, i]) for i in range(2)], -1
+        ).astype(np.float32)
 
     def radius(self, level: np.ndarray, angle: np.ndarray) -> np.ndarray:
         """(n,) radius at positions along the axis and angles around it, bilinear."""
-        t = np.clip(np.interp(level, self.levels, np.arange(len(self.levels))), 0, len(self.levels) - 1.001)
+        t = np.clip(
+            np.interp(level, self.levels, np.arange(len(self.levels))), 0, len(self.levels) - 1.001
+        )
         a = (angle / (2 * np.pi) * ANGLES) % ANGLES
         i, k = t.astype(int), a.astype(int) % ANGLES
         u, w, k1 = t - i, a - np.floor(a), (k + 1) % ANGLES
@@ -342,7 +397,9 @@ def polar(across: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.arctan2(d[:, 0], d[:, 1]), np.sqrt(np.sum(d * d, -1))
 
 
-def boundaries(along: Field, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float) -> Boundaries:
+def boundaries(
+    along: Field, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float
+) -> Boundaries:
     """Silhouettes of the points with position `along` (n,) on the axis and (n, 2) across it.
 
     levels: (l,) increasing. centers: (l, 2), or None for the middle of each slice. window: half thickness of a slice, metres.
@@ -380,5 +437,7 @@ def hanging(shape: Boundaries, slope: float) -> Boundaries:
     """Cloth that hangs: it keeps the largest radius of the slices above it, less `slope` metres per metre."""
     radii = shape.radii.copy()
     for i in range(len(radii) - 2, -1, -1):
-        radii[i] = np.maximum(radii[i], radii[i + 1] - slope * abs(shape.levels[i] - shape.levels[i + 1]))
+        radii[i] = np.maximum(
+            radii[i], radii[i + 1] - slope * abs(shape.levels[i] - shape.levels[i + 1])
+        )
     return dataclasses.replace(shape, radii=radii)

@@ -49,21 +49,31 @@ def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
 def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
     """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `JITTER` of the spacing."""
     spacing = 2 * np.pi / count
-    return rng.uniform(0, spacing) + spacing * (np.arange(count) + rng.uniform(-JITTER, JITTER, count))
+    return rng.uniform(0, spacing) + spacing * (
+        np.arange(count) + rng.uniform(-JITTER, JITTER, count)
+    )
 
 
-def cameras_around(rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int) -> Camera:
+def cameras_around(
+    rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
+) -> Camera:
     """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's ranges."""
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
     elevations = rng.uniform(*ELEVATION, len(azimuths))
     points = np.pad(vertices - center, ((0, -len(vertices) % POINT_STEP), (0, 0)), mode="edge")
-    near = _nearest_distances(jnp.asarray(points), *(jnp.asarray(x, jnp.float32) for x in (azimuths, elevations)))
+    near = _nearest_distances(
+        jnp.asarray(points), *(jnp.asarray(x, jnp.float32) for x in (azimuths, elevations))
+    )
     targets = np.broadcast_to(center, (len(azimuths), 3))
-    return _orbits(image_size, targets, np.maximum(distances, np.asarray(near)), azimuths, elevations)
+    return _orbits(
+        image_size, targets, np.maximum(distances, np.asarray(near)), azimuths, elevations
+    )
 
 
-def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int) -> Camera:
+def close_cameras(
+    rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
+) -> Camera:
     """A batch of cameras that see parts: `CLOSE_FACTOR` bounding radii away from points between middle and surface."""
     center, radius = bounding_sphere(vertices)
     count = len(azimuths)
@@ -72,9 +82,14 @@ def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, 
     distances = radius * rng.uniform(*CLOSE_FACTOR, count)
     elevations = rng.uniform(*ELEVATION, count)
     flat = np.cos(elevations)
-    directions = np.stack([flat * np.sin(azimuths), np.sin(elevations), flat * np.cos(azimuths)], -1)
+    directions = np.stack(
+        [flat * np.sin(azimuths), np.sin(elevations), flat * np.cos(azimuths)], -1
+    )
     for i in range(count):
-        while np.linalg.norm(vertices - targets[i] - distances[i] * directions[i], axis=1).min() < CLEARANCE:
+        while (
+            np.linalg.norm(vertices - targets[i] - distances[i] * directions[i], axis=1).min()
+            < CLEARANCE
+        ):
             distances[i] += 0.05 * radius
     return _orbits(image_size, targets, distances, azimuths, elevations)
 
@@ -96,7 +111,12 @@ def _orbits(
 
 
 def camera_from(
-    u: Array, vertices: Float[Array, "n 3"], count: Int[Array, ""] | int, azimuth: Number, close: Number, size: int
+    u: Array,
+    vertices: Float[Array, "n 3"],
+    count: Int[Array, ""] | int,
+    azimuth: Number,
+    close: Number,
+    size: int,
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
 
@@ -113,7 +133,9 @@ def camera_from(
     target = center + jnp.where(near, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
     along = _along_axes(vertices - target, azimuth, elevation)
     ahead, above, aside = along
-    beside = CLEARANCE**2 - (above * above + aside * aside)  # a camera on its axis comes no nearer than that to a point
+    beside = CLEARANCE**2 - (
+        above * above + aside * aside
+    )  # a camera on its axis comes no nearer than that to a point
     clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
     distance = jnp.maximum(factor * radius, jnp.where(near, clear, _nearest_distance(*along)))
     K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
@@ -121,16 +143,22 @@ def camera_from(
     return look_at(eye, target, jnp.asarray(UP, vertices.dtype), K, size, size)
 
 
-def _nearest_distance(ahead: Float[Array, " n"], above: Float[Array, " n"], aside: Float[Array, " n"]) -> Scalar:
+def _nearest_distance(
+    ahead: Float[Array, " n"], above: Float[Array, " n"], aside: Float[Array, " n"]
+) -> Scalar:
     """Least distance from the origin at which a camera that looks at it has all points in its square frame."""
-    return jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead)
+    return jnp.max(
+        jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead
+    )
 
 
 @jax.jit
 def _nearest_distances(
     points: Float[Array, "n 3"], azimuths: Float[Array, " v"], elevations: Float[Array, " v"]
 ) -> Float[Array, " v"]:
-    return jax.vmap(lambda a, e: _nearest_distance(*_along_axes(points, a, e)))(azimuths, elevations)
+    return jax.vmap(lambda a, e: _nearest_distance(*_along_axes(points, a, e)))(
+        azimuths, elevations
+    )
 
 
 def _within(limits: tuple[float, float] | Float[np.ndarray, "2"], share: Scalar) -> Scalar:
@@ -141,16 +169,25 @@ def _axes(azimuth: Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3
     """Unit vectors towards a camera, up and right in its image."""
     sa, ca, se, ce = jnp.sin(azimuth), jnp.cos(azimuth), jnp.sin(elevation), jnp.cos(elevation)
     zero = jnp.zeros_like(sa)
-    return jnp.stack([ce * sa, se, ce * ca]), jnp.stack([-se * sa, ce, -se * ca]), jnp.stack([ca, zero, -sa])
+    return (
+        jnp.stack([ce * sa, se, ce * ca]),
+        jnp.stack([-se * sa, ce, -se * ca]),
+        jnp.stack([ca, zero, -sa]),
+    )
 
 
-def _along_axes(points: Float[Array, "n 3"], azimuth: Number, elevation: Scalar) -> tuple[Float[Array, " n"], ...]:
+def _along_axes(
+    points: Float[Array, "n 3"], azimuth: Number, elevation: Scalar
+) -> tuple[Float[Array, " n"], ...]:
     """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and TPU."""
     return tuple(jnp.sum(points * axis, -1) for axis in _axes(azimuth, elevation))
 
 
 def azimuths_from(
-    u: Float[Array, " numbers"], jitter: float, scattered_share: float, count: Int[Array, ""] | None = None
+    u: Float[Array, " numbers"],
+    jitter: float,
+    scattered_share: float,
+    count: Int[Array, ""] | None = None,
 ) -> Float[Array, " v"]:
     """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing; or anywhere.
 
@@ -223,12 +260,18 @@ def sample_lights(rng: np.random.Generator) -> Lights:
     scene = SCENES[choice(rng, {name: row[0] for name, row in SCENES.items()})]
     _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
     azimuth = rng.uniform(*azimuths) * rng.choice([-1, 1])
-    angles = azimuth + np.asarray([0.0, rng.uniform(1.4, 2.4) * rng.choice([-1, 1]), np.pi + rng.uniform(-0.5, 0.5)])
+    angles = azimuth + np.asarray(
+        [0.0, rng.uniform(1.4, 2.4) * rng.choice([-1, 1]), np.pi + rng.uniform(-0.5, 0.5)]
+    )
     elevations = np.asarray([rng.uniform(*heights), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)])
     power = np.asarray([rng.uniform(*key), rng.uniform(*fill), rng.uniform(0.4, 1.2) * fill[1]])
     tint = rng.uniform(-0.03, 0.03, (3, 3))
     sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * WARM)
-    exposure, balance, green = np.exp(rng.normal(0.06, 0.12)), rng.normal(0, 0.045), rng.normal(0, 0.012)
+    exposure, balance, green = (
+        np.exp(rng.normal(0.06, 0.12)),
+        rng.normal(0, 0.045),
+        rng.normal(0, 0.012),
+    )
     gain = np.clip(exposure, 0.75, 1.3) * np.asarray([1 + balance, 1 + green, 1 - balance])
     ground = bounce * sky * (1 + rng.uniform(-0.06, 0.06, 3))
     return _lights(np, angles, elevations, power, tint, warmth, sky, ground, gain)
@@ -242,13 +285,26 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     warmth, bounce = row[11], row[12]
     within = lambda limits, share: limits[0] + (limits[1] - limits[0]) * share
     sign = lambda number: jnp.where(number < 0.5, -1.0, 1.0)
-    turns = jnp.stack([jnp.zeros(()), sign(u[1]) * within((1.4, 2.4), u[2]), np.pi + within((-0.5, 0.5), u[3])])
-    elevations = jnp.stack([within(height, u[6]), within((0.1, 0.5), u[7]), within((0.4, 0.9), u[8])])
+    turns = jnp.stack(
+        [jnp.zeros(()), sign(u[1]) * within((1.4, 2.4), u[2]), np.pi + within((-0.5, 0.5), u[3])]
+    )
+    elevations = jnp.stack(
+        [within(height, u[6]), within((0.1, 0.5), u[7]), within((0.4, 0.9), u[8])]
+    )
     power = jnp.stack([within(key, u[9]), within(fill, u[10]), within((0.4, 1.2), u[11]) * fill[1]])
-    tint, color = within((-0.03, 0.03), u[12:21].reshape(3, 3)), within(sky, u[21]) * (1 - 0.5 * warmth * WARM)
+    tint, color = (
+        within((-0.03, 0.03), u[12:21].reshape(3, 3)),
+        within(sky, u[21]) * (1 - 0.5 * warmth * WARM),
+    )
     normal = lambda number: ndtri(jnp.clip(number, 1e-4, 1 - 1e-4))
-    exposure, balance, green = 0.12 * normal(u[22]) + 0.06, 0.045 * normal(u[23]), 0.012 * normal(u[24])
-    gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack([1 + balance, 1 + green, 1 - balance])
+    exposure, balance, green = (
+        0.12 * normal(u[22]) + 0.06,
+        0.045 * normal(u[23]),
+        0.012 * normal(u[24]),
+    )
+    gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack(
+        [1 + balance, 1 + green, 1 - balance]
+    )
     ground = bounce * color * (1 + within((-0.06, 0.06), u[25:28]))
     angles = within(azimuth, u[4]) * sign(u[5]) + turns
     return _lights(jnp, angles, elevations, power, tint, warmth, color, ground, gain)
@@ -267,13 +323,20 @@ def _lights(
 ) -> Lights:
     """numpy: the module of the arrays' kind."""
     flat = numpy.cos(elevations)
-    directions = numpy.stack([flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1)
+    directions = numpy.stack(
+        [flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1
+    )
     strengths = power[:, None] * (1 + tint + warmth * np.outer([1.0, 0.0, 0.0], WARM))
-    return Lights(*(jnp.asarray(x, jnp.float32) for x in (directions, strengths, sky, ground, gain)))
+    return Lights(
+        *(jnp.asarray(x, jnp.float32) for x in (directions, strengths, sky, ground, gain))
+    )
 
 
 def shaded_vertices(
-    vertices: Vectors, normals: Vectors, direction: Float[Array, "3"], faces: Int[Array, "f 3"] | None = None
+    vertices: Vectors,
+    normals: Vectors,
+    direction: Float[Array, "3"],
+    faces: Int[Array, "f 3"] | None = None,
 ) -> tuple[Values, Values]:
     """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in [DARKEST, 1].
 
@@ -301,7 +364,9 @@ def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
     for axis, size in enumerate(GRID):
         apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
         weights = jnp.asarray(np.maximum(3 - apart, 0) / 9, grid.dtype)
-        grid = jnp.moveaxis(jnp.tensordot(weights, grid, (1, axis), precision=lax.Precision.HIGHEST), 0, axis)
+        grid = jnp.moveaxis(
+            jnp.tensordot(weights, grid, (1, axis), precision=lax.Precision.HIGHEST), 0, axis
+        )
     return grid
 
 
@@ -329,14 +394,22 @@ def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Ar
     return total
 
 
-def seen_from_behind(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], eye: Float[Array, "3"]) -> Bool[Array, " f"]:
+def seen_from_behind(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], eye: Float[Array, "3"]
+) -> Bool[Array, " f"]:
     """(f,) whether a point sees the inner side of a face."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0
 
 
 def light_points(
-    lights: Lights, corners: Array, weights: Vectors, behind: Array, albedo: Vectors, slopes: Vectors, sheen: Values
+    lights: Lights,
+    corners: Array,
+    weights: Vectors,
+    behind: Array,
+    albedo: Vectors,
+    slopes: Vectors,
+    sheen: Values,
 ) -> Vectors:
     """Colors (p, 3) of points on faces.
 
@@ -353,7 +426,9 @@ def light_points(
     return shade(lights, albedo, normals, openness, lit, sheen)
 
 
-def shade(lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, lit: Values, sheen: Values) -> Vectors:
+def shade(
+    lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, lit: Values, sheen: Values
+) -> Vectors:
     """Colors in [0, 1] of points; normals are unit, `lit` is the share of the key light that arrives."""
     up = 0.5 + 0.5 * normals[..., 1:2]
     light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
@@ -373,14 +448,18 @@ def rolled_off(colors: Vectors) -> Vectors:
     """Colors from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
     reach = WHITEST - SHOULDER
     colors = jnp.maximum(colors, 0)
-    return jnp.minimum(colors, SHOULDER) + reach * (1 - jnp.exp(-jnp.maximum(colors - SHOULDER, 0) / reach))
+    return jnp.minimum(colors, SHOULDER) + reach * (
+        1 - jnp.exp(-jnp.maximum(colors - SHOULDER, 0) / reach)
+    )
 
 
 def _unit(vectors: Vectors) -> Vectors:
     return vectors / (jnp.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-9)
 
 
-def dyes_from(u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[Array, " m"]) -> Float[Array, "m 3 3"]:
+def dyes_from(
+    u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[Array, " m"]
+) -> Float[Array, "m 3 3"]:
     """(m, 3, 3) matrices that recolor each piece: hue, saturation and brightness of cloth.
 
     Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half of the pieces,

@@ -22,7 +22,17 @@ from humangs_jax.people.anatomy import (
     sewn_coordinates,
     smoothstep,
 )
-from humangs_jax.people.surfaces import Boundaries, Field, Points, Surface, blurred, hanging, polar, ripples, smooth
+from humangs_jax.people.surfaces import (
+    Boundaries,
+    Field,
+    Points,
+    Surface,
+    blurred,
+    hanging,
+    polar,
+    ripples,
+    smooth,
+)
 
 TRUNK_HALF_WIDTH = 0.25
 """In T-pose everything further out than this is an arm."""
@@ -45,7 +55,9 @@ def neckline(template: Points, style: str, depth: float) -> Field:
     plane = 0.152 + lift - 0.42 * z - y
     field = np.maximum(plane, np.minimum(radial - wide, 0.17 - y))  # shoulders, but not the head
     if style == "vee":
-        opening = np.maximum.reduce([0.13 - depth + np.abs(x) * depth / 0.06 - y, np.abs(x) - 0.06, 0.02 - z])
+        opening = np.maximum.reduce(
+            [0.13 - depth + np.abs(x) * depth / 0.06 - y, np.abs(x) - 0.06, 0.02 - z]
+        )
         field = np.minimum(field, opening)
     if style == "scoop":
         inside = 1 - (x / 0.105) ** 2 - ((y - 0.15) / (0.02 + depth)) ** 2
@@ -56,7 +68,9 @@ def neckline(template: Points, style: str, depth: float) -> Field:
 def sleeves(template: Points, end: float) -> Field:
     """Positive inside of |x| = end; for sleeveless tops (end < 0.2) an armhole down to the armpit."""
     x, y = np.abs(template[:, 0]), template[:, 1]
-    return end + 1.6 * np.maximum(0.03 - y, 0) - x if end < 0.2 else np.where(y > -0.1, end - x, 0.5)
+    return (
+        end + 1.6 * np.maximum(0.03 - y, 0) - x if end < 0.2 else np.where(y > -0.1, end - x, 0.5)
+    )
 
 
 def above(template: Points, level: float) -> Field:
@@ -81,7 +95,9 @@ def collar(template: Points, low: float, high: float, gap: float = 0.012) -> Fie
     """Positive on a band around the neck between two heights (of the neckline's plane), open in front."""
     x, y, z = template.T
     radial, plane = np.sqrt(x * x + (z + 0.005) ** 2), y + 0.42 * z
-    return np.minimum.reduce([plane - low, high - plane, 0.125 - radial, np.where(z > 0, np.abs(x) - gap, 0.1)])
+    return np.minimum.reduce(
+        [plane - low, high - plane, 0.125 - radial, np.where(z > 0, np.abs(x) - gap, 0.1)]
+    )
 
 
 def lapel(template: Points, gap: float, spread: float, bottom: float) -> Field:
@@ -89,7 +105,9 @@ def lapel(template: Points, gap: float, spread: float, bottom: float) -> Field:
     x, y, z = template.T
     width = np.clip((y - bottom) * 0.42, 0, 0.075) * np.clip((0.2 - y) / 0.05, 0, 1)
     inner = front_opening(template, gap, spread)
-    return np.minimum.reduce([inner, width - inner, y - bottom, 0.19 - y, 0.4 * (z - 0.0), 0.14 - np.abs(x)])
+    return np.minimum.reduce(
+        [inner, width - inner, y - bottom, 0.19 - y, 0.4 * (z - 0.0), 0.14 - np.abs(x)]
+    )
 
 
 def hips_and_legs(template: Points, top: float, bottom: float) -> Field:
@@ -118,7 +136,9 @@ def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Fi
     across = (x - shoulder) * along[1] - (y - 0.17) * along[0]
     # the side of the trunk is steep
     half_width = half_width * (1 - 0.6 * np.clip((x * np.sign(hip) - 0.06) / 0.08, 0, 1))
-    return np.minimum.reduce([half_width - np.abs(across), y + 0.29, np.where(y > -0.02, 0.186, 0.25) - np.abs(x)])
+    return np.minimum.reduce(
+        [half_width - np.abs(across), y + 0.29, np.where(y > -0.02, 0.186, 0.25) - np.abs(x)]
+    )
 
 
 def necktie(template: Points, length: float, width: float) -> Field:
@@ -166,11 +186,16 @@ class Fit:
     skirted: bool = False
 
 
-def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit) -> Surface:
+def shell(
+    rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit
+) -> Surface:
     """A garment that covers the skin where all fields (n,) over the body's vertices are positive."""
     skin = anatomy.skin
     surface = skin.with_attributes(
-        skin_point=skin.vertices, arm=anatomy.arm, leg=anatomy.leg, **{f"field{i}": f for i, f in enumerate(fields)}
+        skin_point=skin.vertices,
+        arm=anatomy.arm,
+        leg=anatomy.leg,
+        **{f"field{i}": f for i, f in enumerate(fields)},
     )
     for i in range(len(fields)):
         surface = surfaces.cut(surface, surface.attributes[f"field{i}"])
@@ -196,10 +221,14 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
     below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 2))
     points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
-    below_armpit = 1 - smoothstep(-0.03, 0.06, points[:, 1] - anatomy.joints[LEFT_SHOULDER, 1] + ARM_HEIGHT)
+    below_armpit = 1 - smoothstep(
+        -0.03, 0.06, points[:, 1] - anatomy.joints[LEFT_SHOULDER, 1] + ARM_HEIGHT
+    )
     angle, radius = polar(points[:, [0, 2]], np.zeros((1, 2)))
     wanted = hanging(anatomy.trunk, fit.hang).radius(points[:, 1], angle) + fit.ease
-    grown = radius + (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit * np.maximum(wanted - radius, 0)
+    grown = radius + (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit * np.maximum(
+        wanted - radius, 0
+    )
     points = points.astype(np.float64)
     points[:, [0, 2]] *= (grown / np.maximum(radius, 1e-4))[:, None]
     for side, sign in ((0, 1), (1, -1)):
@@ -209,7 +238,9 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
         points = _push(points, (1, 2), along, boundary, arm * (sign * points[:, 0] > 0), *wider)
         if not fit.skirted:
             shape = anatomy.legs[side]
-            inner = dataclasses.replace(shape, radii=np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
+            inner = dataclasses.replace(
+                shape, radii=np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii)
+            )
             wider = fit.ease, fit.leg * np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
             own = leg * (sign * points[:, 0] > 0)
             points = _push(points, (0, 2), points[:, 1], hanging(inner, fit.leg_hang), own, *wider)
@@ -217,11 +248,18 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
     x, y, _ = surface.template.T
     seat = np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
     if seat.any():  # smoother between the buttocks and below the belly
-        points = points + seat[:, None] * (smooth(points, surface.faces, 15, keep_hems=True) - points)
+        points = points + seat[:, None] * (
+            smooth(points, surface.faces, 15, keep_hems=True) - points
+        )
     outer = surfaces.vertex_normals(points, surface.faces)
-    cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
+    cloth = smooth(
+        surface.attributes["cloth"], surface.faces, 10, keep_hems=True
+    )  # as the points were
     template = smooth(surface.template, surface.faces, 8, keep_hems=True)
-    points = points + _fold_heights(rng, sewn_coordinates(cloth, template), arm, leg, fit)[:, None] * outer
+    points = (
+        points
+        + _fold_heights(rng, sewn_coordinates(cloth, template), arm, leg, fit)[:, None] * outer
+    )
     distance = np.sum((points - below) * surface.attributes["normals"], -1)
     least = max(0.55 * fit.ease, fit.inner)
     points = points + np.maximum(least - distance, 0)[:, None] * surface.attributes["normals"]
@@ -232,7 +270,9 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
     return surface.moved(points).with_attributes(cloth=cloth, template=template)
 
 
-def _fold_heights(rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm: Field, leg: Field, fit: Fit) -> Field:
+def _fold_heights(
+    rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm: Field, leg: Field, fit: Fit
+) -> Field:
     """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints and cuffs gather cloth."""
     along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
     heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
@@ -242,7 +282,9 @@ def _fold_heights(rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm
     drapes = np.sin(2 * np.pi * around / 0.09 + 2.5 * wander) * np.clip(-along / 0.35, 0, 1)
     heights = heights + 0.8 * fit.fold * drapes * (1 - arm) * np.where(leg > 0.5, 0.35, 1.0)
     slanted = along + 0.25 * around + 0.012 * ripples(rng, cloth[:, :3], wavelength=0.12)
-    rings = np.sin(2 * np.pi * slanted / 0.055) * (0.6 + 0.4 * ripples(rng, cloth[:, :3], wavelength=0.1))
+    rings = np.sin(2 * np.pi * slanted / 0.055) * (
+        0.6 + 0.4 * ripples(rng, cloth[:, :3], wavelength=0.1)
+    )
     bend = lambda height, wide: np.exp(-(((along + height) / wide) ** 2))
     elbows = arm * (bend(0.14, 0.07) + 0.8 * bend(0.34, 0.06))
     knees = leg * (bend(0.79, 0.07) + 1.3 * bend(1.12, 0.07) + 0.6 * bend(0.46, 0.05))
@@ -254,7 +296,13 @@ def _fold_heights(rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm
 
 
 def _push(
-    points: Points, across: tuple[int, int], along: Field, boundary: Boundaries, amount: Field, ease: float, extra: Field
+    points: Points,
+    across: tuple[int, int],
+    along: Field,
+    boundary: Boundaries,
+    amount: Field,
+    ease: float,
+    extra: Field,
 ) -> Points:
     """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,) on it; across: other axes."""
     center, axes = boundary.center(along), list(across)
@@ -284,7 +332,9 @@ def skirt(
     """
     top, bottom = heights
     rows = max(3, int(np.ceil((top - bottom) / TUBE_STEP)) + 1)
-    template_y, angle, faces = surfaces.tube(np.linspace(top, bottom, rows), surfaces.circle(TUBE_COLUMNS))
+    template_y, angle, faces = surfaces.tube(
+        np.linspace(top, bottom, rows), surfaces.circle(TUBE_COLUMNS)
+    )
     height, drop = rest_height(anatomy, template_y), top - template_y
     below = drop - cling
     boundary = blurred(hanging(anatomy.hips_and_legs, 0.15))
@@ -292,7 +342,9 @@ def skirt(
     radius = radius - UNDER_A_HEM * np.clip(1 - below / 0.06, 0, 1) * (cling > 0)
     waves = ripples(rng, surfaces.around(1, angle, 0.3 * height), wavelength=0.9)
     loose = np.clip(below / 0.25, 0, 1) * (drop / max(top - bottom, 1e-6)) ** 0.5
-    radius = radius + loose * (pleats[1] * np.cos(pleats[0] * angle) + 0.012 * (1 + 4 * flare) * waves)
+    radius = radius + loose * (
+        pleats[1] * np.cos(pleats[0] * angle) + 0.012 * (1 + 4 * flare) * waves
+    )
     vertices = surfaces.around(radius, angle, height).astype(np.float32)
     template = surfaces.around(0.16, angle, template_y, (0, 0.02))
     surface = Surface(vertices, faces, _skirt_weights(anatomy, vertices, template_y))
@@ -317,7 +369,9 @@ def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
     return inside + np.minimum(below, 0) + np.maximum(above, 0)
 
 
-def _skirt_weights(anatomy: Anatomy, vertices: Points, template_y: Field) -> Float[np.ndarray, "n j"]:
+def _skirt_weights(
+    anatomy: Anatomy, vertices: Points, template_y: Field
+) -> Float[np.ndarray, "n j"]:
     """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's side further down."""
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.2) & (y < 0.0) & (y > -0.4))[::2]

@@ -119,7 +119,9 @@ def _darker(colors: Points, share: float | Float[np.ndarray, "n 1"], where: Fiel
 def seamed(colors: Points, s: Spots) -> Points:
     """Seams down the sides of trunk and limbs and around the armholes."""
     armhole = np.where(s.template[:, 1] > -0.02, np.abs(np.abs(s.template[:, 0]) - ARMHOLE), 1.0)
-    return _darker(colors, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024)))
+    return _darker(
+        colors, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024))
+    )
 
 
 def hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
@@ -151,15 +153,21 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     def motif(result, x, y, where):
         if kind in ("words", "number"):
             if framed and kind == "words":
-                box = band(np.abs(x), -1, (0.5 * width + 1.5) * cell) * band(np.abs(y), -1, 5.5 * cell)
+                box = band(np.abs(x), -1, (0.5 * width + 1.5) * cell) * band(
+                    np.abs(y), -1, 5.5 * cell
+                )
                 result = mix(result, ink2, box * where)
             return mix(result, ink, words(x, y) * where)
         if kind == "logo":
-            return mix(result, ink, np.clip(badge(x - 0.075, y - 0.04, 0.02) * 8 + 0.5, 0, 1) * where)
+            return mix(
+                result, ink, np.clip(badge(x - 0.075, y - 0.04, 0.02) * 8 + 0.5, 0, 1) * where
+            )
         if kind == "picture":
             inside = band(np.maximum(np.abs(x), 0.8 * np.abs(y)), -1, 1.2 * size)
             scene = lattice(np.stack([x / 0.05, y / 0.03], -1), seed)
-            drawn = mix(mix(ink, ink2, (scene > 0.45).astype(np.float32)), base, band(scene, 0.62, 2, 0.02))
+            drawn = mix(
+                mix(ink, ink2, (scene > 0.45).astype(np.float32)), base, band(scene, 0.62, 2, 0.02)
+            )
             return mix(result, drawn, inside * where)
         inside = badge(x, y - 0.35 * size * (kind == "both"), size) * size / 0.0015 + 0.5
         result = mix(result, ink, np.clip(inside, 0, 1) * where)
@@ -180,7 +188,11 @@ def side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: Ga
     outside = np.where(girth > 0.1, _from_the_side(s), 0)
     outside = np.where(girth < 0.12, turned - 0.5 * np.pi * girth, outside)
     phase = (outside + 0.011) / wide
-    stripes = band((phase % 1) * wide, 0.0, 0.6 * wide) * (np.floor(phase) >= 0) * (np.floor(phase) < count)
+    stripes = (
+        band((phase % 1) * wide, 0.0, 0.6 * wide)
+        * (np.floor(phase) >= 0)
+        * (np.floor(phase) < count)
+    )
     return mix(colors, ink, stripes * band(girth, 0.0, 0.12, 0.01))
 
 
@@ -214,17 +226,24 @@ def buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
 
 def zipped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A zip down the front, or its halves along the edges of an open front."""
-    ink, edge = color(0.1, 0.05, rng.choice([0.15, 0.6, 0.75])), max(garment.sizes.get("gap", 0.0), 0.0)
+    ink, edge = (
+        color(0.1, 0.05, rng.choice([0.15, 0.6, 0.75])),
+        max(garment.sizes.get("gap", 0.0), 0.0),
+    )
     front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], garment.sizes["bottom"], 0.2)
     away = np.abs(np.abs(s.cloth[:, 0]) - edge)
-    return mix(_darker(colors, 0.55, band(away, 0.004, 0.011) * front), ink, band(away, -1, 0.0035) * front)
+    return mix(
+        _darker(colors, 0.55, band(away, 0.004, 0.011) * front), ink, band(away, -1, 0.0035) * front
+    )
 
 
 def _boundary(x: Field, y: Field, half_width: float, half_height: float) -> Field:
     return band(np.abs(np.maximum(np.abs(x) - half_width, np.abs(y) - half_height)), -1, 0.0018)
 
 
-def pocketed(colors: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str) -> Points:
+def pocketed(
+    colors: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str
+) -> Points:
     """Pockets as stitched silhouettes: on the chest, in a jacket's front, on jeans (front and back) or on the thighs (cargo)."""
     sides = rng.choice([1, 2]) if kind == "chest" else 2
     bright = 1.6 if kind == "jeans" and rng.random() < 0.5 else 0.6
@@ -233,7 +252,11 @@ def pocketed(colors: Points, s: Spots, rng: np.random.Generator, _garment: Garme
         own = x > 0 if sides == 1 else np.abs(x) > 0
         line = _boundary(np.abs(x) - 0.075, y - 0.0, 0.042, 0.048) * front * own * _trunk(s)
     elif kind == "jacket":
-        line = band(np.abs(np.abs(x) - 0.09 + 0.3 * (y + 0.2)), -1, 0.0035) * band(y, -0.27, -0.15) * front
+        line = (
+            band(np.abs(np.abs(x) - 0.09 + 0.3 * (y + 0.2)), -1, 0.0035)
+            * band(y, -0.27, -0.15)
+            * front
+        )
     elif kind == "jeans":
         curve = np.abs((np.abs(x) - 0.16) ** 2 + ((y + 0.25) * 0.9) ** 2 - 0.0065) / 0.16
         fly = band(np.abs(x - 0.018), -1, 0.0018) * band(y, -0.36, -0.2)
@@ -284,7 +307,9 @@ SEWN_ON = (
 they share the fabric's random numbers."""
 
 
-def sewn(garment: Garment, hem: float, sleeve: float | None = None, seams: bool = True) -> Callable[[Spots], Points]:
+def sewn(
+    garment: Garment, hem: float, sleeve: float | None = None, seams: bool = True
+) -> Callable[[Spots], Points]:
     """The garment's fabric with stitches at the hem (height y) and the sleeves' ends, seams, prints and what is sewn on."""
     details = garment.details
     if "collar" in details and "open" not in details:
@@ -294,7 +319,11 @@ def sewn(garment: Garment, hem: float, sleeve: float | None = None, seams: bool 
         rng = garment.fabric.rng(1)
         result = hemmed(garment.fabric.colors(s), s, hem, sleeve)
         result = seamed(result, s) if seams else result
-        result = ribbed(result, s, rng, garment) if "ribbed" in details and sleeve is not None else result
+        result = (
+            ribbed(result, s, rng, garment)
+            if "ribbed" in details and sleeve is not None
+            else result
+        )
         result = printed(result, s, rng, garment) if details & {"print", "number"} else result
         result = side_striped(result, s, rng, garment) if "side_stripe" in details else result
         rng = garment.fabric.rng(2)
@@ -320,7 +349,9 @@ def leather(s: Spots, garment: Garment) -> Points:
     y, x, z = s.cloth[:, 1], np.abs(s.cloth[:, 0]), s.cloth[:, 2]
     result = np.broadcast_to(base, (len(y), 3)).astype(np.float32)
     if sneakers:
-        side = band(np.abs(y - 0.045 - swoosh * (z - 0.04)), -1, 0.011, 0.003) * band(z, -0.05, 0.12, 0.003)
+        side = band(np.abs(y - 0.045 - swoosh * (z - 0.04)), -1, 0.011, 0.003) * band(
+            z, -0.05, 0.12, 0.003
+        )
         result = mix(result, second, side * (x > 0.022))
     if toe:
         result = mix(result, trim, band(z, 0.135, 1.0, 0.004))
@@ -336,9 +367,15 @@ def leather(s: Spots, garment: Garment) -> Points:
 def buckled(s: Spots, garment: Garment) -> Points:
     """A belt with stitched edges, holes and a buckle in front."""
     width = garment.sizes["width"]
-    x, y, front = s.template[:, 0], s.template[:, 1] - (garment.sizes["top"] - 0.5 * width), s.cloth[:, 2] > 0
+    x, y, front = (
+        s.template[:, 0],
+        s.template[:, 1] - (garment.sizes["top"] - 0.5 * width),
+        s.cloth[:, 2] > 0,
+    )
     metal = color(0.12, 0.3, 0.62) if width > 0.035 else color(0.6, 0.05, 0.6)
-    result = _darker(garment.fabric.colors(s), 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012))
+    result = _darker(
+        garment.fabric.colors(s), 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012)
+    )
     frame = np.maximum(np.abs(x) / 0.026, np.abs(y) / (0.56 * width))
     holes = band(np.abs(x - 0.06) % 0.03, -1, 0.003) * band(np.abs(y), -1, 0.003) * (x > 0.03)
     return _darker(mix(result, metal, band(frame, 0.68, 1.02, 0.06) * front), 0.3, holes * front)

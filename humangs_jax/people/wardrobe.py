@@ -69,7 +69,9 @@ class Outfit:
 
     def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
         """Put one more piece on. layered: whether later layers can hide parts of it."""
-        self.pieces.append(Piece(surface, material, np.zeros(len(surface.vertices), bool) if layered else None))
+        self.pieces.append(
+            Piece(surface, material, np.zeros(len(surface.vertices), bool) if layered else None)
+        )
 
     def hide(self, cover: Cover, margin: float, cloth: bool = True) -> None:
         """Take away what lies further than a margin inside of a garment that is put on next: skin, and cloth if it is below."""
@@ -113,11 +115,21 @@ def dress_up(rng: np.random.Generator, anatomy: Anatomy, garments: tuple[Garment
 
 
 def _bodice(
-    outfit: Outfit, neck: str, sizes: Sequence[float], fit: Fit, material: Material, margin: float, opening: Sequence[Cut] = ()
+    outfit: Outfit,
+    neck: str,
+    sizes: Sequence[float],
+    fit: Fit,
+    material: Material,
+    margin: float,
+    opening: Sequence[Cut] = (),
 ) -> None:
     """Cloth on trunk and arms, the outermost so far. sizes: depth of the neckline, ends of the sleeves and of the trunk."""
     depth, sleeve, bottom = sizes
-    cuts = [(tailoring.neckline, neck, depth), (tailoring.sleeves, sleeve), (tailoring.above, bottom)]
+    cuts = [
+        (tailoring.neckline, neck, depth),
+        (tailoring.sleeves, sleeve),
+        (tailoring.above, bottom),
+    ]
     outfit.put([*cuts, *opening], fit, material, margin)
     outfit.trunk, outfit.fit = fit.ease, fit
 
@@ -127,7 +139,11 @@ def _neck(garment: Garment) -> str:
 
 
 def _collar(
-    outfit: Outfit, material: Material, fit: Fit, extra: float = 0.004, sizes: Sequence[float] = (0.125, 0.178, 0.012)
+    outfit: Outfit,
+    material: Material,
+    fit: Fit,
+    extra: float = 0.004,
+    sizes: Sequence[float] = (0.125, 0.178, 0.012),
 ) -> None:
     """sizes: see `tailoring.collar`."""
     cut_of = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
@@ -148,11 +164,23 @@ def _top(outfit: Outfit, garment: Garment) -> None:
     stitches = sewn(garment, bottom + 0.018, sleeve - 0.016 if sleeve > 0.2 else None)
     material = Material(stitches, 0.25 + 0.45 * loose, sheen=0.04)
     opening = [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
-    _bodice(outfit, _neck(garment), (sizes["depth"], sleeve, bottom), fit, material, HEM_MARGIN + 0.03 * loose, opening)
+    _bodice(
+        outfit,
+        _neck(garment),
+        (sizes["depth"], sleeve, bottom),
+        fit,
+        material,
+        HEM_MARGIN + 0.03 * loose,
+        opening,
+    )
     if kind in ("shirt", "polo", "blouse") and "collar" in details:
         _collar(outfit, material, fit)
     if kind == "hoodie":
-        outfit.add(accessories.hood(outfit.rng, outfit.anatomy, "hood_up" in details), material, layered=False)
+        outfit.add(
+            accessories.hood(outfit.rng, outfit.anatomy, "hood_up" in details),
+            material,
+            layered=False,
+        )
 
 
 def _outer(outfit: Outfit, garment: Garment) -> None:
@@ -171,13 +199,24 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         inner=outfit.trunk + 0.5 * LAYER,
     )
     stitches = sewn(garment, bottom + 0.018, sizes["sleeve"] - 0.016 if kind != "vest" else None)
-    material = Material(stitches, 0.15 if blazer else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05)
+    material = Material(
+        stitches, 0.15 if blazer else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05
+    )
     opening = [(tailoring.front_opening, gap, spread)] if gap > 0 else []
     neck, low = "vee" if "lapels" in details else "crew", WAIST - 0.045 if long else bottom
     _bodice(outfit, neck, (0.09, sizes["sleeve"], low), fit, material, 0.03, opening)
     if long:
         width, flare = max(outfit.legs, ease) + 0.002, sizes["flare"]
-        tube = skirt(outfit.rng, outfit.anatomy, (WAIST + 0.02, bottom), width, flare, (5, 0.008), gap, 0.5 * spread)
+        tube = skirt(
+            outfit.rng,
+            outfit.anatomy,
+            (WAIST + 0.02, bottom),
+            width,
+            flare,
+            (5, 0.008),
+            gap,
+            0.5 * spread,
+        )
         if gap < 0:
             outfit.hide(lambda t: tailoring.hips_and_legs(t, WAIST, bottom), 0.02)
         outfit.add(tube, dataclasses.replace(material, draped=True))
@@ -185,7 +224,9 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         edge, low = max(gap, 0.004), outfit.rng.uniform(-0.16, -0.08)
         strip = dataclasses.replace(fit, ease=ease + 0.006, fold=0.0, hem=0.005, inner=ease + 0.003)
         dark = Material(lambda s: 0.88 * stitches(s), sheen=0.06)  # seen against its pile
-        outfit.strip(tailoring.lapel(outfit.template, edge, spread if gap > 0 else 0.0, low), strip, dark)
+        outfit.strip(
+            tailoring.lapel(outfit.template, edge, spread if gap > 0 else 0.0, low), strip, dark
+        )
         _collar(outfit, dark, strip, 0.001, (0.12, 0.17, max(edge, 0.03)))
     elif "hood" in details or kind == "hooded_jacket":
         outfit.add(accessories.hood(outfit.rng, outfit.anatomy, False), material, layered=False)
@@ -235,7 +276,9 @@ def _skirt(outfit: Outfit, garment: Garment) -> None:
     ease = outfit.trunk + 0.004 if tucked else 0.004
     cling = 0.0 if tucked else max(0.0, top - outfit.lowest + 0.02)  # as far as the top reaches
     stitches = sewn(garment, end + 0.02, seams=False)
-    waistband = lambda s: trimmings.banded(stitches(s), s, garment.fabric.base * 0.8, top - 0.035, top)
+    waistband = lambda s: trimmings.banded(
+        stitches(s), s, garment.fabric.base * 0.8, top - 0.035, top
+    )
     surface = skirt(outfit.rng, outfit.anatomy, (top, end), ease, *_hem_of(sizes), cling=cling)
     outfit.hide(lambda t: tailoring.hips_and_legs(t, top, end), 0.0, tucked)
     outfit.add(surface, Material(waistband, wrinkles=0.35, sheen=0.05, draped=True))
@@ -272,9 +315,13 @@ def _socks(outfit: Outfit, garment: Garment) -> None:
 
 def _shoes(outfit: Outfit, garment: Garment) -> None:
     height, sole, over = (garment.sizes[name] for name in ("height", "sole", "over"))
-    material = Material(lambda s: trimmings.leather(s, garment), sheen=0.2 if garment.kind != "sneakers" else 0.08)
+    material = Material(
+        lambda s: trimmings.leather(s, garment), sheen=0.2 if garment.kind != "sneakers" else 0.08
+    )
     if garment.kind == "sandals":
-        outfit.add(accessories.pair_of_shoes(outfit.anatomy, 0.024, sole, 0.004), material, layered=False)
+        outfit.add(
+            accessories.pair_of_shoes(outfit.anatomy, 0.024, sole, 0.004), material, layered=False
+        )
         for field in tailoring.sandal_straps(outfit.template):
             outfit.strip(field, Fit(ease=0.005, fold=0.0, hem=0.004), material)
         return
@@ -309,14 +356,20 @@ def _tie(outfit: Outfit, garment: Garment) -> None:
 
 def _watch(outfit: Outfit, garment: Garment) -> None:
     field = tailoring.bracelet(outfit.template, garment.sizes["side"], 0.628, 0.650)
-    outfit.strip(field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colors, sheen=0.3))
+    outfit.strip(
+        field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colors, sheen=0.3)
+    )
 
 
 def _bag(outfit: Outfit, garment: Garment) -> None:
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
     on_back, colors = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
     if on_back:
-        ease, material, straps = outfit.trunk, Material(colors, 0.1), tailoring.straps(outfit.template, -0.16, -0.03)
+        ease, material, straps = (
+            outfit.trunk,
+            Material(colors, 0.1),
+            tailoring.straps(outfit.template, -0.16, -0.03),
+        )
     else:
         side, ease = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
         material = Material(colors, 0.0, 0.12)
@@ -324,7 +377,14 @@ def _bag(outfit: Outfit, garment: Garment) -> None:
     surface = accessories.bag(outfit.anatomy, garment, ease)
     outfit.add(surface, material, layered=False)
     raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
-    flat = {"ease": raised, "inner": raised - 0.002, "fold": 0.0, "hem": 0.006, "quilt": 0.0, "skirted": True}
+    flat = {
+        "ease": raised,
+        "inner": raised - 0.002,
+        "fold": 0.0,
+        "hem": 0.006,
+        "quilt": 0.0,
+        "skirted": True,
+    }
     strap = Material(garment.fabric.colors, sheen=material.sheen)
     outfit.strip(straps, dataclasses.replace(outfit.fit, **flat), strap)
 

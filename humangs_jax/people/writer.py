@@ -25,7 +25,16 @@ from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.capture_checks import checked_json
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import Motion, save_motion
-from humangs_jax.data.sets import DATA_SET, MANIFEST, SYNTHETIC, begin_set, finished, made, read_manifest, write_manifest
+from humangs_jax.data.sets import (
+    DATA_SET,
+    MANIFEST,
+    SYNTHETIC,
+    begin_set,
+    finished,
+    made,
+    read_manifest,
+    write_manifest,
+)
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.people.bank import export_scan
@@ -100,19 +109,28 @@ def stand(subject: SyntheticSubject, rotations: np.ndarray) -> PosedSubject:
 
 def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = None) -> Motion:
     """The subject's motion, see `sequences`; its lowest points, soles of shoes included, are on y = 0 about all the time."""
-    sequence = sample_sequence(np.random.default_rng([subject.seed, MOTION_STREAM]), subject.build, frames, kind)
-    rotations, translations = sequence.rotations.astype(np.float32), sequence.translations.astype(np.float32)
+    sequence = sample_sequence(
+        np.random.default_rng([subject.seed, MOTION_STREAM]), subject.build, frames, kind
+    )
+    rotations, translations = (
+        sequence.rotations.astype(np.float32),
+        sequence.translations.astype(np.float32),
+    )
     asked = range(0, frames, GROUNDED_EVERY)
     lowest = [subject.posed_vertices(rotations[i], translations[i])[:, 1].min() for i in asked]
     translations[:, 1] -= np.median(lowest)
     return Motion(jnp.asarray(rotations), jnp.asarray(translations), sequence.fps)
 
 
-def capture_views(subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: list[View]) -> Capture:
+def capture_views(
+    subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: list[View]
+) -> Capture:
     """A capture of these views."""
     rendered = [render_view(poses[view.frame], view.camera) for view in views]
     images, masks = (np.stack(x) for x in zip(*rendered, strict=True))
-    rotations, translations = (np.stack([getattr(p, name) for p in poses]) for name in ("rotations", "translation"))
+    rotations, translations = (
+        np.stack([getattr(p, name) for p in poses]) for name in ("rotations", "translation")
+    )
     return Capture(
         images=images,
         masks=masks,
@@ -133,8 +151,16 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
         posed = [sample_pose(subject, i) for i in range(layout.poses)]
     else:
         shown = np.linspace(0, layout.frames - 1, layout.poses).round().astype(int)
-        posed = [pose_subject(subject, np.asarray(motion.rotations[i]), np.asarray(motion.translations[i])) for i in shown]
-    others = [posed[0], *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses))]
+        posed = [
+            pose_subject(
+                subject, np.asarray(motion.rotations[i]), np.asarray(motion.translations[i])
+            )
+            for i in shown
+        ]
+    others = [
+        posed[0],
+        *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses)),
+    ]
     size = layout.image_size
     views = _views([seed, CAMERA_STREAM], cameras_around, layout.views, posed, size)
     views += _views([seed, CLOSE_STREAM], close_cameras, layout.close_views, posed, size, mark="c")
@@ -172,15 +198,25 @@ def write_set(
     generator, or (at the end) some could not be made; OSError if nothing can be written there.
     """
     out, seeds = Path(out), seeds_of(split, first, subjects)
-    made_with = {"generator_version": GENERATOR_VERSION, "split": split, "settings": dataclasses.asdict(layout)}
+    made_with = {
+        "generator_version": GENERATOR_VERSION,
+        "split": split,
+        "settings": dataclasses.asdict(layout),
+    }
     check_writable(out)
     begin_set(out, SYNTHETIC, made_with)
     folders = {seed: out / f"{seed:07d}" for seed in seeds}
-    due = {seed: (folder, seed, layout) for seed, folder in folders.items() if not (folder / CAPTURE).is_file()}
+    due = {
+        seed: (folder, seed, layout)
+        for seed, folder in folders.items()
+        if not (folder / CAPTURE).is_file()
+    }
     failed: dict[int, Exception] = {}
     listed = time.monotonic()
     try:
-        with progress_bar(total=subjects, initial=subjects - len(due), desc="people", shown=progress) as bar:
+        with progress_bar(
+            total=subjects, initial=subjects - len(due), desc="people", shown=progress
+        ) as bar:
             for seed, error in made(_write, due, workers, functools.partial(_given, body)):
                 if error is not None:
                     failed[seed] = error
@@ -193,7 +229,9 @@ def write_set(
         write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
     if failed:
         seed, error = next(iter(failed.items()))
-        raise ValueError(f"{out}: {len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}")
+        raise ValueError(
+            f"{out}: {len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}"
+        )
     return list(folders.values())
 
 
@@ -236,5 +274,7 @@ def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ..
         read_manifest(root, SYNTHETIC)
         for folder in folders:
             if folder.name.isdigit() and (other := split_of(int(folder.name))) != split:
-                raise ValueError(f"{folder}: a subject of the split '{other}', where '{split}' was expected")
+                raise ValueError(
+                    f"{folder}: a subject of the split '{other}', where '{split}' was expected"
+                )
     return folders

@@ -48,23 +48,35 @@ class RefineConfig:
     """How `refine` fits an avatar to its photos."""
 
     iterations: Iterations = knob(
-        ITERATIONS, cost="blur without them", gain="0.25 to 0.5 s each with 4 photos", measured=MEASURED
+        ITERATIONS,
+        cost="blur without them",
+        gain="0.25 to 0.5 s each with 4 photos",
+        measured=MEASURED,
     )
     """Of the learned update (see `learned.py`), before the first step. 0: none."""
-    steps: RefineSteps | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
+    steps: RefineSteps | None = knob(
+        None, cost="blur at few", gain="time in proportion", measured=MEASURED
+    )
     """Limit of the optimizer's steps. None: no limit. 0: iterations alone, which are always finished."""
-    seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
+    seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(
+        5.0, cost="blur at few", gain="time", measured=MEASURED
+    )
     """Limit of the run without compilation; with `steps`, what ends earlier counts. None: no limit. It becomes a number of steps
     before the first step, by the time that a few take; that number, `Refinement.planned`, repeats the run exactly."""
     head_steps: RefineSteps = knob(
-        HEAD_STEPS, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
+        HEAD_STEPS,
+        cost="time in proportion",
+        gain="detail of faces",
+        measured="benchmarks/quality.md",
     )
     """Steps on the head alone afterwards, where photos have 512 pixels or more and calibrated cameras, and `seconds` is None or
     `steps` 0; 0: none. They move the Gaussians of the head by crops of the photos around it, and hold back what grows beyond the
     masks (see `head.py`)."""
     region: tuple[str, ...] = HEAD
     """The region of interest of `head_steps`: parts of the names of its joints; `("left_wrist", "left_index")` is a hand."""
-    image_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
+    image_size: PhotoSide | None = knob(
+        None, cost="detail of the photos", gain="time of a step", measured=MEASURED
+    )
     """Photos whose longer side is larger are reduced to it, pixels. None: photos as they are."""
     structural: Weight = 0.2
     """Weight of the structural dissimilarity beside the L1 distance of colors."""
@@ -92,8 +104,12 @@ class RefineConfig:
     def __post_init__(self):
         """Raises ValueError for settings that do not fit together, naming them."""
         if self.steps is None and self.seconds is None:
-            raise ValueError("RefineConfig: expected steps, seconds or both; without either a run would not end")
+            raise ValueError(
+                "RefineConfig: expected steps, seconds or both; without either a run would not end"
+            )
         if self.iterations == self.steps == self.head_steps == 0:
-            raise ValueError("RefineConfig: iterations 0, steps 0, head_steps 0: expected one of them above 0")
+            raise ValueError(
+                "RefineConfig: iterations 0, steps 0, head_steps 0: expected one of them above 0"
+            )
         if not self.held_out < 1:
             raise ValueError(f"RefineConfig.held_out {self.held_out:g}: expected less than 1")

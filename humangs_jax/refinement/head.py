@@ -21,7 +21,15 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import project
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.objective import Image, avatar_of, compiled, drawn_photo, image_loss, parameters_of, pulled
+from humangs_jax.refinement.objective import (
+    Image,
+    avatar_of,
+    compiled,
+    drawn_photo,
+    image_loss,
+    parameters_of,
+    pulled,
+)
 from humangs_jax.refinement.photos import MARGIN, Photo, crop_to_person, photos_of, windows
 from humangs_jax.refinement.search import BUFFERS, HOST_SETTINGS, Clock, planned
 from humangs_jax.refinement.steps import RefineState, started, update
@@ -69,7 +77,9 @@ def shows_heads(capture: Capture, config: RefineConfig) -> bool:
     return capture.calibrated and min(longest, config.image_size or longest) >= LEAST_SIDE
 
 
-def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: RefineConfig, clock: Clock) -> Avatar:
+def sharpened(
+    avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: RefineConfig, clock: Clock
+) -> Avatar:
     """The avatar after `config.head_steps` steps on its head; 0 steps compile all that others need.
 
     avatar: with the low-pass of the photos. trust: see `RefineState`.
@@ -81,7 +91,9 @@ def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: R
         parameters = parameters_of(drawn.gaussians)
         share = jnp.asarray(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
         state = started(parameters, share, settings, crops.splat)
-        state = replace(state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(count), share=jnp.ones(()))
+        state = replace(
+            state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(count), share=jnp.ones(())
+        )
         state = _advanced(state, 0, photos, drawn, settings, clock)
     for part in range(1, PARTS + 1):
         state = _advanced(state, part * count // PARTS, photos, drawn, settings, clock)
@@ -97,7 +109,14 @@ def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: R
     return replace(avatar, gaussians=jax.tree.map(put, own, new))
 
 
-def _advanced(state: RefineState, stop: int, photos: Photo, avatar: Avatar, settings: RefineConfig, clock: Clock) -> RefineState:
+def _advanced(
+    state: RefineState,
+    stop: int,
+    photos: Photo,
+    avatar: Avatar,
+    settings: RefineConfig,
+    clock: Clock,
+) -> RefineState:
     """The state at step `stop`, with buffers in which all fits."""
 
     def advanced(splat: SplatConfig) -> tuple[RefineState, Array]:
@@ -109,14 +128,18 @@ def _advanced(state: RefineState, stop: int, photos: Photo, avatar: Avatar, sett
 
 
 @compiled
-def _steps(state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, ""], config: RefineConfig) -> RefineState:
+def _steps(
+    state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, ""], config: RefineConfig
+) -> RefineState:
     """The state at step `stop`, one photo a step, in turns; its overflow is that of all steps."""
 
     def one(state: RefineState) -> RefineState:
         photo = jax.tree.map(lambda x: x[state.done % len(photos.image)], photos)
         image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat)
         gradient, _ = pulled(pull_back, jax.grad(head_loss)(image, photo, config))
-        return update(replace(state, overflow=state.overflow + rendering.overflow), gradient, config)
+        return update(
+            replace(state, overflow=state.overflow + rendering.overflow), gradient, config
+        )
 
     return jax.lax.while_loop(lambda state: state.done < stop, one, state)
 
@@ -124,12 +147,18 @@ def _steps(state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, "
 def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
     """`image_loss` of the colors inside the mask, and what alpha exceeds the mask by."""
     rgb = photo.image + photo.mask[..., None] * (image[0] - photo.image)
-    return image_loss((rgb, image[1]), photo, config) + EXCESS * jnp.mean(jnp.maximum(image[1] - photo.mask, 0))
+    return image_loss((rgb, image[1]), photo, config) + EXCESS * jnp.mean(
+        jnp.maximum(image[1] - photo.mask, 0)
+    )
 
 
 def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops | None:
     """Crops of the photos around the region; None if the body has none or no photo shows it. capture: of usable views."""
-    columns = [i for i, name in enumerate(avatar.joint_names) if any(part in name.lower() for part in config.region)]
+    columns = [
+        i
+        for i, name in enumerate(avatar.joint_names)
+        if any(part in name.lower() for part in config.region)
+    ]
     moved = np.asarray(avatar.skinning_weights)[:, columns].sum(axis=1) > 0.5
     sure = moved & (np.asarray(avatar.gaussians.opacities) > OPAQUE)
     if not sure.any():
@@ -148,14 +177,18 @@ def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops 
     half = -(-(side + 2 * MARGIN) // SIDES) * SIDES // 2 - MARGIN
     boxes = [[(int(at) - half, int(at) + half) for at in middles[i]] for i in seen]
     views = replace(views, rotations=views.rotations[seen], translations=views.translations[seen])
-    images, masks, cameras = windows(np.asarray(views.images)[seen], np.asarray(views.masks)[seen], views.cameras[seen], boxes)
+    images, masks, cameras = windows(
+        np.asarray(views.images)[seen], np.asarray(views.masks)[seen], views.cameras[seen], boxes
+    )
     views = replace(views, images=images, masks=masks, cameras=cameras)
     pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
     shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved
     drawn = np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))])
     splat = planned(avatar, views)  # of all Gaussians, by programs that there are already
     buffers = {name: _power(getattr(splat, name)) for name in BUFFERS}
-    return Crops(moved, drawn, views, size > others, dataclasses.replace(splat, visibility=False, **buffers))
+    return Crops(
+        moved, drawn, views, size > others, dataclasses.replace(splat, visibility=False, **buffers)
+    )
 
 
 def _power(number: int) -> int:
@@ -166,7 +199,9 @@ def _power(number: int) -> int:
 def _pixels(avatar: Avatar, views: SubjectViews) -> Float[np.ndarray, "v g 2"]:
     """Where the views show the centres of the Gaussians; those behind a camera: far outside."""
     found = []
-    for rotations, translation, camera in zip(views.rotations, views.translations, views.cameras, strict=True):
+    for rotations, translation, camera in zip(
+        views.rotations, views.translations, views.cameras, strict=True
+    ):
         pixels, depths = _projected(camera, posed(avatar, BodyPose(rotations, translation)).means)
         found.append(np.where(np.asarray(depths)[:, None] > 0, pixels, np.inf))
     return np.stack(found)
@@ -179,7 +214,9 @@ def _squares(
     pixels: Float[np.ndarray, "v g 2"], views: SubjectViews
 ) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "v 2"], int]:
     """The views that show most of the points; (y, x) of the middles of the squares that these fill, and the largest side."""
-    low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[..., ::-1]
+    low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[
+        ..., ::-1
+    ]
     middles, sides, frame = (low + high) / 2, (high - low).max(axis=1), views.masks.shape[1:]
     seen = np.flatnonzero(((middles >= 0) & (middles < frame)).all(axis=1) & (sides <= max(frame)))
     return seen, middles, max(1, int(np.ceil(sides[seen].max(initial=1))))

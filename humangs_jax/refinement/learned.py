@@ -97,7 +97,9 @@ def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
     weights = 1 / (distances + CLUSTER_BLUR)
     weights /= weights.sum(axis=1, keepdims=True)
     indices = jnp.asarray(members, jnp.int32), jnp.asarray(nearest, jnp.int32)
-    return Graph(neighbors_of(means), neighbors_of(centers), *indices, jnp.asarray(weights, jnp.float32))
+    return Graph(
+        neighbors_of(means), neighbors_of(centers), *indices, jnp.asarray(weights, jnp.float32)
+    )
 
 
 def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
@@ -122,9 +124,15 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
     nearest = KDTree(means).query(means, min(count + 1, total))[1].reshape(total, -1)[:, 1:]
     pairs = np.sort((own * total + nearest).ravel())
     reverse = nearest * total + own
-    mutual = pairs[np.minimum(np.searchsorted(pairs, reverse), len(pairs) - 1)] == reverse if pairs.size else reverse > 0
+    mutual = (
+        pairs[np.minimum(np.searchsorted(pairs, reverse), len(pairs) - 1)] == reverse
+        if pairs.size
+        else reverse > 0
+    )
     share = mutual / np.maximum(mutual.sum(axis=1, keepdims=True), 1)
-    return Neighbors(jnp.asarray(np.where(mutual, nearest, own), jnp.int32), jnp.asarray(share, jnp.float32))
+    return Neighbors(
+        jnp.asarray(np.where(mutual, nearest, own), jnp.int32), jnp.asarray(share, jnp.float32)
+    )
 
 
 @jax.custom_vjp
@@ -194,8 +202,12 @@ class Refiner(nn.Module):
         features = features + self.from_clusters(features, graph)
         for i in range(self.layers):
             normed = nn.LayerNorm(name=f"norm_{i}")(features)
-            message = neighbor_mean(nn.relu(dense(f"message_{i}", self.width)(normed)), graph.gaussians)
-            update = nn.relu(dense(f"update_{i}_0", self.width)(jnp.concatenate([normed, message], axis=-1)))
+            message = neighbor_mean(
+                nn.relu(dense(f"message_{i}", self.width)(normed)), graph.gaussians
+            )
+            update = nn.relu(
+                dense(f"update_{i}_0", self.width)(jnp.concatenate([normed, message], axis=-1))
+            )
             features = features + dense(f"update_{i}_1", self.width)(update)
         normed = nn.LayerNorm(name="norm")(features)
         moves = nn.Dense(COLUMNS, kernel_init=nn.initializers.zeros, name="moves")(normed)
@@ -210,9 +222,13 @@ class Refiner(nn.Module):
             normed = norm(f"norm_{i}")(clusters)
             said = nn.relu(dense(f"message_{i}")(normed))
             everywhere = jnp.broadcast_to(jnp.mean(said, axis=0), said.shape)
-            heard = jnp.concatenate([normed, neighbor_mean(said, graph.clusters), everywhere], axis=-1)
+            heard = jnp.concatenate(
+                [normed, neighbor_mean(said, graph.clusters), everywhere], axis=-1
+            )
             clusters = clusters + dense(f"update_{i}_1")(nn.relu(dense(f"update_{i}_0")(heard)))
-        around = jnp.sum(norm("norm_out")(clusters)[graph.nearest] * graph.weights[..., None], axis=1)
+        around = jnp.sum(
+            norm("norm_out")(clusters)[graph.nearest] * graph.weights[..., None], axis=1
+        )
         return nn.Dense(self.width, kernel_init=nn.initializers.zeros, name="cluster_out")(around)
 
 
@@ -220,14 +236,22 @@ def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Ar
     """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of colors before the sigmoid."""
     colors = nn.sigmoid(values[:, 11:])
     longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))
-    units = [jnp.tile(longest, 3), jnp.ones((len(values), 8), values.dtype), 1 / (colors * (1 - colors) + 0.01)]
-    errors = 30 * signals.gradients * jnp.concatenate(units, axis=-1) / (signals.pixels[..., None] + 1.0)
+    units = [
+        jnp.tile(longest, 3),
+        jnp.ones((len(values), 8), values.dtype),
+        1 / (colors * (1 - colors) + 0.01),
+    ]
+    errors = (
+        30 * signals.gradients * jnp.concatenate(units, axis=-1) / (signals.pixels[..., None] + 1.0)
+    )
     return 3 * errors / (1 + jnp.abs(errors))
 
 
 def stacked(parameters: UnconstrainedGaussians) -> Float[Array, "g 14"]:
     """The parameters of the Gaussians side by side."""
-    return jnp.concatenate([getattr(parameters, name).reshape(len(parameters.means), -1) for name in FIELDS], axis=-1)
+    return jnp.concatenate(
+        [getattr(parameters, name).reshape(len(parameters.means), -1) for name in FIELDS], axis=-1
+    )
 
 
 def unstacked(values: Float[Array, "g 14"], like: UnconstrainedGaussians) -> UnconstrainedGaussians:
@@ -235,7 +259,13 @@ def unstacked(values: Float[Array, "g 14"], like: UnconstrainedGaussians) -> Unc
     shapes = {name: getattr(like, name) for name in FIELDS}
     ends = np.cumsum([x[0].size for x in shapes.values()])
     parts = jnp.split(values, ends[:-1], axis=-1)
-    return replace(like, **{name: part.reshape(x.shape) for (name, x), part in zip(shapes.items(), parts, strict=True)})
+    return replace(
+        like,
+        **{
+            name: part.reshape(x.shape)
+            for (name, x), part in zip(shapes.items(), parts, strict=True)
+        },
+    )
 
 
 def learned_update(
@@ -254,7 +284,9 @@ def learned_update(
     for _ in range(iterations):
         each = [photo_signals(parameters, avatar, photo, splat) for photo in chosen]
         signals, missing = jax.tree.map(lambda *x: jnp.stack(x), *each)
-        values, hidden = refiner_iteration(load_refiner(), values, start, hidden, signals, graph, avatar)
+        values, hidden = refiner_iteration(
+            load_refiner(), values, start, hidden, signals, graph, avatar
+        )
         parameters, overflow = unstacked(values, parameters), overflow + jnp.sum(missing)
     return parameters, overflow
 
@@ -325,7 +357,11 @@ def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
     """Write the variables of a `Refiner`; the file appears whole or not at all."""
     from safetensors.numpy import save
 
-    tensors = {f"{layer}/{name}": np.asarray(x) for layer, own in variables["params"].items() for name, x in own.items()}
+    tensors = {
+        f"{layer}/{name}": np.asarray(x)
+        for layer, own in variables["params"].items()
+        for name, x in own.items()
+    }
     write_bytes(path, save(tensors))
 
 

@@ -24,7 +24,13 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.losses.losses import decibels, structural_dissimilarity
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.photos import Photo
-from humangs_jax.rendering.gaussians import Gaussians, UnconstrainedGaussians, constrain, unconstrain, widened
+from humangs_jax.rendering.gaussians import (
+    Gaussians,
+    UnconstrainedGaussians,
+    constrain,
+    unconstrain,
+    widened,
+)
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering, render
 
@@ -35,7 +41,9 @@ FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
 P = ParamSpec("P")
 T = TypeVar("T")
 
-jax.tree_util.register_static(RefineConfig)  # here: its own module is imported by the command line, without JAX
+jax.tree_util.register_static(
+    RefineConfig
+)  # here: its own module is imported by the command line, without JAX
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
@@ -46,9 +54,15 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.cache
     def program() -> Callable[P, T]:
-        static = [name for name in ("config", "splat") if name in inspect.signature(function).parameters]
+        static = [
+            name for name in ("config", "splat") if name in inspect.signature(function).parameters
+        ]
         options = compiler_options()
-        return jax.jit(function, static_argnames=static, compiler_options=options and options | FASTER_COMPILATION)
+        return jax.jit(
+            function,
+            static_argnames=static,
+            compiler_options=options and options | FASTER_COMPILATION,
+        )
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -68,11 +82,15 @@ PullBack = Callable[[Image], tuple[UnconstrainedGaussians, Float[Array, " g"]]]
 def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
     """What refinement moves: inverse of `gaussians_of`, as far as `unconstrain` is one. Raises: ValueError for harmonics."""
     if gaussians.harmonics is not None:
-        raise ValueError("refine: gaussians.harmonics: expected none: colors that depend on the view are not refined")
+        raise ValueError(
+            "refine: gaussians.harmonics: expected none: colors that depend on the view are not refined"
+        )
     return unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
 
 
-def gaussians_of(parameters: UnconstrainedGaussians, low_pass: Float[Array, " g"] | None) -> Gaussians:
+def gaussians_of(
+    parameters: UnconstrainedGaussians, low_pass: Float[Array, " g"] | None
+) -> Gaussians:
     """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
     gaussians = constrain(parameters)
     return replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass)
@@ -99,7 +117,9 @@ def drawn_photo(
 
     def draw(parameters, brightness):
         gaussians = posed_gaussians(parameters, avatar, photo)
-        rendering = render(replace(gaussians, colors=gaussians.colors + brightness[:, None]), photo.camera, splat)
+        rendering = render(
+            replace(gaussians, colors=gaussians.colors + brightness[:, None]), photo.camera, splat
+        )
         return (rendering.rgb, rendering.alpha), rendering
 
     return jax.vjp(draw, parameters, jnp.zeros_like(avatar.gaussians.opacities), has_aux=True)
@@ -148,7 +168,9 @@ class Comparison:
     def together(self) -> "Comparison":
         """With all photos: the mean loss, sums of the errors, the largest visibility."""
         sums = (jnp.sum(x) for x in (self.squared, self.pixels))
-        return Comparison(jnp.mean(self.loss), *sums, jnp.max(self.visibility, axis=0), jnp.sum(self.overflow))
+        return Comparison(
+            jnp.mean(self.loss), *sums, jnp.max(self.visibility, axis=0), jnp.sum(self.overflow)
+        )
 
     @property
     def psnr(self) -> Float[Array, "*v"]:
@@ -157,7 +179,11 @@ class Comparison:
 
 
 def compare(
-    parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, config: RefineConfig, splat: SplatConfig
+    parameters: UnconstrainedGaussians,
+    avatar: Avatar,
+    photo: Photo,
+    config: RefineConfig,
+    splat: SplatConfig,
 ) -> Comparison:
     """Comparison with a photo."""
     splat = dataclasses.replace(splat, visibility=True)
@@ -171,4 +197,9 @@ def compared(image: Image, rendering: Rendering, photo: Photo, config: RefineCon
     squared = jnp.mean(jnp.square(jnp.clip(image[0], 0, 1) - photo.image), axis=-1)
     assert rendering.visibility is not None
     errors = image_loss(image, photo, config), jnp.sum(squared * photo.counted)
-    return Comparison(*errors, jnp.sum(photo.counted, dtype=squared.dtype), rendering.visibility, rendering.overflow)
+    return Comparison(
+        *errors,
+        jnp.sum(photo.counted, dtype=squared.dtype),
+        rendering.visibility,
+        rendering.overflow,
+    )

@@ -79,29 +79,42 @@ def windows(
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
     """Windows of one size around a box in each view, ((top, bottom), (left, right)), and the cameras that see them."""
     height, width = masks.shape[1:]
-    rows, columns = (_window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width)))
+    rows, columns = (
+        _window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width))
+    )
     corners = [(_corner(box[0], rows, height), _corner(box[1], columns, width)) for box in boxes]
 
     def crop(arrays: Float[Array | np.ndarray, "v h w *c"]) -> Float[Array, "v rows columns *c"]:
-        cut = [x[top : top + rows, left : left + columns] for x, (top, left) in zip(arrays, corners, strict=True)]
+        cut = [
+            x[top : top + rows, left : left + columns]
+            for x, (top, left) in zip(arrays, corners, strict=True)
+        ]
         return jnp.asarray(np.stack(cut), jnp.float32)
 
     shift = np.zeros((len(images), 3, 3), np.float32)
     shift[:, 1, 2], shift[:, 0, 2] = np.transpose(corners)
-    return crop(images), crop(masks), replace(cameras, K=cameras.K - shift, width=columns, height=rows)
+    return (
+        crop(images),
+        crop(masks),
+        replace(cameras, K=cameras.K - shift, width=columns, height=rows),
+    )
 
 
 def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.ndarray, "v h w"]:
     """Which pixels of (v, h, w) no step sees: random blocks, `share` of all."""
     v, height, width = shape
-    blocks = np.random.default_rng(seed).random((v, -(-height // BLOCK), -(-width // BLOCK))) < share
+    blocks = (
+        np.random.default_rng(seed).random((v, -(-height // BLOCK), -(-width // BLOCK))) < share
+    )
     return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width]
 
 
 def photo_order(views: Int[np.ndarray, " v"], steps: int, seed: int) -> Int[np.ndarray, " n"]:
     """The view of each step: all in a new order, again and again."""
     rng = np.random.default_rng(seed)
-    return np.concatenate([np.zeros(0, int), *(rng.permutation(views) for _ in range(-(-steps // len(views))))])[:steps]
+    return np.concatenate(
+        [np.zeros(0, int), *(rng.permutation(views) for _ in range(-(-steps // len(views))))]
+    )[:steps]
 
 
 def _bounds(mask: Float[np.ndarray, "h w"]) -> Sequence[Sequence[int]]:

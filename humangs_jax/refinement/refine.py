@@ -105,7 +105,9 @@ def refine(
     Examples:
         >>> sharp = hg.refine(avatar, capture, seconds=15)
     """
-    return refine_with_report(avatar, capture, config, seconds=seconds, steps=steps, progress=progress, watch=watch).avatar
+    return refine_with_report(
+        avatar, capture, config, seconds=seconds, steps=steps, progress=progress, watch=watch
+    ).avatar
 
 
 @checked_arguments
@@ -134,7 +136,10 @@ def refine_with_report(
     with clock.compiling():
         task, best, each = prepare(avatar, views, config, clock)
     unlimited = config.seconds is None or config.steps == 0
-    heads, interrupted = bool(config.head_steps) and unlimited and shows_heads(capture, config), False
+    heads, interrupted = (
+        bool(config.head_steps) and unlimited and shows_heads(capture, config),
+        False,
+    )
     compiler, crops = ThreadPoolExecutor(1), None
     if heads:
         with clock.compiling():
@@ -162,7 +167,9 @@ def refine_with_report(
                 begin = with_low_pass_of(result, views)
                 if len(best.used) < len(task.photos):
                     crops = head_crops(begin, capture.select(_usable(capture)[best.used]), config)
-            sharp = None if crops is None else sharpened(begin, best.state.trust, crops, config, clock)
+            sharp = (
+                None if crops is None else sharpened(begin, best.state.trust, crops, config, clock)
+            )
         except KeyboardInterrupt:
             interrupted = True
     seconds = clock.stopped()
@@ -186,10 +193,14 @@ def _check(avatar: Avatar, capture: Capture) -> None:
     if capture.view_count == 0:
         raise ValueError("refine: the capture has 0 views; at least one photo is needed")
     if capture.masks is None:
-        raise ValueError("refine: the capture has no masks; without them the background would be fitted, too")
+        raise ValueError(
+            "refine: the capture has no masks; without them the background would be fitted, too"
+        )
     joints = capture.poses.rotations.shape[1]
     if joints != len(avatar.parents):
-        raise ValueError(f"refine: the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
+        raise ValueError(
+            f"refine: the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}"
+        )
 
 
 def _without(capture: Capture, used: Int[np.ndarray, " n"]) -> tuple[str, ...]:

@@ -78,7 +78,9 @@ class Clock:
         self.limit, self.seconds = config.steps, config.seconds
         self.began, self.compile_seconds = time.perf_counter(), 0.0
         self.done, self.planned, self.late = 0, None, False
-        self.bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
+        self.bar = progress_bar(
+            total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}"
+        )
 
     def elapsed(self) -> float:
         """Seconds since the start, without compilation."""
@@ -93,12 +95,16 @@ class Clock:
         finally:
             self.compile_seconds = before + time.perf_counter() - began
 
-    def with_room(self, function: Callable[[SplatConfig], tuple[T, Array]], splat: SplatConfig) -> T:
+    def with_room(
+        self, function: Callable[[SplatConfig], tuple[T, Array]], splat: SplatConfig
+    ) -> T:
         """The result of a function of buffers, which also returns what did not fit: they are doubled until all does."""
         result, overflow = function(splat)
         with self.compiling() if int(overflow) else contextlib.nullcontext():
             while int(overflow):
-                splat = dataclasses.replace(splat, **{name: 2 * getattr(splat, name) for name in BUFFERS})
+                splat = dataclasses.replace(
+                    splat, **{name: 2 * getattr(splat, name) for name in BUFFERS}
+                )
                 result, overflow = function(splat)
         return result
 
@@ -113,7 +119,9 @@ class Clock:
             for _ in range(TIMED_STEPS):
                 jax.block_until_ready(one_step())
             now = self.elapsed()
-            fitting = int(max(self.seconds - now - ahead, 0.0) * TIMED_STEPS / max(now - began, 1e-9))
+            fitting = int(
+                max(self.seconds - now - ahead, 0.0) * TIMED_STEPS / max(now - began, 1e-9)
+            )
             self.planned = fitting if self.limit is None else min(self.limit, fitting)
         return self.planned
 
@@ -121,7 +129,9 @@ class Clock:
         """A step is done. shown: where the bar is, in [0, 1]."""
         self.done += 1
         self.show(shown)
-        self.late = self.late or (self.seconds is not None and self.elapsed() > OVERRUN * self.seconds)
+        self.late = self.late or (
+            self.seconds is not None and self.elapsed() > OVERRUN * self.seconds
+        )
 
     def show(self, shown: float) -> None:
         """Move the bar."""
@@ -161,7 +171,9 @@ class Found(NamedTuple):
     kept: bool = True
 
 
-def prepare(avatar: Avatar, views: SubjectViews, config: RefineConfig, clock: Clock) -> tuple[Task, Found, Comparison]:
+def prepare(
+    avatar: Avatar, views: SubjectViews, config: RefineConfig, clock: Clock
+) -> tuple[Task, Found, Comparison]:
     """The task, the start and its comparison with each photo."""
     start = with_low_pass_of(avatar, views)
     fresh = with_low_pass(without_low_pass(avatar), cast(Array, start.gaussians.low_pass))
@@ -196,17 +208,26 @@ def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
     """What a run finds, one after the other: the last that is kept is its result. each: comparison of the start with photos."""
     with task.clock.compiling():  # each part once, so that it is compiled
         if task.config.steps != 0:
-            start = start._replace(state=replace(start.state, splat=stepped(task, start.state, start.used[0]).splat))
+            start = start._replace(
+                state=replace(start.state, splat=stepped(task, start.state, start.used[0]).splat)
+            )
         if task.config.iterations:
             updated(task, start, start.used, 1)
     held_photo = len(task.photos) >= HELD_OUT_PHOTOS and task.config.held_out > 0
-    yield from (search_by_photo if held_photo else search_by_blocks)(task, start, np.asarray(each.loss))
+    yield from (search_by_photo if held_photo else search_by_blocks)(
+        task, start, np.asarray(each.loss)
+    )
 
 
 def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
     """The held-out pixels choose the best state; the last one is kept where there are none. losses: of the photos, at first."""
-    hidden = [replace(all, counted=all.counted & ~seen.counted) for all, seen in zip(task.photos, task.seen, strict=True)]
-    any_hidden = any(photo.counted.any() for photo in hidden)  # a small crop may have no block to hold out
+    hidden = [
+        replace(all, counted=all.counted & ~seen.counted)
+        for all, seen in zip(task.photos, task.seen, strict=True)
+    ]
+    any_hidden = any(
+        photo.counted.any() for photo in hidden
+    )  # a small crop may have no block to hold out
     best, highest = start, psnr_of(task, start, hidden)
     if task.config.iterations:
         found, loss = iterated(task, start, start.used)
@@ -231,7 +252,9 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
     checked = int(np.argmin(losses))
     asked = [task.photos[checked]]
     best, before, began = start, psnr_of(task, start, asked), clock.elapsed()
-    for used in (everybody, np.delete(everybody, int(np.argmax(losses)))) if config.iterations else ():
+    for used in (
+        (everybody, np.delete(everybody, int(np.argmax(losses)))) if config.iterations else ()
+    ):
         found, _ = iterated(task, start, used[used != checked])
         psnr = psnr_of(task, found, asked)
         if psnr > before - ALLOWED_LOSS_OF_ITERATIONS:
@@ -239,7 +262,9 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
             break
         began = clock.elapsed()
     used, others = best.used, best.used[best.used != checked]
-    ahead = (clock.elapsed() - began) * len(used) / len(others)  # iterations with all photos are still to come
+    ahead = (
+        (clock.elapsed() - began) * len(used) / len(others)
+    )  # iterations with all photos are still to come
     if best.iterations:
         yield best
     total = clock.plan(lambda: stepped(task, best.state, others[0]), ahead)
@@ -257,7 +282,12 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
 
 
 def steps(
-    task: Task, begin: Found, photos: Int[np.ndarray, " n"], total: int, end: int, shown: tuple[float, float]
+    task: Task,
+    begin: Found,
+    photos: Int[np.ndarray, " n"],
+    total: int,
+    end: int,
+    shown: tuple[float, float],
 ) -> Iterator[Found]:
     """The first `end` of `total` steps on some photos: the state at each check and at the end. shown: from where to where the
     bar goes.
@@ -268,7 +298,11 @@ def steps(
     for done, view in enumerate(photo_order(photos, end, config.seed), 1):
         state = stepped(task, state, view)
         clock.tick(shown[0] + (shown[1] - shown[0]) * done / total)
-        if done * config.checks // total > (done - 1) * config.checks // total or done == end or clock.late:
+        if (
+            done * config.checks // total > (done - 1) * config.checks // total
+            or done == end
+            or clock.late
+        ):
             yield begin._replace(state=state)
         if clock.late:
             return
@@ -296,7 +330,9 @@ def iterated(task: Task, start: Found, used: Int[np.ndarray, " n"]) -> tuple[Fou
     return Found(state, task.config.iterations, used), float(found.loss)
 
 
-def updated(task: Task, start: Found, used: Int[np.ndarray, " n"], iterations: int) -> UnconstrainedGaussians:
+def updated(
+    task: Task, start: Found, used: Int[np.ndarray, " n"], iterations: int
+) -> UnconstrainedGaussians:
     """The parameters after iterations of the learned update on some photos."""
     fresh, photos = _parameters_of(task.fresh.gaussians), [task.seen[i] for i in used]
 
@@ -307,7 +343,9 @@ def updated(task: Task, start: Found, used: Int[np.ndarray, " n"], iterations: i
     return task.clock.with_room(updated, start.state.splat)
 
 
-def comparison(task: Task, parameters: UnconstrainedGaussians, photos: Sequence[Photo], splat: SplatConfig) -> Comparison:
+def comparison(
+    task: Task, parameters: UnconstrainedGaussians, photos: Sequence[Photo], splat: SplatConfig
+) -> Comparison:
     """Comparison with each of the photos (leading axis v)."""
 
     def compared(splat: SplatConfig) -> tuple[Comparison, Array]:
@@ -320,7 +358,9 @@ def comparison(task: Task, parameters: UnconstrainedGaussians, photos: Sequence[
 
 def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:
     """PSNR over what no step sees, dB."""
-    return float(comparison(task, found.state.parameters, photos, found.state.splat).together().psnr)
+    return float(
+        comparison(task, found.state.parameters, photos, found.state.splat).together().psnr
+    )
 
 
 _parameters_of = jax.jit(parameters_of)

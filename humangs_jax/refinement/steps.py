@@ -65,7 +65,9 @@ class RefineState:
     share: Float[Array, ""] | float = 1.0
 
 
-def init_state(parameters: UnconstrainedGaussians, found: Comparison, config: RefineConfig, splat: SplatConfig) -> RefineState:
+def init_state(
+    parameters: UnconstrainedGaussians, found: Comparison, config: RefineConfig, splat: SplatConfig
+) -> RefineState:
     """The state before the first step. found: comparison of the parameters with the photos; Gaussians that no photo shows get
     no trust.
     """
@@ -73,7 +75,10 @@ def init_state(parameters: UnconstrainedGaussians, found: Comparison, config: Re
 
 
 def started(
-    parameters: UnconstrainedGaussians, trust: Float[Array, " g"], config: RefineConfig, splat: SplatConfig
+    parameters: UnconstrainedGaussians,
+    trust: Float[Array, " g"],
+    config: RefineConfig,
+    splat: SplatConfig,
 ) -> RefineState:
     """`init_state`, with a trust that is known."""
     moments = OPTIMIZERS[config.optimizer]().init(cast(Any, parameters))
@@ -93,13 +98,17 @@ def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig)
 
 
 @compiled
-def update(state: RefineState, gradient: UnconstrainedGaussians, config: RefineConfig) -> RefineState:
+def update(
+    state: RefineState, gradient: UnconstrainedGaussians, config: RefineConfig
+) -> RefineState:
     """The optimizer's step, with a rate for each parameter.
 
     Adam's steps do not shrink with the gradient, so the trust multiplies the step and not the loss.
     """
     steps, moments = OPTIMIZERS[config.optimizer]().update(cast(Any, gradient), state.moments)
-    cosine = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + jnp.cos(jnp.pi * (state.done / state.total)))
+    cosine = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (
+        1 + jnp.cos(jnp.pi * (state.done / state.total))
+    )
 
     def moved(name: str) -> Array:
         value, step = getattr(state.parameters, name), getattr(steps, name)
@@ -131,6 +140,8 @@ def refine_views(
         return state, state.overflow
 
     # the loop carries arrays
-    state = replace(state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(steps), share=jnp.ones(()))
+    state = replace(
+        state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(steps), share=jnp.ones(())
+    )
     state, overflow = jax.lax.scan(one, state, jnp.arange(steps))
     return avatar_of(state.parameters, avatar), jnp.sum(overflow)

@@ -59,7 +59,10 @@ def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConf
 
 @checked_arguments
 def plan_buffers(
-    gaussians: Gaussians, cameras: Camera, config: SplatConfig | str = DEFAULT_CONFIG, margin: float = 1.25
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    margin: float = 1.25,
 ) -> SplatConfig:
     """A configuration with buffers for one camera, or for the most demanding one of a batch, times `margin`.
 
@@ -90,7 +93,9 @@ def plan_buffers(
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 
 
-def raise_on_overflow(overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> None:
+def raise_on_overflow(
+    overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig
+) -> None:
     """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
     if missing := int(jnp.max(overflow, initial=0)):
         rows, pairs = _needed(gaussians, cameras, config)
@@ -121,7 +126,9 @@ def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | No
 def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[int]:
     """Most rows and most pairs that any of the views needs."""
     gaussians, cameras = at_least_float32((gaussians, cameras))
-    config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # not read here: one program for all
+    config = dataclasses.replace(
+        config, max_pairs=None, max_rows=None
+    )  # not read here: one program for all
     return [int(most) for most in _count(gaussians, cameras, config)]
 
 

@@ -49,7 +49,10 @@ EXACT = lax.Precision.HIGHEST
 
 
 def pack_splats(
-    projected: ProjectedGaussians, opacities: Float[Array, " g"], features: Float[Array, "g n"], alpha_min: float
+    projected: ProjectedGaussians,
+    opacities: Float[Array, " g"],
+    features: Float[Array, "g n"],
+    alpha_min: float,
 ) -> Float[Array, "g width"]:
     """Rows x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features; finite where not drawn."""
     p = projected
@@ -70,12 +73,18 @@ def composite(
     return _composite_fwd(splats, lists, grid, config)[0]
 
 
-def _composite_fwd(splats: Array, lists: TileLists, grid: TileGrid, config: SplatConfig) -> tuple[PyTree, PyTree]:
-    features, transmittance, lengths, peaks = _scheduled(forward_by_blocks, forward_by_chunks, grid, config, splats, *lists)
+def _composite_fwd(
+    splats: Array, lists: TileLists, grid: TileGrid, config: SplatConfig
+) -> tuple[PyTree, PyTree]:
+    features, transmittance, lengths, peaks = _scheduled(
+        forward_by_blocks, forward_by_chunks, grid, config, splats, *lists
+    )
     return (features, transmittance, peaks), (splats, lists, features, transmittance, lengths)
 
 
-def _composite_bwd(grid: TileGrid, config: SplatConfig, saved: PyTree, cotangents: PyTree) -> tuple[Array, None]:
+def _composite_bwd(
+    grid: TileGrid, config: SplatConfig, saved: PyTree, cotangents: PyTree
+) -> tuple[Array, None]:
     splats, lists, features, transmittance, lengths = saved
     g, g_transmittance, _ = cotangents
     total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
@@ -87,11 +96,17 @@ def _composite_bwd(grid: TileGrid, config: SplatConfig, saved: PyTree, cotangent
 composite.defvjp(_composite_fwd, _composite_bwd)
 
 
-def _scheduled(on_cpu: Schedule, elsewhere: Schedule, grid: TileGrid, config: SplatConfig, *arrays: Array) -> PyTree:
-    return lax.platform_dependent(*arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config))
+def _scheduled(
+    on_cpu: Schedule, elsewhere: Schedule, grid: TileGrid, config: SplatConfig, *arrays: Array
+) -> PyTree:
+    return lax.platform_dependent(
+        *arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config)
+    )
 
 
-def _splat_gradients(splats: Float[Array, "g width"], sums: Float[Array, "g width"]) -> Float[Array, "g width"]:
+def _splat_gradients(
+    splats: Float[Array, "g width"], sums: Float[Array, "g width"]
+) -> Float[Array, "g width"]:
     """Gradient of the rows from their sums over pixels of e (1, dx, dy, dx^2, dx dy, dy^2) and of w g."""
     r00, r01, r11 = (splats[:, i] for i in (R00, R01, R11))
     e, ex, ey, exx, exy, eyy = sums[:, :6].T
@@ -114,7 +129,10 @@ def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
 
     @function.def_vmap
     def rule(size, batched, *args):
-        args = [a if b else jnp.broadcast_to(a, (size, *a.shape)) for a, b in zip(args, batched, strict=True)]
+        args = [
+            a if b else jnp.broadcast_to(a, (size, *a.shape))
+            for a, b in zip(args, batched, strict=True)
+        ]
         splats, items, starts, *rest = args
         image = jnp.arange(size, dtype=jnp.int32)[:, None]
         args = [splats, items + image * splats.shape[1], starts + image * items.shape[1], *rest]
@@ -133,7 +151,9 @@ def take_chunk(
     tiles: Int[Array, " b"],
     grid: TileGrid,
     k: int,
-) -> tuple[Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]]:
+) -> tuple[
+    Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]
+]:
     """The first k splats of each of b lists, `items[starts : starts + counts]`, which lie on `tiles`.
 
     Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw alphas (0 past the end).
@@ -158,7 +178,9 @@ def take_chunk(
     return item, row, centre, raw
 
 
-def largest_weights(weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid) -> Float[Array, "b k"]:
+def largest_weights(
+    weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid
+) -> Float[Array, "b k"]:
     """Of each splat on the pixels of its tile that lie inside the image."""
     place = tiles % grid.tiles
     x, y = (0.5 * grid.tile_size + offset for offset in grid.offsets())
@@ -179,10 +201,18 @@ def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def moments_about_splat(moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]) -> Float[Array, "*b 6"]:
+def moments_about_splat(
+    moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
+) -> Float[Array, "*b 6"]:
     """Moments of d = (pixel - splat) from those of (pixel - centre of the tile); x, y: (splat - centre)."""
     m, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
-    about = [m, mx - x * m, my - y * m, mxx - 2 * x * mx + x * x * m, mxy - x * my - y * mx + x * y * m]
+    about = [
+        m,
+        mx - x * m,
+        my - y * m,
+        mxx - 2 * x * mx + x * x * m,
+        mxy - x * my - y * mx + x * y * m,
+    ]
     return jnp.stack([*about, myy - 2 * y * my + y * y * m], axis=-1)
 
 
@@ -223,8 +253,12 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
 
             def body(carry):
                 i, transmittance, features, lengths, live, peaks = carry
-                item, row, _, raw = take_chunk(splats, items, start + i * k, count - i * k, tile, grid, k)
-                raw = lax.optimization_barrier(raw)  # one exp per pair: XLA would fuse it into each of its consumers
+                item, row, _, raw = take_chunk(
+                    splats, items, start + i * k, count - i * k, tile, grid, k
+                )
+                raw = lax.optimization_barrier(
+                    raw
+                )  # one exp per pair: XLA would fuse it into each of its consumers
                 alpha = lax.optimization_barrier(visible_alpha(raw, config))
                 before, weights = transmittance[:, None], []
                 for j in range(k):
@@ -238,7 +272,9 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                     peaks = peaks.at[item].max(highest, mode="drop")
                 for j in range(k):
                     after = transmittance * (1 - alpha[:, j])
-                    transmittance = jnp.where(after > stop, after, jnp.minimum(transmittance, -transmittance))
+                    transmittance = jnp.where(
+                        after > stop, after, jnp.minimum(transmittance, -transmittance)
+                    )
                 lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
                 live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
                 return i + 1, transmittance, features, lengths, live, peaks
@@ -246,9 +282,14 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             ones = jnp.ones((block, grid.pixels), dtype)
             zeros = jnp.zeros((block, splats.shape[1] - FEATURES.start, grid.pixels), dtype)
             carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks
-            _, transmittance, features, lengths, _, peaks = lax.while_loop(lambda carry: jnp.any(carry[4]), body, carry)
+            _, transmittance, features, lengths, _, peaks = lax.while_loop(
+                lambda carry: jnp.any(carry[4]), body, carry
+            )
             results = features, jnp.abs(transmittance), lengths
-            drawn = (o.at[tile].set(r, mode="drop", unique_indices=True) for o, r in zip(out, results, strict=True))
+            drawn = (
+                o.at[tile].set(r, mode="drop", unique_indices=True)
+                for o, r in zip(out, results, strict=True)
+            )
             return *drawn, peaks
 
         out = (
@@ -284,8 +325,12 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
 
             def body(carry):
                 i, transmittance, seen, sums = carry
-                item, row, offset, raw = take_chunk(splats, items, start + i * k, count - i * k, tile, grid, k)
-                raw = lax.optimization_barrier(raw)  # one exp per pair: XLA would fuse it into each of its consumers
+                item, row, offset, raw = take_chunk(
+                    splats, items, start + i * k, count - i * k, tile, grid, k
+                )
+                raw = lax.optimization_barrier(
+                    raw
+                )  # one exp per pair: XLA would fuse it into each of its consumers
                 weights, slopes = [], []
                 for j in range(k):
                     if j > 0 and j % LINK == 0:
@@ -293,10 +338,15 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
                     alpha = visible_alpha(raw[:, j], config)
                     after = transmittance * (1 - alpha)
                     weight = jnp.where(after > stop, alpha * transmittance, 0.0)
-                    along = sum(row[:, j, 6 + c, None] * g[:, c] for c in range(splats.shape[1] - FEATURES.start))
+                    along = sum(
+                        row[:, j, 6 + c, None] * g[:, c]
+                        for c in range(splats.shape[1] - FEATURES.start)
+                    )
                     seen = seen + weight * along
                     slope = (along * transmittance - (total - seen) / (1 - alpha)) * raw[:, j]
-                    slopes.append(jnp.where((weight > 0) & (raw[:, j] < config.alpha_max), slope, 0.0))
+                    slopes.append(
+                        jnp.where((weight > 0) & (raw[:, j] < config.alpha_max), slope, 0.0)
+                    )
                     weights.append(weight)
                     transmittance = after
                 weights, slopes = jnp.stack(weights, axis=1), jnp.stack(slopes, axis=1)
@@ -364,7 +414,9 @@ def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step:
     skipped = (slot - slots.first[slots.source]) * CHUNK
     start, count = (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))
     inside = jnp.clip(count - skipped, 0, CHUNK)
-    return Chunks(tile, start + skipped, inside, skipped + inside, (slots.needed + step - 1) // step)
+    return Chunks(
+        tile, start + skipped, inside, skipped + inside, (slots.needed + step - 1) // step
+    )
 
 
 @functools.lru_cache
@@ -386,7 +438,10 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             before, since = _sums_before(fading, c.tiles, tail)
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * jnp.exp(before[:, None] + since), 0.0)
-            features = [jnp.sum(weights * row[..., f, None], axis=1) for f in range(FEATURES.start, splats.shape[1])]
+            features = [
+                jnp.sum(weights * row[..., f, None], axis=1)
+                for f in range(FEATURES.start, splats.shape[1])
+            ]
             parts = jnp.stack([*features, jnp.sum(jnp.where(live, fading, 0.0), axis=1)], axis=1)
             sums = sums.at[c.tiles].add(parts, mode="drop", indices_are_sorted=True)
             reached = jnp.where(jnp.max(before, axis=1) > log_stop, c.ends, 0)
@@ -395,7 +450,10 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                 peaks = peaks.at[item].max(largest_weights(weights, c.tiles, grid), mode="drop")
             return sums, lengths, peaks, _tail(c.tiles, before, since + fading)
 
-        sums, lengths = jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype), jnp.zeros(t, jnp.int32)
+        sums, lengths = (
+            jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype),
+            jnp.zeros(t, jnp.int32),
+        )
         carry = sums, lengths, jnp.zeros(splats.shape[0], dtype), _no_tail(t, p, dtype)
         sums, lengths, peaks, _ = lax.fori_loop(0, chunks.steps, draw, carry)
         return sums[:, :-1], jnp.exp(sums[:, -1]), lengths, peaks
@@ -418,14 +476,19 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
         def draw(i, carry):
             sums, faded_tail, seen_tail = carry
             c = _slice(chunks, i, step)
-            item, row, centre, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+            item, row, centre, raw = take_chunk(
+                splats, items, c.starts, c.counts, c.tiles, grid, CHUNK
+            )
             g, total = (v.at[c.tiles].get(mode="fill", fill_value=0) for v in (cotangents, totals))
             alpha, fading = _fading(raw, config)
             before, since = _sums_before(fading, c.tiles, faded_tail)
             transmittance = jnp.exp(before[:, None] + since)
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * transmittance, 0.0)
-            along = sum(row[..., FEATURES][..., f, None] * g[:, None, f] for f in range(splats.shape[1] - FEATURES.start))
+            along = sum(
+                row[..., FEATURES][..., f, None] * g[:, None, f]
+                for f in range(splats.shape[1] - FEATURES.start)
+            )
             gained = weights * along
             seen_before, seen_since = _sums_before(gained, c.tiles, seen_tail)
             behind = total[:, None] - (seen_before[:, None] + seen_since + gained)
@@ -435,7 +498,10 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             moments = product(slopes.reshape(-1, p), powers).reshape(step, CHUNK, 6)
             features = product(weights, jnp.moveaxis(g, 1, 2))
             rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
-            tails = (_tail(c.tiles, b, s + own) for b, s, own in ((before, since, fading), (seen_before, seen_since, gained)))
+            tails = (
+                _tail(c.tiles, b, s + own)
+                for b, s, own in ((before, since, fading), (seen_before, seen_since, gained))
+            )
             return sums.at[item].add(rows, mode="drop"), *tails
 
         sums, tail = jnp.zeros(splats.shape, dtype), _no_tail(t, p, dtype)
@@ -468,7 +534,9 @@ def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
     return alpha, jnp.maximum(jnp.log1p(-alpha), _LOG_ZERO)
 
 
-def _sums_before(x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: tuple[Array, Array]) -> tuple[Array, Array]:
+def _sums_before(
+    x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: tuple[Array, Array]
+) -> tuple[Array, Array]:
     """Sums of x (B, k, p) along its lists: of what comes before each chunk (B, p), and from there to each splat."""
     b, k, _ = x.shape
     triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))

@@ -57,7 +57,9 @@ def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Value
     """
     ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE, "low_pass": NOT_NEGATIVE}
     names = (field.name for field in dataclasses.fields(gaussians))
-    return {f"gaussians.{name}": (getattr(gaussians, name), ranges.get(name, FINITE)) for name in names}
+    return {
+        f"gaussians.{name}": (getattr(gaussians, name), ranges.get(name, FINITE)) for name in names
+    }
 
 
 def added_variance(low_pass: Float[Array, " g"] | None, eps2d: float) -> float:
@@ -65,7 +67,9 @@ def added_variance(low_pass: Float[Array, " g"] | None, eps2d: float) -> float:
     return eps2d if low_pass is None else min(eps2d, MIP_EPS2D)
 
 
-def widened(scales: Float[Array, "g 3"], low_pass: Float[Array, " g"] | None, sign: int = 1) -> Float[Array, "g 3"]:
+def widened(
+    scales: Float[Array, "g 3"], low_pass: Float[Array, " g"] | None, sign: int = 1
+) -> Float[Array, "g 3"]:
     """Scales with the low-pass of pixels of a size in metres, all but `MIP_EPS2D` of it. sign: -1 takes it away again."""
     if low_pass is None:
         return scales
@@ -96,11 +100,15 @@ def factored(gaussians: Gaussians) -> Gaussians:
     if gaussians.deformations is None:
         return gaussians
     rotations, scales = left_singular_vectors(covariance_factors(gaussians))
-    return replace(gaussians, quats=quaternion.from_matrix(rotations), scales=scales, deformations=None)
+    return replace(
+        gaussians, quats=quaternion.from_matrix(rotations), scales=scales, deformations=None
+    )
 
 
 def skin_gaussians(
-    gaussians: Gaussians, transforms: Float[Array, "g 4 4"], mode: Literal["affine", "rotation"] = "affine"
+    gaussians: Gaussians,
+    transforms: Float[Array, "g 4 4"],
+    mode: Literal["affine", "rotation"] = "affine",
 ) -> Gaussians:
     """Move each Gaussian by its (blended) transform; scales, opacities and colors stay, harmonics turn with it: by the rotation
     that the quaternion of the linear part stands for.
@@ -123,7 +131,9 @@ def skin_gaussians(
     if mode != "rotation":
         raise ValueError(f"skinning mode must be 'affine' or 'rotation', got {mode!r}")
     if gaussians.deformations is not None:
-        raise ValueError("'rotation' skinning keeps quaternions only: these Gaussians are deformed already")
+        raise ValueError(
+            "'rotation' skinning keeps quaternions only: these Gaussians are deformed already"
+        )
     rotations = quaternion.to_matrix(quaternion.normalize(gaussians.quats))
     turned = jnp.matmul(linear, rotations, precision=transform.EXACT)
     return replace(gaussians, means=means, quats=quaternion.from_matrix(turned))
@@ -172,7 +182,9 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
         >>> parameters = optax.apply_updates(parameters, updates)
     """
     if gaussians.deformations is not None:
-        raise ValueError("unconstrain: the Gaussians carry deformations: take rendering.gaussians.factored(gaussians)")
+        raise ValueError(
+            "unconstrain: the Gaussians carry deformations: take rendering.gaussians.factored(gaussians)"
+        )
     parameters = UnconstrainedGaussians(
         gaussians.means,
         gaussians.quats,
@@ -228,10 +240,17 @@ POINTS = 32
 def check_count(count: int) -> None:
     """Raises: ValueError for a number of functions that is not that of whole degrees."""
     if count not in COUNTS[1:]:
-        raise ValueError(f"harmonics: expected (g, 3, 3), (g, 8, 3) or (g, 15, 3), got (g, {count}, 3)")
+        raise ValueError(
+            f"harmonics: expected (g, 3, 3), (g, 8, 3) or (g, 15, 3), got (g, {count}, 3)"
+        )
 
 
-def basis(x: Array | np.ndarray | float, y: Array | np.ndarray | float, z: Array | np.ndarray | float, count: int) -> list:
+def basis(
+    x: Array | np.ndarray | float,
+    y: Array | np.ndarray | float,
+    z: Array | np.ndarray | float,
+    count: int,
+) -> list:
     """Y_1 to Y_count of unit vectors, given as planes. Raises: as `check_count`."""
     check_count(count)
     xx, yy, zz = x * x, y * y, z * z
@@ -240,18 +259,27 @@ def basis(x: Array | np.ndarray | float, y: Array | np.ndarray | float, z: Array
     second = [a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)]
     a, b, c, d, e = _C3
     ring = 4 * zz - xx - yy
-    third = [-a * y * (3 * xx - yy), b * x * y * z, -c * y * ring, d * z * (2 * zz - 3 * xx - 3 * yy)]
+    third = [
+        -a * y * (3 * xx - yy),
+        b * x * y * z,
+        -c * y * ring,
+        d * z * (2 * zz - 3 * xx - 3 * yy),
+    ]
     third += [-c * x * ring, e * z * (xx - yy), -a * x * (xx - 3 * yy)]
     return [*first, *second, *third][:count]
 
 
-def added_colors(harmonics: Float[Array, "g k 3"], x: Array, y: Array, z: Array) -> Float[Array, "g 3"]:
+def added_colors(
+    harmonics: Float[Array, "g k 3"], x: Array, y: Array, z: Array
+) -> Float[Array, "g 3"]:
     """The sum over k for unit vectors d, given as planes of (g,)."""
     values = jnp.stack(basis(x, y, z, harmonics.shape[1]), axis=-1)
     return jnp.sum(values[..., None] * harmonics, axis=1)
 
 
-def turned_harmonics(harmonics: Float[Array, "*g k 3"], rotations: Float[Array, "*#g 3 3"]) -> Float[Array, "*g k 3"]:
+def turned_harmonics(
+    harmonics: Float[Array, "*g k 3"], rotations: Float[Array, "*#g 3 3"]
+) -> Float[Array, "*g k 3"]:
     """Harmonics of the same colors after everything has been turned: those that were seen along d are seen along R d."""
     count = harmonics.shape[-2]
     points, inverse = _points(count)

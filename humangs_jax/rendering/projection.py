@@ -33,7 +33,12 @@ from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians, added_colors, added_variance
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, LARGEST_FOOTPRINT, LEAST_DIMMING, SplatConfig
+from humangs_jax.rendering.splat_config import (
+    DEFAULT_CONFIG,
+    LARGEST_FOOTPRINT,
+    LEAST_DIMMING,
+    SplatConfig,
+)
 
 Planes = list[Array]
 """Arrays of (g,) numbers."""
@@ -82,14 +87,19 @@ class ProjectedGaussians(NamedTuple):
         return 2 * jnp.stack([r00 * r00, r00 * r01, r01 * r01 + r11 * r11], axis=-1)
 
 
-def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> ProjectedGaussians:
+def project_gaussians(
+    gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG
+) -> ProjectedGaussians:
     """Every Gaussian on the image that `config` draws: the first half of `splatting.render`.
 
     A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the half field of view beyond the
     border.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
-    eps2d, jacobian_margin = added_variance(gaussians.low_pass, config.eps2d), config.jacobian_margin
+    eps2d, jacobian_margin = (
+        added_variance(gaussians.low_pass, config.eps2d),
+        config.jacobian_margin,
+    )
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means = _planes(gaussians.means)
@@ -120,7 +130,9 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig 
     colors = None
     if gaussians.harmonics is not None:
         sight = [rotation[0, j] * u + rotation[1, j] * v + rotation[2, j] for j in range(3)]
-        colors = added_colors(gaussians.harmonics, *(lax.rsqrt(_dot(sight, sight)) * s for s in sight))
+        colors = added_colors(
+            gaussians.harmonics, *(lax.rsqrt(_dot(sight, sight)) * s for s in sight)
+        )
     return ProjectedGaussians(
         x=fx * u + cx,
         y=fy * v + cy,
@@ -207,7 +219,9 @@ def _conic_factor_bwd(eps2d: float, saved: PyTree, cotangents: PyTree) -> tuple[
 _conic_factor.defvjp(_conic_factor_fwd, _conic_factor_bwd)
 
 
-def _times_factors(rows: Sequence[Planes], gaussians: Gaussians, normalize_quats: bool) -> list[Planes]:
+def _times_factors(
+    rows: Sequence[Planes], gaussians: Gaussians, normalize_quats: bool
+) -> list[Planes]:
     """Rows @ A R diag(s) for 2 x 3 rows of planes."""
     if gaussians.deformations is not None:
         entries = _planes(gaussians.deformations.reshape(-1, 9))

@@ -21,7 +21,12 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians, added_variance, covariance_factors
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, LARGEST_FOOTPRINT, SplatConfig, splat_config
+from humangs_jax.rendering.splat_config import (
+    DEFAULT_CONFIG,
+    LARGEST_FOOTPRINT,
+    SplatConfig,
+    splat_config,
+)
 from humangs_jax.rendering.splatting import Background, Rendering, features_of, with_background
 
 
@@ -55,7 +60,13 @@ def render_reference(
 
 
 @jax.jit
-def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig, features: Array | None) -> Rendering:
+def _reference(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Array,
+    config: SplatConfig,
+    features: Array | None,
+) -> Rendering:
     centers, axes, depths, visible = _project(gaussians, camera, config)
     eps2d = added_variance(gaussians.low_pass, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
@@ -77,13 +88,20 @@ def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: 
         ended = ended | (transmittance * (1 - alpha) <= config.transmittance_stop)
         alpha = jnp.where(ended, 0.0, alpha)
         weight = alpha * transmittance
-        state = color + weight[..., None] * rgb, distance + weight * depth, transmittance * (1 - alpha), ended
+        state = (
+            color + weight[..., None] * rgb,
+            distance + weight * depth,
+            transmittance * (1 - alpha),
+            ended,
+        )
         return state, None
 
     blank = jnp.zeros((camera.height, camera.width), centers.dtype)
     colors = gaussians.colors
     if gaussians.harmonics is not None:
-        sight = jnp.where(visible[:, None], transform.apply(camera.cam_from_world, gaussians.means), 1.0)
+        sight = jnp.where(
+            visible[:, None], transform.apply(camera.cam_from_world, gaussians.means), 1.0
+        )
         sight = jnp.matmul(sight, camera.cam_from_world[:3, :3], precision=transform.EXACT)
         sight = sight / jnp.linalg.norm(sight, axis=-1, keepdims=True)
         functions = _harmonics(sight, math.isqrt(gaussians.harmonics.shape[1]))
@@ -93,15 +111,21 @@ def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: 
         colors = jnp.concatenate([colors, features], axis=-1)
     state = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype), blank, blank + 1, blank > 0
     splats = centers, axes, determinants, depths, visible, opacities, colors
-    (color, distance, transmittance, _), _ = lax.scan(draw, state, jax.tree.map(lambda leaf: leaf[order], splats))
+    (color, distance, transmittance, _), _ = lax.scan(
+        draw, state, jax.tree.map(lambda leaf: leaf[order], splats)
+    )
     alpha = 1 - transmittance
     some = alpha > 0
     depth = jnp.where(some, distance / jnp.where(some, alpha, 1.0), 0.0)
     rgb = color[..., :3] + transmittance[..., None] * background
-    return Rendering(rgb, alpha, depth, jnp.int32(0), features=None if features is None else color[..., 3:])
+    return Rendering(
+        rgb, alpha, depth, jnp.int32(0), features=None if features is None else color[..., 3:]
+    )
 
 
-def _project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> tuple[Array, Array, Array, Array]:
+def _project(
+    gaussians: Gaussians, camera: Camera, config: SplatConfig
+) -> tuple[Array, Array, Array, Array]:
     """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie at z = 1.
 
     Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d I.
@@ -117,25 +141,51 @@ def _project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> tuple
         size = jnp.asarray([camera.width, camera.height], slopes.dtype)
         extra = config.jacobian_margin * 0.5 * size / focal
         at = jnp.clip(slopes, -center / focal - extra, (size - center) / focal + extra)
-    jacobian = jnp.concatenate([jnp.broadcast_to(jnp.eye(2, dtype=at.dtype), (*depths.shape, 2, 2)), -at[..., None]], axis=-1)
+    jacobian = jnp.concatenate(
+        [jnp.broadcast_to(jnp.eye(2, dtype=at.dtype), (*depths.shape, 2, 2)), -at[..., None]],
+        axis=-1,
+    )
     jacobian = focal[:, None] * jacobian / depths[:, None, None]
     product = functools.partial(jnp.matmul, precision=transform.EXACT)
     image_from_world = product(jacobian, camera.cam_from_world[:3, :3])
     axes = product(image_from_world, covariance_factors(gaussians, config.normalize_quats))
     small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
-    return slopes * focal + center, jnp.where(small[:, None, None], axes, 0.0), depths, visible & small
+    return (
+        slopes * focal + center,
+        jnp.where(small[:, None, None], axes, 0.0),
+        depths,
+        visible & small,
+    )
 
 
 def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
     """Real spherical harmonics of degrees 1 to `degree` of unit vectors: N P_l^m (cos m phi, sin m phi), by recurrence."""
     x, y, z = sight.T
-    cosine, sine, found = jnp.ones_like(x), jnp.zeros_like(x), {}  # of m phi, times sin(theta)^m, which P leaves out
+    cosine, sine, found = (
+        jnp.ones_like(x),
+        jnp.zeros_like(x),
+        {},
+    )  # of m phi, times sin(theta)^m, which P leaves out
     for m in range(degree + 1):
-        legendre = [0 * z, (-1) ** m * math.prod(range(1, 2 * m, 2)) + 0 * z]  # of degrees m - 1 and m
+        legendre = [
+            0 * z,
+            (-1) ** m * math.prod(range(1, 2 * m, 2)) + 0 * z,
+        ]  # of degrees m - 1 and m
         for n in range(m, degree + 1):
-            norm = (2 if m else 1) * (2 * n + 1) / (4 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
-            found[n, m], found[n, -m] = (math.sqrt(norm) * legendre[1] * part for part in (cosine, sine if m else cosine))
-            legendre = [legendre[1], ((2 * n + 1) * z * legendre[1] - (n + m) * legendre[0]) / (n + 1 - m)]
+            norm = (
+                (2 if m else 1)
+                * (2 * n + 1)
+                / (4 * math.pi)
+                * math.factorial(n - m)
+                / math.factorial(n + m)
+            )
+            found[n, m], found[n, -m] = (
+                math.sqrt(norm) * legendre[1] * part for part in (cosine, sine if m else cosine)
+            )
+            legendre = [
+                legendre[1],
+                ((2 * n + 1) * z * legendre[1] - (n + m) * legendre[0]) / (n + 1 - m),
+            ]
         cosine, sine = x * cosine - y * sine, x * sine + y * cosine
     return jnp.stack([found[n, m] for n in range(1, degree + 1) for m in range(-n, n + 1)], axis=-1)
 

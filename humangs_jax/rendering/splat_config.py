@@ -11,7 +11,16 @@ from typing import Annotated
 
 import jax
 
-from humangs_jax.core.configuration import Chunk, Presets, Range, Share, Slots, Spread, configuration, knob
+from humangs_jax.core.configuration import (
+    Chunk,
+    Presets,
+    Range,
+    Share,
+    Slots,
+    Spread,
+    configuration,
+    knob,
+)
 
 NEAR = 0.01
 """Metres; Gaussians whose centre is nearer (or behind) are not drawn. gsplat 0.01; INRIA 0.2."""
@@ -88,17 +97,25 @@ class SplatConfig:
     )
     """Whether `Rendering.visibility` is computed."""
     max_pairs: Slots | None = knob(
-        None, cost="pairs beyond it are not drawn, counted and reported", gain="memory, one compilation", measured=MEASURED
+        None,
+        cost="pairs beyond it are not drawn, counted and reported",
+        gain="memory, one compilation",
+        measured=MEASURED,
     )
     """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and
     takes `buffers.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and `plan_buffers`
     measures a capacity for such calls."""
-    max_rows: Slots | None = knob(None, cost="as max_pairs", gain="a little time", measured=MEASURED)
+    max_rows: Slots | None = knob(
+        None, cost="as max_pairs", gain="a little time", measured=MEASURED
+    )
     """Room for (splat, row of tiles) pairs. None: as many as pairs, always enough in practice."""
     warn_overflow: bool = False
     """Traced calls log a warning whenever something did not fit. It adds a callback to the program."""
     tile_size: Annotated[int, Range(1, 4096)] = knob(
-        8, cost="none", gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time", measured=MEASURED
+        8,
+        cost="none",
+        gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time",
+        measured=MEASURED,
     )
     """Pixels. From here on: the schedule, which changes the time, not the image (but for rounding)."""
     block: Chunk = 32
@@ -108,9 +125,13 @@ class SplatConfig:
 
     def __post_init__(self):
         if not self.alpha_min < self.alpha_max < 1:
-            raise ValueError(f"SplatConfig: need alpha_min < alpha_max < 1, got {self.alpha_min}, {self.alpha_max}")
+            raise ValueError(
+                f"SplatConfig: need alpha_min < alpha_max < 1, got {self.alpha_min}, {self.alpha_max}"
+            )
         if not self.transmittance_stop < 1:
-            raise ValueError(f"SplatConfig.transmittance_stop {self.transmittance_stop:g}: expected less than 1")
+            raise ValueError(
+                f"SplatConfig.transmittance_stop {self.transmittance_stop:g}: expected less than 1"
+            )
         if self.square and self.radius_sigma is None:
             raise ValueError("SplatConfig: a square footprint needs a radius_sigma")
 
@@ -155,8 +176,14 @@ def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
 
     It is returned as it is where it has none of the other conventions: other knobs are the user's.
     """
-    wanted, other = (SPLAT_PRESETS[name] for name in (("exact", "inria") if rendering == "exact" else ("inria", "exact")))
-    if all(getattr(config, name) != getattr(other, name) for name in ("jacobian_margin", "normalize_quats", "square")):
+    wanted, other = (
+        SPLAT_PRESETS[name]
+        for name in (("exact", "inria") if rendering == "exact" else ("inria", "exact"))
+    )
+    if all(
+        getattr(config, name) != getattr(other, name)
+        for name in ("jacobian_margin", "normalize_quats", "square")
+    ):
         return config
     names = [field.name for field in dataclasses.fields(config)]
     differing = [name for name in names if getattr(wanted, name) != getattr(other, name)]

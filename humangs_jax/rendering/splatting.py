@@ -50,7 +50,15 @@ from humangs_jax.rendering.tiling import (
     tiles_to_image,
 )
 
-__all__ = ["BufferOverflowError", "Rendering", "SplatConfig", "plan_buffers", "render", "render_views", "seen_from"]
+__all__ = [
+    "BufferOverflowError",
+    "Rendering",
+    "SplatConfig",
+    "plan_buffers",
+    "render",
+    "render_views",
+    "seen_from",
+]
 
 
 @pytree_dataclass
@@ -131,7 +139,10 @@ def render(
 
 @checked_arguments
 def render_views(
-    gaussians: Gaussians, cameras: Camera, config: SplatConfig | str = DEFAULT_CONFIG, background: Background = None
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    background: Background = None,
 ) -> Rendering:
     """Draw every camera of a batch (leading axis v), one after the other: working memory does not grow with v.
 
@@ -156,20 +167,29 @@ def render_views(
     if len(cameras.batch_shape) != 1:
         raise ValueError(
             "render_views draws cameras with one leading axis, got "
-            + (f"a batch {cameras.batch_shape}" if cameras.batch_shape else "a single camera: use render")
+            + (
+                f"a batch {cameras.batch_shape}"
+                if cameras.batch_shape
+                else "a single camera: use render"
+            )
         )
     return _render(draw_views, gaussians, cameras, config, background)
 
 
 @checked_arguments
 def seen_from(
-    gaussians: Gaussians, cameras: Camera, config: SplatConfig | str = DEFAULT_CONFIG, threshold: float = ALPHA_MIN
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    threshold: float = ALPHA_MIN,
 ) -> Bool[Array, " g"]:
     """Which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis v).
 
     The others can be left out for cameras like these: an avatar's inside is never seen.
     """
-    visibility = render_views(gaussians, cameras, dataclasses.replace(splat_config(config), visibility=True)).visibility
+    visibility = render_views(
+        gaussians, cameras, dataclasses.replace(splat_config(config), visibility=True)
+    ).visibility
     assert visibility is not None
     return jnp.max(visibility, axis=0) >= threshold
 
@@ -183,11 +203,16 @@ def _render(
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
     if gaussians.batch_shape:
-        raise ValueError(f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap")
+        raise ValueError(
+            f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap"
+        )
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     features = features_of(features, len(gaussians.opacities))
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background, features))):
+    if any(
+        isinstance(leaf, Tracer)
+        for leaf in jax.tree.leaves((gaussians, cameras, background, features))
+    ):
         config = with_default_buffers(gaussians, cameras, config)
         rendering = draw(gaussians, cameras, background, config, features)
         warn_of_overflow(rendering.overflow, config)
@@ -232,14 +257,18 @@ def _own(array: Array, of: Array) -> Array:
 
 
 @_own.def_vmap
-def _own_in_batch(size: int, batched: Sequence[bool], array: Array, of: Array) -> tuple[Array, bool]:
+def _own_in_batch(
+    size: int, batched: Sequence[bool], array: Array, of: Array
+) -> tuple[Array, bool]:
     return array if batched[0] else jnp.broadcast_to(array, (size, *array.shape)), True
 
 
 # One image -----------------------------------------------------------------------------------------------------------
 
 
-def with_background(gaussians: Gaussians, cameras: Camera, background: Background) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
+def with_background(
+    gaussians: Gaussians, cameras: Camera, background: Background
+) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
     """What is drawn, in float32 at least. Raises: ValueError for a background that is no color."""
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 
@@ -261,11 +290,15 @@ def _color(background: object, dtype: np.dtype) -> Array:
     else:
         color = background
         fits = isinstance(background, Sequence) and len(background) == 3
-        fits = fits and all(isinstance(x, jax.Array) or (isinstance(x, Real) and 0 <= x <= 1) for x in background)
+        fits = fits and all(
+            isinstance(x, jax.Array) or (isinstance(x, Real) and 0 <= x <= 1) for x in background
+        )
     if not fits:
         shape = getattr(color, "shape", (3,))
         shown = f"shape {shape}" if shape != (3,) else repr(color)
-        raise ValueError(f"background: expected 3 numbers in [0, 1] or the name of a color, got {shown}")
+        raise ValueError(
+            f"background: expected 3 numbers in [0, 1] or the name of a color, got {shown}"
+        )
     return color if isinstance(color, jax.Array) else jnp.asarray(color, dtype)
 
 
@@ -305,16 +338,32 @@ def draw(
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
     """`render` with buffers that are decided, `config.max_pairs`: pure, and without checks."""
-    gaussians, features = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), (gaussians, features))
-    return _draw(project_gaussians(gaussians, camera, config), gaussians, camera, background, config, features)
+    gaussians, features = jax.tree.map(
+        lambda leaf: _once_per_image(leaf, camera), (gaussians, features)
+    )
+    return _draw(
+        project_gaussians(gaussians, camera, config),
+        gaussians,
+        camera,
+        background,
+        config,
+        features,
+    )
 
 
 def draw_views(
-    gaussians: Gaussians, cameras: Camera, background: Float[Array, "3"], config: SplatConfig, features: Array | None = None
+    gaussians: Gaussians,
+    cameras: Camera,
+    background: Float[Array, "3"],
+    config: SplatConfig,
+    features: Array | None = None,
 ) -> Rendering:
     """`draw` for every camera of a batch, one after the other."""
     project = lambda camera: project_gaussians(gaussians, camera, config)
-    return lax.map(lambda camera: _draw(project(camera), gaussians, camera, background, config, features), cameras)
+    return lax.map(
+        lambda camera: _draw(project(camera), gaussians, camera, background, config, features),
+        cameras,
+    )
 
 
 def _draw(
@@ -327,7 +376,10 @@ def _draw(
 ) -> Rendering:
     grid = TileGrid(camera.width, camera.height, config.tile_size)
     if gaussians.means.shape[0] == 0:
-        blank = jnp.zeros((grid.tiles, 4 + (0 if others is None else others.shape[1]), grid.pixels), projected.x.dtype)
+        blank = jnp.zeros(
+            (grid.tiles, 4 + (0 if others is None else others.shape[1]), grid.pixels),
+            projected.x.dtype,
+        )
         visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
         return _blended(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), visibility)
 
@@ -342,7 +394,11 @@ def _draw(
     nearest = jnp.min(depths)
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
     behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
-    seen = [projected.seen_from_here(gaussians.colors), behind[:, None], *([] if others is None else [others])]
+    seen = [
+        projected.seen_from_here(gaussians.colors),
+        behind[:, None],
+        *([] if others is None else [others]),
+    ]
     seen = jnp.concatenate(seen, axis=-1)
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
@@ -351,8 +407,14 @@ def _draw(
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
     features, transmittance, peaks = composite(splats, lists, grid, config)
     peaks = lax.stop_gradient(peaks)
-    visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None
-    return _blended(features, transmittance[:, None], grid, background, nearest, pairs.overflow, visibility)
+    visibility = (
+        jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True)
+        if config.visibility
+        else None
+    )
+    return _blended(
+        features, transmittance[:, None], grid, background, nearest, pairs.overflow, visibility
+    )
 
 
 def _blended(

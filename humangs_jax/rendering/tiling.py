@@ -73,7 +73,9 @@ class TileGrid:
     def offsets(self, dtype: np.dtype | type = np.float32) -> np.ndarray:
         """(2, pixels): x and y of a tile's pixel centres, from the tile's centre. Small: moments stay accurate."""
         pixel = np.arange(self.pixels)
-        offsets = np.stack([pixel % self.tile_size, pixel // self.tile_size]) + 0.5 - self.tile_size / 2
+        offsets = (
+            np.stack([pixel % self.tile_size, pixel // self.tile_size]) + 0.5 - self.tile_size / 2
+        )
         return offsets.astype(dtype)
 
 
@@ -128,8 +130,12 @@ def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
     last = middle[:, -1]
     earlier = jnp.tri(last.shape[0], k=-1, dtype=bool)
     fits = jnp.sum(jnp.where(earlier, last.astype(jnp.float32), 0), axis=1) < SUM_LIMIT
-    before = jnp.where(fits, jnp.sum(jnp.where(earlier, last, 0), axis=1, dtype=jnp.int32), SUM_LIMIT)
-    starts = jnp.minimum((middle + before[:, None]).reshape(-1)[: totals.shape[0]] - totals, SUM_LIMIT)
+    before = jnp.where(
+        fits, jnp.sum(jnp.where(earlier, last, 0), axis=1, dtype=jnp.int32), SUM_LIMIT
+    )
+    starts = jnp.minimum(
+        (middle + before[:, None]).reshape(-1)[: totals.shape[0]] - totals, SUM_LIMIT
+    )
     return jnp.minimum(within + starts[:, None], SUM_LIMIT).reshape(-1)[:n]
 
 
@@ -140,7 +146,9 @@ def _in_rows(x: Int[Array, " n"]) -> Int[Array, "rows 64"]:
 def _sums_in_rows(rows: Int[Array, "rows 64"]) -> Int[Array, "rows 64"]:
     """Running sums along each row, exact while they stay below 2^24."""
     triangle = jnp.triu(jnp.ones((_ROW, _ROW), jnp.float32))
-    return jnp.matmul(rows.astype(jnp.float32), triangle, precision=lax.Precision.HIGHEST).astype(jnp.int32)
+    return jnp.matmul(rows.astype(jnp.float32), triangle, precision=lax.Precision.HIGHEST).astype(
+        jnp.int32
+    )
 
 
 def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
@@ -152,7 +160,9 @@ def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
     return Expansion(owners(first, capacity), first, end[-1])
 
 
-def owners(first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0) -> Int[Array, " size"]:
+def owners(
+    first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0
+) -> Int[Array, " size"]:
     """Which item owns each of the slots start .. start + size, if item i owns those from first[i] to first[i + 1].
 
     As many items begin at or before a slot as the running sum of marks says, and the last of them owns the slot: items
@@ -162,9 +172,13 @@ def owners(first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0) 
     return materialized(cumsum(marks) - 1)
 
 
-def take(table: Shaped[Array, "n *rest"], indices: Int[Array, " slots"]) -> Shaped[Array, "slots *rest"]:
+def take(
+    table: Shaped[Array, "n *rest"], indices: Int[Array, " slots"]
+) -> Shaped[Array, "slots *rest"]:
     """Rows of a table at indices that are known to be in range: no clamping, no wrapping of negative ones."""
-    return materialized(table).at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return (
+        materialized(table).at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    )
 
 
 def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
@@ -185,7 +199,9 @@ def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
     """Ascending. Equal keys are identical, so a sort need not be stable; XLA's stable sort is a third faster on CPUs, and
     elsewhere has to carry the positions along.
     """
-    return lax.platform_dependent(keys, cpu=jnp.sort, default=lambda keys: lax.sort(keys, is_stable=False))
+    return lax.platform_dependent(
+        keys, cpu=jnp.sort, default=lambda keys: lax.sort(keys, is_stable=False)
+    )
 
 
 def sort_into_tiles(
@@ -212,7 +228,9 @@ def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
     t = counts.shape[0]
     bits = bits_for(t)
     longest = (1 << (32 - bits)) - 1
-    key = (longest - jnp.minimum(counts.astype(jnp.uint32), longest)) << bits | jnp.arange(t, dtype=jnp.uint32)
+    key = (longest - jnp.minimum(counts.astype(jnp.uint32), longest)) << bits | jnp.arange(
+        t, dtype=jnp.uint32
+    )
     tiles = (sort_keys(key) & ((1 << bits) - 1)).astype(jnp.int32)
     tiles = jnp.pad(tiles, (0, -t % block), constant_values=t)
     used = jnp.sum(counts > 0, dtype=jnp.int32)
@@ -260,7 +278,16 @@ class Footprints(NamedTuple):
     def bands(self) -> "_Bands":
         height, tip = jnp.sqrt(self.reach * self.yy), self.xy * jnp.sqrt(self.reach / self.xx)
         inverse = 1 / self.yy
-        return _Bands(self.x, self.y, height, tip, self.xy * inverse, self.determinant * inverse, inverse, self.reach)
+        return _Bands(
+            self.x,
+            self.y,
+            height,
+            tip,
+            self.xy * inverse,
+            self.determinant * inverse,
+            inverse,
+            self.reach,
+        )
 
 
 class _Bands(NamedTuple):
@@ -277,13 +304,17 @@ class _Bands(NamedTuple):
     inverse: Float[Array, " g"]
     reach: Float[Array, " g"]
 
-    def columns(self, row: Int[Array, " g"], grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
+    def columns(
+        self, row: Int[Array, " g"], grid: TileGrid
+    ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First and last tile of each ellipse within one row of tiles."""
         size = grid.tile_size
         top = jnp.maximum(row * size + 0.5 - SLACK - self.y, -self.height)
         bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - self.y, self.height)
         right, left = jnp.clip(self.tip, top, bottom), jnp.clip(-self.tip, top, bottom)
-        half = lambda dy: jnp.sqrt(jnp.maximum(self.ratio * (self.reach - dy * dy * self.inverse), 0))
+        half = lambda dy: jnp.sqrt(
+            jnp.maximum(self.ratio * (self.reach - dy * dy * self.inverse), 0)
+        )
         column0 = _first(self.x + self.slope * left - half(left), size, grid.columns)
         column1 = _last(self.x + self.slope * right + half(right), size, grid.columns)
         return column0, column1
@@ -307,14 +338,18 @@ class Squares(NamedTuple):
     def bands(self) -> "Squares":
         return self
 
-    def columns(self, row: Int[Array, " g"], grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
+    def columns(
+        self, row: Int[Array, " g"], grid: TileGrid
+    ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First and last tile of each square, the same in all its rows."""
         return self._range(self.x, grid.tile_size, grid.columns)
 
     def _range(self, center: Array, size: int, tiles: int) -> tuple[Array, Array]:
         low, high = center - 0.5 - self.radius, center - 0.5 + self.radius + size - 1
         first = jnp.clip(jnp.floor(low / size), 0, tiles)
-        return first.astype(jnp.int32), (jnp.clip(jnp.floor(high / size), 0, tiles) - 1).astype(jnp.int32)
+        return first.astype(jnp.int32), (jnp.clip(jnp.floor(high / size), 0, tiles) - 1).astype(
+            jnp.int32
+        )
 
 
 class Pairs(NamedTuple):
@@ -348,7 +383,9 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
     return order
 
 
-def squared_reach(opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN) -> Float[Array, " g"]:
+def squared_reach(
+    opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN
+) -> Float[Array, " g"]:
     """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below. No gradient."""
     opacities = lax.stop_gradient(opacities)
     seen = opacities > alpha_min
@@ -363,16 +400,22 @@ def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Foot
     return Footprints(p.x, p.y, p.xx, p.xy, p.yy, p.determinant, reach)
 
 
-def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], radius_sigma: float) -> Squares:
+def square_footprints(
+    projected: ProjectedGaussians, reach: Float[Array, " g"], radius_sigma: float
+) -> Squares:
     """Squares of `radius_sigma` times the larger standard deviation, rounded up to pixels, where reach is positive."""
     p = lax.stop_gradient(projected)
     middle = 0.5 * (p.xx + p.yy)
-    largest = middle + jnp.sqrt(jnp.maximum(middle * middle - p.determinant, INRIA_MIN_DISCRIMINANT))
+    largest = middle + jnp.sqrt(
+        jnp.maximum(middle * middle - p.determinant, INRIA_MIN_DISCRIMINANT)
+    )
     radius = jnp.where(p.visible & (reach > 0), jnp.ceil(radius_sigma * jnp.sqrt(largest)), 0.0)
     return Squares(p.x, p.y, radius)
 
 
-def footprints_by(projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig) -> Footprints | Squares:
+def footprints_by(
+    projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig
+) -> Footprints | Squares:
     """The footprints that a configuration asks for: ellipses that end at `alpha_min` or `radius_sigma`, or squares."""
     reach = squared_reach(opacities, config.alpha_min)
     if config.radius_sigma is None:
@@ -382,13 +425,17 @@ def footprints_by(projected: ProjectedGaussians, opacities: Float[Array, " g"], 
     return footprints(projected, jnp.minimum(reach, config.radius_sigma**2))
 
 
-def count_pairs(footprints: Footprints | Squares, grid: TileGrid) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def count_pairs(
+    footprints: Footprints | Squares, grid: TileGrid
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """(rows, pairs) that `emit_pairs` needs, without any buffer; both saturate at `SUM_LIMIT`."""
     _, counts = footprints.rows(grid)
     return _saturating_sum(counts), _count_row_by_row(footprints, grid, jnp.max(counts, initial=0))
 
 
-def emit_pairs(footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int) -> Pairs:
+def emit_pairs(
+    footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int
+) -> Pairs:
     """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose theirs."""
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
@@ -397,10 +444,14 @@ def emit_pairs(footprints: Footprints | Squares, grid: TileGrid, max_rows: int, 
     row = take(first - rows.first, rows.source) + slot
     table = take(jnp.stack(bands, axis=-1), rows.source)
     column0, column1 = type(bands)(*(table[:, i] for i in range(len(bands)))).columns(row, grid)
-    pairs = expand(jnp.where(slot < rows.needed, jnp.maximum(column1 - column0 + 1, 0), 0), max_pairs)
+    pairs = expand(
+        jnp.where(slot < rows.needed, jnp.maximum(column1 - column0 + 1, 0), 0), max_pairs
+    )
 
     slot = jnp.arange(max_pairs, dtype=jnp.int32)
-    table = take(jnp.stack([row * grid.columns + column0 - pairs.first, rows.source], axis=-1), pairs.source)
+    table = take(
+        jnp.stack([row * grid.columns + column0 - pairs.first, rows.source], axis=-1), pairs.source
+    )
     tiles = jnp.where(slot < pairs.needed, table[:, 0] + slot, grid.tiles)
     # If rows are missing, so are their pairs, and they are counted row by row; otherwise this loop runs zero times.
     missing = rows.needed > max_rows
@@ -411,7 +462,9 @@ def emit_pairs(footprints: Footprints | Squares, grid: TileGrid, max_rows: int, 
 
 def _first(v: Array, tile_size: int, tiles: int) -> Array:
     """First of `tiles` whose last pixel centre is not left of v."""
-    return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(jnp.int32)
+    return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(
+        jnp.int32
+    )
 
 
 def _last(v: Array, tile_size: int, tiles: int) -> Array:

@@ -73,12 +73,20 @@ class Ablation:
     def rows(self) -> list[AblationRow]:
         """The base first, then the variants that have a score, in their order."""
         base = self.scores[BASE]
-        return [_row(name, own, base) for name, own in self.scores.items() if own.keys() & base.keys()]
+        return [
+            _row(name, own, base) for name, own in self.scores.items() if own.keys() & base.keys()
+        ]
 
     def __str__(self) -> str:
         head = ["variant", "seeds", self.metric, "difference", f"{CONFIDENCE:.0%} interval"]
         cells = [
-            [row.name, str(row.seeds), f"{row.mean:.2f}", *(_shown(row) if row.name != BASE else ("", ""))] for row in self.rows
+            [
+                row.name,
+                str(row.seeds),
+                f"{row.mean:.2f}",
+                *(_shown(row) if row.name != BASE else ("", "")),
+            ]
+            for row in self.rows
         ]
         return "\n".join([*text_table([head, *cells]), *self._missing_told()])
 
@@ -90,7 +98,9 @@ class Ablation:
         if self.longest:
             enough = _as_budget(self.missing * self.longest * (1 + MARGIN))
             took = f"a run took up to {_as_budget(self.longest)}"
-            told.insert(0, f'{took}: the same call goes on, budget="{enough}" would do for the rest')
+            told.insert(
+                0, f'{took}: the same call goes on, budget="{enough}" would do for the rest'
+            )
         return told
 
     def plot(self) -> Any:
@@ -102,7 +112,9 @@ class Ablation:
         make = importlib.import_module("matplotlib.figure").Figure
         if not rows:
             figure = make(figsize=(6.4, 1.0), dpi=150)
-            words = "\n".join(["no variant finished: there is nothing to compare", *self._missing_told()])
+            words = "\n".join(
+                ["no variant finished: there is nothing to compare", *self._missing_told()]
+            )
             figure.text(0.5, 0.5, words, ha="center", va="center", fontsize="small")
             return figure
         figure = make(figsize=(6.4, 1.0 + 0.35 * len(rows)), dpi=150, layout="constrained")
@@ -111,7 +123,11 @@ class Ablation:
             color = "tab:blue" if row.clear else "0.6"
             axis.errorbar(row.difference, place, xerr=row.interval, fmt="o", color=color, capsize=3)
         axis.axvline(0, color="black", linewidth=0.8)
-        axis.set(yticks=range(len(rows)), yticklabels=[row.name for row in rows], ylim=(-0.6, len(rows) - 0.4))
+        axis.set(
+            yticks=range(len(rows)),
+            yticklabels=[row.name for row in rows],
+            ylim=(-0.6, len(rows) - 0.4),
+        )
         axis.set_xlabel(f"change of {self.metric}, with {CONFIDENCE:.0%} intervals by paired seeds")
         return figure
 
@@ -181,13 +197,19 @@ def ablate(
     for name, seed in bar(order, desc="ablate", unit="run", shown=progress):
         folder, config = folders[name] / str(seed), dataclasses.replace(runs[name], seed=seed)
         start = time.monotonic()
-        if seconds is not None and not _validated(folder, config.steps) and start - began + longest > seconds:
+        if (
+            seconds is not None
+            and not _validated(folder, config.steps)
+            and start - began + longest > seconds
+        ):
             continue
         others = functools.partial(train, validation=compared, validated=count, networks=networks)
         others(config, body, learned, folder, progress=progress)
         found = _validated(folder, config.steps)
         if metric not in found:
-            raise ArgumentError("validation", f"{validation!r}: nobody was looked at: expected people to compare on")
+            raise ArgumentError(
+                "validation", f"{validation!r}: nobody was looked at: expected people to compare on"
+            )
         scores[name][seed] = found[metric]
         longest = max(longest, time.monotonic() - start)
     result = Ablation(metric, scores, sum(seeds - len(own) for own in scores.values()), longest)
@@ -201,7 +223,9 @@ def _check_metric(metric: str, networks: LossNetworks) -> None:
     known = METRICS if networks.lpips is None else (*METRICS, "lpips")
     if metric not in known:
         usual_first = sorted(known, key=lambda name: (name != DEFAULT_METRIC, name))
-        raise ArgumentError("metric", f"{metric!r}: is none of validation: {', '.join(usual_first)}")
+        raise ArgumentError(
+            "metric", f"{metric!r}: is none of validation: {', '.join(usual_first)}"
+        )
 
 
 def _checked_variants(
@@ -211,9 +235,13 @@ def _checked_variants(
     runs = {}
     for name, changes in variants.items():
         if name == BASE:
-            raise ArgumentError("variants", f"{BASE!r}: is the name of the run that variants are compared with")
+            raise ArgumentError(
+                "variants", f"{BASE!r}: is the name of the run that variants are compared with"
+            )
         if "seed" in changes:
-            raise ArgumentError("variants", f"{name!r}: seed: all variants have the seeds 0, 1, ... of `seeds`")
+            raise ArgumentError(
+                "variants", f"{name!r}: seed: all variants have the seeds 0, 1, ... of `seeds`"
+            )
         try:
             runs[name] = run = vary(base, changes)
             jax.eval_shape(lambda run=run: init_state(run, None))  # whether its network can be made
@@ -221,7 +249,9 @@ def _checked_variants(
             said = (str(error).splitlines() or [type(error).__name__])[0]
             raise ArgumentError("variants", f"{name!r}: {said}") from error
         if missing := missing_networks(run, networks):
-            raise ArgumentError("variants", f"{name!r}: loss.{missing[0]}: expected its network in networks")
+            raise ArgumentError(
+                "variants", f"{name!r}: loss.{missing[0]}: expected its network in networks"
+            )
     return runs
 
 
@@ -230,9 +260,15 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
     own, not even for file systems that do not tell upper from lower case.
     """
     plain = {name: re.sub(r"[^\w.+-]+", "_", name) for name in names}
-    unusable = [name for name in names if not re.search(r"\w", plain[name]) or len(plain[name]) > LONGEST_NAME]
+    unusable = [
+        name
+        for name in names
+        if not re.search(r"\w", plain[name]) or len(plain[name]) > LONGEST_NAME
+    ]
     taken, folders = set[str](), {}
-    for name in sorted(names, key=lambda name: (name != BASE, plain[name] != name)):  # exact names keep theirs
+    for name in sorted(
+        names, key=lambda name: (name != BASE, plain[name] != name)
+    ):  # exact names keep theirs
         folder = plain[name]
         if name in unusable or folder.lower() in taken:
             folder = f"{folder.strip('.')[:LONGEST_NAME]}-{zlib.crc32(name.encode()):08x}"
@@ -248,7 +284,9 @@ def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[M
         count = validation
     if not isinstance(found, Sequence):
         return compared_as(base, found), count
-    captured = functools.cache(lambda: captured_people(found, body))  # photos that are decoded once serve all runs
+    captured = functools.cache(
+        lambda: captured_people(found, body)
+    )  # photos that are decoded once serve all runs
     return compared_as(base, lambda config: captured()(config)), len(found)
 
 
@@ -256,8 +294,12 @@ def _row(name: str, own: Mapping[int, float], base: Mapping[int, float]) -> Abla
     differences = np.asarray([own[seed] - base[seed] for seed in own.keys() & base.keys()])
     count, interval = len(differences), None
     if count > 1:
-        interval = float(student.ppf((1 + CONFIDENCE) / 2, count - 1) * differences.std(ddof=1) / np.sqrt(count))
-    return AblationRow(name, len(own), float(np.mean(list(own.values()))), float(differences.mean()), interval)
+        interval = float(
+            student.ppf((1 + CONFIDENCE) / 2, count - 1) * differences.std(ddof=1) / np.sqrt(count)
+        )
+    return AblationRow(
+        name, len(own), float(np.mean(list(own.values()))), float(differences.mean()), interval
+    )
 
 
 def _shown(row: AblationRow) -> tuple[str, str]:

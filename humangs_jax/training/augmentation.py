@@ -49,7 +49,9 @@ def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -
 
     def augmented(example):
         inputs, targets = example.inputs, example.targets
-        betas = inputs.betas + config.betas * jax.random.normal(betas_key, inputs.betas.shape, inputs.betas.dtype)
+        betas = inputs.betas + config.betas * jax.random.normal(
+            betas_key, inputs.betas.shape, inputs.betas.dtype
+        )
         pelvis = shape_body(body, betas).joints[0]
         inputs = augment_views(views_key, replace(inputs, betas=betas), pelvis, config)
         return replace(example, inputs=inputs, targets=replace(targets, betas=betas))
@@ -57,7 +59,11 @@ def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -
     def exposed(example):
         views = example.inputs
         outside = 1 - views.masks[..., None]
-        images = _gains(views_key, len(views.images), views.images.dtype, config) * (views.images - outside) + outside
+        images = (
+            _gains(views_key, len(views.images), views.images.dtype, config)
+            * (views.images - outside)
+            + outside
+        )
         return replace(example, inputs=replace(views, images=jnp.clip(images, 0, 1)))
 
     chosen = jax.random.bernoulli(choice_key, config.share)
@@ -71,7 +77,9 @@ def _gains(key: Key, count: int, dtype: Any, config: Augmentation) -> Float[Arra
     return jnp.exp(gain + config.tint * jax.random.normal(tint_key, (count, 1, 1, 3), dtype))
 
 
-def augment_views(key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Augmentation) -> SubjectViews:
+def augment_views(
+    key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Augmentation
+) -> SubjectViews:
     """Photos, masks, cameras and poses. pelvis: (3,) metres, in the rest pose: cameras turn about the posed one."""
     photo_key, camera_key, pose_key, body_key = jax.random.split(key, 4)
     normal = lambda key, like: jax.random.normal(key, like.shape, like.dtype)
@@ -83,7 +91,8 @@ def augment_views(key: Key, views: SubjectViews, pelvis: Float[Array, "3"], conf
         masks=masks,
         cameras=augment_cameras(camera_key, views.cameras, views.translations + pelvis, config),
         rotations=views.rotations + math.radians(config.pose_degrees) * normal(pose_key, rotations),
-        translations=views.translations + config.body_metres * normal(body_key, views.translations[0]),
+        translations=views.translations
+        + config.body_metres * normal(body_key, views.translations[0]),
     )
 
 
@@ -106,7 +115,9 @@ def augment_photos(
     return jnp.clip(cut[..., None] * (seen - 1) + 1, 0, 1), cut
 
 
-def _grown(masks: Float[Array, "v h w"], radii: Int[Array, " v"], most: int) -> Float[Array, "v h w"]:
+def _grown(
+    masks: Float[Array, "v h w"], radii: Int[Array, " v"], most: int
+) -> Float[Array, "v h w"]:
     """Masks dilated by radii > 0 and eroded by radii < 0, in pixels; squares grow to squares."""
     for radius in range(1, most + 1):
         larger, smaller = _largest_near(masks), -_largest_near(-masks)
@@ -125,7 +136,9 @@ def _largest_near(images: Float[Array, "v h w"]) -> Float[Array, "v h w"]:
     return images
 
 
-def augment_cameras(key: Key, cameras: Camera, centers: Float[Array, "v 3"], config: Augmentation) -> Camera:
+def augment_cameras(
+    key: Key, cameras: Camera, centers: Float[Array, "v 3"], config: Augmentation
+) -> Camera:
     """Cameras that are turned about centres (v, 3) of the world, and shifted."""
     turn_key, shift_key = jax.random.split(key)
     dtype = centers.dtype

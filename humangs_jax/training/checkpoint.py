@@ -33,7 +33,13 @@ from humangs_jax.training.state import TrainState
 logger = logging.getLogger("humangs_jax.training")
 UNSCORED = -1e9
 """Score of a checkpoint that was saved before any validation: worse than every other."""
-ADJUSTABLE = ("log_every", "validate_every", "checkpoint_every", "keep_checkpoints", "microbatch_size")
+ADJUSTABLE = (
+    "log_every",
+    "validate_every",
+    "checkpoint_every",
+    "keep_checkpoints",
+    "microbatch_size",
+)
 """What may change in the middle of a run without changing its numbers (but for shared batch statistics)."""
 
 
@@ -51,11 +57,17 @@ class Checkpoints:
         score = operator.itemgetter("score")
         kept = AnyPreservationPolicy([LatestN(keep), BestN(get_metric_fn=score, n=1)])
         options = ocp.CheckpointManagerOptions(
-            best_fn=score, preservation_policy=kept, enable_async_checkpointing=True, create=not read_only, read_only=read_only
+            best_fn=score,
+            preservation_policy=kept,
+            enable_async_checkpointing=True,
+            create=not read_only,
+            read_only=read_only,
         )
         if unreadable := _without_score(folder):
             if read_only:
-                raise FileError(unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside")
+                raise FileError(
+                    unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside"
+                )
             _set_aside(unreadable)
         logging.getLogger("absl").addFilter(_not_of_orbax)
         self._manager = ocp.CheckpointManager(folder, options=options)
@@ -84,12 +96,16 @@ class Checkpoints:
         step = int(state.step)
         if step in self._manager.all_steps():
             return
-        if jax.default_backend() == "cpu":  # where the next step would overwrite the memory that is being written
+        if (
+            jax.default_backend() == "cpu"
+        ):  # where the next step would overwrite the memory that is being written
             state = jax.tree.map(jnp.copy, state)
         scored = score is not None and not math.isnan(score)
         metrics = {"score": float(score) if scored else UNSCORED, CHECKSUM: _checksum(state)}
         with self._writing():
-            self._manager.save(step, args=self._ocp.args.StandardSave(_as_dict(state)), metrics=metrics)
+            self._manager.save(
+                step, args=self._ocp.args.StandardSave(_as_dict(state)), metrics=metrics
+            )
 
     def wait(self) -> None:
         """Return when all that was saved is on disk. Raises: FileError if one could not be written, as on a full disk."""
@@ -101,7 +117,9 @@ class Checkpoints:
         try:
             yield
         except Exception as error:  # of many types: Orbax's own, TensorStore's, Python's
-            raise FileError(self._manager.directory, "", f"a checkpoint cannot be written: {error}") from error
+            raise FileError(
+                self._manager.directory, "", f"a checkpoint cannot be written: {error}"
+            ) from error
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
         """The state of a step (None: the newest good one). `like`: a state of the same run, for structure, shapes and devices.
@@ -113,7 +131,9 @@ class Checkpoints:
         folder = Path(self._manager.directory)
         steps = self.steps[::-1] if step is None else [step] if step in self.steps else []
         if not steps:
-            raise FileNotFoundError(f"{folder}: no checkpoint{'' if step is None else f' of step {step}'}")
+            raise FileNotFoundError(
+                f"{folder}: no checkpoint{'' if step is None else f' of step {step}'}"
+            )
         damaged: list[Path] = []
         for candidate in steps:
             state, problem = self._restore(candidate, like)
@@ -124,7 +144,11 @@ class Checkpoints:
                 return state
             damaged.append(folder / str(candidate))
             logger.warning("%s: going back to the checkpoint before", problem)
-        raise FileError(folder, "", f"none of {len(damaged)} checkpoints can be used, the last one tried: {problem}")
+        raise FileError(
+            folder,
+            "",
+            f"none of {len(damaged)} checkpoints can be used, the last one tried: {problem}",
+        )
 
     def _restore(self, step: int, like: TrainState) -> tuple[TrainState | None, str]:
         """The state, or what is wrong; all processes come to the same result."""
@@ -132,18 +156,27 @@ class Checkpoints:
         state, problem = None, ""
         try:
             with reading(path, "checkpoint"):
-                described = self._ocp.StandardCheckpointHandler().metadata(self._manager.directory / str(step) / "default")
-                shapes = sorted(x.shape for x in jax.tree.leaves(getattr(described, "tree", described)))
+                described = self._ocp.StandardCheckpointHandler().metadata(
+                    self._manager.directory / str(step) / "default"
+                )
+                shapes = sorted(
+                    x.shape for x in jax.tree.leaves(getattr(described, "tree", described))
+                )
                 if shapes != sorted(x.shape for x in jax.tree.leaves(wanted)):
                     raise Refused("its arrays are those of another model")
                 abstract = jax.tree.map(self._ocp.utils.to_shape_dtype_struct, wanted)
-                restored = self._manager.restore(step, args=self._ocp.args.StandardRestore(abstract))
+                restored = self._manager.restore(
+                    step, args=self._ocp.args.StandardRestore(abstract)
+                )
                 state = TrainState(**jax.tree.map(_placed_as, restored, wanted))
         except (FileError, FileNotFoundError) as error:
             problem = str(error)
         recorded = (self._manager.metrics(step) or {}).get(CHECKSUM)
         if state is not None and recorded != (found := _checksum(state)):
-            state, problem = None, f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}"
+            state, problem = (
+                None,
+                f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}",
+            )
         if not _everywhere(state is not None).all():
             state, problem = None, problem or f"{path}: damaged, as another process found"
         return state, problem
@@ -174,7 +207,11 @@ def _checksum(state: TrainState) -> str:
     """
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path(_as_dict(state)):
-        own = [_weighted_sum(shard, leaf.shape) for shard in leaf.addressable_shards if shard.replica_id == 0]
+        own = [
+            _weighted_sum(shard, leaf.shape)
+            for shard in leaf.addressable_shards
+            if shard.replica_id == 0
+        ]
         total += (zlib.crc32(jax.tree_util.keystr(path).encode()) | 1) * sum(own)
     total %= 1 << 64
     halves = _everywhere(np.asarray([total >> 32, total & 0xFFFFFFFF], np.uint32))
@@ -184,7 +221,10 @@ def _checksum(state: TrainState) -> str:
 def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
     data = np.asarray(shard.data)
     words = data.reshape(-1).view(f"u{data.itemsize}").astype(np.uint64)
-    axes = [np.arange(size) + (part.start or 0) for size, part in zip(data.shape, shard.index, strict=True)]
+    axes = [
+        np.arange(size) + (part.start or 0)
+        for size, part in zip(data.shape, shard.index, strict=True)
+    ]
     places = np.ravel_multi_index(np.ix_(*axes), shape).reshape(-1) if shape else np.zeros(1)
     return int(((2 * places.astype(np.uint64) + 1) * words).sum(dtype=np.uint64))
 
@@ -192,7 +232,9 @@ def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
 def _without_score(folder: Path) -> list[Path]:
     """Checkpoints whose score cannot be read; Orbax would stop at the first of them."""
     found = []
-    for step in sorted(path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()):
+    for step in sorted(
+        path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()
+    ):
         try:
             readable = isinstance(read_json(step / "metrics" / "metrics")["score"], int | float)
         except (OSError, ValueError, LookupError, TypeError):
@@ -205,7 +247,9 @@ def _set_aside(steps: list[Path]) -> None:
     """Rename damaged checkpoints, so that their steps can be saved again; nothing is deleted."""
     for step in steps if jax.process_index() == 0 else ():
         numbers = ("", *(f"-{i}" for i in range(1, 1000)))
-        aside = next(p for i in numbers if not (p := step.with_name(f"damaged-{step.name}{i}")).exists())
+        aside = next(
+            p for i in numbers if not (p := step.with_name(f"damaged-{step.name}{i}")).exists()
+        )
         step.rename(aside)
         logger.warning("%s: a damaged checkpoint, set aside as %s", step, aside.name)
     _everywhere(0)  # all processes wait for it
@@ -220,7 +264,9 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
     """
     path = Path(out) / "config.json"
     if path.is_file():
-        earlier, now = (_flat(json.loads(config_to_json(run))) for run in (load_config(out), config))
+        earlier, now = (
+            _flat(json.loads(config_to_json(run))) for run in (load_config(out), config)
+        )
         finished = (Path(out) / "checkpoints" / str(earlier["steps"])).is_dir()
         longer = {"steps"} if finished and now["steps"] > earlier["steps"] else set()
         for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE) - longer):
@@ -255,7 +301,11 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """{"loss.squared": 1.0, ...} from nested dicts."""
     items = {}
     for name, value in tree.items():
-        items |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        items |= (
+            _flat(value, f"{prefix}{name}.")
+            if isinstance(value, dict)
+            else {f"{prefix}{name}": value}
+        )
     return items
 
 

@@ -33,7 +33,13 @@ from humangs_jax.training.augmentation import Augmentation
 logger = logging.getLogger(__name__)
 Below = Annotated[float, Range(0, 0.999_999)]
 """Of a running mean that forgets."""
-HOST_SETTINGS = {"seed": 0, "log_every": 1, "validate_every": 1, "checkpoint_every": 1, "keep_checkpoints": 1}
+HOST_SETTINGS = {
+    "seed": 0,
+    "log_every": 1,
+    "validate_every": 1,
+    "checkpoint_every": 1,
+    "keep_checkpoints": 1,
+}
 """Settings of a run that no compiled program depends on, with the values that programs are compiled for."""
 
 
@@ -94,7 +100,10 @@ class TrainConfig:
     batch_size: Few = 1
     """Subjects per step."""
     microbatch_size: Few = knob(
-        1, cost="memory in proportion", gain="fewer, larger steps on accelerators", measured="performance.md"
+        1,
+        cost="memory in proportion",
+        gain="fewer, larger steps on accelerators",
+        measured="performance.md",
     )
     """How many subjects of a device it works on at once, gradients accumulating over the rest: 1 needs least memory and suits
     CPUs. The upsampler's batch statistics are of the subjects that all devices work on at once."""
@@ -112,10 +121,14 @@ class TrainConfig:
 
     def __post_init__(self):
         if self.model.runtime.dtype == "float16":
-            raise ValueError("model.runtime.dtype float16: gradients underflow; expected float32 or bfloat16 for training")
+            raise ValueError(
+                "model.runtime.dtype float16: gradients underflow; expected float32 or bfloat16 for training"
+            )
         starts = [stage.start for stage in self.stages]
         if starts != sorted(set(starts)) or (starts and starts[-1] >= self.steps):
-            raise ValueError(f"stages start at {starts}: expected ascending steps between 1 and {self.steps - 1}")
+            raise ValueError(
+                f"stages start at {starts}: expected ascending steps between 1 and {self.steps - 1}"
+            )
         for start in starts:
             self.at(start)
 
@@ -125,7 +138,9 @@ class TrainConfig:
         for stage in self.stages:
             if stage.start <= step:
                 changes = {path: getattr(stage, name) for name, path in STAGED.items()}
-                config = vary(config, {path: value for path, value in changes.items() if value is not None})
+                config = vary(
+                    config, {path: value for path, value in changes.items() if value is not None}
+                )
         return config
 
     def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
@@ -147,7 +162,15 @@ def small() -> TrainConfig:
     """For the shipped network: some hours on a CPU of two cores. Its present weights had other losses (assets/weights.md)."""
     return TrainConfig(
         views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
-        loss=LossConfig(squared=0.5, absolute=0.15, silhouette=0.0, boundary=0.1, depth=0.3, distortion=1.0, opaque=0.001),
+        loss=LossConfig(
+            squared=0.5,
+            absolute=0.15,
+            silhouette=0.0,
+            boundary=0.1,
+            depth=0.3,
+            distortion=1.0,
+            opaque=0.001,
+        ),
         augmentation=Augmentation(share=0.4),
         optimizer=OptimizerConfig(learning_rate=5e-4, warmup_steps=100),
         target_size=256,
@@ -167,7 +190,9 @@ def published() -> TrainConfig:
         model=presets.published(),
         splat=SPLAT_PRESETS["inria"],
         views=ViewSampling(target_count=4, rule="window"),
-        loss=LossConfig(structural=0.0, silhouette=0.0, perceptual=1.0, lpips=0.1, random_background=0.0),
+        loss=LossConfig(
+            structural=0.0, silhouette=0.0, perceptual=1.0, lpips=0.1, random_background=0.0
+        ),
         target_size=512,
         steps=100_000,
         batch_size=8,
@@ -214,14 +239,18 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
         return PRESETS[str(preset_or_path)]()
     path = Path(preset_or_path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: neither a file nor one of the presets {', '.join(PRESETS)}")
+        raise FileNotFoundError(
+            f"{path}: neither a file nor one of the presets {', '.join(PRESETS)}"
+        )
     return read_configuration(TrainConfig, path)
 
 
 def missing_networks(config: TrainConfig, networks: LossNetworks) -> list[str]:
     """The losses of a run whose networks are missing."""
     needing = ("perceptual", "vgg16", "lpips")
-    return [name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None]
+    return [
+        name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None
+    ]
 
 
 def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:

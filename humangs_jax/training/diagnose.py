@@ -105,7 +105,9 @@ def _stored(name: str, tree: PyTree) -> StageReport:
 def _numbers(report: StageReport) -> StageReport:
     """A report of arrays as one of `Leaf`s."""
     of = lambda arrays: {name: Leaf.of(name, np.asarray(x)) for name, x in arrays.items()}
-    return StageReport(report.name, *map(of, (report.values, report.taken, report.returned, report.gradients)))
+    return StageReport(
+        report.name, *map(of, (report.values, report.taken, report.returned, report.gradients))
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,10 +151,25 @@ class Diagnosis:
     @property
     def faults(self) -> tuple[Fault, ...]:
         """All that was stored and is not finite; then the first stage to blame, going forward or else going back."""
-        stored = [Fault("stored", part.name, leaf) for part in self.stored for leaf in part.values.values() if leaf.bad]
-        forward = [Fault("forward", stage.name, leaf) for stage in self.stages if (leaf := _first_bad(stage.values))]
-        back = [Fault("backward", stage.name, leaf) for stage in self.stages if (leaf := stage.spoils)]
-        inner = [fault for fault in back if not any(other.stage.startswith(f"{fault.stage}.") for other in back)]
+        stored = [
+            Fault("stored", part.name, leaf)
+            for part in self.stored
+            for leaf in part.values.values()
+            if leaf.bad
+        ]
+        forward = [
+            Fault("forward", stage.name, leaf)
+            for stage in self.stages
+            if (leaf := _first_bad(stage.values))
+        ]
+        back = [
+            Fault("backward", stage.name, leaf) for stage in self.stages if (leaf := stage.spoils)
+        ]
+        inner = [
+            fault
+            for fault in back
+            if not any(other.stage.startswith(f"{fault.stage}.") for other in back)
+        ]
         return (*stored, *(forward[:1] or inner[-1:]))
 
     @property
@@ -167,7 +184,9 @@ class Diagnosis:
             return "\n".join(map(str, self.faults))
         norm = self.gradient_norm
         if norm <= self.skip_norm:
-            return f"all finite; gradient norm {norm:.3g} (a step is skipped above {self.skip_norm:g})"
+            return (
+                f"all finite; gradient norm {norm:.3g} (a step is skipped above {self.skip_norm:g})"
+            )
         worst = max(self.stages, key=lambda stage: stage.gradient_norm)
         return (
             f"all finite, but the gradient norm {norm:.3g} is above {self.skip_norm:g}, where a step is skipped; "
@@ -176,13 +195,39 @@ class Diagnosis:
 
     def __str__(self) -> str:
         title = f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
-        rows = [("stage", "values: bad", "smallest", "largest", "mean |x|", "sent back: bad", "parameters: bad", "norm")]
+        rows = [
+            (
+                "stage",
+                "values: bad",
+                "smallest",
+                "largest",
+                "mean |x|",
+                "sent back: bad",
+                "parameters: bad",
+                "norm",
+            )
+        ]
         bad = lambda leaves: str(sum(leaf.bad for leaf in leaves.values())) if leaves else ""
         for report in (*self.stored, *self.stages):
-            leaves, columns = report.values.values(), ((min, "smallest"), (max, "largest"), (np.mean, "mean"))
-            numbers = [f"{of([getattr(x, name) for x in leaves]):.3g}" if leaves else "" for of, name in columns]
+            leaves, columns = (
+                report.values.values(),
+                ((min, "smallest"), (max, "largest"), (np.mean, "mean")),
+            )
+            numbers = [
+                f"{of([getattr(x, name) for x in leaves]):.3g}" if leaves else ""
+                for of, name in columns
+            ]
             norm = f"{report.gradient_norm:.3g}" if report.gradients else ""
-            rows.append((report.name, bad(report.values), *numbers, bad(report.taken), bad(report.gradients), norm))
+            rows.append(
+                (
+                    report.name,
+                    bad(report.values),
+                    *numbers,
+                    bad(report.taken),
+                    bad(report.gradients),
+                    norm,
+                )
+            )
         return "\n".join([title, self.verdict, "", *text_table(rows)])
 
 
@@ -198,7 +243,9 @@ class Recorder:
         self.shapes: dict[str, tuple[Named, Named]] = {}
         self._probes = probes
 
-    def __call__(self, run: Callable, arguments: tuple, named: dict, context: nn.module.InterceptorContext) -> Any:
+    def __call__(
+        self, run: Callable, arguments: tuple, named: dict, context: nn.module.InterceptorContext
+    ) -> Any:
         module, (first, *others) = context.module, arguments
         if isinstance(module, Watched):
             if not module.apart:
@@ -207,7 +254,11 @@ class Recorder:
             names = jax.eval_shape(lambda: first(*others))
             return {key: self.watch(f"{module.name}: {key}", entry(key), *others) for key in names}
         path = ".".join(module.path)
-        if context.method_name != "__call__" or module.path[:1] not in PARTS or len(module.path) > DEEPEST:
+        if (
+            context.method_name != "__call__"
+            or module.path[:1] not in PARTS
+            or len(module.path) > DEEPEST
+        ):
             return run(*arguments, **named)
         if isinstance(first, HumanGSInputs):  # nothing of it depends on parameters
             return self.watch(path, lambda: run(*arguments, **named))
@@ -230,7 +281,13 @@ class Recorder:
 
 @functools.partial(jax.jit, static_argnames="config")
 def observe_subject(
-    params: PyTree, batch_stats: PyTree, body: BodyModel, example: Example, key: Key, config: TrainConfig, networks: LossNetworks
+    params: PyTree,
+    batch_stats: PyTree,
+    body: BodyModel,
+    example: Example,
+    key: Key,
+    config: TrainConfig,
+    networks: LossNetworks,
 ) -> tuple[Scalar, list[StageReport]]:
     """The loss (`subject_loss`), and all its stages in the order in which they end.
 
@@ -248,18 +305,28 @@ def observe_subject(
     dry = Recorder()  # finds the stages and their shapes
     jax.eval_shape(lambda params: loss(params, None, dry)[0], params)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), dry.shapes)
-    differentiated = jax.value_and_grad(lambda *trees: loss(*trees, None), argnums=(0, 1), has_aux=True)
+    differentiated = jax.value_and_grad(
+        lambda *trees: loss(*trees, None), argnums=(0, 1), has_aux=True
+    )
     (value, given), (gradients, sent) = differentiated(params, zeros)
     own: dict[str, Named] = {}
     for name, gradient in inexact_leaves(gradients):
         users = [stage for stage in given if name.startswith(f"{stage}.")] or ["driver"]
         own.setdefault(max(users, key=len), {})[name] = gradient
-    report = lambda name, values: StageReport(name, values, *sent.get(name, ({}, {})), own.get(name, {}))
-    return value, [report(name, given[name]) for name in (*dry.given, "loss")]  # a transformation sorts what it returns
+    report = lambda name, values: StageReport(
+        name, values, *sent.get(name, ({}, {})), own.get(name, {})
+    )
+    return value, [
+        report(name, given[name]) for name in (*dry.given, "loss")
+    ]  # a transformation sorts what it returns
 
 
 def diagnose_step(
-    state: TrainState, batch: Example, body: BodyModel, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
+    state: TrainState,
+    batch: Example,
+    body: BodyModel,
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
 ) -> Diagnosis:
     """Diagnose the step that `train_step` would make of these arguments; the state is not given away.
 
@@ -278,9 +345,13 @@ def diagnose_step(
     found = []
     for subject, key in enumerate(bar(keys, desc="diagnose", unit="subject", shown=watched())):
         example = jax.tree.map(lambda x, i=subject: x[i], batch)
-        loss, stages = observe_subject(state.params, state.batch_stats, body, example, key, config, networks)
+        loss, stages = observe_subject(
+            state.params, state.batch_stats, body, example, key, config, networks
+        )
         given, reports = (*stored, _stored("batch", example)), tuple(map(_numbers, stages))
-        found.append(Diagnosis(step, subject, float(loss), config.optimizer.skip_norm, given, reports))
+        found.append(
+            Diagnosis(step, subject, float(loss), config.optimizer.skip_norm, given, reports)
+        )
         if found[-1].fault is not None:
             return found[-1]
     return max(found, key=lambda diagnosis: diagnosis.gradient_norm)
@@ -303,7 +374,9 @@ def diagnose_run(
     config = load_config(out)
     make_source = captured_people(training, body) if isinstance(training, Sequence) else training
     body = gaussian_body(body, config.model)
-    checkpoints = Checkpoints(Path(out) / "checkpoints", read_only=True)  # the run may still be writing
+    checkpoints = Checkpoints(
+        Path(out) / "checkpoints", read_only=True
+    )  # the run may still be writing
     failed = first_failed_step(Path(out) / "log.jsonl")
     state = init_state(config, variables)
     before = [step for step in checkpoints.steps if failed is None or step <= failed]
@@ -312,7 +385,9 @@ def diagnose_run(
     checkpoints.close()
     begin = int(state.step)
     target = begin if failed is None else failed
-    repeated = bar(total=target - begin, desc="repeat", unit="step", shown=watched() and target > begin)
+    repeated = bar(
+        total=target - begin, desc="repeat", unit="step", shown=watched() and target > begin
+    )
     for first, last in config.spans(begin, target + 1):
         for step, batch in stage_loader(make_source, config, first).batches(first, last):
             if step == target:
@@ -329,4 +404,6 @@ def first_failed_step(log: Path) -> int | None:
         return None
     with reading(log, "log"):
         records = map(parse_json, read_text(log).splitlines())
-        return next((int(record["step"]) - 1 for record in records if record.get("event") in FAILED), None)
+        return next(
+            (int(record["step"]) - 1 for record in records if record.get("event") in FAILED), None
+        )

@@ -22,7 +22,13 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import Example, Source, ViewSampling
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
-from humangs_jax.losses.losses import masked_psnr, psnr, ray_spread, semi_transparent, similarity_map
+from humangs_jax.losses.losses import (
+    masked_psnr,
+    psnr,
+    ray_spread,
+    semi_transparent,
+    similarity_map,
+)
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, part_variables
@@ -48,7 +54,9 @@ def reconstruct_example(
     """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
     model = token_share(config, len(inputs.images))
     prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, model))
-    computed = stage("position maps", lambda: {name: getattr(prepared, name) for name in RASTERIZED})
+    computed = stage(
+        "position maps", lambda: {name: getattr(prepared, name) for name in RASTERIZED}
+    )
     return apply_humangs(variables, replace(prepared, **computed), model, train, axis_name)
 
 
@@ -77,19 +85,28 @@ def draw_targets(
     """The Gaussians drawn in the pose and from the camera of every target. inputs: the photos that they come from."""
     driver = config.model.architecture.driver
     if driver is not None:
-        own, given = part_variables(variables, "driver"), (body, inputs, targets, backgrounds, config)
+        own, given = (
+            part_variables(variables, "driver"),
+            (body, inputs, targets, backgrounds, config),
+        )
         return stage("driver", lambda outputs: driver.draw(own, outputs, *given), outputs)
 
     def pose(outputs):
         avatar = completed_avatar(outputs, body, inputs, config.model)
-        return jax.lax.map(lambda pose: skin(avatar, BodyPose(*pose)), (targets.rotations, targets.translations))
+        return jax.lax.map(
+            lambda pose: skin(avatar, BodyPose(*pose)), (targets.rotations, targets.translations)
+        )
 
     posed = stage("posed Gaussians", pose, outputs)
     drawn = draw_posed(posed, targets, backgrounds, config)
-    return drawn._replace(opacities=outputs.gaussians.opacities, tight_offsets=outputs.tight_offsets)
+    return drawn._replace(
+        opacities=outputs.gaussians.opacities, tight_offsets=outputs.tight_offsets
+    )
 
 
-def draw_posed(posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array, "v 3"], config: TrainConfig) -> Drawn:
+def draw_posed(
+    posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array, "v 3"], config: TrainConfig
+) -> Drawn:
     """Gaussians posed for each target, from its camera. posed: with a leading axis v."""
 
     def project(shapes):
@@ -104,7 +121,9 @@ def draw_posed(posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array
         gaussians = replace(jax.tree.map(lambda x: x[0], posed), opacities=opacities, colors=colors)
         if not config.loss.distortion:
             return Drawn(draw_projected(splats, gaussians, camera, config.splat, background))
-        z = splats.depths - jax.lax.stop_gradient(jnp.mean(splats.depths))  # small numbers have small squares
+        z = splats.depths - jax.lax.stop_gradient(
+            jnp.mean(splats.depths)
+        )  # small numbers have small squares
         # no colors, to which harmonics would be added, and which are not negative
         powers = jnp.stack([z, z**2], axis=-1)
         rendering = draw_projected(splats, gaussians, camera, config.splat, background, powers)
@@ -121,11 +140,15 @@ def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
     return jnp.ones((*targets.translations.shape[:-1], 3), targets.images.dtype)
 
 
-def predict(variables: Variables, body: BodyModel, example: Example, config: TrainConfig) -> tuple[Drawn, HumanGSOutputs]:
+def predict(
+    variables: Variables, body: BodyModel, example: Example, config: TrainConfig
+) -> tuple[Drawn, HumanGSOutputs]:
     """What the trained network shows of an example's targets, on white, and the Gaussians that it shows."""
     outputs, _ = reconstruct_example(variables, body, example.inputs, config)
     white = white_backgrounds(example.targets)
-    return draw_targets(variables, outputs, body, example.inputs, example.targets, white, config), outputs
+    return draw_targets(
+        variables, outputs, body, example.inputs, example.targets, white, config
+    ), outputs
 
 
 # Validation -----------------------------------------------------------------------------------------------------------
@@ -153,8 +176,12 @@ def as_validated(config: TrainConfig) -> TrainConfig:
         scattered_share=0.0,
         mixed_pose_share=0.0,
     )
-    without = dataclasses.replace(config.loss, depth=0.0)  # no loss is computed, so no depths are needed
-    return dataclasses.replace(config, views=views, loss=without, target_size=config.model.conventions.image_size)
+    without = dataclasses.replace(
+        config.loss, depth=0.0
+    )  # no loss is computed, so no depths are needed
+    return dataclasses.replace(
+        config, views=views, loss=without, target_size=config.model.conventions.image_size
+    )
 
 
 def compared_as(base: TrainConfig, make_source: MakeSource) -> MakeSource:
@@ -164,14 +191,20 @@ def compared_as(base: TrainConfig, make_source: MakeSource) -> MakeSource:
     own = as_validated(base.at(base.steps - 1))
 
     def make(config: TrainConfig) -> Source:
-        return make_source(dataclasses.replace(config, views=own.views, target_size=own.target_size))
+        return make_source(
+            dataclasses.replace(config, views=own.views, target_size=own.target_size)
+        )
 
     return make
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def evaluate(
-    variables: Variables, body: BodyModel, example: Example, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
+    variables: Variables,
+    body: BodyModel,
+    example: Example,
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
     """The images of one example's targets and their mean psnr, psnr_fg (both dB), ssim, semi-transparent foreground, and lpips
     if its network is there. semi-transparent foreground is NaN where the network draws pixels: there is no alpha.
@@ -196,7 +229,11 @@ def evaluate(
 
 
 def validate(
-    variables: Variables, body: BodyModel, examples: Sequence[Example], config: TrainConfig, networks: LossNetworks = NO_NETWORKS
+    variables: Variables,
+    body: BodyModel,
+    examples: Sequence[Example],
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[dict[str, float], list[np.ndarray]]:
     """Means over the examples of all processes, and the images of this process's. All arguments are local arrays."""
     # buffers of another size than in training: as many pairs as the larger images may need

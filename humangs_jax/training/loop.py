@@ -62,9 +62,13 @@ class RunLog:
     recording: False in all processes but one; then nothing is written or shown.
     """
 
-    def __init__(self, out: str | Path, step: int, total: int, recording: bool = True, progress: bool = True):
+    def __init__(
+        self, out: str | Path, step: int, total: int, recording: bool = True, progress: bool = True
+    ):
         shown = recording and progress
-        self.bar = bar(shown=shown, total=total, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
+        self.bar = bar(
+            shown=shown, total=total, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05
+        )
         self._recording = recording
         self._lines = self._board = None
         self._previous = (step, time.perf_counter(), 0.0)
@@ -86,7 +90,9 @@ class RunLog:
             with _naming(self._board.logdir):
                 self._board.close()
 
-    def steps(self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int) -> None:
+    def steps(
+        self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int
+    ) -> None:
         """Numbers of the last step done. subjects: per step; seconds and samples a second are since the last line."""
         numbers = {name: float(value) for name, value in metrics.items()}
         before, began, waited = self._previous
@@ -100,7 +106,10 @@ class RunLog:
             numbers["broken_folders"] = broken
         self.numbers(done, numbers, "train")
         digits = {"loss": 4, "psnr": 2, "samples_per_second": 2}
-        self.bar.set_postfix({name: f"{numbers[name]:.{n}f}" for name, n in digits.items() if name in numbers}, refresh=False)
+        self.bar.set_postfix(
+            {name: f"{numbers[name]:.{n}f}" for name, n in digits.items() if name in numbers},
+            refresh=False,
+        )
 
     def numbers(self, done: int, numbers: dict[str, float], group: str) -> None:
         """Numbers after a step, as a line and as curves "group/name"."""
@@ -112,7 +121,9 @@ class RunLog:
     def image(self, done: int, name: str, image: np.ndarray) -> None:
         """An (h, w, 3) image in [0, 1] for TensorBoard."""
         if self._board is not None:
-            self._board.add_image(name, (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC")
+            self._board.add_image(
+                name, (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC"
+            )
 
     def event(self, done: int, event: str, message: str, **details: float | list[str]) -> None:
         """Something worth knowing, as a line and beside the progress bar."""
@@ -124,7 +135,9 @@ class RunLog:
         if self._lines is not None:  # JSON has no NaN
             finite = lambda x: x if not isinstance(x, float) or math.isfinite(x) else None
             with _naming(self._lines.name):
-                self._lines.write(json.dumps({name: finite(value) for name, value in record.items()}) + "\n")
+                self._lines.write(
+                    json.dumps({name: finite(value) for name, value in record.items()}) + "\n"
+                )
 
 
 class Watch:
@@ -135,7 +148,9 @@ class Watch:
         self._counts = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
         self._in_a_row = self._without_gradient = 0
 
-    def __call__(self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list) -> None:
+    def __call__(
+        self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list
+    ) -> None:
         """The metrics of the step that was just begun; done: steps with it. bad_samples: asked if it failed, see `sources`."""
         # one step may wait behind the one that runs: enough to keep a device busy, and the run reacts to a signal soon
         self.look()
@@ -155,7 +170,9 @@ class Watch:
         self._without_gradient = self._without_gradient + 1 if numbers["grad_norm"] == 0 else 0
         if skipped or replaced:
             samples = bad_samples()
-            text = "; ".join([f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}", *samples])
+            text = "; ".join(
+                [f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}", *samples]
+            )
             what = f"gradient entries that were not finite were replaced ({text})"
             if skipped:
                 what = f"skipped ({text}), {counts[0]} so far"
@@ -163,7 +180,10 @@ class Watch:
             self._log.event(done, "skipped" if skipped else "nonfinite", what, **details)
             if samples and jax.process_index():  # whose log is not written
                 logger.warning("step %d: %s", done, text)
-        for count, problem in ((self._in_a_row, ALL_SKIPPED), (self._without_gradient, NO_GRADIENT)):
+        for count, problem in (
+            (self._in_a_row, ALL_SKIPPED),
+            (self._without_gradient, NO_GRADIENT),
+        ):
             if count == MANY_SKIPPED:
                 self._log.event(done, "stuck", f"{MANY_SKIPPED} steps in a row {problem}")
 
@@ -226,7 +246,9 @@ class TrainingInterrupted(KeyboardInterrupt):
     """
 
     def __init__(self, state: TrainState, steps: int):
-        super().__init__(f"after {int(state.step)} of {steps} steps, which are saved: the same call goes on")
+        super().__init__(
+            f"after {int(state.step)} of {steps} steps, which are saved: the same call goes on"
+        )
         self.state = state
 
 
@@ -278,7 +300,9 @@ def train(
     (out / "sheets").mkdir(parents=True, exist_ok=True)
     with only_writer(out) if leading else contextlib.nullcontext():
         save_config(out, config, write=leading)
-        of = lambda people: captured_people(people, body) if isinstance(people, Sequence) else people
+        of = lambda people: (
+            captured_people(people, body) if isinstance(people, Sequence) else people
+        )
         make_source, unseen = of(training), of(validation) if validation else None
         body = gaussian_body(body, config.model)
 
@@ -293,13 +317,19 @@ def train(
         if checkpoints.steps:
             state, best_step = checkpoints.restore(state), checkpoints.best_step
             best = None if best_step is None else checkpoints.score(best_step)
-        begin, end = int(state.step), config.steps if stop_at is None else min(config.steps, stop_at)
+        begin, end = (
+            int(state.step),
+            config.steps if stop_at is None else min(config.steps, stop_at),
+        )
 
         for first, _ in config.spans(begin, end)[1:]:
             _rehearse(make_source, config, first, state, body, networks, mesh)
 
         waiting = Waiting()
-        with stop_requested() as stopping, RunLog(out, begin, config.steps, leading, progress) as log:
+        with (
+            stop_requested() as stopping,
+            RunLog(out, begin, config.steps, leading, progress) as log,
+        ):
             watch, stop = Watch(log, state), False
             for first, last in config.spans(begin, end):
                 part = config.at(first)
@@ -307,7 +337,9 @@ def train(
                 examples = [] if unseen is None else validation_examples(unseen, part, validated)
                 batches = loader.batches(first, last, waiting=waiting)
                 for step, batch in batches:
-                    if step == first and mesh is None:  # costs nothing: once, and the arrays are in memory
+                    if (
+                        step == first and mesh is None
+                    ):  # costs nothing: once, and the arrays are in memory
                         for line in bad_samples(loader, step, batch):
                             log.event(step, "sample", line, samples=[line])
                     with stage("compiling the step") if step == first else contextlib.nullcontext():
@@ -315,18 +347,39 @@ def train(
                     watch(done := step + 1, metrics, functools.partial(bad_samples, loader, step))
                     stop = stopping(done)
                     if done % config.log_every == 0 or done == end or stop:
-                        log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(loader.source.broken))
+                        log.steps(
+                            done,
+                            jax.device_get(metrics),
+                            part.batch_size,
+                            waiting,
+                            len(loader.source.broken),
+                        )
                     log.bar.update(1)
-                    validating = unseen is not None and (done % config.validate_every == 0 or done == config.steps)
-                    if not (validating or stop or done == end or done % config.checkpoint_every == 0):
+                    validating = unseen is not None and (
+                        done % config.validate_every == 0 or done == config.steps
+                    )
+                    if not (
+                        validating or stop or done == end or done % config.checkpoint_every == 0
+                    ):
                         continue
-                    recorded = part.model.with_conventions(tokens=part.model.tokens)  # what the weights were trained with
-                    variables, score = state.variables if mesh is None else whole(state.variables, mesh), None
+                    recorded = part.model.with_conventions(
+                        tokens=part.model.tokens
+                    )  # what the weights were trained with
+                    variables, score = (
+                        state.variables if mesh is None else whole(state.variables, mesh),
+                        None,
+                    )
                     if validating:
-                        numbers, images = validate(variables, own_body, examples, part, own_networks)
-                        score = None if math.isnan(numbers["psnr"]) else numbers["psnr"]  # NaN is no score
+                        numbers, images = validate(
+                            variables, own_body, examples, part, own_networks
+                        )
+                        score = (
+                            None if math.isnan(numbers["psnr"]) else numbers["psnr"]
+                        )  # NaN is no score
                         if leading:
-                            _report(log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN]))
+                            _report(
+                                log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN])
+                            )
                     if leading:
                         save_weights(out / "weights.safetensors", variables, recorded, "float16")
                     if score is not None and (best is None or score > best):
@@ -364,12 +417,16 @@ def _rehearse(
     jax.eval_shape(one, state, batch, body, networks, seed_numbers(part.seed))
 
 
-def _report(log: RunLog, out: Path, done: int, numbers: dict[str, float], image: Float[np.ndarray, "h w 3"]) -> None:
+def _report(
+    log: RunLog, out: Path, done: int, numbers: dict[str, float], image: Float[np.ndarray, "h w 3"]
+) -> None:
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
     write_png(out / "sheets" / f"{done:07d}.png", image, mark=DRAWN)
     log.image(done, "validation/sheet", image)
     why = lambda name, value: f" ({DROPPED[name]})" if value and name in DROPPED else ""
-    say(f"step {done}: " + ", ".join(f"{name} {x:.4g}{why(name, x)}" for name, x in numbers.items()))
+    say(
+        f"step {done}: " + ", ".join(f"{name} {x:.4g}{why(name, x)}" for name, x in numbers.items())
+    )
 
 
 @contextlib.contextmanager
@@ -395,7 +452,11 @@ def stop_requested() -> Generator[Callable[[int], bool], None, None]:
         stop.set()  # the handler stays: with that of the command line again, saving would have to be done within seconds
         logger.warning("stopping after this step; what is done is saved")
 
-    caught = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()  # others may not
+    caught = (
+        (signal.SIGINT, signal.SIGTERM)
+        if threading.current_thread() is threading.main_thread()
+        else ()
+    )  # others may not
     previous = {number: signal.signal(number, handle) for number in caught}
     try:
         yield lambda _: stop.is_set()

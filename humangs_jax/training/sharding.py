@@ -61,7 +61,9 @@ def state_shardings(state: TrainState, mesh: Mesh) -> TrainState:
     named = lambda spec: NamedSharding(mesh, spec)
     divided = replace(state, batch_stats={})
     shardings = jax.tree.map(named, partition(divided, mesh))
-    return replace(shardings, batch_stats=jax.tree.map(lambda _: named(PartitionSpec()), state.batch_stats))
+    return replace(
+        shardings, batch_stats=jax.tree.map(lambda _: named(PartitionSpec()), state.batch_stats)
+    )
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
@@ -100,7 +102,9 @@ def gather(params: PyTree, specs: PyTree) -> PyTree:
     """Inside `shard_map`: whole parameters from this device's parts."""
 
     def one(part, spec):
-        return jax.lax.all_gather(part, "fsdp", axis=len(spec) - 1, tiled=True) if len(spec) else part
+        return (
+            jax.lax.all_gather(part, "fsdp", axis=len(spec) - 1, tiled=True) if len(spec) else part
+        )
 
     return jax.tree.map(one, params, specs)
 
@@ -110,14 +114,20 @@ def mean_parts(gradients: PyTree, specs: PyTree, mesh: Mesh) -> PyTree:
 
     def one(gradient, spec):
         if len(spec):
-            part = jax.lax.psum_scatter(gradient, "fsdp", scatter_dimension=len(spec) - 1, tiled=True)
+            part = jax.lax.psum_scatter(
+                gradient, "fsdp", scatter_dimension=len(spec) - 1, tiled=True
+            )
             return jax.lax.psum(part, "data") / mesh.size
         return jax.lax.pmean(gradient, AXES)
 
     return jax.tree.map(one, gradients, specs)
 
 
-def join_processes(coordinator: str | None = None, process_count: int | None = None, process_index: int | None = None) -> None:
+def join_processes(
+    coordinator: str | None = None,
+    process_count: int | None = None,
+    process_index: int | None = None,
+) -> None:
     """Become one of several processes; call it before anything else asks for devices.
 
     Arguments: coordinator "host:port" of process 0, how many processes, which of them this is. All None: as the cluster
@@ -126,6 +136,10 @@ def join_processes(coordinator: str | None = None, process_count: int | None = N
     """
     given = (coordinator, process_count, process_index)
     if None in given and any(value is not None for value in given):
-        raise ValueError("several processes: give coordinator, number of processes and process index, or none of them")
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")  # CPUs have no others; no matter elsewhere
+        raise ValueError(
+            "several processes: give coordinator, number of processes and process index, or none of them"
+        )
+    jax.config.update(
+        "jax_cpu_collectives_implementation", "gloo"
+    )  # CPUs have no others; no matter elsewhere
     jax.distributed.initialize(coordinator, process_count, process_index)

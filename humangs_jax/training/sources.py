@@ -18,7 +18,15 @@ from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import inexact_leaves
 from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.data.datasets.subject import FileBody, open_people
-from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader, Mixture, PeopleCache, Source
+from humangs_jax.data.loading import (
+    CaptureCache,
+    CaptureSource,
+    Example,
+    Loader,
+    Mixture,
+    PeopleCache,
+    Source,
+)
 from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
 from humangs_jax.people.subject import SPLITS
@@ -32,12 +40,21 @@ MakeSource = Callable[[TrainConfig], Source]
 """Configuration of a stage -> examples of its sizes."""
 
 
-def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: Mesh | None = None) -> Loader:
+def stage_loader(
+    make_source: MakeSource, config: TrainConfig, step: int, mesh: Mesh | None = None
+) -> Loader:
     """Batches from a step on, until the end of the stage that holds there."""
     part = config.at(step)
     sharding = None if mesh is None else batch_sharding(mesh)
     before = config.examples_before(step)
-    return Loader(make_source(part), part.batch_size, part.seed, sharding, first_step=step, first_example=before)
+    return Loader(
+        make_source(part),
+        part.batch_size,
+        part.seed,
+        sharding,
+        first_step=step,
+        first_example=before,
+    )
 
 
 def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list[str]:
@@ -47,16 +64,25 @@ def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list
     """
     found, kinds = [], {"images": UNIT, "masks": UNIT}
     for i, row in enumerate(loader.rows):
-        example = loader.example_at(step, row) if batch is None else jax.tree.map(lambda x, i=i: x[i], batch)
+        example = (
+            loader.example_at(step, row)
+            if batch is None
+            else jax.tree.map(lambda x, i=i: x[i], batch)
+        )
         leaves = {path: np.asarray(leaf) for path, leaf in inexact_leaves(example)}
         try:
-            check_values(f"sample {row}", {path: (x, kinds.get(path.split(".")[-1], FINITE)) for path, x in leaves.items()})
+            check_values(
+                f"sample {row}",
+                {path: (x, kinds.get(path.split(".")[-1], FINITE)) for path, x in leaves.items()},
+            )
         except ValueError as error:
             found.append(f"{error} ({loader.describe_at(step, row)})")
     return found
 
 
-def captured_people(folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> MakeSource:
+def captured_people(
+    folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY
+) -> MakeSource:
     """Capture folders whose parameters belong to `body`; images that are decoded once serve all stages."""
     return cached_people(CaptureCache(folders, body, body_file=body_file))
 
@@ -67,13 +93,20 @@ def cached_people(cache: PeopleCache) -> MakeSource:
     def make(config: TrainConfig) -> Source:
         depths = config.loss.depth > 0  # all examples of a mixture have the same arrays
         if depths:
-            logger.warning("people on disk have no depths: loss.depth (weight %g) is 0 for them", config.loss.depth)
-        return CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size, depths)
+            logger.warning(
+                "people on disk have no depths: loss.depth (weight %g) is 0 for them",
+                config.loss.depth,
+            )
+        return CaptureSource(
+            cache, config.views, config.model.conventions.image_size, config.target_size, depths
+        )
 
     return make
 
 
-def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False) -> MakeSource:
+def on_the_fly_people(
+    bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False
+) -> MakeSource:
     """People of a bank, rendered for every step on the device that trains; sizes and views are those of the run.
 
     each_once: each person once, in order, as a validation wants them; otherwise they are drawn at random.
@@ -82,7 +115,10 @@ def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, e
     def make(config: TrainConfig) -> Source:
         views = config.views
         if views.rule != "random":
-            logger.warning('views.rule "%s" is for written people; on-the-fly people are drawn by "random"', views.rule)
+            logger.warning(
+                'views.rule "%s" is for written people; on-the-fly people are drawn by "random"',
+                views.rule,
+            )
         drawn = dataclasses.replace(
             settings,
             target_views=views.target_count,
@@ -118,7 +154,11 @@ def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> M
 
 
 def training_people(
-    data: Path | None, on_the_fly: int, out: Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
+    data: Path | None,
+    on_the_fly: int,
+    out: Path,
+    body: BodyModel,
+    body_file: str | Path = DEFAULT_BODY,
 ) -> MakeSource:
     """The people of `people_on_disk`, `on_the_fly` synthetic people rendered for every step, or both by halves.
 
@@ -127,11 +167,15 @@ def training_people(
     """
     parts = [] if data is None else [people_on_disk(data, FileBody(body, str(body_file)))]
     if on_the_fly and str(body_file) != DEFAULT_BODY:
-        raise ValueError(f"synthetic people have the body that comes with the package, not {body_file}")
+        raise ValueError(
+            f"synthetic people have the body that comes with the package, not {body_file}"
+        )
     if on_the_fly:
         parts.append(on_the_fly_people(_bank(on_the_fly, out, body)))
     if not parts:
-        raise ValueError("nobody to train on: expected a folder of captures, or a number of people on the fly")
+        raise ValueError(
+            "nobody to train on: expected a folder of captures, or a number of people on the fly"
+        )
     return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
 
 

@@ -68,7 +68,9 @@ class GuardState(NamedTuple):
 def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
     """Step number -> learning rate of a run of `steps` steps."""
     warmup = min(config.warmup_steps, steps)
-    return optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, max(steps, warmup + 1))
+    return optax.warmup_cosine_decay_schedule(
+        0.0, config.learning_rate, warmup, max(steps, warmup + 1)
+    )
 
 
 def decayed(params: PyTree) -> PyTree:
@@ -79,7 +81,9 @@ def decayed(params: PyTree) -> PyTree:
 def finite_gradients(gradients: PyTree) -> PyTree:
     """NaN entries become 0 and infinite ones +-1e-6."""
     stand_in = INFINITY_STAND_IN
-    return jax.tree.map(lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients)
+    return jax.tree.map(
+        lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients
+    )
 
 
 def gradient_norm(gradients: PyTree) -> Scalar:
@@ -87,7 +91,9 @@ def gradient_norm(gradients: PyTree) -> Scalar:
     return jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradients)))
 
 
-def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.GradientTransformationExtraArgs:
+def guard(
+    inner: optax.GradientTransformation, skip_norm: float
+) -> optax.GradientTransformationExtraArgs:
     """`inner` on finite gradients, skipped where their norm exceeds `skip_norm` or the loss is not finite.
 
     The loss is the extra argument `value` of `update`.
@@ -99,7 +105,9 @@ def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.Gradie
         return GuardState(*counts, jnp.zeros(()), inner.init(params))
 
     def update(gradients: PyTree, state: GuardState, params: PyTree, *, value: Scalar, **_):
-        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in (value, *jax.tree.leaves(gradients))]))
+        finite = jnp.all(
+            jnp.stack([jnp.all(jnp.isfinite(x)) for x in (value, *jax.tree.leaves(gradients))])
+        )
         gradients = finite_gradients(gradients)
         norm = gradient_norm(gradients)
         good = jnp.isfinite(value) & (norm <= skip_norm)
@@ -116,5 +124,7 @@ def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.Gradie
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformationExtraArgs:
     """The optimizer of a run of `steps` steps; its state is a `GuardState`."""
     named = getattr(optax, config.name)
-    inner = named(learning_rate(config, steps), *config.betas, weight_decay=config.weight_decay, mask=decayed)
+    inner = named(
+        learning_rate(config, steps), *config.betas, weight_decay=config.weight_decay, mask=decayed
+    )
     return guard(optax.chain(optax.clip_by_global_norm(config.clip_norm), inner), config.skip_norm)

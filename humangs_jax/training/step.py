@@ -61,7 +61,9 @@ def seed_numbers(seed: int) -> Shaped[np.ndarray, " n"]:
 
 def subject_keys(seed: Seed, step: Int[Array, ""], count: int) -> Array:
     """One key per subject of a step. seed: `seed_numbers`."""
-    return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(jnp.asarray(seed)), step), count)
+    return jax.random.split(
+        jax.random.fold_in(jax.random.wrap_key_data(jnp.asarray(seed)), step), count
+    )
 
 
 def subject_loss(
@@ -78,14 +80,18 @@ def subject_loss(
     if config.augmentation.share:
         example = augment(jax.random.fold_in(key, AUGMENTED), example, body, config.augmentation)
     variables, targets = {"params": params, "batch_stats": batch_stats}, example.targets
-    outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, True, axis_name)
+    outputs, batch_stats = reconstruct_example(
+        variables, body, example.inputs, config, True, axis_name
+    )
     driver = config.model.architecture.driver
     colored = config.loss.random_background if driver is None or driver.has_alpha else 0.0
     backgrounds = random_backgrounds(key, len(targets.translations), colored)
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets.images, targets.masks, backgrounds)
     drawn = draw_targets(variables, outputs, body, example.inputs, targets, backgrounds, config)
-    compare = lambda drawn: loss_terms(drawn, images, targets.masks, targets.depths, config.loss, networks)
+    compare = lambda drawn: loss_terms(
+        drawn, images, targets.masks, targets.depths, config.loss, networks
+    )
     terms = stage("loss", compare, drawn, apart=True)
     metrics = {
         **terms,
@@ -93,7 +99,10 @@ def subject_loss(
         "dropped_tokens": outputs.dropped_tokens,
         "overflow": jnp.sum(drawn.rendering.overflow),
     }
-    return sum(getattr(config.loss, name) * term for name, term in terms.items()), (batch_stats, metrics)
+    return sum(getattr(config.loss, name) * term for name, term in terms.items()), (
+        batch_stats,
+        metrics,
+    )
 
 
 def local_gradients(
@@ -113,11 +122,15 @@ def local_gradients(
     """
     count, size = len(keys), config.microbatch_size
     if count % size:
-        raise ValueError(f"{count} subjects per device cannot be divided into microbatches of {size}")
+        raise ValueError(
+            f"{count} subjects per device cannot be divided into microbatches of {size}"
+        )
 
     def microbatch_loss(params, batch, keys):
         names = (SUBJECTS, *axes) if size > 1 else axes
-        one = lambda example, key: subject_loss(params, batch_stats, body, example, key, config, networks, names or None)
+        one = lambda example, key: subject_loss(
+            params, batch_stats, body, example, key, config, networks, names or None
+        )
         if size == 1:  # without vmap: a CPU runs the loops of a single subject faster
             first = lambda tree: jax.tree.map(lambda x: x[0], tree)
             loss, aux = one(first(batch), keys[0])
@@ -183,16 +196,21 @@ def train_step(
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
     """`update`, compiled; the state is given away (donated)."""
-    return compiled_update()(state, batch, body, networks, seed_numbers(config.seed), compiled_for(config), mesh)
+    return compiled_update()(
+        state, batch, body, networks, seed_numbers(config.seed), compiled_for(config), mesh
+    )
 
 
 @functools.cache
 def compiled_update() -> Callable[
-    [TrainState, Example, BodyModel, LossNetworks, Seed, TrainConfig, Mesh | None], tuple[TrainState, Metrics]
+    [TrainState, Example, BodyModel, LossNetworks, Seed, TrainConfig, Mesh | None],
+    tuple[TrainState, Metrics],
 ]:
     """`update` for the default backend; a step of all runs that differ in host settings alone is one program."""
     static, options = ("config", "mesh"), compiler_options()
-    return jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
+    return jax.jit(
+        update, static_argnames=static, donate_argnames="state", compiler_options=options
+    )
 
 
 def update(
@@ -242,7 +260,9 @@ def update(
         state,
         step=state.step + 1,
         params=params,
-        batch_stats=jax.tree.map(lambda new, old: jnp.where(good, new, old), batch_stats, state.batch_stats),
+        batch_stats=jax.tree.map(
+            lambda new, old: jnp.where(good, new, old), batch_stats, state.batch_stats
+        ),
         opt_state=opt_state,
         ema_params=ema_params,
     )

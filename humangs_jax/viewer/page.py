@@ -80,7 +80,12 @@ class Packed:
     data: bytes
 
 
-def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = None, motion_name: str = "motion") -> Packed:
+def pack(
+    avatar: Avatar,
+    motion: Motion | None = None,
+    body: BodyModel | None = None,
+    motion_name: str = "motion",
+) -> Packed:
     """What the page holds of an avatar.
 
     Arguments: motion: of the avatar's joints. body: the model that the avatar's vertices are of, for sliders of its shape.
@@ -88,15 +93,25 @@ def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = 
     Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other joints, or a body that
     does not explain the avatar's vertices.
     """
-    check_values("the page", gaussian_values(avatar.gaussians) | light_values(avatar.light) | _other_values(avatar, motion))
+    check_values(
+        "the page",
+        gaussian_values(avatar.gaussians)
+        | light_values(avatar.light)
+        | _other_values(avatar, motion),
+    )
     joints = len(avatar.parents)
     if joints > 256:
         raise ValueError(f"the page draws avatars of up to 256 joints, got {joints}")
-    for what, count in (("Gaussians", len(avatar.gaussians.means)), ("vertices", len(avatar.rest_vertices))):
+    for what, count in (
+        ("Gaussians", len(avatar.gaussians.means)),
+        ("vertices", len(avatar.rest_vertices)),
+    ):
         if not count:
             raise ValueError(f"the page: the avatar has no {what}")
     if motion is not None and motion.rotations.shape[1] != joints:
-        raise ValueError(f"the motion has {motion.rotations.shape[1]} joints, the avatar has {joints}")
+        raise ValueError(
+            f"the motion has {motion.rotations.shape[1]} joints, the avatar has {joints}"
+        )
     how = SPLAT_PRESETS[avatar.rendering]
     vertices = np.asarray(avatar.rest_vertices, np.float64)
     header: dict[str, Any] = {
@@ -106,7 +121,10 @@ def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = 
         "joint_names": avatar.joint_names,
         "skinning": avatar.skinning,
         "splatting": {name: getattr(how, name) for name in DRAWN_FIELDS}
-        | {"eps2d": added_variance(avatar.gaussians.low_pass, how.eps2d), "low_pass": _low_pass(avatar)},
+        | {
+            "eps2d": added_variance(avatar.gaussians.low_pass, how.eps2d),
+            "low_pass": _low_pass(avatar),
+        },
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
     arrays: dict[str, np.ndarray] = {}
@@ -116,7 +134,12 @@ def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = 
         step = max(float(np.abs(rotations).max()), SMALLEST_RANGE) / 32767
         arrays["rotations"] = np.rint(rotations / step).astype("<i2")
         arrays["translations"] = np.asarray(motion.translations, "<f4")
-        header["motion"] = {"name": motion_name, "frames": len(rotations), "fps": float(motion.fps), "step": step}
+        header["motion"] = {
+            "name": motion_name,
+            "frames": len(rotations),
+            "fps": float(motion.fps),
+            "step": step,
+        }
     if body is not None:
         _pack_shape(avatar, body, header, arrays)
     return _joined(header, arrays)
@@ -127,12 +150,16 @@ def _low_pass(avatar: Avatar) -> float:
     return 0.0 if avatar.gaussians.low_pass is None else float(np.median(avatar.gaussians.low_pass))
 
 
-def largest_weights(weights: Float[np.ndarray, "g j"]) -> tuple[Int[np.ndarray, "g 8"], Int[np.ndarray, "g 8"]]:
+def largest_weights(
+    weights: Float[np.ndarray, "g j"],
+) -> tuple[Int[np.ndarray, "g 8"], Int[np.ndarray, "g 8"]]:
     """Joints and weights of the 8 largest of each row, largest first; 65535 is a weight of 1, and rows sum to it.
 
     What is left out is given to the others in proportion; what rounding leaves, to the largest.
     """
-    weights = np.pad(np.asarray(weights, np.float64), ((0, 0), (0, max(0, WEIGHTS - weights.shape[1]))))
+    weights = np.pad(
+        np.asarray(weights, np.float64), ((0, 0), (0, max(0, WEIGHTS - weights.shape[1])))
+    )
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :WEIGHTS]
     kept = np.take_along_axis(weights, joints, axis=1)
     kept /= kept.sum(1, keepdims=True)
@@ -155,9 +182,15 @@ def fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | N
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
-    values = {name: (getattr(avatar, name), FINITE) for name in ("skinning_weights", "rest_vertices", "rest_joints")}
+    values = {
+        name: (getattr(avatar, name), FINITE)
+        for name in ("skinning_weights", "rest_vertices", "rest_joints")
+    }
     if motion is not None:
-        values |= {f"motion.{name}": (getattr(motion, name), FINITE) for name in ("rotations", "translations")}
+        values |= {
+            f"motion.{name}": (getattr(motion, name), FINITE)
+            for name in ("rotations", "translations")
+        }
     return values
 
 
@@ -169,10 +202,14 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
     logs = np.log(np.maximum(scales, SMALLEST_SCALE))
     header["means"], arrays["means"] = _quantized(means, means.min(0), means.max(0))
     header["scales"], arrays["scales"] = _quantized(logs, logs.min(), logs.max())
-    header["colors"], arrays["colors"] = _quantized(colors, min(colors.min(), 0.0), max(colors.max(), 1.0))
+    header["colors"], arrays["colors"] = _quantized(
+        colors, min(colors.min(), 0.0), max(colors.max(), 1.0)
+    )
     if g.harmonics is not None:
         harmonics = np.asarray(g.harmonics, np.float64)
-        header["harmonics"], arrays["harmonics"] = _quantized(harmonics, harmonics.min(), harmonics.max())
+        header["harmonics"], arrays["harmonics"] = _quantized(
+            harmonics, harmonics.min(), harmonics.max()
+        )
     arrays["quats"] = np.rint(unit_quats(quats) * 32767).astype("<i2")
     arrays["opacities"] = np.rint(opacities * STEPS).astype("<u2")
     joints, weights = largest_weights(np.asarray(avatar.skinning_weights))
@@ -182,10 +219,14 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
         header["light"] = np.asarray(avatar.light.coefficients, np.float64).tolist()
         arrays["light_normals"] = np.rint(127 * np.asarray(avatar.light.normals)).astype("i1")
         shading = np.asarray(avatar.light.shading, np.float64)
-        header["light_shading"], arrays["light_shading"] = _quantized(shading, shading.min(), shading.max())
+        header["light_shading"], arrays["light_shading"] = _quantized(
+            shading, shading.min(), shading.max()
+        )
 
 
-def _pack_shape(avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+def _pack_shape(
+    avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays: dict[str, np.ndarray]
+) -> None:
     """Of every direction its offsets of the vertices; the Gaussians of a vertex move with it (they are vertex-major)."""
     betas = fitted_shape(avatar, body)
     vertices = len(avatar.rest_vertices)
@@ -194,12 +235,16 @@ def _pack_shape(avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays:
     directions = np.moveaxis(np.asarray(body.shape_directions, np.float64), -1, 0)
     step = max(SHAPE_STEP, float(np.abs(directions).max()) / 32767)
     arrays["shape_directions"] = np.rint(directions / step).astype("<i2")
-    arrays["shape_joints"] = np.einsum("jn,sna->sja", np.asarray(body.joint_regressor, np.float64), directions).astype("<f4")
+    arrays["shape_joints"] = np.einsum(
+        "jn,sna->sja", np.asarray(body.joint_regressor, np.float64), directions
+    ).astype("<f4")
     names = body.shape_names or tuple(f"shape {i + 1}" for i in range(len(directions)))
     header["shape"] = {"names": names, "betas": betas.tolist(), "step": step}
 
 
-def _quantized(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> tuple[dict[str, Any], np.ndarray]:
+def _quantized(
+    values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float
+) -> tuple[dict[str, Any], np.ndarray]:
     low, high = np.asarray(low), np.maximum(high, np.asarray(low) + SMALLEST_RANGE)
     whole = np.rint((values - low) / (high - low) * STEPS).astype("<u2")
     return {"low": low.tolist(), "high": high.tolist()}, whole
@@ -210,7 +255,11 @@ def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
     for name, array in arrays.items():
         data = np.ascontiguousarray(array).tobytes()
         data += bytes(-len(data) % 4)
-        header["arrays"][name] = {"type": array.dtype.str, "shape": list(array.shape), "offset": offset}
+        header["arrays"][name] = {
+            "type": array.dtype.str,
+            "shape": list(array.shape),
+            "offset": offset,
+        }
         parts.append(data)
         offset += len(data)
     return Packed(header, b"".join(parts))
@@ -229,7 +278,12 @@ LARGEST_FPS = 60.0
 _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 
-def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar", motion_name: str | None = None) -> str:
+def page_html(
+    avatar: Avatar,
+    motion: Motion | None = None,
+    title: str = "avatar",
+    motion_name: str | None = None,
+) -> str:
     """The page as text.
 
     Arguments: motion: None for the walk that comes with the package (if the avatar has its joints). title, motion_name: shown
@@ -243,7 +297,9 @@ def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar
         motion = walk if walk.rotations.shape[1] == len(avatar.parents) else None
     if motion is not None and motion.rotations.shape[1] == len(avatar.parents):
         motion = motion.at_rate(LARGEST_FPS) if motion.fps > LARGEST_FPS else motion
-        motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
+        motion = grounded(
+            motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents
+        )
     packed = pack(avatar, motion, known_body(avatar), name)
     header = json.dumps(packed.header, separators=(",", ":"))
     parts = {
@@ -281,7 +337,9 @@ class NotebookPage:
     def _repr_html_(self) -> str:
         """An iframe that holds the whole page."""
         style = f"width:100%;height:{self._height}px;border:1px solid #ddd;border-radius:8px"
-        return f'<iframe srcdoc="{html.escape(self._text)}" style="{style}" allowfullscreen></iframe>'
+        return (
+            f'<iframe srcdoc="{html.escape(self._text)}" style="{style}" allowfullscreen></iframe>'
+        )
 
 
 @checked_arguments
@@ -362,7 +420,9 @@ def _shipped_network() -> HumanGSConfig:
     """The network of the shipped weights, without reading their tensors; the default one if none are shipped."""
     with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
         metadata = read_safetensors(file, lambda key: False)[2] if file.exists() else {}
-    return HumanGSConfig(conventions=config_from_json(Conventions, metadata.get("conventions", "{}")))
+    return HumanGSConfig(
+        conventions=config_from_json(Conventions, metadata.get("conventions", "{}"))
+    )
 
 
 def page_script(*names: str) -> str:
@@ -373,14 +433,21 @@ def page_script(*names: str) -> str:
 
 def read_part(name: str) -> str:
     """The text of a file in page/."""
-    return (resources.files("humangs_jax") / "viewer" / "page" / name).read_text(encoding="utf-8").strip()
+    return (
+        (resources.files("humangs_jax") / "viewer" / "page" / name)
+        .read_text(encoding="utf-8")
+        .strip()
+    )
 
 
 def _template() -> str:
     """index.html with styles, shaders and scripts in their places; the avatar's are still marked."""
     parts = {
         "style": read_part("style.css"),
-        "shaders": "\n".join(f'<script type="x-shader" id="{name}">\n{read_part(name)}\n</script>' for name in SHADERS),
+        "shaders": "\n".join(
+            f'<script type="x-shader" id="{name}">\n{read_part(name)}\n</script>'
+            for name in SHADERS
+        ),
         "sorting": read_part("sorting.js"),  # runs twice: in the page, and as the text of a worker
         "scripts": page_script(*SCRIPTS),
     }
@@ -422,7 +489,11 @@ class LiveView:
         """Show an avatar in place of the last one, and a line above it. May be called from any thread."""
         self.pages["/avatar"] = page_html(avatar, self.motion)
         self.shown += 1
-        self.say(f"{len(avatar.gaussians.means):,} Gaussians, {time.strftime('%H:%M:%S')}" if status is None else status)
+        self.say(
+            f"{len(avatar.gaussians.means):,} Gaussians, {time.strftime('%H:%M:%S')}"
+            if status is None
+            else status
+        )
 
     def say(self, status: str) -> None:
         """Show a line above the avatar."""
@@ -430,7 +501,11 @@ class LiveView:
 
 
 def follow(
-    path: str | Path, capture: str | Path | None = None, motion: Motion | None = None, port: int = 0, open_browser: bool = True
+    path: str | Path,
+    capture: str | Path | None = None,
+    motion: Motion | None = None,
+    port: int = 0,
+    open_browser: bool = True,
 ) -> None:
     """Show what a training run or a refinement makes, until Ctrl-C.
 
@@ -442,12 +517,18 @@ def follow(
     path, photos = Path(path), None
     if path.is_dir():
         if not (path / "config.json").is_file():
-            raise ValueError(f"{path}: no config.json: expected the folder of a training run, or an avatar file")
+            raise ValueError(
+                f"{path}: no config.json: expected the folder of a training run, or an avatar file"
+            )
         photos = load_capture(DEMO_CAPTURE if capture is None else capture)
     elif path.suffix != ".npz" or not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: no such run: expected the folder of a training run, or an avatar file (.npz)")
+        raise FileNotFoundError(
+            f"{path}: no such run: expected the folder of a training run, or an avatar file (.npz)"
+        )
     elif capture is not None:
-        raise ArgumentError("capture", f"{capture}: only for the folder of a training run; {path} is an avatar file")
+        raise ArgumentError(
+            "capture", f"{capture}: only for the folder of a training run; {path} is an avatar file"
+        )
     with LiveView(motion, port) as view, contextlib.suppress(KeyboardInterrupt):
         say(f"{view.url} shows {path} as it changes; Ctrl-C ends.")
         if open_browser:
@@ -458,7 +539,9 @@ def follow(
             time.sleep(LOOK_AGAIN)
 
 
-def show_newest(view: LiveView, path: Path, photos: Capture | None, shown: tuple | None) -> tuple | None:
+def show_newest(
+    view: LiveView, path: Path, photos: Capture | None, shown: tuple | None
+) -> tuple | None:
     """Show the file at `path` unless it is shown already. Returns its time and size, which is `shown` in the next call.
 
     photos: of the person that the weights of the run in `path` reconstruct; None: `path` is an avatar file. A file that cannot be
@@ -476,7 +559,9 @@ def show_newest(view: LiveView, path: Path, photos: Capture | None, shown: tuple
     try:
         view.say(f"Reading {file.name} ...")
         avatar = Avatar.load(file) if photos is None else reconstruct(*load_weights(file), photos)
-        view.show(avatar, f"{file.name} of {time.strftime('%H:%M:%S', time.localtime(found.st_mtime))}")
+        view.show(
+            avatar, f"{file.name} of {time.strftime('%H:%M:%S', time.localtime(found.st_mtime))}"
+        )
     except (ValueError, OSError) as error:
         view.say(str(error))
     return stamp

@@ -89,15 +89,21 @@ def test_a_right_capture_has_full_overlap_and_no_warning(tmp_path):
 @pytest.mark.slow
 def test_left_is_blue_and_right_is_red_on_the_photo():
     body = boxes()
-    front = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE)[0]
-    image, parts = draw_body(body, jnp.zeros(0), rest_pose(body), front, np.ones((SIZE, SIZE, 3), np.float32))
+    front = orbit(
+        jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE
+    )[0]
+    image, parts = draw_body(
+        body, jnp.zeros(0), rest_pose(body), front, np.ones((SIZE, SIZE, 3), np.float32)
+    )
     # seen from the front the person's left arm (x > 0) is on the right of the image
     covered = np.asarray(parts.covered)
     row = int(SIZE / 2 - 0.2 / (3 * np.tan(0.3)) * SIZE / 2)
     columns = np.flatnonzero(covered[row])
     assert image[row, columns[-3], 2] > image[row, columns[-3], 0] + 0.2
     assert image[row, columns[2], 0] > image[row, columns[2], 2] + 0.2
-    np.testing.assert_allclose(side_tints(body)[:8], np.broadcast_to(module.MIDDLE, (8, 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        side_tints(body)[:8], np.broadcast_to(module.MIDDLE, (8, 3)), atol=1e-6
+    )
 
 
 def test_without_names_of_sides_the_tints_go_by_position():
@@ -121,7 +127,10 @@ def test_overlay_changes_only_the_body():
 
 def test_mistakes_that_no_single_view_shows_are_named(tmp_path):
     report = check_capture(capture(rotations=np.full((1, 3, 3), 30.0)), tmp_path / "check.png")
-    assert not report.ok and "the poses seem to be in degrees: rotations up to 52" in report.warnings[0]
+    assert (
+        not report.ok
+        and "the poses seem to be in degrees: rotations up to 52" in report.warnings[0]
+    )
     assert f"warning: {report.warnings[0]}" in str(report) and "no warnings" not in str(report)
 
 
@@ -140,7 +149,9 @@ def test_warnings_tell_what_is_wrong(tmp_path):
     masks[:, : SIZE * 3 // 8] = 0  # the person without the upper part of the body
     slimmer = dataclasses.replace(right, masks=masks)
     report = check_capture(slimmer, tmp_path / "check.png")
-    assert all(view.outside > 0.05 and "--refine` fits cameras" in view.warning for view in report.views)
+    assert all(
+        view.outside > 0.05 and "--refine` fits cameras" in view.warning for view in report.views
+    )
     assert all(view.outside < 0.01 for view in check_capture(right, tmp_path / "check.png").views)
 
 
@@ -148,29 +159,40 @@ def test_warnings_tell_what_is_wrong(tmp_path):
 def test_the_displacement_of_a_capture_is_drawn(tmp_path, masks):
     moved = np.tile([0, 0.03, 0], (24, 1))
     report = check_capture(capture(masks=masks, displacement=moved), tmp_path / "check.png")
-    assert "reconstruct will move the body as body.npz says, by up to 3.0 cm (yellow)" in str(report)
+    assert "reconstruct will move the body as body.npz says, by up to 3.0 cm (yellow)" in str(
+        report
+    )
     yellow = (np.abs(read_image(tmp_path / "check.png")[0] - module.DISPLACED) < 0.01).all(-1)
     assert yellow.sum() > 3 * SIZE / 4
-    assert "yellow" not in str(check_capture(capture(displacement=0 * moved), tmp_path / "check.png"))
+    assert "yellow" not in str(
+        check_capture(capture(displacement=0 * moved), tmp_path / "check.png")
+    )
 
 
 def test_a_skirt_of_the_avatar_is_said(tmp_path, monkeypatch):
     assert "skirt" not in str(check_capture(capture(), tmp_path / "check.png"))
     monkeypatch.setattr(module, "with_skirt", lambda body, capture, moves: (body, moves))
-    assert "reconstruct will put a skirt around the legs" in str(check_capture(capture(), tmp_path / "check.png"))
+    assert "reconstruct will put a skirt around the legs" in str(
+        check_capture(capture(), tmp_path / "check.png")
+    )
 
 
 def test_photos_are_shrunk_and_cameras_with_them(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "LONGEST_SIDE", SIZE // 2)
     report = check_capture(capture(), tmp_path / "check.png")
-    assert report.ok and min(view.iou for view in report.views) > 0.7  # arms are 2 pixels thick then; a wrong scale leaves 0.3
+    assert (
+        report.ok and min(view.iou for view in report.views) > 0.7
+    )  # arms are 2 pixels thick then; a wrong scale leaves 0.3
     sheet, _ = read_image(tmp_path / "check.png")
     assert sheet.shape[1] < 2 * SIZE
 
 
 def test_each_view_shows_its_own_frame(tmp_path):
     moved = np.array([[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
-    report = check_capture(capture(rotations=np.zeros((2, 3, 3)), translations=moved, frames=[0, 1, 0]), tmp_path / "check.png")
+    report = check_capture(
+        capture(rotations=np.zeros((2, 3, 3)), translations=moved, frames=[0, 1, 0]),
+        tmp_path / "check.png",
+    )
     assert [not view.warning for view in report.views] == [True, False, True]
 
 
@@ -188,7 +210,11 @@ def right():
 def with_cameras(capture, order):
     order = jnp.asarray(order)
     cameras = capture.cameras
-    return {"cameras": replace(cameras, K=cameras.K[order], cam_from_world=cameras.cam_from_world[order])}
+    return {
+        "cameras": replace(
+            cameras, K=cameras.K[order], cam_from_world=cameras.cam_from_world[order]
+        )
+    }
 
 
 def on_white(capture, images):
@@ -197,14 +223,26 @@ def on_white(capture, images):
 
 
 CHANGES = {
-    "masks are inverted": (lambda c: {"masks": 1 - c.masks}, "if the mask is inverted: view 0_00, 0_01, 0_02, 0_03"),
+    "masks are inverted": (
+        lambda c: {"masks": 1 - c.masks},
+        "if the mask is inverted: view 0_00, 0_01, 0_02, 0_03",
+    ),
     "photos are mirrored": (
         lambda c: {"images": c.images[:, :, ::-1], "masks": c.masks[:, :, ::-1]},
         "if the photo is mirrored: view 0_00, 0_01, 0_02, 0_03",
     ),
-    "one mask is empty": (lambda c: {"masks": np.concatenate([c.masks[:1] * 0, c.masks[1:]])}, "the mask is empty: view 0_00"),
-    "photos are underexposed": (lambda c: {"images": on_white(c, c.images / 16)}, "the person is nearly black"),
-    "photos are burnt out": (lambda c: {"images": on_white(c, c.images * 16)}, "most of the person is white"),
+    "one mask is empty": (
+        lambda c: {"masks": np.concatenate([c.masks[:1] * 0, c.masks[1:]])},
+        "the mask is empty: view 0_00",
+    ),
+    "photos are underexposed": (
+        lambda c: {"images": on_white(c, c.images / 16)},
+        "the person is nearly black",
+    ),
+    "photos are burnt out": (
+        lambda c: {"images": on_white(c, c.images * 16)},
+        "most of the person is white",
+    ),
     "two cameras are exchanged": (
         lambda c: with_cameras(c, [1, 0, 2, 3]),
         "cameras are exchanged: the body would fit 0_00 by the camera of 0_01, 0_01 by the camera of 0_00",
@@ -222,12 +260,17 @@ CHANGES = {
         "most of the body is outside the frame",
     ),
 }
-FLIP, Z_UP = np.diag([1.0, -1, -1, 1]), np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+FLIP, Z_UP = (
+    np.diag([1.0, -1, -1, 1]),
+    np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
+)
 MADE = {
     "is the inverse": np.linalg.inv,
     "looks along -z": lambda m: FLIP @ m,
     "camera to world in OpenGL": lambda m: np.linalg.inv(FLIP @ m),
-    "camera's translation is in millimetres": lambda m: np.block([[m[:3, :3], m[:3, 3:] * 1000], [m[3:]]]),
+    "camera's translation is in millimetres": lambda m: np.block(
+        [[m[:3, :3], m[:3, 3:] * 1000], [m[3:]]]
+    ),
     "a world with z up": lambda m: m @ Z_UP,
 }
 """What people do to a right cam_from_world, and what is said of it."""
@@ -249,20 +292,28 @@ def test_right_captures_have_no_warnings(right):
 @pytest.mark.parametrize("mistake", MADE)
 def test_wrong_cameras_are_explained(mistake, masks, right):
     """Without masks only where nothing else puts the body into the frame."""
-    wrong = np.stack([MADE[mistake](np.asarray(matrix, float)) for matrix in right.cameras.cam_from_world])
+    wrong = np.stack(
+        [MADE[mistake](np.asarray(matrix, float)) for matrix in right.cameras.cam_from_world]
+    )
     cameras = replace(right.cameras, cam_from_world=jnp.asarray(wrong, jnp.float32))
     capture = dataclasses.replace(right, cameras=cameras, masks=right.masks if masks else None)
     found = likely_mistakes(capture)
     explained = [line for line in found if "it would fit if" in line]
-    assert all(mistake in line for line in explained) and (len(explained) == len(found) > 0 or not masks)
+    assert all(mistake in line for line in explained) and (
+        len(explained) == len(found) > 0 or not masks
+    )
 
 
 def test_a_body_in_millimetres_is_explained(right):
     offset = np.asarray([400.0, 300.0, 200.0], np.float32)
     back = np.eye(4)
     back[:3, 3] = -offset / 1000
-    poses = replace(right.poses, translation=jnp.asarray(np.asarray(right.poses.translation) * 1000 + offset))
-    cameras = replace(right.cameras, cam_from_world=right.cameras.cam_from_world @ jnp.asarray(back, jnp.float32))
+    poses = replace(
+        right.poses, translation=jnp.asarray(np.asarray(right.poses.translation) * 1000 + offset)
+    )
+    cameras = replace(
+        right.cameras, cam_from_world=right.cameras.cam_from_world @ jnp.asarray(back, jnp.float32)
+    )
     (found,) = likely_mistakes(dataclasses.replace(right, poses=poses, cameras=cameras))
     assert "the body's translation is in millimetres" in found
 
@@ -273,7 +324,9 @@ def test_the_points_lie_on_the_body(right):
     points = surface_points(right.body, right.betas, right.poses, right.frames, 6000)[frame]
     vertices = np.asarray(person_vertices(right.body, jnp.asarray(right.betas), right.pose(frame)))
     nearest = np.array([np.linalg.norm(vertices - point, axis=1).min() for point in points[::60]])
-    assert np.median(nearest) < 0.02 and nearest.max() < 0.06  # half an edge, and what bends at a joint
+    assert (
+        np.median(nearest) < 0.02 and nearest.max() < 0.06
+    )  # half an edge, and what bends at a joint
 
 
 def test_it_is_quick_and_looks_at_some_of_many_views(right):

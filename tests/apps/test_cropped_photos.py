@@ -12,5 +12,7 @@ def test_photos_that_were_cropped_are_named(tmp_path):
     for file, size in zip(files, [(120, 60), (80, 60)], strict=True):
         Image.new("RGB", size).save(file, exif=exif)
     named = "a.jpg (120 x 60, EXIF 4032 x 3024): their focal length is taken for unknown"
-    assert photos_alone._cropped(files) == (f"cropped, as their shape is not that of their EXIF: {named}",)
+    assert photos_alone._cropped(files) == (
+        f"cropped, as their shape is not that of their EXIF: {named}",
+    )
     assert photos_alone._cropped(files[1:]) == ()

@@ -26,7 +26,18 @@ def video_frames(path):
     """(m, h, w, 3) bytes by ffmpeg itself: imageio's reader leaves file handles open."""
     import imageio_ffmpeg
 
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-i",
+        str(path),
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
     data = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=True).stdout
     return np.frombuffer(data, np.uint8).reshape(-1, FRAME_SIZE, FRAME_SIZE, 3)
 
@@ -34,7 +45,11 @@ def video_frames(path):
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    run_demo(folder / "demo_out", frame_size=FRAME_SIZE, refine=RefineConfig(steps=12, seconds=None, checks=1))
+    run_demo(
+        folder / "demo_out",
+        frame_size=FRAME_SIZE,
+        refine=RefineConfig(steps=12, seconds=None, checks=1),
+    )
     assert [p.name for p in folder.iterdir()] == ["demo_out"]  # nothing else is left behind
     assert {p.name for p in (folder / "demo_out").iterdir()} == PRODUCTS
     return folder / "demo_out"
@@ -78,7 +93,9 @@ def test_images_show_a_person(out):
     covered = (frames.min(-1) < 200).mean(axis=(1, 2))
     assert (covered > 0.04).all() and (covered < 0.5).all()
     assert np.abs(np.diff(frames, axis=0)).mean(axis=(1, 2, 3)).min() > 0.05  # every frame moves
-    border = np.concatenate([frames[:, 0], frames[:, -1], frames[:, :, 0], frames[:, :, -1]], axis=1)
+    border = np.concatenate(
+        [frames[:, 0], frames[:, -1], frames[:, :, 0], frames[:, :, -1]], axis=1
+    )
     assert border.min() > 230  # nobody is cut by the frame
 
 

@@ -15,7 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax import cli
 from humangs_jax.apps import detect
-from humangs_jax.apps.detect import Found, PhotoPeople, choose, person_mask, same_people, write_found
+from humangs_jax.apps.detect import (
+    Found,
+    PhotoPeople,
+    choose,
+    person_mask,
+    same_people,
+    write_found,
+)
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.keypoints.formats import SeenPerson
@@ -34,7 +41,9 @@ DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 def found(mark, area, corner=(5, 10)):
     """A person whose pixels are all `mark`."""
     points = np.concatenate([np.full((33, 2), float(mark)), np.ones((33, 1))], axis=1)
-    return Found(SeenPerson(points, np.zeros((33, 3)), 1.0), np.full((8, 4), 255, np.uint8), corner, area)
+    return Found(
+        SeenPerson(points, np.zeros((33, 3)), 1.0), np.full((8, 4), 255, np.uint8), corner, area
+    )
 
 
 def photo(name, *people):
@@ -42,19 +51,29 @@ def photo(name, *people):
 
 
 def marks(photos):
-    return [[None if each is None else each.person.points[0, 0] for each in p.people] for p in photos]
+    return [
+        [None if each is None else each.person.points[0, 0] for each in p.people] for p in photos
+    ]
 
 
 def test_without_cameras_the_largest_of_each_photo_is_the_person(tmp_path):
-    photos = same_people([photo("a", found(1, 90.0), found(2, 20.0)), photo("b"), photo("c", found(3, 80.0))])
+    photos = same_people(
+        [photo("a", found(1, 90.0), found(2, 20.0)), photo("b"), photo("c", found(3, 80.0))]
+    )
     assert marks(photos) == [[1, 2], [None, None], [3, None]]
-    assert choose(photos, None, tmp_path / "s.png") == 0 and choose(photos, 1, tmp_path / "s.png") == 1
-    assert detect.remarks(photos, 1) == [f"{name}: the person was not found in it" for name in ("b", "c")]
+    assert (
+        choose(photos, None, tmp_path / "s.png") == 0 and choose(photos, 1, tmp_path / "s.png") == 1
+    )
+    assert detect.remarks(photos, 1) == [
+        f"{name}: the person was not found in it" for name in ("b", "c")
+    ]
 
 
 def test_who_is_meant_is_never_guessed(tmp_path):
     photos = same_people([photo("a", found(1, 90.0), found(2, 60.0)), photo("b", found(3, 80.0))])
-    with pytest.raises(ValueError, match=r"2 people in a: expected one\. Person 0 to 1: numbers on .*s\.png"):
+    with pytest.raises(
+        ValueError, match=r"2 people in a: expected one\. Person 0 to 1: numbers on .*s\.png"
+    ):
         choose(photos, None, tmp_path / "s.png")
     with pytest.raises(ValueError, match=r"^person 2: expected 0 to 1, as on .*s\.png"):
         choose(photos, 2, tmp_path / "s.png")
@@ -74,9 +93,16 @@ def colored(name, *shades, size=(60, 40)):
 
 
 def test_without_cameras_colors_tell_large_people_apart(tmp_path):
-    photos = same_people([colored("a", 0.9, 0.1), colored("b", 0.2, 0.8), colored("c", 0.05), colored("d")])
+    photos = same_people(
+        [colored("a", 0.9, 0.1), colored("b", 0.2, 0.8), colored("c", 0.05), colored("d")]
+    )
     shades = [[None if each is None else int(each.area) for each in p.people] for p in photos]
-    assert shades == [[89, 90], [90, 89], [90, None], [None, None]]  # the dark one has more pixels in all
+    assert shades == [
+        [89, 90],
+        [90, 89],
+        [90, None],
+        [None, None],
+    ]  # the dark one has more pixels in all
     with pytest.raises(ValueError, match="2 people in a, b: expected one"):
         choose(photos, None, tmp_path / "s.png")
     assert choose(photos, 1, tmp_path / "s.png") == 1
@@ -84,7 +110,10 @@ def test_without_cameras_colors_tell_large_people_apart(tmp_path):
 
 def test_people_of_one_color_are_not_mixed_in_silence(tmp_path):
     photos = same_people([colored("a", 0.9, 0.1), colored("b", 0.5, 0.5), colored("c", 0.9, 0.2)])
-    with pytest.raises(ValueError, match=r"^b: which of the people of .*people\.png is meant\? Their colors do not tell"):
+    with pytest.raises(
+        ValueError,
+        match=r"^b: which of the people of .*people\.png is meant\? Their colors do not tell",
+    ):
         choose(photos, 1, tmp_path / "people.png")
     assert (tmp_path / "people.png").is_file()
 
@@ -130,36 +159,54 @@ def test_without_litert_it_is_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
     (tmp_path / "photos").mkdir()
     write_png(tmp_path / "photos" / "black.png", np.zeros((64, 64, 3)))
-    assert cli.execute(["detect", str(tmp_path / "photos"), "--out", str(tmp_path / "found")]) == cli.BAD_DATA
+    assert (
+        cli.execute(["detect", str(tmp_path / "photos"), "--out", str(tmp_path / "found")])
+        == cli.BAD_DATA
+    )
     said = capsys.readouterr().err
-    assert "error: finding people in photos needs LiteRT: pip install 'humangs_jax[photos]'" in said and said.count("\n") == 1
+    assert (
+        "error: finding people in photos needs LiteRT: pip install 'humangs_jax[photos]'" in said
+        and said.count("\n") == 1
+    )
 
 
 def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path, monkeypatch):
     """The second person of one view comes first there: only the cameras tell."""
     capture = load_capture("demo_capture")
     shutil.copytree(DEMO, tmp_path / "c")
-    edit_json(tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]])
+    edit_json(
+        tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]]
+    )
     model = landmark_model(capture.body, MEDIAPIPE_33.names)
     points = np.asarray(pose_landmarks(model, jnp.asarray(capture.betas), capture.pose(0))[0])
     shown = []
     for v in range(4):
-        K, transform = (np.asarray(x[v], float) for x in (capture.cameras.K, capture.cameras.cam_from_world))
+        K, transform = (
+            np.asarray(x[v], float) for x in (capture.cameras.K, capture.cameras.cam_from_world)
+        )
         people = []
         for area, place in ((50.0, points), (40.0, points + BESIDE)):
             local = (place @ transform[:3, :3].T + transform[:3, 3]) @ K.T
             pixels = np.c_[local[:, :2] / local[:, 2:], np.asarray(model.known, float)]
-            people.append(found(0, area)._replace(person=SeenPerson(pixels, np.zeros((33, 3)), 1.0)))
+            people.append(
+                found(0, area)._replace(person=SeenPerson(pixels, np.zeros((33, 3)), 1.0))
+            )
         if v == 2:
             mirrored = people[1].person.points[np.asarray(MEDIAPIPE_33.mirror)]
-            people[1] = people[1]._replace(person=SeenPerson(mirrored, np.zeros((33, 3)), 1.0), area=70.0)
+            people[1] = people[1]._replace(
+                person=SeenPerson(mirrored, np.zeros((33, 3)), 1.0), area=70.0
+            )
             people.reverse()
         shown.append(photo(f"{capture.names[v]}.png", *people))
     monkeypatch.setattr(detect, "detect_photos", lambda names, photos: shown)
     ordered = detect.found_in_photos(tmp_path / "c")
     assert [p.people[0].area for p in ordered] == [50.0, 50.0, 50.0, 50.0]
-    repaired = lambda person: [line for line in detect.remarks(ordered, person) if line.endswith("repaired")]
-    assert repaired(0) == [] and [line.split(":")[0] for line in repaired(1)] == [f"{capture.names[2]}.png"]
+    repaired = lambda person: [
+        line for line in detect.remarks(ordered, person) if line.endswith("repaired")
+    ]
+    assert repaired(0) == [] and [line.split(":")[0] for line in repaired(1)] == [
+        f"{capture.names[2]}.png"
+    ]
 
 
 # One person in front of calibrated cameras is one person ---------------------------------------------------------------
@@ -172,8 +219,13 @@ OTHER_BODY = np.random.default_rng(4).normal(0, [0.15, 0.45, 0.1], (33, 3))
 
 def camera_at(degrees, turned=0.0, distance=3.5):
     """cam_from_world of a camera around the origin that looks at it. turned: about its own x, degrees."""
-    look, tilt = (Rotation.from_euler(axis, angle, degrees=True).as_matrix() for axis, angle in (("y", degrees), ("x", turned)))
-    return np.block([[tilt @ look, (tilt @ [0, 0, distance])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    look, tilt = (
+        Rotation.from_euler(axis, angle, degrees=True).as_matrix()
+        for axis, angle in (("y", degrees), ("x", turned))
+    )
+    return np.block(
+        [[tilt @ look, (tilt @ [0, 0, distance])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]
+    )
 
 
 def batch(matrices):
@@ -193,7 +245,9 @@ def seen_at(name, matrix, *bodies, areas=(9e3, 8e3)):
         local = body @ matrix[:3, :3].T + matrix[:3, 3]
         pixels = np.c_[local[:, :2] / local[:, 2:] * FOCAL + SIDE / 2, np.ones(33)]
         people.append(found(0, area)._replace(person=SeenPerson(pixels, np.zeros((33, 3)), 1.0)))
-    return PhotoPeople(name, (SIDE, SIDE), np.ones((30, 30, 3)), tuple(sorted(people, key=lambda each: -each.area)))
+    return PhotoPeople(
+        name, (SIDE, SIDE), np.ones((30, 30, 3)), tuple(sorted(people, key=lambda each: -each.area))
+    )
 
 
 def is_in_every_photo(photos, sheet):
@@ -203,14 +257,19 @@ def is_in_every_photo(photos, sheet):
 WAYS = {
     "one camera that stands still": [camera_at(0)] * 4,
     "one camera that moves": [camera_at(angle) for angle in (0, 25, 50, 75)],
-    "a camera for each moment": [camera_at(angle, distance=2 + angle / 100) for angle in (0, 90, 180, 270)],
+    "a camera for each moment": [
+        camera_at(angle, distance=2 + angle / 100) for angle in (0, 90, 180, 270)
+    ],
 }
 
 
 @pytest.mark.parametrize("cameras", WAYS.values(), ids=WAYS)
 @pytest.mark.parametrize("step", [0.0, 0.4, 1.6])
 def test_frames_that_one_view_sees_show_one_person(cameras, step, tmp_path):
-    photos = [seen_at(f"{f}", matrix, moved(BODY, 0.3 * step * f, 0, step * f)) for f, matrix in enumerate(cameras)]
+    photos = [
+        seen_at(f"{f}", matrix, moved(BODY, 0.3 * step * f, 0, step * f))
+        for f, matrix in enumerate(cameras)
+    ]
     photos = same_people(photos, batch(cameras), range(4))
     assert is_in_every_photo(photos, tmp_path / "s.png") and len(photos[0].people) == 1
     assert not any("is not where" in line for line in detect.remarks(photos, 0))
@@ -219,7 +278,11 @@ def test_frames_that_one_view_sees_show_one_person(cameras, step, tmp_path):
 @pytest.mark.parametrize("step", [0.9, 1.1, 2.5])
 def test_a_person_who_walks_far_between_moments_stays_one_person(step, tmp_path):
     views = [camera_at(0, distance=9.0), camera_at(70, distance=9.0)]
-    photos = [seen_at(f"{f}{v}", views[v], moved(BODY, step * f, 0, 0)) for f in range(3) for v in range(2)]
+    photos = [
+        seen_at(f"{f}{v}", views[v], moved(BODY, step * f, 0, 0))
+        for f in range(3)
+        for v in range(2)
+    ]
     photos = same_people(photos, batch(views * 3), [0, 0, 1, 1, 2, 2])
     assert is_in_every_photo(photos, tmp_path / "s.png")
     assert not any("is not where" in line for line in detect.remarks(photos, 0))
@@ -263,7 +326,9 @@ def test_of_two_cameras_that_do_not_agree_both_are_named(tmp_path):
     photos = [seen_at(f"c{v}", camera_at(80 * v), BODY) for v in range(2)]
     photos = same_people(photos, batch([camera_at(0, 9.0), camera_at(80)]))
     assert is_in_every_photo(photos, tmp_path / "s.png")
-    assert any(line.startswith("c0, c1: the person is not where") for line in detect.remarks(photos, 0))
+    assert any(
+        line.startswith("c0, c1: the person is not where") for line in detect.remarks(photos, 0)
+    )
 
 
 def test_bystanders_of_one_view_do_not_make_the_person_another(tmp_path):
@@ -277,7 +342,8 @@ def test_bystanders_of_one_view_do_not_make_the_person_another(tmp_path):
 def test_two_people_are_followed_in_the_photos_of_one_camera(tmp_path):
     steps = [np.asarray([0.1 * f, 0, 0]) for f in range(4)]
     photos = [
-        seen_at(f"{f}", camera_at(0), BODY - 0.8 + step, moved(OTHER_BODY, 0.8, 0, 0) - step) for f, step in enumerate(steps)
+        seen_at(f"{f}", camera_at(0), BODY - 0.8 + step, moved(OTHER_BODY, 0.8, 0, 0) - step)
+        for f, step in enumerate(steps)
     ]
     photos[2] = dataclasses.replace(photos[2], people=tuple(reversed(photos[2].people)))
     photos = same_people(photos, batch([camera_at(0)] * 4), range(4))
@@ -290,12 +356,15 @@ def test_two_people_are_followed_in_the_photos_of_one_camera(tmp_path):
 def test_rivals_who_are_matched_to_nobody_are_asked_about_and_get_no_black_mask(tmp_path):
     """Moments from different sides: neither space nor the photo says who is who."""
     cameras = [camera_at(0), camera_at(180)]
-    photos = [seen_at(f"{f}", matrix, BODY - 0.8, OTHER_BODY + 0.8) for f, matrix in enumerate(cameras)]
+    photos = [
+        seen_at(f"{f}", matrix, BODY - 0.8, OTHER_BODY + 0.8) for f, matrix in enumerate(cameras)
+    ]
     photos = same_people(photos, batch(cameras), [0, 1])
     with pytest.raises(ValueError, match=r"2 people in 0, 1: expected one\. Person 0 to 3"):
         choose(photos, None, tmp_path / "s.png")
     with pytest.raises(
-        ValueError, match=r"which of the people of .*s\.png is meant\? Their places do not tell: cut these photos"
+        ValueError,
+        match=r"which of the people of .*s\.png is meant\? Their places do not tell: cut these photos",
     ):
         choose(photos, 0, tmp_path / "s.png")
 
@@ -303,7 +372,10 @@ def test_rivals_who_are_matched_to_nobody_are_asked_about_and_get_no_black_mask(
 def test_somebody_else_for_certain_is_not_the_person(tmp_path):
     """The last view shows only the other one, who is beside the person in the others."""
     views = [camera_at(angle) for angle in (0, 80, 200)]
-    photos = [seen_at(f"c{v}", matrix, BODY, moved(OTHER_BODY, 0.7, 0, 0.4)) for v, matrix in enumerate(views)]
+    photos = [
+        seen_at(f"c{v}", matrix, BODY, moved(OTHER_BODY, 0.7, 0, 0.4))
+        for v, matrix in enumerate(views)
+    ]
     photos[2] = seen_at("c2", views[2], moved(OTHER_BODY, 0.7, 0, 0.4), areas=(8e3,))
     photos = same_people(photos, batch(views))
     assert choose(photos, 1, tmp_path / "s.png") == 1
@@ -312,7 +384,9 @@ def test_somebody_else_for_certain_is_not_the_person(tmp_path):
 
 
 def with_masks(photo, corners):
-    people = tuple(each._replace(corner=corner) for each, corner in zip(photo.people, corners, strict=True))
+    people = tuple(
+        each._replace(corner=corner) for each, corner in zip(photo.people, corners, strict=True)
+    )
     return dataclasses.replace(photo, people=people)
 
 
@@ -321,22 +395,34 @@ def test_masks_and_keypoints_choose_in_each_photo_whatever_the_matching_says(kin
     places = [(5, 10), (15, 30)]
     photos = [with_masks(photo(name, found(1, 90.0), found(2, 80.0)), places) for name in "abc"]
     meant = [0, 1, 1]
-    masks, points, confidences = np.zeros((3, 30, 40), np.float32), np.zeros((3, 33, 2), np.float32), np.ones((3, 33), np.float32)
+    masks, points, confidences = (
+        np.zeros((3, 30, 40), np.float32),
+        np.zeros((3, 33, 2), np.float32),
+        np.ones((3, 33), np.float32),
+    )
     for v, i in enumerate(meant):
         (top, left) = places[i]
         masks[v, top : top + 8, left : left + 4] = 1
         points[v] = left + 2, top + 3
     given = list(masks) if kind == "masks" else Keypoints(points, confidences, MEDIAPIPE_33)
-    settled, number = detect.person_of([dataclasses.replace(each, unclear=True) for each in photos], given, tmp_path / "s.png")
+    settled, number = detect.person_of(
+        [dataclasses.replace(each, unclear=True) for each in photos], given, tmp_path / "s.png"
+    )
     assert [each.people[number].corner for each in settled] == [places[i] for i in meant]
     assert not any(each.unclear for each in settled)
 
 
 def test_a_photo_without_keypoints_whose_people_are_rivals_is_asked_about(tmp_path):
-    photos = [dataclasses.replace(photo(name, found(1, 90.0), found(2, 80.0)), unclear=True) for name in "ab"]
+    photos = [
+        dataclasses.replace(photo(name, found(1, 90.0), found(2, 80.0)), unclear=True)
+        for name in "ab"
+    ]
     points = np.full((2, 33, 2), [11.0, 7.0], np.float32)
     confidences = np.repeat([[1.0], [0.0]], 33, axis=1).astype(np.float32)
-    with pytest.raises(ValueError, match=r"^b: which of the people of .* is meant\? There are no keypoints of the person: add"):
+    with pytest.raises(
+        ValueError,
+        match=r"^b: which of the people of .* is meant\? There are no keypoints of the person: add",
+    ):
         detect.person_of(photos, Keypoints(points, confidences, MEDIAPIPE_33), tmp_path / "s.png")
 
 
@@ -359,12 +445,17 @@ def looked_at(center, side):
     mask = (u**2 / 0.3 + v**2 / 0.8 < 1).astype(np.float32)
     crop = Crop(np.asarray(center, float), side, 0.1)
     points = crop.to_photo(np.random.default_rng(0).uniform(0.3, 0.7, (33, 2)))
-    return Landmarks(points, np.ones(33), np.zeros((33, 3)), 1.0, mask, crop, Detection(1.0, *np.eye(2)))
+    return Landmarks(
+        points, np.ones(33), np.zeros((33, 3)), 1.0, mask, crop, Detection(1.0, *np.eye(2))
+    )
 
 
 @pytest.mark.parametrize("center", [(150, 100), (8, 4), (295, 190)])
 def test_a_mask_is_made_where_the_person_is_and_is_the_one_of_the_whole_photo(center):
-    picture, person = np.random.default_rng(0).uniform(size=(200, 300, 3)).astype(np.float32), looked_at(center, 120.0)
+    picture, person = (
+        np.random.default_rng(0).uniform(size=(200, 300, 3)).astype(np.float32),
+        looked_at(center, 120.0),
+    )
     whole = to_uint8(sharpened(mask_in_photo(person, 300, 200), picture, 120 / 256))
     seen = detect._found(person, picture)
     (top, left), (height, width) = seen.corner, seen.mask.shape
@@ -386,11 +477,15 @@ def test_masks_of_many_people_take_no_more_than_the_people_do(monkeypatch):
 
 def test_photos_of_a_capture_without_masks_are_read_once(tmp_path, monkeypatch):
     shutil.copytree(DEMO, tmp_path / "c")
-    edit_json(tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]])
+    edit_json(
+        tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]]
+    )
     read = []
     monkeypatch.setattr(detect, "read_image", lambda *_: read.append(1))
     monkeypatch.setattr(
-        detect, "detect_photos", lambda names, photos: [photo(name) for name, _ in zip(names, photos, strict=True)]
+        detect,
+        "detect_photos",
+        lambda names, photos: [photo(name) for name, _ in zip(names, photos, strict=True)],
     )
     assert len(detect.found_in_capture(tmp_path / "c")) == 4 and not read
 

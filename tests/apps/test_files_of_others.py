@@ -44,9 +44,13 @@ def test_detect_replaces_what_it_wrote_and_nothing_else(name, here, capsys):
     command = ["detect", "photos", "--out", "photos"]
     assert cli.execute(command) == cli.BAD_DATA
     assert (
-        f"photos/{name}: exists, and was not written by humangs: choose another folder, or --overwrite" in capsys.readouterr().err
+        f"photos/{name}: exists, and was not written by humangs: choose another folder, or --overwrite"
+        in capsys.readouterr().err
     )
-    assert file.read_bytes() == before and sum(path.is_file() for path in Path("photos").rglob("*")) == 3
+    assert (
+        file.read_bytes() == before
+        and sum(path.is_file() for path in Path("photos").rglob("*")) == 3
+    )
     assert cli.execute([*command, "--overwrite"]) == 0 and file.read_bytes() != before
     assert mark_of("photos/masks/a.png") == MASK and is_own_picture("photos/people.png")
     assert cli.execute(command) == 0  # its own
@@ -71,7 +75,9 @@ def test_a_sheet_of_numbers_replaces_no_picture_of_others(tmp_path):
     two = [photo("a.png", found(1, 90.0), found(2, 80.0))]
     write_png(tmp_path / "me_people.png", GREY)
     before = (tmp_path / "me_people.png").read_bytes()
-    with pytest.raises(ValueError, match=r"me_people\.png: exists, and was not written by humangs: several people"):
+    with pytest.raises(
+        ValueError, match=r"me_people\.png: exists, and was not written by humangs: several people"
+    ):
         detect.choose(two, None, tmp_path / "me_people.png")
     assert (tmp_path / "me_people.png").read_bytes() == before
 
@@ -81,7 +87,9 @@ def test_frames_replace_and_delete_own_pictures_only(tmp_path):
     write_video(tmp_path / "frames", [GREY] * 2, 10)
     assert len(list((tmp_path / "frames").iterdir())) == 2
     write_png(tmp_path / "frames" / "frame_00007.png", GREY)
-    with pytest.raises(ValueError, match=r"frame_00007\.png: exists, and was not written by humangs"):
+    with pytest.raises(
+        ValueError, match=r"frame_00007\.png: exists, and was not written by humangs"
+    ):
         write_video(tmp_path / "frames", [GREY] * 2, 10)
 
 
@@ -102,7 +110,10 @@ def test_files_are_added_all_or_none_where_one_is_of_others(tmp_path):
 @pytest.mark.parametrize("suffix", [".png", ".mtl"])
 def test_an_obj_takes_no_name_of_others_for_its_texture(suffix, tmp_path):
     (tmp_path / "me").with_suffix(suffix).write_bytes(b"my photo")
-    with pytest.raises(ValueError, match=rf"me\{suffix}: exists, and was not written by humangs: .*another name for the \.obj"):
+    with pytest.raises(
+        ValueError,
+        match=rf"me\{suffix}: exists, and was not written by humangs: .*another name for the \.obj",
+    ):
         mesh.check_beside(tmp_path / "me.obj")
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"my photo"]
 
@@ -116,11 +127,19 @@ def test_the_demo_replaces_an_earlier_one_and_nothing_else(tmp_path):
     demo._check_place(tmp_path)
 
 
-@pytest.mark.parametrize(("name", "options"), [("check.png", []), ("check_fit.png", []), ("x_fit.png", ["--out", "x.png"])])
-def test_check_takes_no_name_that_nobody_asked_for_from_a_picture(name, options, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("check.png", []), ("check_fit.png", []), ("x_fit.png", ["--out", "x.png"])],
+)
+def test_check_takes_no_name_that_nobody_asked_for_from_a_picture(
+    name, options, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     write_png(name, GREY)
     before = Path(name).read_bytes()
     assert cli.execute(["check", str(DEMO), *options]) == cli.BAD_DATA
-    assert f"{name}: exists, and was not written by humangs: choose another name by --out" in capsys.readouterr().err
+    assert (
+        f"{name}: exists, and was not written by humangs: choose another name by --out"
+        in capsys.readouterr().err
+    )
     assert Path(name).read_bytes() == before

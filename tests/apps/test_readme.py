@@ -25,14 +25,27 @@ LEAST_PSNR = 25.7
 """dB of a photo that the network was given, rendered again: 26.0 when this was written."""
 README_WORDS = 700
 """Of README.md, with its code, table and citation: it is read in three minutes."""
-MODULES = {"hg": hg, "jax": jax, "jnp": jnp, "np": np, "dataclasses": dataclasses, "LiveView": LiveView}
+MODULES = {
+    "hg": hg,
+    "jax": jax,
+    "jnp": jnp,
+    "np": np,
+    "dataclasses": dataclasses,
+    "LiveView": LiveView,
+}
 
 WHOLE = ("docs/how_it_works.md", "docs/splatting.md", "docs/ablations.md")
 """Pages that begin with nothing."""
 ON_FILES = ("docs/capture_format.md", "docs/motions.md")
 """Quick ones: with three Gaussians, and files of motions."""
 ON_A_PERSON = (
-    *("docs/data.md", "docs/evaluation.md", "docs/export.md", "docs/fitting.md", "docs/performance.md"),
+    *(
+        "docs/data.md",
+        "docs/evaluation.md",
+        "docs/export.md",
+        "docs/fitting.md",
+        "docs/performance.md",
+    ),
     *("docs/refinement.md", "docs/tradeoff.md", "docs/video.md", "docs/viewer.md"),
 )
 """With the shipped person at 256 px."""
@@ -80,7 +93,9 @@ def test_the_blocks_of_the_readme_run(whole, monkeypatch, tmp_path, body):
         load = hg.load_capture
         save_tiny_avatar(tmp_path / "tiny.npz", np.asarray(shape_body(body, jnp.zeros(0)).joints))
         monkeypatch.setattr(hg, "load_capture", lambda path: load(path).resized(64))
-        monkeypatch.setattr(hg, "reconstruct", lambda variables, config, capture: Avatar.load(tmp_path / "tiny.npz"))
+        monkeypatch.setattr(
+            hg, "reconstruct", lambda variables, config, capture: Avatar.load(tmp_path / "tiny.npz")
+        )
         monkeypatch.setattr(hg, "refine", lambda avatar, capture, steps: avatar)
     names = run("README.md")
     image, capture = np.asarray(names["image"]), names["capture"]
@@ -98,7 +113,9 @@ def test_the_readme_is_short():
 
 
 def test_every_page_with_python_is_run():
-    pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md") if blocks(f"docs/{path.name}")}
+    pages = {
+        f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md") if blocks(f"docs/{path.name}")
+    }
     assert pages == {*WHOLE, *ON_FILES, *ON_A_PERSON, *LEFT_OUT}
 
 
@@ -109,8 +126,18 @@ def files(tmp_path, monkeypatch, body):
     still = np.zeros((3, 55, 3))
     (tmp_path / "dance.bvh").write_text(write_bvh(rest, np.zeros((3, len(rest), 3)), CMU))
     np.savez(tmp_path / "dance.npz", rotations=still, translations=still[:, 0], fps=30.0)
-    np.savez(tmp_path / "amass.npz", poses=still.reshape(3, -1), trans=still[:, 0] + [0, 0, 1], mocap_framerate=120)
-    person = {"pose_world": np.zeros((3, 72)), "trans_world": still[:, 0], "betas": np.zeros(10), "frame_ids": np.arange(3)}
+    np.savez(
+        tmp_path / "amass.npz",
+        poses=still.reshape(3, -1),
+        trans=still[:, 0] + [0, 0, 1],
+        mocap_framerate=120,
+    )
+    person = {
+        "pose_world": np.zeros((3, 72)),
+        "trans_world": still[:, 0],
+        "betas": np.zeros(10),
+        "frame_ids": np.arange(3),
+    }
     (tmp_path / "wham_output.pkl").write_bytes(pickle.dumps({0: person, 1: person}))
     save_tiny_avatar(tmp_path / "tiny.npz", rest)
     monkeypatch.chdir(tmp_path)
@@ -121,13 +148,20 @@ def check_described_capture(text):
     """The lines of Python wrote a capture whose capture.json has the keys of the one that is described, and its camera."""
     capture, file = hg.load_capture("me"), Path("me/capture.json")
     assert capture.view_count == 4 and capture.body.name == "makehuman"
-    written, content = json.loads(file.read_text()), json.loads(re.search(r"```json\n(.*?)```", text, re.DOTALL)[1])
+    written, content = (
+        json.loads(file.read_text()),
+        json.loads(re.search(r"```json\n(.*?)```", text, re.DOTALL)[1]),
+    )
     assert set(content) == set(written) and set(content["views"][0]) == set(written["views"][0])
     for key in ("image", "mask"):
         shutil.copyfile(f"me/{written['views'][0][key]}", f"me/{content['views'][0][key]}")
     file.write_text(json.dumps(content))
-    np.testing.assert_array_equal(hg.load_capture("me").cameras.cam_from_world[0], capture.cameras.cam_from_world[0])
-    np.testing.assert_allclose(capture.cameras.center[0], [0, 0.9, 2.6], atol=1e-6)  # 2.6 m in front, 0.9 m above the ground
+    np.testing.assert_array_equal(
+        hg.load_capture("me").cameras.cam_from_world[0], capture.cameras.cam_from_world[0]
+    )
+    np.testing.assert_allclose(
+        capture.cameras.center[0], [0, 0.9, 2.6], atol=1e-6
+    )  # 2.6 m in front, 0.9 m above the ground
 
 
 @pytest.mark.parametrize("page", ON_FILES)
@@ -153,11 +187,27 @@ def person():
     capture = hg.load_capture("demo_capture").resized(256)
     avatar = hg.reconstruct(variables, config, capture)
     gaussians = hg.animate(avatar, capture.pose(0))
-    given = {"variables": variables, "config": config, "capture": capture, "avatar": avatar, "gaussians": gaussians}
+    given = {
+        "variables": variables,
+        "config": config,
+        "capture": capture,
+        "avatar": avatar,
+        "gaussians": gaussians,
+    }
     loss_and_gradient = jax.value_and_grad(lambda g: jnp.sum(g.colors**2))
     sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    given |= {"cameras": capture.cameras, "body": capture.body, "motion": hg.load_motion(), "key": jax.random.key(0)}
-    return given | {"loss_and_gradient": loss_and_gradient, "sharding": sharding, "start": 0, "stop": 1}
+    given |= {
+        "cameras": capture.cameras,
+        "body": capture.body,
+        "motion": hg.load_motion(),
+        "key": jax.random.key(0),
+    }
+    return given | {
+        "loss_and_gradient": loss_and_gradient,
+        "sharding": sharding,
+        "start": 0,
+        "stop": 1,
+    }
 
 
 @pytest.mark.slow
@@ -168,9 +218,13 @@ def test_the_blocks_of_a_page_on_a_person_run(page, person, files):
         from humangs_jax.people.writer import Layout, write_set
 
         write_set(files / "people", 2, Layout(128, views=4), "train", 0, workers=1)
-        person = person | {"bank": build_bank(range(2), person["body"], "train", texture_size=256, processes=1)}
+        person = person | {
+            "bank": build_bank(range(2), person["body"], "train", texture_size=256, processes=1)
+        }
     if page == "docs/evaluation.md":
-        shutil.copyfile(ROOT / "humangs_jax/assets/weights.safetensors", files / "weights.safetensors")
+        shutil.copyfile(
+            ROOT / "humangs_jax/assets/weights.safetensors", files / "weights.safetensors"
+        )
         for name, capture in (("me", "demo_capture"), ("me/held_out", "demo_capture/held_out")):
             save_capture(files / "people" / name, hg.load_capture(capture))
     run(page, MODULES | person)

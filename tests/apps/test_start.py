@@ -62,7 +62,11 @@ def mine(photos, tmp_path, monkeypatch):
 def test_everything_is_found(mine):
     found = look(mine)
     assert (found.images, found.photos, found.size) == (mine / "images", 4, (512, 512))
-    assert (found.cameras, found.masks, found.keypoints) == (mine, mine / "masks", mine / "keypoints")
+    assert (found.cameras, found.masks, found.keypoints) == (
+        mine,
+        mine / "masks",
+        mine / "keypoints",
+    )
     assert missing(found) == () and str(found).count("\n") == 3
 
 
@@ -93,26 +97,39 @@ def test_alpha_is_a_mask(mine):
 
 @pytest.mark.parametrize("distortion", [0, 0.1])
 def test_opaque_alpha_is_no_mask(distortion, mine, capsys):
-    edit_json(mine / "calibration.json", lambda rig: [camera.update(dist=[distortion, 0, 0, 0, 0]) for camera in rig.values()])
+    edit_json(
+        mine / "calibration.json",
+        lambda rig: [camera.update(dist=[distortion, 0, 0, 0, 0]) for camera in rig.values()],
+    )
     without(mine, "masks", "keypoints")
     for path in (mine / "images").iterdir():
         write_png(path, np.ones((512, 512, 4)))
     found = look(mine)
     assert not found.alpha and [each.name for each in missing(found)] == ["masks", "keypoints"]
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
-    assert load_photos("me").masks is None and "masks and keypoints missing" in capsys.readouterr().err
+    assert (
+        load_photos("me").masks is None and "masks and keypoints missing" in capsys.readouterr().err
+    )
 
 
 TOOLS = {
-    "cameras": ("colmap automatic_reconstructor --workspace_path photos/colmap --image_path photos/images", "EasyMocap"),
+    "cameras": (
+        "colmap automatic_reconstructor --workspace_path photos/colmap --image_path photos/images",
+        "EasyMocap",
+    ),
     "masks": ("rembg p -m u2net_human_seg -om photos/images photos/masks", "SAM 2"),
-    "keypoints": ("inferencer_demo.py photos/images --pose2d wholebody --pred-out-dir photos/keypoints", "openpose.bin"),
+    "keypoints": (
+        "inferencer_demo.py photos/images --pose2d wholebody --pred-out-dir photos/keypoints",
+        "openpose.bin",
+    ),
 }
 
 
 def without(folder, *names):
     for name in names:
-        shutil.rmtree(folder / name) if name != "cameras" else (folder / "calibration.json").unlink()
+        shutil.rmtree(folder / name) if name != "cameras" else (
+            folder / "calibration.json"
+        ).unlink()
 
 
 @pytest.mark.parametrize("names", [("cameras",), ("masks",), ("keypoints",), tuple(TOOLS)])
@@ -131,12 +148,17 @@ def test_what_is_missing_comes_with_its_tools(names, mine, capsys):
     if "cameras" in names:
         assert list(Path().iterdir()) == [mine]
     else:  # what is there was imported
-        assert load_photos("me").images.shape == (4, 512, 512, 3) and not Path("me/body.npz").exists()
+        assert (
+            load_photos("me").images.shape == (4, 512, 512, 3) and not Path("me/body.npz").exists()
+        )
 
 
 def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
     without(mine, "keypoints")
-    edit_json(mine / "calibration.json", lambda rig: [camera.update(dist=[0.1, 0, 0, 0, 0]) for camera in rig.values()])
+    edit_json(
+        mine / "calibration.json",
+        lambda rig: [camera.update(dist=[0.1, 0, 0, 0, 0]) for camera in rig.values()],
+    )
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert "inferencer_demo.py me/images --pose2d" in capsys.readouterr().out
 
@@ -148,10 +170,21 @@ def detected(mine, monkeypatch):
     points = np.nan_to_num(landmarks_in(capture, MEDIAPIPE_33.names))
     shown = []
     for v, name in enumerate(capture.names):
-        person = SeenPerson(np.concatenate([points[v], np.ones((33, 1))], axis=1), np.zeros((33, 3)), 1.0)
+        person = SeenPerson(
+            np.concatenate([points[v], np.ones((33, 1))], axis=1), np.zeros((33, 3)), 1.0
+        )
         mask = to_uint8(capture.masks[v])
-        bystander = Found(person, mask[:60, :20], (0, 0), 2e5)  # larger, but nobody's masks or keypoints are there
-        shown.append(PhotoPeople(f"{name}.png", (512, 512), np.ones((48, 48, 3)), (bystander, Found(person, mask, (0, 0), 1e5))))
+        bystander = Found(
+            person, mask[:60, :20], (0, 0), 2e5
+        )  # larger, but nobody's masks or keypoints are there
+        shown.append(
+            PhotoPeople(
+                f"{name}.png",
+                (512, 512),
+                np.ones((48, 48, 3)),
+                (bystander, Found(person, mask, (0, 0), 1e5)),
+            )
+        )
 
     def stop(self, material):
         told.append(material)
@@ -164,16 +197,23 @@ def detected(mine, monkeypatch):
 
 
 @pytest.mark.parametrize("names", [("keypoints",), ("masks",), ("masks", "keypoints")])
-def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(names, mine, detected, capsys):
+def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(
+    names, mine, detected, capsys
+):
     shutil.rmtree(mine)
     write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
     without(mine, *names)
     options = ["--person", "1"] if len(names) == 2 else []  # what is given says who is meant
     assert cli.execute(["start", str(mine), "--out", "me", *options]) == cli.BAD_DATA
     out, err = capsys.readouterr()
-    assert err == "humangs: error: the fit\n" and f"{' and '.join(names)} found in the photos: me/people.png" in out
+    assert (
+        err == "humangs: error: the fit\n"
+        and f"{' and '.join(names)} found in the photos: me/people.png" in out
+    )
     (material,) = detected
-    assert material.keypoints == (Path("me/keypoints.json") if "keypoints" in names else mine / "keypoints")
+    assert material.keypoints == (
+        Path("me/keypoints.json") if "keypoints" in names else mine / "keypoints"
+    )
     imported = load_photos("me")
     np.testing.assert_allclose(imported.masks, truth.masks, atol=1 / 255)
 
@@ -187,19 +227,36 @@ def test_fit_and_check_find_what_a_capture_lacks_too(mine, detected, capsys, mon
 
     truth, shown = load_capture("demo_capture"), detect.found_in_capture("me")
     named = lambda folder: [
-        dataclasses.replace(each, name=f"{name}.png") for each, name in zip(shown, load_photos(folder).names, strict=True)
+        dataclasses.replace(each, name=f"{name}.png")
+        for each, name in zip(shown, load_photos(folder).names, strict=True)
     ]
     monkeypatch.setattr(detect, "found_in_capture", named)
-    cameras = ["import", "cameras", str(mine / "calibration.json"), "--images", str(mine / "images"), "--out", "me"]
+    cameras = [
+        "import",
+        "cameras",
+        str(mine / "calibration.json"),
+        "--images",
+        str(mine / "images"),
+        "--out",
+        "me",
+    ]
     monkeypatch.setattr(fit_capture, "fit_photos", fit)
     assert cli.execute(cameras) == 0 and load_photos("me").masks is None
-    assert cli.execute(["fit", "me"]) == cli.BAD_DATA and "Person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
+    assert (
+        cli.execute(["fit", "me"]) == cli.BAD_DATA
+        and "Person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
+    )
     assert cli.execute(["fit", "me", "--person", "1"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
-    assert err.endswith("error: the fit\n") and "keypoints and masks found in the photos: me/people.png shows them" in out
+    assert (
+        err.endswith("error: the fit\n")
+        and "keypoints and masks found in the photos: me/people.png shows them" in out
+    )
     ((photos, keypoints),) = given
     np.testing.assert_allclose(photos.masks, truth.masks, atol=1 / 255)
-    np.testing.assert_allclose(keypoints.points, np.nan_to_num(landmarks_in(truth, MEDIAPIPE_33.names)), atol=1e-3)
+    np.testing.assert_allclose(
+        keypoints.points, np.nan_to_num(landmarks_in(truth, MEDIAPIPE_33.names)), atol=1e-3
+    )
     assert cli.execute(["fit", "me"]) == cli.BAD_DATA  # what was found is taken
     assert "found" not in capsys.readouterr().out and len(given) == 2
     monkeypatch.setattr(blazepose, "available", lambda: False)
@@ -225,11 +282,19 @@ def two_people(mine, detected, monkeypatch):
         bystander, person = photo.people
         people = (bystander._replace(mask=beside), person)
         name = f"cam{v}.png"
-        shown[v] = dataclasses.replace(photo, name=name, people=people[:: 1 if v % 2 else -1], unclear=True)
-    points = {"person": landmarks_in(truth, COCO_17.names), "bystander": np.random.default_rng(0).uniform(5, 29, (4, 17, 2))}
+        shown[v] = dataclasses.replace(
+            photo, name=name, people=people[:: 1 if v % 2 else -1], unclear=True
+        )
+    points = {
+        "person": landmarks_in(truth, COCO_17.names),
+        "bystander": np.random.default_rng(0).uniform(5, 29, (4, 17, 2)),
+    }
     (mine / "keypoints").mkdir()
     for v in range(4):
-        both = [{"keypoints": points[who][v].tolist(), "keypoint_scores": [0.9] * 17} for who in ("bystander", "person")]
+        both = [
+            {"keypoints": points[who][v].tolist(), "keypoint_scores": [0.9] * 17}
+            for who in ("bystander", "person")
+        ]
         write_json(mine / "keypoints" / f"cam{v}.json", both)
     write_masks(mine / "masks", truth.masks)
     monkeypatch.setattr(photos_alone.detect, "detect_photos", lambda names, photos: shown)
@@ -249,7 +314,10 @@ def test_without_cameras_keypoints_of_several_people_choose_in_each_photo(who, a
     files = sorted((two_people / "images").iterdir())
     choice = photos_alone._Choice(who, two_people / "keypoints", None, Path("me"))
     looked = photos_alone._look(two_people / "images", files, files, choice)
-    assert looked.shown == [0, 1, 2, 3] and [photo.people[looked.number].area for photo in looked.photos] == [area] * 4
+    assert (
+        looked.shown == [0, 1, 2, 3]
+        and [photo.people[looked.number].area for photo in looked.photos] == [area] * 4
+    )
     with pytest.raises(CaptureError, match="2 people: expected one"):
         photos_alone._look(two_people / "images", files, files, choice._replace(person=None))
 
@@ -262,13 +330,18 @@ def test_without_cameras_masks_choose_in_each_photo(two_people):
 
 
 @pytest.mark.slow  # finds the cameras
-def test_start_goes_on_with_the_person_whom_the_keypoints_choose(two_people, detected, monkeypatch, capsys):
+def test_start_goes_on_with_the_person_whom_the_keypoints_choose(
+    two_people, detected, monkeypatch, capsys
+):
     strangers = detect.detect_photos(None, None)
 
     def with_strangers(names, photos):
         found = detect_photos(names, photos)
         others = [max(photo.people, key=lambda each: each.area) for photo in strangers]
-        return [dataclasses.replace(p, people=(other, *p.people)) for p, other in zip(found, others, strict=True)]
+        return [
+            dataclasses.replace(p, people=(other, *p.people))
+            for p, other in zip(found, others, strict=True)
+        ]
 
     monkeypatch.setattr(detect, "detect_photos", with_strangers)
     shutil.rmtree(two_people / "masks")
@@ -295,18 +368,34 @@ def test_photos_alone_are_enough(mine, detected, capsys):
     centers, true = (np.asarray(capture.cameras.center) for capture in (imported, truth))
     # of cameras without a common world: distances between them, over the first
     apart = lambda points: np.linalg.norm(points[1:] - points[0], axis=-1)
-    np.testing.assert_allclose(apart(centers) / apart(centers)[0], apart(true) / apart(true)[0], rtol=0.2)
+    np.testing.assert_allclose(
+        apart(centers) / apart(centers)[0], apart(true) / apart(true)[0], rtol=0.2
+    )
 
 
 def test_cameras_from_the_person_are_no_calibrated_ones_in_the_capture(tmp_path):
     points = np.full((1, 2, 2), 4.0)
-    seen = PersonViews(points, np.ones((1, 2)), np.ones((1, 2, 3)), ("nose", "neck"), ((8, 8),), np.asarray([8.0]), ("a.png",))
+    seen = PersonViews(
+        points,
+        np.ones((1, 2)),
+        np.ones((1, 2, 3)),
+        ("nose", "neck"),
+        ((8, 8),),
+        np.asarray([8.0]),
+        ("a.png",),
+    )
     cam_from_world = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
     camera = Camera.from_opencv([[8, 0, 4], [0, 8, 4], [0, 0, 1]], cam_from_world, 8, 8)
-    found = PersonCameras((0,), (camera,), np.ones((1, 2, 3)), np.zeros(1, bool), 1, np.zeros(1), ())
+    found = PersonCameras(
+        (0,), (camera,), np.ones((1, 2, 3)), np.zeros(1, bool), 1, np.zeros(1), ()
+    )
     (tmp_path / "photos").mkdir()
     write_png(tmp_path / "photos" / "a.png", np.ones((8, 8, 3)))
-    import_calibration(photos_alone._calibration(seen, found, tmp_path / "photos"), tmp_path / "photos", tmp_path / "me")
+    import_calibration(
+        photos_alone._calibration(seen, found, tmp_path / "photos"),
+        tmp_path / "photos",
+        tmp_path / "me",
+    )
     assert not load_photos(tmp_path / "me").calibrated
 
 
@@ -322,17 +411,23 @@ def test_refinement_takes_cameras_for_calibrated_if_the_capture_says_so(tmp_path
     demo = load_capture("demo_capture")
     alone = dataclasses.replace(demo.select([0]), frames=np.zeros(1, np.int32))
     for capture, calibrated in ((demo, True), (demo, False), (alone, True), (alone, False)):
-        save_capture(tmp_path / "me", dataclasses.replace(capture, calibrated=calibrated), overwrite=True)
+        save_capture(
+            tmp_path / "me", dataclasses.replace(capture, calibrated=calibrated), overwrite=True
+        )
         assert cli.execute(["fit", str(tmp_path / "me"), "--refine", "--overwrite"]) != 0
     starts = [usual_config(False, calibrated=calibrated) for calibrated in (True, False)] * 2
-    assert [config.keypoints_worse for config in configs] == [config.keypoints_worse for config in starts]
+    assert [config.keypoints_worse for config in configs] == [
+        config.keypoints_worse for config in starts
+    ]
     assert [config.fixed_cameras for config in configs] == [False, False, False, True]
 
 
 def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypatch):
     folders = [tmp_path / name for name in ("photos", "reduced")]
     (folders[0] / "left").mkdir(parents=True)
-    picture = Image.fromarray(np.kron(np.asarray([[0, 255]], np.uint8), np.ones((60, 60), np.uint8)))
+    picture = Image.fromarray(
+        np.kron(np.asarray([[0, 255]], np.uint8), np.ones((60, 60), np.uint8))
+    )
     picture.save(folders[0] / "left/a.png")
     lying = Image.Exif()
     lying[0x0112] = 6
@@ -343,7 +438,12 @@ def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypa
     found = photos_alone._reduced(folders[0], files, folders[1])
     assert [str(file.relative_to(folders[1])) for file in found] == ["left/a.png", "b.png"]
     first, second = (read_image(file)[0][..., 0] for file in found)
-    assert first.shape == (40, 80) and second.shape == (80, 40) and first[0, -1] == 1 and second[-1, 0] > 0.9 > 0.1 > second[0, 0]
+    assert (
+        first.shape == (40, 80)
+        and second.shape == (80, 40)
+        and first[0, -1] == 1
+        and second[-1, 0] > 0.9 > 0.1 > second[0, 0]
+    )
     shutil.copy(files[0], folders[0] / "b.png")  # of the same name, but for the suffix
     assert photos_alone._reduced(folders[0], [*files, folders[0] / "b.png"], folders[1]) == []
 
@@ -370,10 +470,14 @@ def test_without_the_detector_a_height_does_not_hide_how_to_install_it(mine, cap
     without(mine, "cameras", "masks", "keypoints")
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.78"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
-    assert "pip install 'humangs_jax[photos]'" in out and "cameras, masks and keypoints missing" in err
+    assert (
+        "pip install 'humangs_jax[photos]'" in out and "cameras, masks and keypoints missing" in err
+    )
 
 
-def test_a_run_that_was_interrupted_while_it_wrote_can_be_run_again(mine, detected, monkeypatch, capsys):
+def test_a_run_that_was_interrupted_while_it_wrote_can_be_run_again(
+    mine, detected, monkeypatch, capsys
+):
     """The mark of `start` appears together with the capture."""
     without(mine, *TOOLS)
 
@@ -399,16 +503,25 @@ def test_a_body_that_other_options_made_is_not_taken(mine, detected, capsys):
         write_json(Path("me") / name, content)
     Path("me/body.npz").touch()
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.8"]) == cli.BAD_USAGE
-    assert "--height: the body in me was made with 1.7: --overwrite begins anew" in capsys.readouterr().err
+    assert (
+        "--height: the body in me was made with 1.7: --overwrite begins anew"
+        in capsys.readouterr().err
+    )
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_DATA
     assert "begins anew" not in capsys.readouterr().err  # it goes on, to a capture without photos
 
 
-@pytest.mark.parametrize(("calibrated", "sheet"), [(True, "me/people.png"), (False, "me_people.png")])
-def test_two_people_are_refused_with_the_sheet_that_numbers_them(calibrated, sheet, mine, detected, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("calibrated", "sheet"), [(True, "me/people.png"), (False, "me_people.png")]
+)
+def test_two_people_are_refused_with_the_sheet_that_numbers_them(
+    calibrated, sheet, mine, detected, monkeypatch, capsys
+):
     without(mine, "masks", "keypoints", *([] if calibrated else ["cameras"]))
     found = detect.found_in_capture(Path("me"))
-    named = lambda names, photos: [dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)]
+    named = lambda names, photos: [
+        dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)
+    ]
     monkeypatch.setattr(detect, "detect_photos", named)
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert f"expected one. Person 0 to 1: numbers on {sheet}" in capsys.readouterr().err
@@ -424,7 +537,9 @@ def test_a_video_becomes_photos_beside_the_capture(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(blazepose, "available", lambda: False)
     Path("clips").mkdir()
     scenes = np.random.default_rng(0).uniform(0.1, 0.9, (3, 4, 6, 3))
-    write_video(Path("v.mp4"), [np.kron(scenes[i // 5], np.ones((12, 12, 1))) for i in range(15)], 10)
+    write_video(
+        Path("v.mp4"), [np.kron(scenes[i // 5], np.ones((12, 12, 1))) for i in range(15)], 10
+    )
     Path("v.mp4").rename("clips/me.MP4")
     command = ["start", "clips/me.MP4", "--out", "out/me", "--no-browser"]
     assert cli.execute(command) == cli.BAD_DATA  # there are no cameras
@@ -434,7 +549,9 @@ def test_a_video_becomes_photos_beside_the_capture(tmp_path, monkeypatch, capsys
     Path("out/me_photos/masks").mkdir()
     shutil.copy(photos[0], "out/me_photos/masks")
     before = {path: path.stat().st_mtime_ns for path in photos}
-    assert cli.execute([command[0], "clips", *command[2:]]) == cli.BAD_DATA  # the only video of a folder
+    assert (
+        cli.execute([command[0], "clips", *command[2:]]) == cli.BAD_DATA
+    )  # the only video of a folder
     out = capsys.readouterr().out
     assert "3 of 15 frames" in out and "masks:     out/me_photos/masks" in out
     assert {path: path.stat().st_mtime_ns for path in photos} == before
@@ -478,7 +595,12 @@ def test_folders_without_photos_and_captures_are_refused(mine):
 
 
 @pytest.mark.parametrize(
-    "files", [("capture.json", "body.npz"), ("capture.json", "pose.npz"), ("capture.json", "body.npz", "fit.json")]
+    "files",
+    [
+        ("capture.json", "body.npz"),
+        ("capture.json", "pose.npz"),
+        ("capture.json", "body.npz", "fit.json"),
+    ],
 )
 def test_a_capture_of_something_else_is_not_replaced(files, mine, capsys):
     Path("me").mkdir()
@@ -486,7 +608,9 @@ def test_a_capture_of_something_else_is_not_replaced(files, mine, capsys):
         Path("me", name).write_text("mine")
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE
     assert "--out me: the folder is not empty" in capsys.readouterr().err
-    assert {path.name: path.read_text() for path in Path("me").iterdir()} == dict.fromkeys(files, "mine")
+    assert {path.name: path.read_text() for path in Path("me").iterdir()} == dict.fromkeys(
+        files, "mine"
+    )
 
 
 def test_masks_that_are_there_may_be_left_out(mine, capsys):
@@ -507,16 +631,29 @@ def test_from_photos_to_the_page(mine, capsys, monkeypatch):
     monkeypatch.setattr(webbrowser, "open", opened.append)
     assert cli.execute(["start", str(mine), "--out", "me"]) == 0, capsys.readouterr().err
     out, _ = capsys.readouterr()
-    assert "keypoints, median error" in out and "silhouette IoU" in out and "next: humangs animate me/avatar.npz" in out
+    assert (
+        "keypoints, median error" in out
+        and "silhouette IoU" in out
+        and "next: humangs animate me/avatar.npz" in out
+    )
     assert "4 iterations and 0 steps" in out and "dB in the foreground" in out
     assert opened == [(Path("me").resolve() / "avatar.html").as_uri()]
     assert len(Avatar.load("me/avatar.npz").gaussians.means) > 10_000
     fitted = load_capture("me")
     # the world of the calibration, OpenCV's, was turned back to y up
-    np.testing.assert_allclose(fitted.cameras.cam_from_world, truth.cameras.cam_from_world, atol=1e-4)
-    error = np.linalg.norm(np.asarray(fitted.pose(0).translation) - np.asarray(truth.pose(0).translation))
+    np.testing.assert_allclose(
+        fitted.cameras.cam_from_world, truth.cameras.cam_from_world, atol=1e-4
+    )
+    error = np.linalg.norm(
+        np.asarray(fitted.pose(0).translation) - np.asarray(truth.pose(0).translation)
+    )
     assert error < 0.05
-    assert {path.name for path in Path("me").iterdir()} >= {"check.png", "avatar.html", "fit.json", "body.npz"}
+    assert {path.name for path in Path("me").iterdir()} >= {
+        "check.png",
+        "avatar.html",
+        "fit.json",
+        "body.npz",
+    }
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE  # finished
     Path("me/avatar.html").unlink()  # as after an interrupt
     written = Path("me/body.npz").stat().st_mtime_ns
@@ -549,7 +686,9 @@ def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, toy
     given = []
     reconstructed(monkeypatch, body, lambda others: given.append(others.names) or 0.0)
     found = held_out_psnr({}, tiny(), toy, None)
-    assert set(toy.names) - set(given[0]) == {found.name} and len(given[0]) == 4  # a copy in its place
+    assert (
+        set(toy.names) - set(given[0]) == {found.name} and len(given[0]) == 4
+    )  # a copy in its place
     assert found.psnr > 25 and found.name in str(found)
     reconstructed(monkeypatch, body, lambda _: 0.15)
     assert held_out_psnr({}, tiny(), toy, None).psnr < found.psnr - 3
@@ -571,16 +710,24 @@ def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
 def test_the_photo_that_is_held_out_of_a_person_who_turns_is_the_one_with_the_nearest_other():
     """Turning the person before one camera is going round the person with it, whichever frame a view shows."""
     angles = np.radians([0.0, 90.0, 200.0, 215.0])
-    around = orbit(jnp.zeros(3), 3.0, jnp.asarray(-angles), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8)
-    before = orbit(jnp.zeros(3), 3.0, jnp.zeros(4), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8)
+    around = orbit(
+        jnp.zeros(3), 3.0, jnp.asarray(-angles), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8
+    )
+    before = orbit(
+        jnp.zeros(3), 3.0, jnp.zeros(4), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8
+    )
     still, order = np.zeros((4, 1, 3), np.float32), np.asarray([2, 0, 3, 1])
     turning = still.copy()
     turning[order, 0, 1] = angles
     poses = lambda rotations: jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.zeros((4, 3)))
     K, matrices = before.K, before.cam_from_world
-    capture = capture_from_arrays(np.ones((4, 8, 8, 3)), K, matrices, np.zeros((1, 55, 3)), np.zeros((1, 3)))
+    capture = capture_from_arrays(
+        np.ones((4, 8, 8, 3)), K, matrices, np.zeros((1, 55, 3)), np.zeros((1, 3))
+    )
     of = lambda cameras, rotations: start._distances(
-        dataclasses.replace(capture, cameras=cameras, poses=poses(rotations), frames=order.astype(np.int32))
+        dataclasses.replace(
+            capture, cameras=cameras, poses=poses(rotations), frames=order.astype(np.int32)
+        )
     )
     found = of(before, turning)
     np.testing.assert_allclose(found, of(around, still), atol=1e-5)

@@ -49,9 +49,15 @@ def test_settings_come_back_from_their_file(name, tmp_path):
         ("{", "line 1: not valid JSON"),
         ("[]", 'expected "kind": "humangs_jax settings"'),
         ('{"kind": "humangs_jax settings"}', "config: expected an object, got None"),
-        ('{"kind": "humangs_jax settings", "settings": {"speed": 9}}', "config.speed: Settings has no such field"),
+        (
+            '{"kind": "humangs_jax settings", "settings": {"speed": 9}}',
+            "config.speed: Settings has no such field",
+        ),
         ('{"kind": "humangs_jax settings", "settings": {"views": "two"}}', "config.views"),
-        ('{"kind": "humangs_jax settings", "settings": {"views": 0}}', "config.views 0: expected 1 to 1,024"),
+        (
+            '{"kind": "humangs_jax settings", "settings": {"views": 0}}',
+            "config.views 0: expected 1 to 1,024",
+        ),
         ('{"kind": "humangs_jax settings", "settings": {"splat": "blurred"}}', "config.splat"),
     ],
 )
@@ -66,7 +72,10 @@ def test_what_is_wrong_in_a_file_of_settings_is_one_line(content, said, tmp_path
 
 def test_presets_have_one_set_of_names():
     assert tuple(PRESETS) == typing.get_args(Preset)
-    assert not Settings().refinement and PRESETS["best"].refinement.steps == PRESETS["best"].refine_steps
+    assert (
+        not Settings().refinement
+        and PRESETS["best"].refinement.steps == PRESETS["best"].refine_steps
+    )
 
 
 def test_what_a_shot_says_wins_over_the_settings():
@@ -92,10 +101,19 @@ shares = st.floats(0.05, 20)
 def fronts(draw):
     count = draw(st.integers(1, 8))
     rows = [
-        (draw(shares), draw(st.just(0.0) | shares), draw(shares), draw(st.floats(10, 2000)), draw(st.floats(15, 30)))
+        (
+            draw(shares),
+            draw(st.just(0.0) | shares),
+            draw(shares),
+            draw(st.floats(10, 2000)),
+            draw(st.floats(15, 30)),
+        )
         for _ in range(count)
     ]
-    return [FrontPoint(str(i), Settings(), m, r, f, mib, q, q - 1) for i, (m, r, f, mib, q) in enumerate(rows)]
+    return [
+        FrontPoint(str(i), Settings(), m, r, f, mib, q, q - 1)
+        for i, (m, r, f, mib, q) in enumerate(rows)
+    ]
 
 
 def searched(front, machine, budget):
@@ -106,25 +124,40 @@ def searched(front, machine, budget):
     return point, measured
 
 
-@given(fronts(), shares, shares, shares, st.floats(1, 3000), st.floats(1, 3000), st.floats(10, 2000))
-def test_the_choice_is_the_best_within_the_budget_where_ratios_carry_over(front, make, refine, frame, most, each, memory):
-    machine = lambda p: Cost(100 * make * p.make, 100 * refine * p.refine, 10 * frame * p.frame, p.memory_mb)
+@given(
+    fronts(), shares, shares, shares, st.floats(1, 3000), st.floats(1, 3000), st.floats(10, 2000)
+)
+def test_the_choice_is_the_best_within_the_budget_where_ratios_carry_over(
+    front, make, refine, frame, most, each, memory
+):
+    machine = lambda p: Cost(
+        100 * make * p.make, 100 * refine * p.refine, 10 * frame * p.frame, p.memory_mb
+    )
     budget = Budget(most, each, memory)
     for point in front:  # where a point is at the edge of the budget, rounding decides
         cost = machine(point)
-        assume(all(abs(a / b - 1) > 1e-6 for a, b in ((MARGIN * cost.reconstruct_ms, most), (MARGIN * cost.frame_ms, each))))
+        assume(
+            all(
+                abs(a / b - 1) > 1e-6
+                for a, b in ((MARGIN * cost.reconstruct_ms, most), (MARGIN * cost.frame_ms, each))
+            )
+        )
         assume(abs(cost.memory_mb / memory - 1) > 1e-6)
     allowed = [point for point in front if budget.allows(machine(point))]
     found, measured = searched(front, machine, budget)
     if not allowed:
         assert found is None
     else:
-        assert found.quality == max(point.quality for point in allowed) and budget.allows(measured[found.name])
+        assert found.quality == max(point.quality for point in allowed) and budget.allows(
+            measured[found.name]
+        )
 
 
 @given(fronts(), st.randoms(use_true_random=False), st.floats(1, 3000))
 def test_what_is_chosen_has_been_measured_within_the_budget_on_any_machine(front, random, most):
-    machine = lambda p: Cost(random.uniform(1, 3000), random.uniform(0, 3000) if p.refine else 0.0, 1.0)
+    machine = lambda p: Cost(
+        random.uniform(1, 3000), random.uniform(0, 3000) if p.refine else 0.0, 1.0
+    )
     budget = Budget(reconstruct_ms=most)
     found, measured = searched(front, machine, budget)
     assert len(measured) <= len(front)
@@ -133,7 +166,8 @@ def test_what_is_chosen_has_been_measured_within_the_budget_on_any_machine(front
 
 def test_a_choice_that_is_slower_the_second_time_is_not_taken(monkeypatch):
     fast, good = (
-        FrontPoint(n, Settings(views=v), float(v), 0.0, 1.0, 100.0, q, q) for n, v, q in (("a", 1, 20.0), ("b", 2, 25.0))
+        FrontPoint(n, Settings(views=v), float(v), 0.0, 1.0, 100.0, q, q)
+        for n, v, q in (("a", 1, 20.0), ("b", 2, 25.0))
     )
     times = {1: [30.0, 31.0], 2: [70.0, 90.0]}
     measure = lambda settings, *_: Cost(times[settings.views].pop(0), 0.0, 10.0, None)
@@ -156,16 +190,25 @@ def test_costs_are_extrapolated_from_the_nearest_measured_point():
 
 
 def test_what_is_given_up_is_said():
-    low, best = (FrontPoint(n, Settings(views=2), 1.0, 0.0, 1.0, 100.0, q, q - 2) for n, q in (("low", 20.0), ("best", 26.5)))
+    low, best = (
+        FrontPoint(n, Settings(views=2), 1.0, 0.0, 1.0, 100.0, q, q - 2)
+        for n, q in (("low", 20.0), ("best", 26.5))
+    )
     text = str(tuning.Tuned(low, Cost(210.0, 0.0, 12.5, 300.0), best, {}))
-    assert text.startswith("low") and "takes 210 ms a reconstruction, 12.5 ms a frame, 300 MiB" in text
-    assert "gives up 6.5 dB in the pose of the photos and 6.5 dB in novel poses against 'best'" in text
+    assert (
+        text.startswith("low") and "takes 210 ms a reconstruction, 12.5 ms a frame, 300 MiB" in text
+    )
+    assert (
+        "gives up 6.5 dB in the pose of the photos and 6.5 dB in novel poses against 'best'" in text
+    )
     assert "is the best of all settings" in str(tuning.Tuned(best, Cost(1.0, 0.0, 1.0), best, {}))
 
 
 def test_without_masks_nothing_that_refines_is_tried(monkeypatch):
     tried = []
-    monkeypatch.setattr(tuning, "measure", lambda settings, *_: tried.append(settings) or Cost(1.0, 0.0, 1.0))
+    monkeypatch.setattr(
+        tuning, "measure", lambda settings, *_: tried.append(settings) or Cost(1.0, 0.0, 1.0)
+    )
     capture = object.__new__(Capture)
     object.__setattr__(capture, "masks", None)
     tuned = tune({}, presets.tiny(), capture, frame_ms=1e9)
@@ -190,18 +233,52 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     save_weights(tmp_path / "tiny.safetensors", variables, config)
     small = Runtime(image_size=32)
     front = [
-        FrontPoint("one photo", Settings(views=1, runtime=small, splat="fast"), 0.5, 0.0, 0.8, 100.0, 20.0, 19.0),
-        FrontPoint("refined", Settings(runtime=small, refine_iterations=1, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0),
+        FrontPoint(
+            "one photo",
+            Settings(views=1, runtime=small, splat="fast"),
+            0.5,
+            0.0,
+            0.8,
+            100.0,
+            20.0,
+            19.0,
+        ),
+        FrontPoint(
+            "refined",
+            Settings(runtime=small, refine_iterations=1, refine_steps=3),
+            1.0,
+            2.0,
+            1.0,
+            150.0,
+            24.0,
+            21.0,
+        ),
     ]
-    assert tune(variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32, front=front).point.name == "refined"
+    assert (
+        tune(
+            variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32, front=front
+        ).point.name
+        == "refined"
+    )
     monkeypatch.setattr(tuning, "load_front", lambda: front)
-    command = ("tune", "someone", "--weights", "tiny.safetensors", "--size", "32", "--out", "tuned.json")
+    command = (
+        "tune",
+        "someone",
+        "--weights",
+        "tiny.safetensors",
+        "--size",
+        "32",
+        "--out",
+        "tuned.json",
+    )
 
     code, _, err = run(monkeypatch, capsys, *command, "--reconstruct-ms", "0.001")
     assert code == 1 and "no setting is within the budget" in err.splitlines()[-1]
     assert not (tmp_path / "tuned.json").exists()
 
-    code, out, err = run(monkeypatch, capsys, *command, "--reconstruct-ms", "1e7", "--frame-ms", "1e6")
+    code, out, err = run(
+        monkeypatch, capsys, *command, "--reconstruct-ms", "1e7", "--frame-ms", "1e6"
+    )
     assert code == 0, err
     assert "refined\n" in out and "is the best of all settings" in out
     assert load_settings(tmp_path / "tuned.json") == front[1].settings
@@ -210,7 +287,15 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     code, _, err = run_with("reconstruct", "someone", "--weights", "tiny.safetensors", "--no-check")
     assert code == 0 and len(Avatar.load("avatar.npz").gaussians.means), err
     save_capture(tmp_path / "unmasked", dataclasses.replace(capture, masks=None))
-    words = ("reconstruct", "unmasked", "--weights", "tiny.safetensors", "--no-check", "--out", "plain.npz")
+    words = (
+        "reconstruct",
+        "unmasked",
+        "--weights",
+        "tiny.safetensors",
+        "--no-check",
+        "--out",
+        "plain.npz",
+    )
     code, out, err = run(monkeypatch, capsys, *words, "--preset", "quality")
     assert code == 0 and "no masks: the avatar is not refined" in out + err, err
     code, _, err = run_with("render", "avatar.npz", "--size", "32", "--views", "2")

@@ -25,7 +25,10 @@ def make_avatar(seed=0):
 
 def make_pose(seed=1):
     rng = np.random.default_rng(seed)
-    return BodyPose(jnp.asarray(rng.normal(size=(3, 3)), jnp.float32), jnp.asarray(rng.normal(size=3), jnp.float32))
+    return BodyPose(
+        jnp.asarray(rng.normal(size=(3, 3)), jnp.float32),
+        jnp.asarray(rng.normal(size=3), jnp.float32),
+    )
 
 
 def test_a_gradient_with_regard_to_an_avatar_leaves_its_integers_out():
@@ -44,7 +47,9 @@ def test_a_gradient_with_regard_to_an_avatar_leaves_its_integers_out():
 def test_save_and_load_are_exact(tmp_path, functions):
     avatar = make_avatar()
     if functions:
-        harmonics = jnp.asarray(np.random.default_rng(1).normal(size=(12, functions, 3)), jnp.float32)
+        harmonics = jnp.asarray(
+            np.random.default_rng(1).normal(size=(12, functions, 3)), jnp.float32
+        )
         avatar = replace(avatar, gaussians=replace(avatar.gaussians, harmonics=harmonics))
     avatar.save(tmp_path / "a.npz")
     loaded = Avatar.load(tmp_path / "a.npz")
@@ -62,7 +67,9 @@ def test_batches_of_avatars_are_indexed_and_not_saved(tmp_path):
     assert batch[-1].parents == people[2].parents and batch
     with pytest.raises(ValueError, match=r"expected one avatar, got a batch \(3,\): save each"):
         batch.save(tmp_path / "all.npz")
-    with pytest.raises(ValueError, match=r"avatar\.rest_joints: expected shape \(3, 3\), got \(2, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"avatar\.rest_joints: expected shape \(3, 3\), got \(2, 3\)"
+    ):
         replace(people[0], rest_joints=people[0].rest_joints[:2]).save(tmp_path / "all.npz")
     assert not any(tmp_path.iterdir())
 
@@ -76,7 +83,9 @@ def test_what_a_file_cannot_hold_is_refused_and_short_numbers_become_float32(tmp
     short = jax.tree.map(lambda x: x.astype(jnp.bfloat16) if x.dtype == jnp.float32 else x, avatar)
     short.save(tmp_path / "a.npz")
     loaded = Avatar.load(tmp_path / "a.npz")
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.asarray(a, np.float32), b), short, loaded)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_array_equal(np.asarray(a, np.float32), b), short, loaded
+    )
     assert loaded.gaussians.means.dtype == jnp.float32
 
 
@@ -93,11 +102,20 @@ def test_no_avatar_is_written_that_could_not_be_read(tmp_path):
     path = tmp_path / "nobody.npz"
     for wrong, said in (
         (avatar.select(np.zeros(0, int)), "means: expected at least one Gaussian"),
-        (unlike(avatar, rest_vertices=jnp.zeros((0, 3))), "rest_vertices: expected at least one vertex"),
+        (
+            unlike(avatar, rest_vertices=jnp.zeros((0, 3))),
+            "rest_vertices: expected at least one vertex",
+        ),
         (unlike(avatar, means=drawn.means.at[3, 1].set(jnp.nan)), "means: expected numbers in"),
         (unlike(avatar, scales=drawn.scales.at[3, 1].set(jnp.inf)), "scales: expected numbers in"),
-        (unlike(avatar, rest_joints=avatar.rest_joints.at[0].set(jnp.inf)), "rest_joints: expected numbers in"),
-        (unlike(avatar, skinning_weights=0 * avatar.skinning_weights), "skinning_weights: expected rows with the sum 1"),
+        (
+            unlike(avatar, rest_joints=avatar.rest_joints.at[0].set(jnp.inf)),
+            "rest_joints: expected numbers in",
+        ),
+        (
+            unlike(avatar, skinning_weights=0 * avatar.skinning_weights),
+            "skinning_weights: expected rows with the sum 1",
+        ),
     ):
         with pytest.raises(FileError, match=said) as caught:
             wrong.save(path)
@@ -133,10 +151,15 @@ def test_a_rigid_motion_moves_everything_rigidly(skinning):
     from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 
     R, root = np.asarray(matrix_from_axis_angle(turn[0])), np.asarray(avatar.rest_joints[0])
-    expected = (np.asarray(avatar.gaussians.means) - root) @ R.T + root + np.asarray([0.1, 0.2, -0.3])
+    expected = (
+        (np.asarray(avatar.gaussians.means) - root) @ R.T + root + np.asarray([0.1, 0.2, -0.3])
+    )
     np.testing.assert_allclose(moved.means, expected, atol=1e-5)
     exact = R @ np.asarray(covariances(avatar.gaussians)) @ R.T
-    assert np.abs(np.asarray(covariances(moved)) - exact).max() < COVARIANCE_TOLERANCE * np.abs(exact).max()
+    assert (
+        np.abs(np.asarray(covariances(moved)) - exact).max()
+        < COVARIANCE_TOLERANCE * np.abs(exact).max()
+    )
 
 
 def test_five_arrays_say_what_the_deformation_says():
@@ -160,9 +183,21 @@ def test_ply_has_the_fields_of_rest_that_some_viewers_want(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda a, p: (a, replace(p, rotations=p.rotations.at[1, 2].set(jnp.nan))), r"pose\.rotations: .*\[1, 2\]: nan"),
-        (lambda a, p: (a, replace(p, translation=p.translation.at[0].set(jnp.inf))), r"pose\.translation"),
-        (lambda a, p: (replace(a, gaussians=replace(a.gaussians, opacities=a.gaussians.opacities + 9)), p), "opacities"),
+        (
+            lambda a, p: (a, replace(p, rotations=p.rotations.at[1, 2].set(jnp.nan))),
+            r"pose\.rotations: .*\[1, 2\]: nan",
+        ),
+        (
+            lambda a, p: (a, replace(p, translation=p.translation.at[0].set(jnp.inf))),
+            r"pose\.translation",
+        ),
+        (
+            lambda a, p: (
+                replace(a, gaussians=replace(a.gaussians, opacities=a.gaussians.opacities + 9)),
+                p,
+            ),
+            "opacities",
+        ),
         (lambda a, p: (a, replace(p, rotations=p.rotations[:1])), "expected one pose of 3 joints"),
         (lambda a, p: (a, jax.tree.map(lambda x: x[None], p)), "use jax.vmap for a batch of poses"),
     ],

@@ -68,7 +68,9 @@ class Case:
     bare: bool = False
 
     def __str__(self):
-        return "-".join([self.style, self.tokens, self.pool, *(flag for flag in FLAGS if getattr(self, flag))])
+        return "-".join(
+            [self.style, self.tokens, self.pool, *(flag for flag in FLAGS if getattr(self, flag))]
+        )
 
     @property
     def config(self) -> TrainConfig:
@@ -84,8 +86,14 @@ class Case:
             skinning_joints=JOINTS if self.bare else None,
         )
         model = model.with_parts(
-            encoder=dataclasses.replace(encoder, transformer=transformer, upsampler=None if self.bare else encoder.upsampler),
-            reader=dataclasses.replace(reader, output_width=None if self.bare else reader.output_width, sample_rgb=not published),
+            encoder=dataclasses.replace(
+                encoder, transformer=transformer, upsampler=None if self.bare else encoder.upsampler
+            ),
+            reader=dataclasses.replace(
+                reader,
+                output_width=None if self.bare else reader.output_width,
+                sample_rgb=not published,
+            ),
             decoder=decoder,
         )
         model = model.with_conventions(
@@ -96,8 +104,12 @@ class Case:
             ray_origins="twice_normalized" if published else "normalized",
         )
         remat = "full" if self.remat else "none"
-        model = model.with_runtime(tokens=self.tokens, token_capacity=40, remat=remat, scan=self.scan)
-        return TrainConfig(model=model, loss=LossConfig(structural_scales=2), target_size=TARGET_SIZE)
+        model = model.with_runtime(
+            tokens=self.tokens, token_capacity=40, remat=remat, scan=self.scan
+        )
+        return TrainConfig(
+            model=model, loss=LossConfig(structural_scales=2), target_size=TARGET_SIZE
+        )
 
 
 PUBLISHED = Case("published", "all", "all", remat=False)
@@ -107,7 +119,10 @@ SLOW = [
     Case("published", "foreground", "visible", remat=True),
     Case("published", "all", "visible", remat=True, train=True),
     Case("small", "all", "all", remat=True, train=True, scan=True),
-    *(Case(style, "foreground", "visible", remat=False, bare=True) for style in ("published", "small")),
+    *(
+        Case(style, "foreground", "visible", remat=False, bare=True)
+        for style in ("published", "small")
+    ),
 ]
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -138,7 +153,9 @@ def random_views(seed, count, size, betas):
     """Noise in a pose: images far from what they are to show give every pixel a say."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:size, :size] / size - 0.5
-    masks = np.broadcast_to((x / 0.25) ** 2 + (y / 0.45) ** 2 < 1, (count, size, size)).astype(np.float64)
+    masks = np.broadcast_to((x / 0.25) ** 2 + (y / 0.45) ** 2 < 1, (count, size, size)).astype(
+        np.float64
+    )
     return SubjectViews(
         images=jnp.asarray(rng.uniform(0.1, 0.9, (count, size, size, 3))),
         masks=jnp.asarray(masks),
@@ -161,7 +178,9 @@ def random_variables(config):
             return 1 + 0.1 * np.abs(noise)
         if names[-1] == "bias" and names[-2] == "geometry_out":
             bias = [0, 0, 0, 1, 0, 0, 0, -3, -3, -3]  # softplus(-3) is 5 cm
-            return np.tile(bias, len(noise) // len(bias)) + 0.2 * noise * (np.abs(np.tile(bias, len(noise) // 10)) > 0)
+            return np.tile(bias, len(noise) // len(bias)) + 0.2 * noise * (
+                np.abs(np.tile(bias, len(noise) // 10)) > 0
+            )
         small = 0.1 if names[-2] in ("geometry_out",) else 1.0
         fan_in = np.prod(leaf.shape[:-1]) if leaf.ndim > 1 else 100
         return small * noise / np.sqrt(fan_in)
@@ -175,7 +194,11 @@ def group_of(path):
         return "texture"
     if "class_token" in names:
         return "tokenizer"
-    return next({"reader": "upsampler"}.get(name, name) for name in names if name not in ("params", "encoder"))
+    return next(
+        {"reader": "upsampler"}.get(name, name)
+        for name in names
+        if name not in ("params", "encoder")
+    )
 
 
 @functools.cache
@@ -195,7 +218,9 @@ def subject(position_map):
     betas = jnp.asarray(np.random.default_rng(5).normal(size=4))
     prepare = jax.jit(prepare_inputs, static_argnames="config", compiler_options=in_a_hurry())
     config = tiny().with_conventions(position_map=position_map)
-    return prepare(body(), random_views(1, VIEWS, SIZE, betas), config=config), random_views(2, TARGETS, TARGET_SIZE, betas)
+    return prepare(body(), random_views(1, VIEWS, SIZE, betas), config=config), random_views(
+        2, TARGETS, TARGET_SIZE, betas
+    )
 
 
 def starting_point(inputs, targets, params):
@@ -208,7 +233,8 @@ def starting_point(inputs, targets, params):
     return {
         "params": params,
         "images": inputs.images,
-        "input_geometry": {name: getattr(inputs, name) for name in GEOMETRY} | {"position_maps": positions},
+        "input_geometry": {name: getattr(inputs, name) for name in GEOMETRY}
+        | {"position_maps": positions},
         "target_pose": {name: getattr(targets, name) for name in POSE},
         "target_cameras": targets.cameras,
     }
@@ -221,7 +247,9 @@ def compiled(case, dtype):
     variables = random_variables(config.model)
     inputs, targets = subject(config.model.conventions.position_map)
     point = starting_point(inputs, targets, variables["params"])
-    point, fixed, own_body = as_dtype((point, (inputs, targets, variables["batch_stats"]), body()), dtype)
+    point, fixed, own_body = as_dtype(
+        (point, (inputs, targets, variables["batch_stats"]), body()), dtype
+    )
 
     def loss(point, fixed):
         inputs, targets, batch_stats = fixed
@@ -231,7 +259,9 @@ def compiled(case, dtype):
         outputs, _ = apply_humangs(variables, inputs, config.model, case.train)
         given = as_jax(own_body), targets, targets, white_backgrounds(targets), config
         drawn = draw_targets(variables, outputs, *given)
-        terms = loss_terms(drawn, targets.images, targets.masks, targets.depths, config.loss, NO_NETWORKS)
+        terms = loss_terms(
+            drawn, targets.images, targets.masks, targets.depths, config.loss, NO_NETWORKS
+        )
         total = sum(getattr(config.loss, name) * term for name, term in terms.items())
         return total, {
             "overflow": jnp.sum(drawn.rendering.overflow),
@@ -266,7 +296,9 @@ def random_direction(point, paths, rng):
 
 
 def inner(a, b):
-    return sum(float(np.vdot(x, y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    return sum(
+        float(np.vdot(x, y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
 
 
 @pytest.mark.slow
@@ -277,7 +309,9 @@ def test_gradients_agree_with_differences(case):
     assert int(facts["overflow"]) == int(facts["dropped"]) == 0
     assert SEEN[0] < np.mean(facts["alpha"]) < SEEN[1]
     rng = np.random.default_rng(3)
-    assert set(by_group(point)) == {*PARAMETER_GROUPS, *OTHERS} - ({"upsampler"} if case.bare else set())
+    assert set(by_group(point)) == {*PARAMETER_GROUPS, *OTHERS} - (
+        {"upsampler"} if case.bare else set()
+    )
     for group, paths in by_group(point).items():
         direction = random_direction(point, paths, rng)
         derivative = inner(gradients, direction)
@@ -287,7 +321,9 @@ def test_gradients_agree_with_differences(case):
         assert expected > SMALLEST_DERIVATIVE, f"nothing depends on {group}"
 
         def value(step, direction=direction):
-            return float(function(jax.tree.map(lambda x, d: x + step * d, point, direction), fixed)[0][0])
+            return float(
+                function(jax.tree.map(lambda x, d: x + step * d, point, direction), fixed)[0][0]
+            )
 
         errors = []
         for change in CHANGES:
@@ -309,10 +345,20 @@ def turned_away(cameras):
 def nobody_in_the_photos(point, fixed):
     """White photos, and a body that stands beside what they show."""
     inputs, *rest = fixed
-    blank = replace(inputs, depth_maps=-np.ones_like(inputs.depth_maps), foreground=np.zeros_like(inputs.foreground))
+    blank = replace(
+        inputs,
+        depth_maps=-np.ones_like(inputs.depth_maps),
+        foreground=np.zeros_like(inputs.foreground),
+    )
     geometry = point["input_geometry"]
-    nowhere = {"position_maps": np.ones_like(inputs.position_maps), "posed_vertices": geometry["posed_vertices"] + 10.0}
-    return point | {"images": np.ones_like(point["images"]), "input_geometry": geometry | nowhere}, (blank, *rest)
+    nowhere = {
+        "position_maps": np.ones_like(inputs.position_maps),
+        "posed_vertices": geometry["posed_vertices"] + 10.0,
+    }
+    return point | {
+        "images": np.ones_like(point["images"]),
+        "input_geometry": geometry | nowhere,
+    }, (blank, *rest)
 
 
 def subject_behind_the_cameras(point, fixed):
@@ -326,7 +372,9 @@ def subject_behind_the_cameras(point, fixed):
 def vertices_in_the_cameras(point, fixed):
     """Every posed vertex at its camera's centre: nothing divides by its depth."""
     geometry = point["input_geometry"]
-    centers = np.broadcast_to(as_jax(geometry["cameras"]).center[:, None], geometry["posed_vertices"].shape)
+    centers = np.broadcast_to(
+        as_jax(geometry["cameras"]).center[:, None], geometry["posed_vertices"].shape
+    )
     return point | {"input_geometry": geometry | {"posed_vertices": centers}}, fixed
 
 
@@ -335,7 +383,12 @@ def every_gaussian_culled(point, fixed):
     return point | {"target_cameras": turned_away(point["target_cameras"])}, fixed
 
 
-DEGENERATE = (nobody_in_the_photos, subject_behind_the_cameras, vertices_in_the_cameras, every_gaussian_culled)
+DEGENERATE = (
+    nobody_in_the_photos,
+    subject_behind_the_cameras,
+    vertices_in_the_cameras,
+    every_gaussian_culled,
+)
 
 
 @pytest.mark.slow
@@ -358,10 +411,18 @@ def test_gradients_are_finite_where_there_is_nothing_to_see(case, degenerate, dt
 @pytest.mark.slow
 @pytest.mark.parametrize("case", FAST, ids=str)
 def test_gradients_in_float32_point_the_same_way(case):
-    gradients = [function(point, fixed)[1] for function, point, fixed in (compiled(case, x) for x in DTYPES)]
+    gradients = [
+        function(point, fixed)[1] for function, point, fixed in (compiled(case, x) for x in DTYPES)
+    ]
     for group, paths in by_group(gradients[0]).items():
         chosen = [
-            np.concatenate([np.ravel(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(x) if path in paths])
+            np.concatenate(
+                [
+                    np.ravel(leaf)
+                    for path, leaf in jax.tree_util.tree_leaves_with_path(x)
+                    if path in paths
+                ]
+            )
             for x in gradients
         ]
         cosine = np.dot(*chosen) / np.prod([np.linalg.norm(x) for x in chosen])

@@ -16,7 +16,14 @@ from scipy.spatial.transform import Rotation
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import mesh as mesh_export
-from humangs_jax.avatar.export.mesh import BodyMesh, body_mesh, skin_colors, strongest, vertex_weights, write_mesh_glb
+from humangs_jax.avatar.export.mesh import (
+    BodyMesh,
+    body_mesh,
+    skin_colors,
+    strongest,
+    vertex_weights,
+    write_mesh_glb,
+)
 from humangs_jax.avatar.export.splats import write_glb
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import RestBody
@@ -77,7 +84,9 @@ def mesh():
     vertices, weights = np.asarray(one.rest_vertices), np.asarray(one.skinning_weights)[::2]
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     texture = np.full((4, 4, 3), 128, np.uint8)
-    return BodyMesh(vertices, normals, np.asarray(one.faces), vertices[:, :2] * 0.5 + 0.5, texture, weights)
+    return BodyMesh(
+        vertices, normals, np.asarray(one.faces), vertices[:, :2] * 0.5 + 0.5, texture, weights
+    )
 
 
 def dance(frames=3):
@@ -97,7 +106,9 @@ def test_the_outermost_gaussians_give_the_skin_its_color():
         jnp.asarray([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
     )
     points = np.asarray([[0, 0, 0], [1, 0, 0], [9, 0, 0]], np.float32)
-    seen = skin_colors(replace(one, gaussians=sheets), points, np.tile(np.float32([0, 0, 1]), (3, 1)))
+    seen = skin_colors(
+        replace(one, gaussians=sheets), points, np.tile(np.float32([0, 0, 1]), (3, 1))
+    )
     np.testing.assert_allclose(seen[0], [0.75 / 0.975, 0, 0.225 / 0.975], atol=1e-3)
     np.testing.assert_allclose(seen[1:], [[0, 1, 0], [0, 1, 0]], atol=1e-3)
     behind = skin_colors(replace(one, gaussians=sheets), points[:1], np.float32([[0, 0, -1]]))
@@ -111,11 +122,18 @@ def test_vertices_have_the_weights_of_their_gaussians_also_after_refinement():
     added = replace(
         one,
         gaussians=replace(
-            one.gaussians, **{k: jnp.concatenate([v, v[:1]]) for k, v in vars(one.gaussians).items() if v is not None}
+            one.gaussians,
+            **{
+                k: jnp.concatenate([v, v[:1]])
+                for k, v in vars(one.gaussians).items()
+                if v is not None
+            },
         ),
         skinning_weights=jnp.concatenate([one.skinning_weights, one.skinning_weights[:1]]),
     )
-    assert np.abs(vertex_weights(added) - own).max() < 0.35 and np.allclose(vertex_weights(added).sum(1), 1, atol=1e-5)
+    assert np.abs(vertex_weights(added) - own).max() < 0.35 and np.allclose(
+        vertex_weights(added).sum(1), 1, atol=1e-5
+    )
     joints, kept = strongest(np.asarray([[0.1, 0.0, 0.4, 0.2, 0.2, 0.1], [0, 1.0, 0, 0, 0, 0]]))
     assert joints.tolist()[1] == [1, 0, 0, 0] and set(joints[0][:3]) == {2, 3, 4}
     np.testing.assert_allclose(kept.sum(1), 1)
@@ -146,7 +164,9 @@ def skinned(path, frame):
         values[channel["target"]["node"], channel["target"]["path"]] = get(sampler["output"])[frame]
     for i, node in enumerate(nodes):
         matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat(values.get((i, "rotation"), node.get("rotation", [0, 0, 0, 1]))).as_matrix()
+        matrix[:3, :3] = Rotation.from_quat(
+            values.get((i, "rotation"), node.get("rotation", [0, 0, 0, 1]))
+        ).as_matrix()
         matrix[:3, 3] = values.get((i, "translation"), node.get("translation", [0, 0, 0]))
         local.append(matrix)
     above = {child: i for i, node in enumerate(nodes) for child in node.get("children", [])}
@@ -154,7 +174,11 @@ def skinned(path, frame):
     skin, part = content["skins"][0], content["meshes"][0]["primitives"][0]["attributes"]
     bind = get(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
     matrices = np.stack([world(j) @ b for j, b in zip(skin["joints"], bind, strict=True)])
-    joints, weights, points = get(part["JOINTS_0"]).astype(int), get(part["WEIGHTS_0"]), get(part["POSITION"])
+    joints, weights, points = (
+        get(part["JOINTS_0"]).astype(int),
+        get(part["WEIGHTS_0"]),
+        get(part["POSITION"]),
+    )
     blended = np.einsum("uk,ukab->uab", weights, matrices[joints])
     return np.einsum("uab,ub->ua", blended[:, :3, :3], points) + blended[:, :3, 3]
 
@@ -164,23 +188,33 @@ def test_the_skin_moves_the_mesh_as_we_do(tmp_path, up):
     one, shape = avatar(), mesh()
     joints, kept = strongest(shape.weights)
     four = np.zeros_like(shape.weights)
-    np.put_along_axis(four, joints, kept, axis=1)  # ours with the weights that the file has room for
+    np.put_along_axis(
+        four, joints, kept, axis=1
+    )  # ours with the weights that the file has room for
     motion = grounded(dance(), RestBody(one.rest_vertices, one.rest_joints), PARENTS)
     write_mesh_glb(tmp_path / "a.glb", one, shape, motion, up=up)
     turn = np.asarray({"y": np.eye(3), "z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}[up], float)
     for frame in range(3):
-        moved = type(shape)(**{**vars(shape), "weights": four}).posed(one, motion.pose(frame)).vertices
+        moved = (
+            type(shape)(**{**vars(shape), "weights": four}).posed(one, motion.pose(frame)).vertices
+        )
         np.testing.assert_allclose(skinned(tmp_path / "a.glb", frame), moved @ turn.T, atol=2e-5)
     write_mesh_glb(tmp_path / "b.glb", one, shape)
     still = skinned(tmp_path / "b.glb", 0)
-    np.testing.assert_allclose(still, shape.vertices - [0, shape.vertices[:, 1].min(), 0], atol=2e-5)
+    np.testing.assert_allclose(
+        still, shape.vertices - [0, shape.vertices[:, 1].min(), 0], atol=2e-5
+    )
 
 
 def test_a_motion_that_was_exported_is_read_again(tmp_path):
     one, motion = avatar(), dance(4)
     write_mesh_glb(tmp_path / "a.glb", one, mesh(), motion)
     back = load_motion(tmp_path / "a.glb", rest_joints=one.rest_joints)
-    matrices = lambda m: Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3)).as_matrix().reshape(4, 55, 3, 3)
+    matrices = lambda m: (
+        Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
+        .as_matrix()
+        .reshape(4, 55, 3, 3)
+    )
     np.testing.assert_allclose(matrices(back), matrices(motion), atol=1e-4)
     moved = np.asarray(back.translations - motion.translations)
     np.testing.assert_allclose(moved - moved[0], 0, atol=1e-4)
@@ -192,18 +226,27 @@ def test_numbers_of_turns_never_jump_between_frames(tmp_path):
     angles = (np.linspace(0, 4 * np.pi, 25) + np.pi) % (2 * np.pi) - np.pi
     rotations = np.zeros((25, 55, 3))
     rotations[:, 0, 1], rotations[:, 3, 0] = angles, -angles
-    write_mesh_glb(tmp_path / "a.glb", avatar(), mesh(), Motion(jnp.asarray(rotations, jnp.float32), jnp.zeros((25, 3))))
+    write_mesh_glb(
+        tmp_path / "a.glb",
+        avatar(),
+        mesh(),
+        Motion(jnp.asarray(rotations, jnp.float32), jnp.zeros((25, 3))),
+    )
     content, binary = parse_glb((tmp_path / "a.glb").read_bytes())
     tracks = [x for x in content["animations"][0]["channels"] if x["target"]["path"] == "rotation"]
     assert len(tracks) == 2
     for track in tracks:
-        quats = read_accessor(content, binary, content["animations"][0]["samplers"][track["sampler"]]["output"])
+        quats = read_accessor(
+            content, binary, content["animations"][0]["samplers"][track["sampler"]]["output"]
+        )
         assert np.abs(np.diff(quats, axis=0)).max() < 0.3  # a twelfth of a turn
 
 
 def test_bodies_without_faces_and_textures_of_other_sizes_are_refused():
     for size in (64, 1000):
-        with pytest.raises(ValueError, match=f"texture of {size} texels a side: expected a multiple of 128"):
+        with pytest.raises(
+            ValueError, match=f"texture of {size} texels a side: expected a multiple of 128"
+        ):
             body_mesh(avatar(), size)
     with pytest.raises(ValueError, match="faces and Gaussians"):
         body_mesh(replace(avatar(), faces=avatar().faces[:0]))
@@ -226,8 +269,14 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     seen = read.visual.to_color().vertex_colors[:, :3] / 255
     placed = np.asarray(read.vertices) + np.asarray([0, low, 0])
     np.testing.assert_allclose(seen, color_at(placed), atol=0.06)
-    assert (np.asarray(read.vertex_normals) * (read.vertices - read.vertices.mean(0))).sum(1).min() > 0
-    monkeypatch.setattr(sys, "argv", [*export, "--motion", str(tmp_path / "dance.npz"), "--frames", "::2", "--up", "z"])
+    assert (np.asarray(read.vertex_normals) * (read.vertices - read.vertices.mean(0))).sum(
+        1
+    ).min() > 0
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [*export, "--motion", str(tmp_path / "dance.npz"), "--frames", "::2", "--up", "z"],
+    )
     cli.main()
     names = {path.name for path in tmp_path.glob("x*")}
     assert names == {"x.obj", "x_0000.obj", "x_0002.obj", "x.mtl", "x.png"}
@@ -235,10 +284,14 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     placed = grounded(dance(), RestBody(one.rest_vertices, one.rest_joints), PARENTS)
     expected = textured().posed(one, placed.pose(2)).vertices
     frame = trimesh.load(tmp_path / "x_0002.obj", process=False)
-    np.testing.assert_allclose(frame.vertices, expected @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-5)
+    np.testing.assert_allclose(
+        frame.vertices, expected @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-5
+    )
 
 
-@pytest.mark.skipif(not VALIDATOR.exists(), reason="needs npm's gltf-validator (HUMANGS_NPM: its folder)")
+@pytest.mark.skipif(
+    not VALIDATOR.exists(), reason="needs npm's gltf-validator (HUMANGS_NPM: its folder)"
+)
 @pytest.mark.slow
 def test_khronos_validator_finds_nothing(tmp_path):
     """No issue at all with the mesh; with the Gaussians only that it does not know the extension."""
@@ -254,7 +307,10 @@ def test_khronos_validator_finds_nothing(tmp_path):
     assert found["mesh"] == []
     codes = {issue["code"] for issue in found["gaussians"]}
     assert codes == {"UNSUPPORTED_EXTENSION", "MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
-    assert all("KHR_gaussian_splatting" in issue["pointer"] + issue["message"] for issue in found["gaussians"])
+    assert all(
+        "KHR_gaussian_splatting" in issue["pointer"] + issue["message"]
+        for issue in found["gaussians"]
+    )
 
 
 THROUGH_BLENDER = """
@@ -280,7 +336,9 @@ bpy.ops.export_anim.bvh(filepath=f"{folder}/theirs.bvh", frame_start=0, frame_en
 """
 
 
-@pytest.mark.skipif(not BLENDER, reason="needs a Python with Blender's module bpy (HUMANGS_BLENDER: its path)")
+@pytest.mark.skipif(
+    not BLENDER, reason="needs a Python with Blender's module bpy (HUMANGS_BLENDER: its path)"
+)
 @pytest.mark.slow
 def test_blender_shows_our_frames_and_we_read_its_files(tmp_path):
     """Vertices of a frame in Blender are ours with z up; its .glb and .bvh of our motion are that motion."""
@@ -288,11 +346,17 @@ def test_blender_shows_our_frames_and_we_read_its_files(tmp_path):
     rest = RestBody(one.rest_vertices, one.rest_joints)
     motion = grounded(dance(4), rest, PARENTS)
     write_mesh_glb(tmp_path / "ours.glb", one, mesh(), motion)
-    done = subprocess.run([BLENDER, "-c", THROUGH_BLENDER, tmp_path], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [BLENDER, "-c", THROUGH_BLENDER, tmp_path], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     shown = np.load(tmp_path / "frame.npy") @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # z up to y up
     np.testing.assert_allclose(shown, skinned(tmp_path / "ours.glb", 2), atol=1e-4)
-    matrices = lambda m: Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3)).as_matrix().reshape(4, 55, 3, 3)
+    matrices = lambda m: (
+        Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
+        .as_matrix()
+        .reshape(4, 55, 3, 3)
+    )
     for name in ("theirs.glb", "theirs.bvh"):
         back = grounded(load_motion(tmp_path / name, rest_joints=one.rest_joints), rest, PARENTS)
         np.testing.assert_allclose(matrices(back), matrices(motion), atol=1e-3, err_msg=name)

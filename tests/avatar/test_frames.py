@@ -23,9 +23,17 @@ PIXEL_ROUNDING = 2e-2
 
 def blobs(count=80):
     rng = np.random.default_rng(0)
-    means = np.concatenate([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(3, 4, (count, 1))], axis=1)
+    means = np.concatenate(
+        [rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(3, 4, (count, 1))], axis=1
+    )
     quats = np.tile([1.0, 0, 0, 0], (count, 1))
-    arrays = means, quats, np.full((count, 3), 0.02), np.full(count, 0.8), rng.uniform(size=(count, 3))
+    arrays = (
+        means,
+        quats,
+        np.full((count, 3), 0.02),
+        np.full(count, 0.8),
+        rng.uniform(size=(count, 3)),
+    )
     return Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
 
 
@@ -33,9 +41,14 @@ def blobs(count=80):
 def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
     plans, gaussians = [], blobs()
     real = frames.plan_buffers
-    monkeypatch.setattr(frames, "plan_buffers", lambda *arguments: plans.append(1) or real(*arguments))
+    monkeypatch.setattr(
+        frames, "plan_buffers", lambda *arguments: plans.append(1) or real(*arguments)
+    )
     focal = [5.0, 5.2, 150.0, 6.0]  # the third one comes close
-    cameras = [Camera(jnp.asarray([[f, 0, 36], [0, f, 36], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64) for f in focal]
+    cameras = [
+        Camera(jnp.asarray([[f, 0, 36], [0, f, 36], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64)
+        for f in focal
+    ]
     drawn = list(frames.draw_gaussians(iter([gaussians] * 4), iter(cameras)))
     assert len(plans) == 2
     for rendering, camera in zip(drawn, cameras, strict=True):
@@ -46,7 +59,9 @@ def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
 def test_each_camera_has_its_exposure(monkeypatch):
     gaussians = blobs()
     monkeypatch.setattr(frames, "posed", lambda avatar, pose: gaussians)
-    camera = Camera(jnp.asarray([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64)
+    camera = Camera(
+        jnp.asarray([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64
+    )
     pose = BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
     gains, how = np.asarray([[1.0, 1, 1], [0.5, 0.7, 0.9]]), SPLAT_PRESETS["exact"]
     plain, darker = frames.draw(two_balls(), [pose] * 2, [camera] * 2, jnp.zeros(3), how, gains)
@@ -70,7 +85,10 @@ def walker(metres=3.0, frames_per_second=30, seconds=3.0):
     """A box 1.7 m high that walks along x, bobbing and swaying at the pace of steps."""
     count = int(seconds * frames_per_second)
     time = np.arange(count) / frames_per_second
-    path = np.stack([metres * time / seconds, 0.03 * np.sin(4 * np.pi * time), 0.05 * np.sin(2 * np.pi * time)], axis=-1)
+    path = np.stack(
+        [metres * time / seconds, 0.03 * np.sin(4 * np.pi * time), 0.05 * np.sin(2 * np.pi * time)],
+        axis=-1,
+    )
     box = np.stack(np.meshgrid([-0.3, 0.3], [0, 1.7], [-0.2, 0.2]), axis=-1).reshape(-1, 3)
     return path[:, None] + box
 
@@ -78,7 +96,9 @@ def walker(metres=3.0, frames_per_second=30, seconds=3.0):
 SHOTS = {
     "square": Shot(),
     "portrait from above": Shot(width=90, height=160, azimuth=40.0, elevation=50.0),
-    "landscape, wide angle, from behind": Shot(width=640, height=200, azimuth=200.0, fov=90.0, elevation=-20.0),
+    "landscape, wide angle, from behind": Shot(
+        width=640, height=200, azimuth=200.0, fov=90.0, elevation=-20.0
+    ),
 }
 
 
@@ -90,7 +110,9 @@ def test_the_camera_is_as_near_as_everything_fits(name, smoothing):
     size = np.asarray(shot.resolution)
     assert (cameras.width, cameras.height) == shot.resolution and len(cameras) == len(points)
     from_middle = np.abs(pixels(cameras, points) - size / 2) / (size / 2)
-    np.testing.assert_allclose(from_middle.max(), 1 / frames.MARGIN, atol=PIXEL_ROUNDING / size.min() * 2)
+    np.testing.assert_allclose(
+        from_middle.max(), 1 / frames.MARGIN, atol=PIXEL_ROUNDING / size.min() * 2
+    )
 
 
 def test_the_camera_goes_along_and_does_not_bob():
@@ -102,10 +124,14 @@ def test_the_camera_goes_along_and_does_not_bob():
     still = frames.shot_cameras(shot, points, np.zeros(len(points)), None)
     assert np.ptp(pixels(still, points)[..., 1], axis=1).max() < 50
     middle = 0.5 * (seen.min(axis=1) + seen.max(axis=1))
-    assert np.abs(middle[:, 0] - 50).max() < 3  # in the middle of the image, at the ends of the walk, too
+    assert (
+        np.abs(middle[:, 0] - 50).max() < 3
+    )  # in the middle of the image, at the ends of the walk, too
     eyes = np.asarray(cameras.center)
     np.testing.assert_allclose(np.diff(eyes[:, 0]), 3.0 / 90, rtol=1e-2)
-    assert np.ptp(eyes[:, 1]) < 0.25 * 0.06  # the head moves by 0.06; at the ends the path is mirrored at a point of that
+    assert (
+        np.ptp(eyes[:, 1]) < 0.25 * 0.06
+    )  # the head moves by 0.06; at the ends the path is mirrored at a point of that
 
 
 def test_distance_and_angles_are_those_that_are_asked_for():
@@ -126,17 +152,23 @@ def test_smoothing_keeps_straight_paths_and_short_ones():
     assert frames.smoothed_path(line[:1], 5.0).shape == (1, 3)
     wave = np.sin(np.arange(200))[:, None] * [1.0, 1.0, 1.0]
     assert np.abs(frames.smoothed_path(wave, 6.0)[30:-30]).max() < 1e-3
-    np.testing.assert_allclose(frames.smoothed_path(wave, 1e12), frames.smoothed_path(wave, 500.0), atol=1e-6)
+    np.testing.assert_allclose(
+        frames.smoothed_path(wave, 1e12), frames.smoothed_path(wave, 500.0), atol=1e-6
+    )
 
 
 def test_a_turntable_shows_the_person_from_all_sides():
     avatar = two_balls(2)
-    poses, cameras = frames.turntable_views(avatar, frames.rest_pose_of(avatar), 4, Shot(elevation=0.0))
+    poses, cameras = frames.turntable_views(
+        avatar, frames.rest_pose_of(avatar), 4, Shot(elevation=0.0)
+    )
     assert len(poses) == len(cameras) == 4
     middle = CENTRES.mean(axis=0)
     directions = np.asarray(cameras.center) - middle
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    np.testing.assert_allclose(directions, [[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]], atol=0.02)
+    np.testing.assert_allclose(
+        directions, [[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]], atol=0.02
+    )
     with pytest.raises(ValueError, match="views 0: expected at least 1"):
         frames.turntable_views(avatar, frames.rest_pose_of(avatar), 0, Shot())
 
@@ -145,7 +177,9 @@ def test_what_is_tracked_moves_with_the_joints():
     avatar = two_balls(2)
     rotations = np.zeros((2, 3, 3), np.float32)
     rotations[1, 0] = [0, 0, np.pi / 2]  # about the lower ball's centre: the upper one goes to -x
-    poses = jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray([[0, 0, 0], [0, 0, 2.0]], jnp.float32))
+    poses = jax.vmap(BodyPose)(
+        jnp.asarray(rotations), jnp.asarray([[0, 0, 0], [0, 0, 2.0]], jnp.float32)
+    )
     points = frames.tracked_points(avatar, poses)
     still, turned = (0.5 * (frame.min(axis=0) + frame.max(axis=0)) for frame in points)
     np.testing.assert_allclose(still, CENTRES.mean(axis=0), atol=0.02)
@@ -168,7 +202,9 @@ def test_the_a_pose_lowers_the_arms():
 
 
 def walk(count=24, fps=24.0):
-    path = np.stack([np.zeros(count), 1 + 0.1 * np.sin(np.arange(count)), 0.05 * np.arange(count)], axis=-1)
+    path = np.stack(
+        [np.zeros(count), 1 + 0.1 * np.sin(np.arange(count)), 0.05 * np.arange(count)], axis=-1
+    )
     turns = np.random.default_rng(0).normal(size=(count, 3, 3))
     return Motion(jnp.asarray(turns, jnp.float32), jnp.asarray(path, jnp.float32), fps)
 
@@ -188,12 +224,16 @@ def test_a_loop_goes_on_where_it_was():
     motion = walk()
     twice = frames.excerpt(motion, loop=3)
     path = np.asarray(twice.translations)
-    np.testing.assert_allclose(np.diff(path[:, 2]), 0.05, atol=1e-5)  # no step back, no step of another length
+    np.testing.assert_allclose(
+        np.diff(path[:, 2]), 0.05, atol=1e-5
+    )  # no step back, no step of another length
     np.testing.assert_allclose(path[24:48, 1], path[:24, 1], atol=1e-6)
     np.testing.assert_array_equal(twice.rotations[24:48], motion.rotations)
 
 
-@pytest.mark.parametrize("times", [(-0.1, None), (0.5, 0.5), (0.5, 0.2), (0.0, 1.2), (1.0, None), (float("nan"), None)])
+@pytest.mark.parametrize(
+    "times", [(-0.1, None), (0.5, 0.5), (0.5, 0.2), (0.0, 1.2), (1.0, None), (float("nan"), None)]
+)
 def test_times_outside_of_the_motion_are_named(times):
     with pytest.raises(ValueError, match=r"start .*stop .*expected 0 <= start < stop <= 1,"):
         frames.excerpt(walk(), *times)
@@ -206,10 +246,14 @@ def test_what_is_behind_the_person():
     rng = np.random.default_rng(0)
     alpha = np.concatenate([[0.0, 1.0], rng.random(10)]).reshape(3, 4).astype(np.float32)
     own = rng.random((3, 4, 3)).astype(np.float32)
-    rendering = Rendering(jnp.asarray(own * alpha[..., None]), jnp.asarray(alpha), jnp.zeros((3, 4)), jnp.int32(0))
+    rendering = Rendering(
+        jnp.asarray(own * alpha[..., None]), jnp.asarray(alpha), jnp.zeros((3, 4)), jnp.int32(0)
+    )
     color = (0.1, 0.5, 0.9)
     opaque, clear = frames.image_of(rendering, color), frames.image_of(rendering, None)
-    np.testing.assert_allclose(opaque, own * alpha[..., None] + (1 - alpha[..., None]) * color, atol=ROUNDING)
+    np.testing.assert_allclose(
+        opaque, own * alpha[..., None] + (1 - alpha[..., None]) * color, atol=ROUNDING
+    )
     assert clear.shape == (3, 4, 4) and np.isfinite(clear).all() and not clear[0, 0].any()
     over = clear[..., :3] * clear[..., 3:] + (1 - clear[..., 3:]) * np.asarray(color)
     np.testing.assert_allclose(over, opaque, atol=ROUNDING)
@@ -248,7 +292,12 @@ def test_a_shot_that_cannot_be_taken_is_named(message):
 
 
 def test_colors_have_names_and_numbers():
-    assert Shot().color() == (1, 1, 1) == Shot(background="#ffffff").color() == Shot(background="rgb(255,255,255)").color()
+    assert (
+        Shot().color()
+        == (1, 1, 1)
+        == Shot(background="#ffffff").color()
+        == Shot(background="rgb(255,255,255)").color()
+    )
     assert Shot(background=" Transparent ").color() is None
     assert Shot(background="#336699").color() == (0.2, 0.4, 0.6)
     assert Shot(width=20).resolution == (20, 512) and Shot(size=9, height=5).resolution == (9, 5)

@@ -8,7 +8,15 @@ from avatar_cases import two_balls
 from changes import edit_npz
 
 from humangs_jax.avatar.animate import animate, skin
-from humangs_jax.avatar.avatar import LIMIT, Avatar, Light, light_terms, relit, surface_normals, turned_normals
+from humangs_jax.avatar.avatar import (
+    LIMIT,
+    Avatar,
+    Light,
+    light_terms,
+    relit,
+    surface_normals,
+    turned_normals,
+)
 from humangs_jax.avatar.reconstruct import with_light
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
@@ -63,7 +71,9 @@ def test_turned_parts_are_lit_from_where_they_were(person):
     truth = lit(avatar, albedo, TURNED).gaussians.colors
     assert jnp.abs(avatar.gaussians.colors - truth).mean() > 5 * ESTIMATED
     assert jnp.abs(skin(avatar, TURNED).colors - truth).max() < ESTIMATED
-    np.testing.assert_allclose(animate(avatar, TURNED).colors, skin(avatar, TURNED).colors, atol=ROUNDING)
+    np.testing.assert_allclose(
+        animate(avatar, TURNED).colors, skin(avatar, TURNED).colors, atol=ROUNDING
+    )
 
 
 def test_in_the_pose_of_the_photos_colors_stay(person):
@@ -76,7 +86,9 @@ def test_padding_is_not_a_photo(person):
     avatar, _ = person
     views = in_pose(PHOTOS, 3)
     views = replace(views, rotations=views.rotations.at[2].add(1.0), view_count=jnp.asarray(2))
-    np.testing.assert_allclose(with_light(avatar, views).light.shading, avatar.light.shading, atol=ROUNDING)
+    np.testing.assert_allclose(
+        with_light(avatar, views).light.shading, avatar.light.shading, atol=ROUNDING
+    )
 
 
 def test_colors_have_the_mean_light_of_photos_in_several_poses(person):
@@ -92,7 +104,10 @@ def test_colors_have_the_mean_light_of_photos_in_several_poses(person):
 @pytest.mark.slow
 def test_bodies_of_one_brightness_have_no_light():
     avatar = two_balls(2)
-    grey = replace(avatar, gaussians=replace(avatar.gaussians, colors=jnp.full_like(avatar.gaussians.colors, 0.4)))
+    grey = replace(
+        avatar,
+        gaussians=replace(avatar.gaussians, colors=jnp.full_like(avatar.gaussians.colors, 0.4)),
+    )
     assert jnp.abs(with_light(grey, in_pose(PHOTOS)).light.coefficients).max() < ROUNDING
 
 
@@ -101,9 +116,13 @@ def test_what_says_nothing_about_the_light_gives_finite_numbers(change):
     avatar = two_balls(2)
     gaussians = avatar.gaussians
     if change == "clear":
-        avatar = replace(avatar, gaussians=replace(gaussians, opacities=jnp.zeros_like(gaussians.opacities)))
+        avatar = replace(
+            avatar, gaussians=replace(gaussians, opacities=jnp.zeros_like(gaussians.opacities))
+        )
     if change == "black":
-        avatar = replace(avatar, gaussians=replace(gaussians, colors=jnp.zeros_like(gaussians.colors)))
+        avatar = replace(
+            avatar, gaussians=replace(gaussians, colors=jnp.zeros_like(gaussians.colors))
+        )
     if change == "one place":
         avatar = replace(avatar, rest_vertices=jnp.ones_like(avatar.rest_vertices))
     light = with_light(avatar, in_pose(PHOTOS)).light
@@ -112,11 +131,18 @@ def test_what_says_nothing_about_the_light_gives_finite_numbers(change):
 
 def test_normals_of_stretched_surfaces_stay_perpendicular_to_them():
     rng = np.random.default_rng(1)
-    normals, linear = np.linalg.qr(rng.normal(size=(20, 3, 3)))[0], np.eye(3) + 0.4 * rng.normal(size=(20, 3, 3))
+    normals, linear = (
+        np.linalg.qr(rng.normal(size=(20, 3, 3)))[0],
+        np.eye(3) + 0.4 * rng.normal(size=(20, 3, 3)),
+    )
     linear = linear * np.sign(np.linalg.det(linear))[:, None, None]
-    got = np.asarray(turned_normals(jnp.asarray(normals[:, :, 0], jnp.float32), jnp.asarray(linear, jnp.float32)))
+    got = np.asarray(
+        turned_normals(jnp.asarray(normals[:, :, 0], jnp.float32), jnp.asarray(linear, jnp.float32))
+    )
     tangents = linear @ normals[:, :, 1:]
-    cosines = np.einsum("gi,gij->gj", got, tangents / np.linalg.norm(tangents, axis=1, keepdims=True))
+    cosines = np.einsum(
+        "gi,gij->gj", got, tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+    )
     assert np.abs(cosines).max() < 1e-5 and np.abs(np.linalg.norm(got, axis=1) - 1).max() < 1e-6
     assert (np.einsum("gi,gij,gj->g", got, linear, normals[:, :, 0]) > 0).all()
 
@@ -147,4 +173,6 @@ def test_selected_gaussians_keep_their_light(person):
     avatar, _ = person
     index = np.arange(0, len(avatar.gaussians.means), 3)
     few = avatar.select(index)
-    np.testing.assert_allclose(skin(few, TURNED).colors, skin(avatar, TURNED).colors[index], atol=ROUNDING)
+    np.testing.assert_allclose(
+        skin(few, TURNED).colors, skin(avatar, TURNED).colors[index], atol=ROUNDING
+    )

@@ -32,9 +32,13 @@ def flat_avatar():
 def test_variances_grow_by_the_low_pass_and_back():
     avatar = flat_avatar()
     wide = with_low_pass(avatar, PIXEL)
-    grown = np.square(np.asarray(wide.gaussians.scales, np.float64)) - np.square(avatar.gaussians.scales, dtype=np.float64)
+    grown = np.square(np.asarray(wide.gaussians.scales, np.float64)) - np.square(
+        avatar.gaussians.scales, dtype=np.float64
+    )
     np.testing.assert_allclose(grown, (EPS2D - MIP_EPS2D) * PIXEL**2, rtol=ROUNDING)
-    np.testing.assert_array_equal(wide.gaussians.low_pass, jnp.full_like(wide.gaussians.opacities, PIXEL))
+    np.testing.assert_array_equal(
+        wide.gaussians.low_pass, jnp.full_like(wide.gaussians.opacities, PIXEL)
+    )
     back = without_low_pass(wide)
     np.testing.assert_allclose(back.gaussians.scales, avatar.gaussians.scales, rtol=ROUNDING)
     assert back.gaussians.low_pass is None
@@ -44,10 +48,22 @@ def test_variances_grow_by_the_low_pass_and_back():
 @pytest.mark.parametrize("draw", [render, render_reference])
 def test_renderers_add_what_the_scales_do_not_contain(draw):
     gaussians = skin(with_low_pass(two_balls(1), PIXEL), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))
-    camera = orbit(jnp.asarray([0.0, 0.9, 0.0]), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 48, 48), 48, 48)[0]
+    camera = orbit(
+        jnp.asarray([0.0, 0.9, 0.0]),
+        3.0,
+        jnp.zeros(1),
+        0.0,
+        intrinsics_from_fov(0.7, 48, 48),
+        48,
+        48,
+    )[0]
     plain, less = replace(gaussians, low_pass=None), SplatConfig(eps2d=MIP_EPS2D)
-    of_larger_pixels = replace(gaussians, low_pass=jnp.full_like(gaussians.opacities, 1.0))  # nothing is dimmed
-    np.testing.assert_allclose(draw(of_larger_pixels, camera).rgb, draw(plain, camera, less).rgb, atol=1e-6)  # float32
+    of_larger_pixels = replace(
+        gaussians, low_pass=jnp.full_like(gaussians.opacities, 1.0)
+    )  # nothing is dimmed
+    np.testing.assert_allclose(
+        draw(of_larger_pixels, camera).rgb, draw(plain, camera, less).rgb, atol=1e-6
+    )  # float32
     assert jnp.abs(draw(gaussians, camera).rgb - draw(plain, camera).rgb).max() > 0.01
     none = SplatConfig(eps2d=0.0)
     np.testing.assert_array_equal(draw(gaussians, camera, none).rgb, draw(plain, camera, none).rgb)
@@ -75,15 +91,23 @@ def test_fine_things_weigh_the_same_in_small_images():
     """A Gaussian thinner than a pixel: its opacity times its area, in metres, is that of the images that it was fitted to."""
     fine = 0.002
     one = Gaussians(
-        jnp.zeros((1, 3)), jnp.asarray([[1.0, 0, 0, 0]]), jnp.full((1, 3), fine), jnp.asarray([0.5]), jnp.ones((1, 3))
+        jnp.zeros((1, 3)),
+        jnp.asarray([[1.0, 0, 0, 0]]),
+        jnp.full((1, 3), fine),
+        jnp.asarray([0.5]),
+        jnp.ones((1, 3)),
     )
     wide = replace(one, scales=widened(one.scales, jnp.full(1, fine)), low_pass=jnp.full(1, fine))
 
     def weight(gaussians, size):
-        camera = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, size, size), size, size)[0]
+        camera = orbit(
+            jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, size, size), size, size
+        )[0]
         seen = project(gaussians, camera)
         pixel = 3.0 / float(camera.K[0, 0])
-        return float(seen.dimmed(gaussians.opacities)[0] * jnp.sqrt(seen.determinant[0])) * pixel**2, pixel
+        return float(
+            seen.dimmed(gaussians.opacities)[0] * jnp.sqrt(seen.determinant[0])
+        ) * pixel**2, pixel
 
     fitted = 3.0 / float(intrinsics_from_fov(0.7, 1, 1)[0, 0]) / fine
     exact, pixel = weight(wide, int(np.ceil(fitted)))
@@ -98,9 +122,13 @@ def test_fine_things_weigh_the_same_in_small_images():
 def test_nothing_is_dimmed_in_the_photos_that_give_the_size_of_the_pixels():
     """Also if their pixels are not square."""
     rest, blank = BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)), jnp.zeros((1, 48, 48, 3))
-    K = intrinsics_from_fov(0.7, 48, 48) * jnp.asarray([[0.5], [1.0], [1.0]]) + jnp.zeros((3, 3)).at[0, 2].set(12.0)
+    K = intrinsics_from_fov(0.7, 48, 48) * jnp.asarray([[0.5], [1.0], [1.0]]) + jnp.zeros(
+        (3, 3)
+    ).at[0, 2].set(12.0)
     cameras = orbit(jnp.asarray([0.0, 0.9, 0.0]), 3.0, jnp.zeros(1), 0.0, K, 48, 48)
-    views = SubjectViews(blank, blank[..., 0], cameras, rest.rotations[None], rest.translation[None], jnp.zeros(2))
+    views = SubjectViews(
+        blank, blank[..., 0], cameras, rest.rotations[None], rest.translation[None], jnp.zeros(2)
+    )
     avatar = flat_avatar()
     seen = project(skin(with_low_pass(avatar, pixel_sizes(avatar, views)), rest), cameras[0])
     np.testing.assert_allclose(seen.dimming, 1.0, atol=ROUNDING)
@@ -110,10 +138,22 @@ def test_nothing_is_dimmed_in_the_photos_that_give_the_size_of_the_pixels():
 
 @pytest.mark.slow
 def test_dimmed_splats_are_drawn_as_defined():
-    gaussians = skin(with_low_pass(flat_avatar(), PIXEL / 10), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))
-    camera = orbit(jnp.asarray([0.0, 0.9, 0.0]), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 48, 48), 48, 48)[0]
+    gaussians = skin(
+        with_low_pass(flat_avatar(), PIXEL / 10), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3))
+    )
+    camera = orbit(
+        jnp.asarray([0.0, 0.9, 0.0]),
+        3.0,
+        jnp.zeros(1),
+        0.0,
+        intrinsics_from_fov(0.7, 48, 48),
+        48,
+        48,
+    )[0]
     drawn, exact = render(gaussians, camera), render_reference(gaussians, camera)
-    np.testing.assert_allclose(drawn.rgb, exact.rgb, atol=1e-4)  # float32; another order of operations
+    np.testing.assert_allclose(
+        drawn.rgb, exact.rgb, atol=1e-4
+    )  # float32; another order of operations
     undimmed = replace(gaussians, low_pass=jnp.ones_like(gaussians.opacities))
     assert jnp.abs(render(undimmed, camera).alpha - drawn.alpha).max() > 0.05
 
@@ -121,10 +161,14 @@ def test_dimmed_splats_are_drawn_as_defined():
 @pytest.mark.slow
 def test_dimming_is_differentiable_at_any_size(float64):
     """Needles, points without extent, and footprints that overflow."""
-    camera = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 32, 32), 32, 32)[0]
+    camera = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 32, 32), 32, 32)[
+        0
+    ]
     quats = jnp.asarray([[1.0, 0.2, 0.1, 0]] * 4)
     scales = jnp.asarray([[1e-9, 1e-9, 0.1], [0, 0, 0], [0.01, 0.02, 0.03], [1e7, 1e7, 1e7]])
-    gaussians = Gaussians(jnp.zeros((4, 3)), quats, scales, jnp.ones(4), jnp.ones((4, 3)), low_pass=jnp.full(4, 1e-3))
+    gaussians = Gaussians(
+        jnp.zeros((4, 3)), quats, scales, jnp.ones(4), jnp.ones((4, 3)), low_pass=jnp.full(4, 1e-3)
+    )
     dimming = lambda scales: jnp.sum(project(replace(gaussians, scales=scales), camera).dimming)
     assert jnp.all(jnp.isfinite(jax.grad(dimming)(scales)))
     singles = replace(gaussians, scales=scales.astype(jnp.float32))

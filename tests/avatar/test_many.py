@@ -49,13 +49,17 @@ def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(monke
 
     monkeypatch.setattr(many, "reconstruct_batch", batch)
     monkeypatch.setattr(many, "reconstruct", alone)
-    captures = {str(number): (lambda number=number: load(number)) for number in (1, 13, 2, 3, 7, 4, 5)}
+    captures = {
+        str(number): (lambda number=number: load(number)) for number in (1, 13, 2, 3, 7, 4, 5)
+    }
     found = list(reconstruct_many({}, presets.tiny(), captures, batch=3))
     assert [each.name for each in found] == list(captures)
     errors = {each.name: str(each.error) for each in found if each.avatar is None}
     assert errors == {"13": "thirteen", "7": "seven"}
     assert calls == [(1, 2), (3, 7, 4), 3, 7, 4, 5]
-    monkeypatch.setattr(many, "reconstruct", lambda *_: load(13))  # what no capture is to blame for ends it
+    monkeypatch.setattr(
+        many, "reconstruct", lambda *_: load(13)
+    )  # what no capture is to blame for ends it
     with pytest.raises(OSError, match="thirteen"):
         list(reconstruct_many({}, presets.tiny(), {"1": lambda: load(1)}))
 
@@ -84,7 +88,11 @@ def test_a_folder_of_captures_goes_on_after_failures_and_interruptions(people, t
     code, _, err = humangs(*line)
     assert code == cli.BAD_DATA and "warning: b: " in err
     assert err.splitlines()[-1] == "humangs: error: 1 of 4 captures failed: b"
-    assert {file.name for file in (tmp_path / "avatars").glob("*.npz")} == {"a.npz", "c.npz", "d.npz"}
+    assert {file.name for file in (tmp_path / "avatars").glob("*.npz")} == {
+        "a.npz",
+        "c.npz",
+        "d.npz",
+    }
     shutil.copy("people/a/body.npz", "people/b/body.npz")
     (tmp_path / "avatars/d.npz").unlink()
     people.clear()
@@ -93,7 +101,9 @@ def test_a_folder_of_captures_goes_on_after_failures_and_interruptions(people, t
     assert code == cli.BAD_DATA and "views 'None' -> '2'" in err
 
 
-def test_an_avatar_of_a_set_whose_refinement_is_interrupted_is_made_again(people, tmp_path, monkeypatch, capsys):
+def test_an_avatar_of_a_set_whose_refinement_is_interrupted_is_made_again(
+    people, tmp_path, monkeypatch, capsys
+):
     shutil.copy("people/a/body.npz", "people/b/body.npz")
     stopped = ["b"]
 
@@ -115,19 +125,36 @@ def test_an_avatar_of_a_set_whose_refinement_is_interrupted_is_made_again(people
     assert (tmp_path / "a.npz").is_file()  # of one avatar what there is so far is written
 
 
-def test_a_set_of_avatars_made_with_other_weights_of_that_name_is_refused(people, tmp_path, monkeypatch, humangs):
-    monkeypatch.setattr("humangs_jax.network.weights.load_weights", lambda path: ({}, presets.tiny()))
+def test_a_set_of_avatars_made_with_other_weights_of_that_name_is_refused(
+    people, tmp_path, monkeypatch, humangs
+):
+    monkeypatch.setattr(
+        "humangs_jax.network.weights.load_weights", lambda path: ({}, presets.tiny())
+    )
     (tmp_path / "w.safetensors").write_bytes(b"one")
     line = ("reconstruct", "people", "--refine", "0", "--no-check", "--weights", "w.safetensors")
     humangs(*line)
     (tmp_path / "w.safetensors").write_bytes(b"another")
     code, _, err = humangs(*line)
-    assert code == cli.BAD_DATA and "written with settings other than asked for now (weights 'w.safetensors (" in err
+    assert (
+        code == cli.BAD_DATA
+        and "written with settings other than asked for now (weights 'w.safetensors (" in err
+    )
 
 
 def test_shards_are_all_captures_once(people, humangs):
     for shard in ("0/3", "1/3", "2/3"):
-        humangs("reconstruct", "people", "--refine", "0", "--no-check", "--out", "avatars", "--shard", shard)
+        humangs(
+            "reconstruct",
+            "people",
+            "--refine",
+            "0",
+            "--no-check",
+            "--out",
+            "avatars",
+            "--shard",
+            shard,
+        )
     assert people == ["a", "d", "b", "c"]
 
 
@@ -135,10 +162,16 @@ def test_shards_are_all_captures_once(people, humangs):
     ("line", "said"),
     [
         ("reconstruct people --out x.npz", "--out x.npz: expected a folder"),
-        ("reconstruct people/a people/b/../a", "people/b/../a and people/a: expected captures of different names"),
+        (
+            "reconstruct people/a people/b/../a",
+            "people/b/../a and people/a: expected captures of different names",
+        ),
         ("reconstruct", "CAPTURES: expected at least one folder"),
         ("reconstruct people --shard 3/3", "--shard 3/3: expected I/N"),
-        ("reconstruct people/a --shard 3/8", "--shard 3/8: expected several captures, or a folder of them"),
+        (
+            "reconstruct people/a --shard 3/8",
+            "--shard 3/8: expected several captures, or a folder of them",
+        ),
         ("reconstruct people/a --batch 0", "--batch 0: expected at least 1"),
     ],
 )
@@ -161,4 +194,6 @@ def test_batches_are_the_avatars_of_single_captures(tmp_path, monkeypatch, human
     for name in ("a", "b", "c"):
         assert humangs("reconstruct", f"people/{name}", *words, "--out", f"{name}.npz")[0] == 0
         alone, batched = Avatar.load(f"{name}.npz"), Avatar.load(f"avatars/{name}.npz")
-        np.testing.assert_allclose(batched.gaussians.means, alone.gaussians.means, atol=1e-5)  # batched products round
+        np.testing.assert_allclose(
+            batched.gaussians.means, alone.gaussians.means, atol=1e-5
+        )  # batched products round

@@ -26,7 +26,9 @@ def test_every_tile_is_where_it_belongs(count, columns):
 
 def test_texts_are_written_beside_the_images_and_cut_to_their_width():
     tiles = images(4)
-    sheet = tile(tiles, labels=["a", "long label " * 20, "", "d"], headers=["truth", "ours"], columns=2)
+    sheet = tile(
+        tiles, labels=["a", "long label " * 20, "", "d"], headers=["truth", "ours"], columns=2
+    )
     found = [
         (y, x)
         for y in range(sheet.shape[0] - 39)
@@ -35,13 +37,23 @@ def test_texts_are_written_beside_the_images_and_cut_to_their_width():
     ]
     assert len(found) == 4  # no letter on any image
     first_rows = sheet[: found[0][0]]
-    assert (first_rows[: first_rows.shape[0] // 2] < 0.5).any() and (first_rows[first_rows.shape[0] // 2 :] < 0.5).any()
+    assert (first_rows[: first_rows.shape[0] // 2] < 0.5).any() and (
+        first_rows[first_rows.shape[0] // 2 :] < 0.5
+    ).any()
     assert (sheet[: found[0][0], -GAP:] == 1).all()  # the long one stays inside its tile
     assert (sheet[found[0][0] + 40 : found[2][0], :50] == 1).all()  # an empty label leaves white
 
 
 def test_colors_are_rounded_to_the_nearest():
-    assert list(to_uint8(np.array([-1.0, 0, 0.4999 / 255, 0.5001 / 255, 1, 7, np.nan]))) == [0, 0, 0, 1, 255, 255, 0]
+    assert list(to_uint8(np.array([-1.0, 0, 0.4999 / 255, 0.5001 / 255, 1, 7, np.nan]))) == [
+        0,
+        0,
+        0,
+        1,
+        255,
+        255,
+        0,
+    ]
 
 
 def test_error_colors_are_ordered_and_saturate():
@@ -59,7 +71,9 @@ def test_side_by_side_shows_truth_ours_and_error(tmp_path, count):
     side_by_side(truth, ours, tmp_path / "a.png", labels=[f"view {i}" for i in range(count)])
     sheet, alpha = read_image(tmp_path / "a.png")
     assert alpha is None and [p.name for p in tmp_path.iterdir()] == ["a.png"]
-    y = next(y for y in range(80) if np.abs(sheet[y : y + 40, GAP : GAP + 50] - truth[0]).max() < LEVEL)
+    y = next(
+        y for y in range(80) if np.abs(sheet[y : y + 40, GAP : GAP + 50] - truth[0]).max() < LEVEL
+    )
     tiles = [sheet[y : y + 40, GAP + i * (50 + GAP) : GAP + i * (50 + GAP) + 50] for i in range(3)]
     np.testing.assert_allclose(tiles[1], ours[0], atol=LEVEL)
     assert (tiles[2][20:] == 1).all() and (tiles[2][:20].mean() < 0.7)

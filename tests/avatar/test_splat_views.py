@@ -24,7 +24,13 @@ def ball(g=60, seed=0):
     rng = np.random.default_rng(seed)
     d = rng.normal(size=(g, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    arrays = d + np.asarray([1, 2, 3]), rng.normal(size=(g, 4)), np.full((g, 3), 0.1), np.full(g, 0.9), (d + 1) / 2
+    arrays = (
+        d + np.asarray([1, 2, 3]),
+        rng.normal(size=(g, 4)),
+        np.full((g, 3), 0.1),
+        np.full(g, 0.9),
+        (d + 1) / 2,
+    )
     return hg.Gaussians(*(jnp.asarray(x, jnp.float32) for x in arrays))
 
 
@@ -36,15 +42,34 @@ def rendered(monkeypatch, *words):
 def test_a_circle_shows_the_whole_scene_upright(tmp_path, monkeypatch, capsys):
     hg.save_gaussians(tmp_path / "a.ply", ball())
     out = tmp_path / "views"
-    rendered(monkeypatch, tmp_path / "a.ply", "--out", out, "--views", 3, "--size", 64, "--background", "black")
+    rendered(
+        monkeypatch,
+        tmp_path / "a.ply",
+        "--out",
+        out,
+        "--views",
+        3,
+        "--size",
+        64,
+        "--background",
+        "black",
+    )
     assert "3 views of 60 Gaussians" in capsys.readouterr().out
-    assert sorted(file.name for file in out.iterdir()) == ["view_000.png", "view_001.png", "view_002.png"]
+    assert sorted(file.name for file in out.iterdir()) == [
+        "view_000.png",
+        "view_001.png",
+        "view_002.png",
+    ]
     loaded = hg.load_gaussians(tmp_path / "a.ply")
     cameras = circle_cameras(loaded, "-y", 3, Shot(size=64))
     for name, camera in cameras.items():
         drawn = hg.render(loaded, camera, background="black")
-        np.testing.assert_allclose(read_image(out / f"{name}.png")[0], np.clip(drawn.rgb, 0, 1), atol=STEP)
-        assert np.mean(np.asarray(drawn.alpha) > 0.5) > 0.2 and np.asarray(drawn.alpha)[:2].max() < 0.1
+        np.testing.assert_allclose(
+            read_image(out / f"{name}.png")[0], np.clip(drawn.rgb, 0, 1), atol=STEP
+        )
+        assert (
+            np.mean(np.asarray(drawn.alpha) > 0.5) > 0.2 and np.asarray(drawn.alpha)[:2].max() < 0.1
+        )
     # -y is up in a .ply: what has a small y is above
     rgb, alpha = np.asarray(drawn.rgb), np.asarray(drawn.alpha)
     green = (rgb[..., 1] * alpha).sum(1) / np.maximum(alpha.sum(1), 1e-6)
@@ -55,10 +80,19 @@ def person_like(far=0):
     """Centres in a box of a person with its arms out, fewer in the feet, and some far away."""
     rng = np.random.default_rng(0)
     body = rng.uniform(-1, 1, (2000, 3)) * [0.25, 0.5, 0.15] + [0, 1.2, 0]
-    arms, feet = rng.uniform(-1, 1, (200, 3)) * [0.9, 0.05, 0.05] + [0, 1.4, 0], rng.uniform(-0.1, 0.1, (60, 3))
+    arms, feet = (
+        rng.uniform(-1, 1, (200, 3)) * [0.9, 0.05, 0.05] + [0, 1.4, 0],
+        rng.uniform(-0.1, 0.1, (60, 3)),
+    )
     means = np.concatenate([body, arms, feet, rng.uniform(20, 30, (far, 3))])
     count = len(means)
-    arrays = means, np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 3), 0.01), np.full(count, 0.9), np.full((count, 3), 0.5)
+    arrays = (
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), 0.01),
+        np.full(count, 0.9),
+        np.full((count, 3), 0.5),
+    )
     return hg.Gaussians(*(jnp.asarray(x, jnp.float32) for x in arrays))
 
 
@@ -80,17 +114,25 @@ def test_what_is_far_away_of_a_scene_does_not_make_it_small():
 def test_cameras_of_a_file_are_in_the_world_of_the_gaussians(tmp_path, monkeypatch):
     gaussians, pose = ball(), np.eye(4)
     pose[:3, 3] = [1, 2, 8]  # OpenGL's axes: looks along -z
-    frames = [{"file_path": f"images/{name}.jpg", "transform_matrix": pose.tolist()} for name in ("b", "a", "c/a")]
+    frames = [
+        {"file_path": f"images/{name}.jpg", "transform_matrix": pose.tolist()}
+        for name in ("b", "a", "c/a")
+    ]
     lens = {"fl_x": 60.0, "fl_y": 62.0, "cx": 25.0, "cy": 15.0, "w": 48, "h": 32}
     (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
     hg.save_gaussians(tmp_path / "a.ply", gaussians)
     out = tmp_path / "views"
     out.mkdir()
     (out / "mine.txt").write_text("stays")
-    rendered(monkeypatch, tmp_path / "a.ply", "--camera", tmp_path / "transforms.json", "--out", out)
+    rendered(
+        monkeypatch, tmp_path / "a.ply", "--camera", tmp_path / "transforms.json", "--out", out
+    )
     assert sorted(file.name for file in out.iterdir()) == ["a.png", "a_2.png", "b.png", "mine.txt"]
     camera = hg.Camera.from_opencv(
-        [[60.0, 0, 25], [0, 62, 15], [0, 0, 1]], [[1, 0, 0, -1], [0, -1, 0, 2], [0, 0, -1, 8], [0, 0, 0, 1]], 48, 32
+        [[60.0, 0, 25], [0, 62, 15], [0, 0, 1]],
+        [[1, 0, 0, -1], [0, -1, 0, 2], [0, 0, -1, 8], [0, 0, 0, 1]],
+        48,
+        32,
     )
     expected = np.clip(hg.render(gaussians, camera).rgb, 0, 1)
     np.testing.assert_allclose(read_image(out / "b.png")[0], expected, atol=STEP + 1e-4)

@@ -18,7 +18,9 @@ PALETTE_ERROR = 0.02
 def moving_square(count, height=48, width=64):
     """A smooth colored background, a saturated square that moves."""
     y, x = np.mgrid[:height, :width]
-    frames = np.stack([np.stack([x / width, y / height, np.full(x.shape, 0.5)], -1) for _ in range(count)])
+    frames = np.stack(
+        [np.stack([x / width, y / height, np.full(x.shape, 0.5)], -1) for _ in range(count)]
+    )
     for i in range(count):
         frames[i, 8:24, 2 * i : 2 * i + 16] = [0.9, 0.1, 0.1]
     return frames
@@ -33,7 +35,19 @@ def ffmpeg(*arguments):
 
 def read_back(path, height=48, width=64):
     """By ffmpeg itself (imageio's reader leaves file handles open)."""
-    data = ffmpeg("-v", "error", "-i", path, "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-").stdout
+    data = ffmpeg(
+        "-v",
+        "error",
+        "-i",
+        path,
+        "-fps_mode",
+        "passthrough",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ).stdout
     return np.frombuffer(data, np.uint8).reshape(-1, height, width, 3) / 255.0
 
 
@@ -44,7 +58,9 @@ def test_frames_come_back(tmp_path, name):
     back = read_back(tmp_path / name)
     assert back.shape == frames.shape
     assert np.abs(back - frames).mean() < (PALETTE_ERROR if name.endswith("gif") else H264_ERROR)
-    red = back[5, 12:20, 14:22].mean((0, 1))  # inside the square: the colors of the matrix that the file names
+    red = back[5, 12:20, 14:22].mean(
+        (0, 1)
+    )  # inside the square: the colors of the matrix that the file names
     np.testing.assert_allclose(red, [0.9, 0.1, 0.1], atol=0.03)
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
@@ -57,15 +73,29 @@ def test_webm_and_png_files_are_transparent(tmp_path):
     alpha[:, 20:30, 20:40] = 1
     frames = np.concatenate([colors, alpha], axis=-1)
     write_video(tmp_path / "a.webm", frames, 24)
-    decode = ("-c:v", "libvpx-vp9", "-i", tmp_path / "a.webm", "-f", "rawvideo", "-pix_fmt", "rgba", "-")
-    back = np.frombuffer(ffmpeg("-v", "error", *decode).stdout, np.uint8).reshape(6, 48, 64, 4) / 255.0
+    decode = (
+        "-c:v",
+        "libvpx-vp9",
+        "-i",
+        tmp_path / "a.webm",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgba",
+        "-",
+    )
+    back = (
+        np.frombuffer(ffmpeg("-v", "error", *decode).stdout, np.uint8).reshape(6, 48, 64, 4) / 255.0
+    )
     assert np.abs(back[..., 3] - alpha[..., 0]).mean() < H264_ERROR
     seen = alpha[..., 0] == 1
     assert np.abs(back - frames)[seen].mean() < H264_ERROR
     assert write_video(tmp_path / "frames", frames, 24) == 6
     for i, frame in enumerate(frames):
         image, its_alpha = read_image(tmp_path / "frames" / f"frame_{i:05d}.png")
-        np.testing.assert_allclose(np.concatenate([image, its_alpha[..., None]], -1), frame, atol=0.5 / 255 + 1e-6)
+        np.testing.assert_allclose(
+            np.concatenate([image, its_alpha[..., None]], -1), frame, atol=0.5 / 255 + 1e-6
+        )
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
@@ -80,14 +110,26 @@ def test_frames_of_bytes_are_those_of_numbers(tmp_path, name):
 
 ONE = np.full((4, 6, 3), 0.5, np.float32)
 NO_COLORS = {
-    "numbers up to 200": (np.full((4, 6, 3), 200.0), r"frame 1: expected numbers in \[0, 1\], or uint8, got 200 to 200: divide"),
-    "a little above": (1.01 * np.ones((4, 6, 3)), r"expected numbers in \[0, 1\], or uint8, got 1.01 to 1.01"),
+    "numbers up to 200": (
+        np.full((4, 6, 3), 200.0),
+        r"frame 1: expected numbers in \[0, 1\], or uint8, got 200 to 200: divide",
+    ),
+    "a little above": (
+        1.01 * np.ones((4, 6, 3)),
+        r"expected numbers in \[0, 1\], or uint8, got 1.01 to 1.01",
+    ),
     "below": (ONE - 1, r"expected numbers in \[0, 1\], or uint8, got -0.5 to -0.5"),
-    "whole numbers": (np.full((4, 6, 3), 200), "frame 1: expected floating-point numbers in .*, or uint8, got int64"),
+    "whole numbers": (
+        np.full((4, 6, 3), 200),
+        "frame 1: expected floating-point numbers in .*, or uint8, got int64",
+    ),
     "bits": (np.ones((4, 6, 3), bool), "expected floating-point numbers in .*, got bool"),
     "a hole": (ONE * np.nan, "frame 1 has numbers that are not finite"),
     "gray": (ONE[..., 0], r"frame 1: expected shape \(h, w, 3\) or \(h, w, 4\), got \(4, 6\)"),
-    "two channels": (ONE[..., :2], r"frame 1: expected shape \(h, w, 3\) or \(h, w, 4\), got \(4, 6, 2\)"),
+    "two channels": (
+        ONE[..., :2],
+        r"frame 1: expected shape \(h, w, 3\) or \(h, w, 4\), got \(4, 6, 2\)",
+    ),
 }
 
 
@@ -100,11 +142,19 @@ def test_numbers_that_are_no_colors_are_refused_and_nothing_is_written(tmp_path,
 
 
 def test_float32_roundings_beside_0_and_1_are_written(tmp_path):
-    write_video(tmp_path / "frames", [ONE * 0 + np.float32(1 + 5e-7), ONE * 0 - np.float32(5e-7)], 24)
-    assert [read_image(tmp_path / "frames" / f"frame_{i:05d}.png")[0].mean() for i in range(2)] == [1, 0]
+    write_video(
+        tmp_path / "frames", [ONE * 0 + np.float32(1 + 5e-7), ONE * 0 - np.float32(5e-7)], 24
+    )
+    assert [read_image(tmp_path / "frames" / f"frame_{i:05d}.png")[0].mean() for i in range(2)] == [
+        1,
+        0,
+    ]
 
 
-@pytest.mark.parametrize(("name", "size"), [("a.mp4", (64, 48)), ("a.webm", (64, 48)), ("a.gif", (63, 47)), ("a", (63, 47))])
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("a.mp4", (64, 48)), ("a.webm", (64, 48)), ("a.gif", (63, 47)), ("a", (63, 47))],
+)
 def test_the_size_that_is_told_is_that_of_the_file(tmp_path, name, size):
     write_video(tmp_path / name, moving_square(2, 47, 63), 24)
     file = tmp_path / name / "frame_00000.png" if name == "a" else tmp_path / name
@@ -116,7 +166,11 @@ def test_png_files_of_an_earlier_video_are_replaced_and_others_stay(tmp_path):
     write_video(tmp_path / "frames", moving_square(5), 24)
     (tmp_path / "frames" / "notes.txt").write_text("mine")
     write_video(tmp_path / "frames", moving_square(2), 24)
-    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["frame_00000.png", "frame_00001.png", "notes.txt"]
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [
+        "frame_00000.png",
+        "frame_00001.png",
+        "notes.txt",
+    ]
 
 
 def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path):
@@ -126,7 +180,9 @@ def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path):
         check_video(tmp_path / "a.mp4", 10, 64, 64)
     with pytest.raises(ValueError, match=r"frames: is a file: expected a folder name"):
         check_video(tmp_path / "frames", 10, 64, 64)
-    with pytest.raises(ValueError, match=r"1000 frames of 1024 x 1024 are too many for a .gif: use .mp4 or .webm"):
+    with pytest.raises(
+        ValueError, match=r"1000 frames of 1024 x 1024 are too many for a .gif: use .mp4 or .webm"
+    ):
         check_video(tmp_path / "a.gif", 1000, 1024, 1024)
     check_video(tmp_path / "b.webm", 10**9, 8192, 8192, transparent=True)
 
@@ -157,11 +213,18 @@ def test_frames_are_taken_one_by_one(tmp_path, name):
 def test_mp4_says_its_speed_and_pixel_format(tmp_path):
     write_video(tmp_path / "a.mp4", moving_square(30, 47, 63), 30)  # odd sides
     message = ffmpeg("-i", tmp_path / "a.mp4").stderr.decode()
-    assert "Video: h264" in message and "yuv420p(tv, bt709" in message and "64x48" in message and " 30 fps" in message
+    assert (
+        "Video: h264" in message
+        and "yuv420p(tv, bt709" in message
+        and "64x48" in message
+        and " 30 fps" in message
+    )
     assert "Duration: 00:00:01.0" in message
     back = read_back(tmp_path / "a.mp4")
     assert back.shape[0] == 30
-    assert np.abs(back[:, :47, :63] - moving_square(30, 47, 63)).mean() < H264_ERROR  # padded, not resized
+    assert (
+        np.abs(back[:, :47, :63] - moving_square(30, 47, 63)).mean() < H264_ERROR
+    )  # padded, not resized
 
 
 @pytest.mark.parametrize(("fps", "count"), [(24, 24), (10, 24), (60, 12), (7.5, 24)])
@@ -185,14 +248,18 @@ def test_gif_background_is_exact(tmp_path, background):
 
     frames = np.full((4, 48, 64, 3), background)
     near = np.linspace(background - 0.02, background + 0.02, 4 * 32 * 32).reshape(4, 32, 32, 1)
-    frames[:, 8:40, 16:48] = np.clip(near * np.random.default_rng(0).uniform(0.9, 1.1, (4, 32, 32, 1)), 0, 1)
+    frames[:, 8:40, 16:48] = np.clip(
+        near * np.random.default_rng(0).uniform(0.9, 1.1, (4, 32, 32, 1)), 0, 1
+    )
     frames[:, 12:36, 20:44] = np.random.default_rng(0).uniform(0, 1, (4, 24, 24, 3))
     write_video(tmp_path / "a.gif", frames, 24)
     with Image.open(tmp_path / "a.gif") as image:
         for i in range(4):
             image.seek(i)
             pixels = np.asarray(image.convert("RGB"))
-            assert (pixels[:8] == round(255 * background)).all() and (pixels[40:] == round(255 * background)).all()
+            assert (pixels[:8] == round(255 * background)).all() and (
+                pixels[40:] == round(255 * background)
+            ).all()
 
 
 NAN = np.zeros((3, 4, 4, 3))
@@ -206,7 +273,12 @@ NAN[1, 2, 2, 0] = np.nan
         ("a.mp4", np.zeros((2, 0, 4, 3)), 24, "at least one frame"),
         ("a.mp4", NAN, 24, "frame 1"),
         ("a.mp4", np.zeros((2, 4, 4, 3)), 0, "frames per second"),
-        ("a.avi", np.zeros((2, 4, 4, 3)), 24, r"expected a name ending in \.mp4, \.webm, \.gif or a folder"),
+        (
+            "a.avi",
+            np.zeros((2, 4, 4, 3)),
+            24,
+            r"expected a name ending in \.mp4, \.webm, \.gif or a folder",
+        ),
         ("a.mp4", np.zeros((2, 4, 4, 4)), 24, r"\.mp4 has no transparency: expected \.webm"),
         ("a.gif", np.zeros((2, 4, 4, 4)), 24, r"\.gif has no transparency"),
     ],

@@ -19,7 +19,9 @@ def made_up_body(seed=0, n=25, s=4, pose_directions=True, dtype=None):
     return BodyModel(
         template=number(rng.normal(size=(n, 3))),
         shape_directions=number(0.1 * rng.normal(size=(n, 3, s))),
-        pose_directions=number(0.1 * rng.normal(size=(n, 3, 9 * (j - 1)))) if pose_directions else None,
+        pose_directions=number(0.1 * rng.normal(size=(n, 3, 9 * (j - 1))))
+        if pose_directions
+        else None,
         joint_regressor=number(regressor / regressor.sum(1, keepdims=True)),
         skinning_weights=number(weights / weights.sum(1, keepdims=True)),
         faces=jnp.asarray(rng.integers(0, n, size=(10, 3)), jnp.int32),
@@ -53,9 +55,13 @@ def oracle(body, betas, rotations, translation):
     rest = get("template").copy()
     for i, beta in enumerate(betas):
         rest += beta * get("shape_directions")[:, :, i]
-    joints = np.stack([sum(w * v for w, v in zip(row, rest, strict=True)) for row in get("joint_regressor")])
+    joints = np.stack(
+        [sum(w * v for w, v in zip(row, rest, strict=True)) for row in get("joint_regressor")]
+    )
     if body.pose_directions is not None:
-        feature = np.concatenate([(Rotation.from_rotvec(r).as_matrix() - np.eye(3)).ravel() for r in rotations[1:]])
+        feature = np.concatenate(
+            [(Rotation.from_rotvec(r).as_matrix() - np.eye(3)).ravel() for r in rotations[1:]]
+        )
         rest = rest + np.stack([d @ feature for d in get("pose_directions")])
     transforms = []
     for frame, joint in zip(world_frames(joints, body.parents, rotations), joints, strict=True):
@@ -66,7 +72,12 @@ def oracle(body, betas, rotations, translation):
         transforms.append(moved)
     vertices = []
     for weights, vertex in zip(get("skinning_weights"), rest, strict=True):
-        vertices.append(sum(w * (g[:3, :3] @ vertex + g[:3, 3]) for w, g in zip(weights, transforms, strict=True)))
+        vertices.append(
+            sum(
+                w * (g[:3, :3] @ vertex + g[:3, 3])
+                for w, g in zip(weights, transforms, strict=True)
+            )
+        )
     posed_joints = [g[:3, :3] @ j + g[:3, 3] for g, j in zip(transforms, joints, strict=True)]
     return np.stack(vertices), np.stack(posed_joints), np.stack(transforms)
 
@@ -74,7 +85,10 @@ def oracle(body, betas, rotations, translation):
 def edge_counts(faces):
     """How often each directed edge occurs."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return {tuple(edge): count for edge, count in zip(*np.unique(edges, axis=0, return_counts=True), strict=True)}
+    return {
+        tuple(edge): count
+        for edge, count in zip(*np.unique(edges, axis=0, return_counts=True), strict=True)
+    }
 
 
 def is_closed(faces):

@@ -27,23 +27,33 @@ def test_vertices_are_a_subset_with_everything_they_carry(small, body):
     assert len(np.unique(kept)) == len(kept) == small.template.shape[0]
     assert np.array_equal(small.shape_directions, body.shape_directions[kept])
     assert np.array_equal(small.skinning_weights, body.skinning_weights[kept])
-    assert (small.parents, small.joint_names, small.shape_names) == (body.parents, body.joint_names, body.shape_names)
+    assert (small.parents, small.joint_names, small.shape_names) == (
+        body.parents,
+        body.joint_names,
+        body.shape_names,
+    )
 
 
 def test_the_surface_stays_closed_and_solid(small, body):
     faces, vertices = np.asarray(small.faces), np.asarray(small.template)
     assert is_closed(faces)
     assert np.unique(faces).size == len(vertices)
-    assert len(faces) == 2 * len(vertices) - (2 * body.template.shape[0] - body.faces.shape[0])  # Euler's formula
+    assert len(faces) == 2 * len(vertices) - (
+        2 * body.template.shape[0] - body.faces.shape[0]
+    )  # Euler's formula
     assert areas(vertices, faces).min() > 1e-9
     full = signed_volume(body.template, body.faces)
     assert abs(signed_volume(vertices, faces) / full - 1) < 0.04
-    assert np.allclose(np.ptp(vertices, axis=0), np.ptp(np.asarray(body.template), axis=0), atol=0.015)
+    assert np.allclose(
+        np.ptp(vertices, axis=0), np.ptp(np.asarray(body.template), axis=0), atol=0.015
+    )
 
 
 def test_joints_are_those_of_the_full_body_for_any_shape(small, body):
     betas = jnp.asarray(np.random.default_rng(0).normal(size=len(body.shape_names)), jnp.float32)
-    assert np.allclose(shape_body(small, betas).joints, shape_body(body, betas).joints, atol=SAME_JOINTS)
+    assert np.allclose(
+        shape_body(small, betas).joints, shape_body(body, betas).joints, atol=SAME_JOINTS
+    )
     assert np.allclose(np.asarray(small.joint_regressor).sum(1), 1, atol=1e-5)
 
 
@@ -52,11 +62,15 @@ def test_texture_corners_belong_to_their_vertices_and_stay_in_their_charts(small
     uv_of = {
         (int(v), *uv)
         for v, uv in zip(
-            np.asarray(body.faces).ravel(), np.asarray(body.uvs)[np.asarray(body.uv_faces).ravel()].tolist(), strict=True
+            np.asarray(body.faces).ravel(),
+            np.asarray(body.uvs)[np.asarray(body.uv_faces).ravel()].tolist(),
+            strict=True,
         )
     }
     uvs = np.asarray(small.uvs)[np.asarray(small.uv_faces)]
-    for v, uv in zip(kept[np.asarray(small.faces)].ravel(), uvs.reshape(-1, 2).tolist(), strict=True):
+    for v, uv in zip(
+        kept[np.asarray(small.faces)].ravel(), uvs.reshape(-1, 2).tolist(), strict=True
+    ):
         assert (int(v), *uv) in uv_of
     # A face torn between two charts would be long in the texture and short on the skin.
     corners = np.asarray(small.template)[np.asarray(small.faces)]
@@ -92,25 +106,38 @@ def sphere(rings=12, radius=1.0, open_below=False):
     angles = np.linspace(0, np.pi, rings + 1)[1:-1]
     angles = angles[: len(angles) // 2 + 1] if open_below else angles
     turn = np.arange(columns) * 2 * np.pi / columns
-    grid = [[[np.sin(a) * np.sin(t + 0.1 * a), np.cos(a), np.sin(a) * np.cos(t + 0.1 * a)] for t in turn] for a in angles]
+    grid = [
+        [
+            [np.sin(a) * np.sin(t + 0.1 * a), np.cos(a), np.sin(a) * np.cos(t + 0.1 * a)]
+            for t in turn
+        ]
+        for a in angles
+    ]
     vertices = np.concatenate([[[0, 1.0, 0]], np.reshape(grid, (-1, 3)), [[0, -1.0, 0]]])
     at = lambda r, c: 1 + r * columns + c % columns
     faces = [(0, at(0, c), at(0, c + 1)) for c in range(columns)]
     for r in range(len(angles) - 1):
         for c in range(columns):
-            faces += [(at(r, c), at(r + 1, c), at(r, c + 1)), (at(r, c + 1), at(r + 1, c), at(r + 1, c + 1))]
+            faces += [
+                (at(r, c), at(r + 1, c), at(r, c + 1)),
+                (at(r, c + 1), at(r + 1, c), at(r + 1, c + 1)),
+            ]
     if open_below:
         vertices = vertices[:-1]
     else:
         last = len(vertices) - 1
-        faces += [(last, at(len(angles) - 1, c + 1), at(len(angles) - 1, c)) for c in range(columns)]
+        faces += [
+            (last, at(len(angles) - 1, c + 1), at(len(angles) - 1, c)) for c in range(columns)
+        ]
     return radius * vertices, np.asarray(faces)
 
 
 def bare_body(vertices, faces):
     n = len(vertices)
     body = made_up_body(n=n, pose_directions=True)
-    return replace(body, template=jnp.asarray(vertices, jnp.float32), faces=jnp.asarray(faces, jnp.int32))
+    return replace(
+        body, template=jnp.asarray(vertices, jnp.float32), faces=jnp.asarray(faces, jnp.int32)
+    )
 
 
 def test_a_vertex_of_no_face_outside_of_all_faces_is_seen():
@@ -126,7 +153,9 @@ def test_a_body_without_collapses_finds_them():
     assert small.template.shape == (60, 3) and small.pose_directions.shape[0] == 60
     assert small.uvs is None and is_closed(np.asarray(small.faces))
     assert signed_volume(small.template, small.faces) > 0.9 * signed_volume(vertices, faces) > 0
-    assert np.array_equal(decimate(small, 40).template, decimate(body, 40).template)  # the result carries its own
+    assert np.array_equal(
+        decimate(small, 40).template, decimate(body, 40).template
+    )  # the result carries its own
 
 
 @pytest.mark.slow
@@ -137,8 +166,12 @@ def test_a_rim_stays_a_rim():
     small = decimate(bare_body(vertices, faces), len(vertices) // 3)
     edges = rim(np.asarray(small.faces))
     assert 3 <= len(edges) < len(rim(faces))
-    assert np.allclose(np.asarray(small.template)[np.asarray(sorted(edges))][..., 1], lowest, atol=1e-6)
-    assert len({a for a, _ in edges}) == len(edges)  # one closed loop, each corner entered and left once
+    assert np.allclose(
+        np.asarray(small.template)[np.asarray(sorted(edges))][..., 1], lowest, atol=1e-6
+    )
+    assert len({a for a, _ in edges}) == len(
+        edges
+    )  # one closed loop, each corner entered and left once
 
 
 @pytest.mark.slow

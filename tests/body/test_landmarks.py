@@ -11,11 +11,18 @@ from humangs_jax.body.landmarks import Place, landmark_model, mirrored_name, pos
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67
+from humangs_jax.data.keypoints.keypoints import (
+    COCO_17,
+    COCO_WHOLEBODY_133,
+    MEDIAPIPE_33,
+    OPENPOSE_67,
+)
 
 ATOL = 2e-6  # metres, float32
 SYMMETRY = 0.004  # metres: the shipped body's feet are not quite mirror images
-COARSER = 0.015  # metres: how far a vertex of a quarter of the mesh is from the best of the whole one
+COARSER = (
+    0.015  # metres: how far a vertex of a quarter of the mesh is from the best of the whole one
+)
 REST = BodyPose(jnp.zeros((55, 3)), jnp.zeros(3))
 
 posed = jax.jit(pose_landmarks)
@@ -40,19 +47,32 @@ def whole(body):
 def test_the_shipped_body_has_all_but_most_of_the_face(whole):
     model, _ = whole
     missing = {name for name, known in zip(model.names, model.known, strict=True) if not known}
-    assert missing == {n for n in model.names if n.startswith("face_")} - {"face_8", "face_27", "face_30"}
-    np.testing.assert_allclose(np.asarray(model.regressor).sum(1), np.asarray(model.known, float), atol=1e-6)
+    assert missing == {n for n in model.names if n.startswith("face_")} - {
+        "face_8",
+        "face_27",
+        "face_30",
+    }
+    np.testing.assert_allclose(
+        np.asarray(model.regressor).sum(1), np.asarray(model.known, float), atol=1e-6
+    )
 
 
-BENT = BodyPose(REST.rotations.at[JOINT_NAMES.index("left_elbow")].set(jnp.asarray([0, -np.pi / 2, 0])), jnp.zeros(3))
+BENT = BodyPose(
+    REST.rotations.at[JOINT_NAMES.index("left_elbow")].set(jnp.asarray([0, -np.pi / 2, 0])),
+    jnp.zeros(3),
+)
 """The left elbow is bent by a right angle, to the front; the body stands where it stood."""
 
 
-@pytest.mark.parametrize(("joints", "turned"), [(("left_shoulder",), (0.03, 0.02, 0.0)), (("left_elbow",), (0.0, 0.02, 0.03))])
+@pytest.mark.parametrize(
+    ("joints", "turned"),
+    [(("left_shoulder",), (0.03, 0.02, 0.0)), (("left_elbow",), (0.0, 0.02, 0.03))],
+)
 def test_a_place_is_beside_its_joint_and_turns_with_its_bones(small, joints, turned):
     names = ("left_elbow", "nose")
     plain, moved = (
-        landmark_model(small, names, places) for places in ((), (Place(names[0], names[0], (0.03, 0.02, 0), joints),))
+        landmark_model(small, names, places)
+        for places in ((), (Place(names[0], names[0], (0.03, 0.02, 0), joints),))
     )
     for betas in (jnp.zeros(2), jnp.asarray([2.0, -1.0])):
         (a, nose), (b, same) = (posed(model, betas, BENT)[0] for model in (plain, moved))
@@ -60,14 +80,18 @@ def test_a_place_is_beside_its_joint_and_turns_with_its_bones(small, joints, tur
         np.testing.assert_array_equal(nose, same)
 
 
-def test_a_place_beside_a_vertex_is_carried_by_the_same_bones_and_one_of_joints_that_a_body_lacks_is_ignored(small):
+def test_a_place_beside_a_vertex_is_carried_by_the_same_bones_and_one_of_joints_that_a_body_lacks_is_ignored(
+    small,
+):
     names = ("left_index_tip", "nose")
     places = (
         Place(names[0], names[0], (0.0, 0.01, 0.0)),
         Place("nose", "left_horn", (1.0, 0, 0)),
         Place("nose", "nose", (1, 0, 0), ("tail",)),
     )
-    plain, moved = (posed(landmark_model(small, names, own), jnp.zeros(1), BENT)[0] for own in ((), places))
+    plain, moved = (
+        posed(landmark_model(small, names, own), jnp.zeros(1), BENT)[0] for own in ((), places)
+    )
     np.testing.assert_allclose(moved - plain, [[0, 0.01, 0], [0, 0, 0]], atol=ATOL)  # up stays up
 
 
@@ -87,7 +111,9 @@ def test_mirror_images_share_one_offset_with_x_turned_round(body, kind):
     """Points of the face, too: the corners of the eyes and of the mouth are pairs."""
     model = landmark_model(body, kind.names, kind.places)
     groups = {model.names[row]: own for row, own in zip(model.placed, model.groups, strict=True)}
-    assert len({group for group, _ in groups.values()}) == len({frozenset((n, mirrored_name(n))) for n in groups})
+    assert len({group for group, _ in groups.values()}) == len(
+        {frozenset((n, mirrored_name(n))) for n in groups}
+    )
     offsets = np.random.default_rng(0).normal(0, 0.01, (len(groups), 3))
     moved = dict(zip(model.names, model.by_landmark(jnp.asarray(offsets)), strict=True))
     x = {name: at_rest(model)[i, 0] for i, name in enumerate(model.names)}
@@ -118,7 +144,9 @@ def test_landmarks_are_the_posed_bodys(body, correctives):
     names = ("nose", "left_heel", "right_index_tip", "left_knee", "neck", "right_ear", "face_3")
     model = landmark_model(body, names)
     betas = jnp.asarray(rng.normal(0, 1, 5), jnp.float32)
-    pose = BodyPose(jnp.asarray(rng.normal(0, 0.4, (55, 3)), jnp.float32), jnp.asarray([0.3, -0.2, 1.0]))
+    pose = BodyPose(
+        jnp.asarray(rng.normal(0, 0.4, (55, 3)), jnp.float32), jnp.asarray([0.3, -0.2, 1.0])
+    )
     landmarks, joints = posed(model, betas, pose)
     whole = jax.jit(lambda b, s, p: pose_body(b, shape_body(b, s), p))(body, betas, pose)
     np.testing.assert_allclose(joints, whole.joints, atol=ATOL)
@@ -134,9 +162,16 @@ def test_landmarks_are_the_posed_bodys(body, correctives):
 def test_where_the_surface_landmarks_are(whole):
     at, height, depth = whole[1], 1, 2
     assert at["face_27"][height] > at["nose"][height] > at["face_8"][height]
-    assert at["nose"][depth] > max(at["face_27"][depth], at["face_8"][depth]) > at["left_ear"][depth]
+    assert (
+        at["nose"][depth] > max(at["face_27"][depth], at["face_8"][depth]) > at["left_ear"][depth]
+    )
     assert at["left_small_toe"][0] > at["left_ankle"][0] > at["left_big_toe"][0]
-    assert at["left_big_toe"][depth] > at["left_small_toe"][depth] > at["left_ankle"][depth] > at["left_heel"][depth]
+    assert (
+        at["left_big_toe"][depth]
+        > at["left_small_toe"][depth]
+        > at["left_ankle"][depth]
+        > at["left_heel"][depth]
+    )
 
 
 def test_a_coarser_mesh_has_them_nearly_where_the_whole_one_has_them(small, whole):
@@ -150,7 +185,17 @@ def test_a_coarser_mesh_has_them_nearly_where_the_whole_one_has_them(small, whol
 def test_movers_are_the_joints_that_move_a_landmark(small):
     model = landmark_model(small, ("left_wrist", "nose"))
     moved = {JOINT_NAMES[j] for j in model.movers}
-    chain = {"pelvis", "spine1", "spine2", "spine3", "left_collar", "left_shoulder", "left_elbow", "neck", "head"}
+    chain = {
+        "pelvis",
+        "spine1",
+        "spine2",
+        "spine3",
+        "left_collar",
+        "left_shoulder",
+        "left_elbow",
+        "neck",
+        "head",
+    }
     assert chain <= moved <= chain | {"jaw"}
 
 

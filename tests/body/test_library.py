@@ -31,13 +31,25 @@ def test_sizes(body):
     assert body.joint_names == JOINT_NAMES and body.parents == PARENTS
     assert len(JOINT_NAMES) == len(PARENTS) == 55
     assert [JOINT_NAMES[i] for i in (25, 28, 31, 34, 39, 40, 54)] == [
-        *("left_index1", "left_middle1", "left_pinky1", "left_ring1", "left_thumb3", "right_index1", "right_thumb3")
+        *(
+            "left_index1",
+            "left_middle1",
+            "left_pinky1",
+            "left_ring1",
+            "left_thumb3",
+            "right_index1",
+            "right_thumb3",
+        )
     ]
     assert [PARENTS[i] for i in (25, 26, 27, 28, 40, 41, 22)] == [20, 25, 26, 20, 21, 40, 15]
     assert len(body.shape_names) == body.shape_directions.shape[-1] >= 10
-    assert {"sex_male", "age", "weight", "muscle", "height", "leg_length", "head_size"} <= set(body.shape_names)
+    assert {"sex_male", "age", "weight", "muscle", "height", "leg_length", "head_size"} <= set(
+        body.shape_names
+    )
     assert body.template.dtype == jnp.float32
-    assert (resources.files("humangs_jax") / "assets" / "makehuman.npz").stat().st_size < 3 * MEGABYTE
+    assert (
+        resources.files("humangs_jax") / "assets" / "makehuman.npz"
+    ).stat().st_size < 3 * MEGABYTE
     assert "CC0" in (resources.files("humangs_jax") / "assets" / "makehuman.LICENSE.md").read_text()
 
 
@@ -67,7 +79,9 @@ def test_left_and_right_mirror_each_other(body, joints):
     directions = np.asarray(body.shape_directions)
     difference = np.abs(directions[twin] - directions * mirror[:, None]).max(axis=(0, 1))
     assert difference.max() < 5 * SYMMETRY  # per unit of a coefficient
-    for left, right in ((n, n.replace("left", "right")) for n in JOINT_NAMES if n.startswith("left_")):
+    for left, right in (
+        (n, n.replace("left", "right")) for n in JOINT_NAMES if n.startswith("left_")
+    ):
         assert np.allclose(joints[left] * mirror, joints[right], atol=SYMMETRY)
 
 
@@ -97,18 +111,27 @@ def test_shapes_are_plausible_people_and_keep_the_pelvis(body):
     rests = {}
     for i, name in enumerate(body.shape_names):
         for sign in (-2.0, 2.0):
-            rest = rests[name, sign] = shaped(body, jnp.zeros(len(body.shape_names)).at[i].set(sign))
+            rest = rests[name, sign] = shaped(
+                body, jnp.zeros(len(body.shape_names)).at[i].set(sign)
+            )
             assert 1.45 < height(rest) < 1.9, name
             assert 0.035 < signed_volume(rest.vertices, faces) < 0.1, name
             assert np.allclose(rest.joints[0], [0, -0.35, 0], atol=6e-3), name
             assert np.ptp(np.asarray(rest.joints)[[16, 18, 20], 1]) < 0.02, name  # still a T-pose
     assert height(rests["height", 2.0]) > height(rests["height", -2.0]) + 0.12
-    legs = [float(rests["leg_length", sign].joints[1, 1] - rests["leg_length", sign].joints[7, 1]) for sign in (-2.0, 2.0)]
+    legs = [
+        float(rests["leg_length", sign].joints[1, 1] - rests["leg_length", sign].joints[7, 1])
+        for sign in (-2.0, 2.0)
+    ]
     assert legs[1] > legs[0] + 0.12
 
 
 def test_limbs_bend_the_way_smplx_limbs_do(body, joints):
-    pose = jax.jit(lambda rotations: pose_body(body, shape_body(body, jnp.zeros(1)), BodyPose(rotations, jnp.zeros(3))))
+    pose = jax.jit(
+        lambda rotations: pose_body(
+            body, shape_body(body, jnp.zeros(1)), BodyPose(rotations, jnp.zeros(3))
+        )
+    )
 
     def posed(**rotations):
         vectors = np.zeros((55, 3), np.float32)
@@ -117,13 +140,19 @@ def test_limbs_bend_the_way_smplx_limbs_do(body, joints):
         return pose(vectors)
 
     wrist = np.asarray(posed(left_elbow=(0, -np.pi / 2, 0)).joints[20])
-    assert wrist[2] > joints["left_elbow"][2] + 0.15 and abs(wrist[0] - joints["left_elbow"][0]) < 0.02
-    assert posed(right_knee=(np.pi / 2, 0, 0)).joints[8, 2] < joints["right_knee"][2] - 0.3  # the heel goes back
+    assert (
+        wrist[2] > joints["left_elbow"][2] + 0.15 and abs(wrist[0] - joints["left_elbow"][0]) < 0.02
+    )
+    assert (
+        posed(right_knee=(np.pi / 2, 0, 0)).joints[8, 2] < joints["right_knee"][2] - 0.3
+    )  # the heel goes back
     arms = posed(left_shoulder=(0, 0, -1.2), right_shoulder=(0, 0, 1.2))
     assert np.asarray(arms.joints)[[20, 21], 1].max() < joints["left_shoulder"][1] - 0.3
     turned, template = posed(head=(0, 0.8, 0)), np.asarray(body.template)
     face = np.where(np.asarray(body.skinning_weights)[:, 15] > 0.9, template[:, 2], -1)
-    assert turned.vertices[int(np.argmax(face)), 0] > 0.04  # the nose goes towards the person's left
+    assert (
+        turned.vertices[int(np.argmax(face)), 0] > 0.04
+    )  # the nose goes towards the person's left
     assert np.allclose(turned.vertices[template[:, 1] < 0], template[template[:, 1] < 0], atol=1e-5)
 
 
@@ -132,7 +161,9 @@ def test_own_files_keep_a_body(tmp_path):
     body = replace(
         body,
         uvs=jnp.asarray(np.random.default_rng(0).uniform(size=(12, 2)), jnp.float32),
-        uv_faces=jnp.asarray(np.random.default_rng(1).integers(0, 12, size=body.faces.shape), jnp.int32),
+        uv_faces=jnp.asarray(
+            np.random.default_rng(1).integers(0, 12, size=body.faces.shape), jnp.int32
+        ),
         joint_names=tuple("abcdefg"),
         shape_names=tuple("pqrs"),
         shape_directions=body.shape_directions / 4,

@@ -27,7 +27,9 @@ def test_vertices_joints_and_transforms_agree_with_the_oracle(pose_directions):
             body = made_up_body(1, pose_directions=pose_directions)
             expected = oracle(body, betas, rotations, translation)
             found = posed(body, betas, rotations, translation)
-            for a, b in zip((found.vertices, found.joints, found.joint_transforms), expected, strict=True):
+            for a, b in zip(
+                (found.vertices, found.joints, found.joint_transforms), expected, strict=True
+            ):
                 assert a.dtype == (jnp.float64 if x64 else jnp.float32)
                 assert np.abs(np.asarray(a) - b).max() < exact
 
@@ -40,7 +42,9 @@ def test_gradients_at_the_zero_pose_are_finite_and_right():
         @jax.jit
         def loss(numbers):
             betas, rotations = numbers[:4], numbers[4:].reshape(-1, 3)
-            return jnp.sum(jnp.square(posed(body, betas, rotations, jnp.zeros(3)).vertices - target))
+            return jnp.sum(
+                jnp.square(posed(body, betas, rotations, jnp.zeros(3)).vertices - target)
+            )
 
         zero = jnp.zeros(4 + rest_pose(body).rotations.size)
         gradient = jax.grad(loss)(zero)

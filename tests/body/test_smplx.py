@@ -55,7 +55,10 @@ PARTS = ("global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose")
 def compare_body(model: Path, arrays: Path) -> list[tuple[str, int, float, float, float]]:
     """Rows (convention, pose index, vertex, joint and pose difference)."""
     expected = np.load(arrays, allow_pickle=False)
-    counts = {"shape_count": expected["betas"].shape[1], "expression_count": expected["expression"].shape[1]}
+    counts = {
+        "shape_count": expected["betas"].shape[1],
+        "expression_count": expected["expression"].shape[1],
+    }
     body, hands = load_smplx(model, **counts), load_hands(model)
 
     @jax.jit
@@ -75,7 +78,9 @@ def compare_body(model: Path, arrays: Path) -> list[tuple[str, int, float, float
             rotations = jnp.concatenate([*(number(part, i).ravel() for part in PARTS), *hand])
             pose = BodyPose(rotations.reshape(55, 3), number("transl", i))
             found = run(jnp.concatenate([number("betas", i), number("expression", i)]), pose)
-            wanted = [expected[f"{convention}_{name}"][i] for name in ("vertices", "joints", "full_pose")]
+            wanted = [
+                expected[f"{convention}_{name}"][i] for name in ("vertices", "joints", "full_pose")
+            ]
             vertices, joints, rotations = (
                 float(np.abs(np.asarray(a, np.float64) - b).max())
                 for a, b in zip((*found, pose.rotations.reshape(-1)), wanted, strict=True)
@@ -89,8 +94,13 @@ def test_agrees_with_the_public_package_in_every_hand_convention(tmp_path):
     assert {convention for convention, *_ in rows} == set(CONVENTIONS) and len(rows) == 6
     assert max(max(errors) for _, _, *errors in rows) < TOLERANCE
     arrays = dict(np.load(ARRAYS))
-    np.savez(tmp_path / "other.npz", **arrays | {"axis_mean_joints": arrays["axis_mean_joints"] + 2e-5})
-    assert max(max(errors) for _, _, *errors in compare_body(MODEL, tmp_path / "other.npz")) > TOLERANCE
+    np.savez(
+        tmp_path / "other.npz", **arrays | {"axis_mean_joints": arrays["axis_mean_joints"] + 2e-5}
+    )
+    assert (
+        max(max(errors) for _, _, *errors in compare_body(MODEL, tmp_path / "other.npz"))
+        > TOLERANCE
+    )
 
 
 def test_an_npz_is_read_as_it_is(tmp_path):
@@ -101,14 +111,27 @@ def test_an_npz_is_read_as_it_is(tmp_path):
     assert body.name == "SMPLX_NEUTRAL"
     assert body.parents == PARENTS and body.joint_names == JOINT_NAMES
     assert body.shape_names == ("shape_0", "shape_1", "shape_2", "expression_0", "expression_1")
-    assert np.allclose(body.shape_directions, arrays["shapedirs"][..., [0, 1, 2, 10, 11]], atol=ATOL)
-    for field, key in (("template", "v_template"), ("pose_directions", "posedirs"), ("joint_regressor", "J_regressor")):
+    assert np.allclose(
+        body.shape_directions, arrays["shapedirs"][..., [0, 1, 2, 10, 11]], atol=ATOL
+    )
+    for field, key in (
+        ("template", "v_template"),
+        ("pose_directions", "posedirs"),
+        ("joint_regressor", "J_regressor"),
+    ):
         assert np.allclose(getattr(body, field), arrays[key], atol=ATOL)
-    for field, key in (("skinning_weights", "weights"), ("faces", "f"), ("uvs", "vt"), ("uv_faces", "ft")):
+    for field, key in (
+        ("skinning_weights", "weights"),
+        ("faces", "f"),
+        ("uvs", "vt"),
+        ("uv_faces", "ft"),
+    ):
         assert np.allclose(getattr(body, field), arrays[key], atol=ATOL)
     assert body.template.dtype == jnp.float32
     with jax.enable_x64(True):
-        assert np.array_equal(load_smplx(tmp_path / "SMPLX_NEUTRAL.npz").template, arrays["v_template"])
+        assert np.array_equal(
+            load_smplx(tmp_path / "SMPLX_NEUTRAL.npz").template, arrays["v_template"]
+        )
 
 
 def test_expressions_are_no_shape_of_a_person(tmp_path):
@@ -125,14 +148,18 @@ def test_current_files_hold_expressions_after_300_columns(tmp_path):
     np.savez(tmp_path / "model.npz", **{k: v % 2 if k == "f" else v for k, v in arrays.items()})
     body = load_body(tmp_path / "model.npz", shape_count=1, expression_count=1)
     assert np.allclose(body.shape_directions, arrays["shapedirs"][..., [0, 300]], atol=ATOL)
-    assert load_smplx(tmp_path / "model.npz", shape_count=300, expression_count=100).shape_directions.shape == (2, 3, 400)
+    assert load_smplx(
+        tmp_path / "model.npz", shape_count=300, expression_count=100
+    ).shape_directions.shape == (2, 3, 400)
     with pytest.raises(ValueError, match="shapedirs: has 300 shape directions, asked for 301"):
         load_smplx(tmp_path / "model.npz", shape_count=301)
 
 
 def chumpy_pickle(path, content, wrap):
     """Write a pickle that names chumpy's classes, with the attributes that chumpy's own pickles carry."""
-    modules = {name: types.ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")}
+    modules = {
+        name: types.ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")
+    }
 
     class Ch:
         pass
@@ -148,7 +175,11 @@ def chumpy_pickle(path, content, wrap):
     chumpy._dirty_vars = {}
     source, select = Ch(), Select()
     source.x = np.concatenate([[7.0], content[wrap[1]].ravel()])
-    select.a, select.idxs, select.preferred_shape = source, np.arange(1, source.x.size), content[wrap[1]].shape
+    select.a, select.idxs, select.preferred_shape = (
+        source,
+        np.arange(1, source.x.size),
+        content[wrap[1]].shape,
+    )
     sys.modules.update(modules)
     try:
         path.write_bytes(pickle.dumps({**content, wrap[0]: chumpy, wrap[1]: select}, protocol=2))
@@ -157,11 +188,17 @@ def chumpy_pickle(path, content, wrap):
             del sys.modules[name]
 
 
-@pytest.mark.parametrize("sparse", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.coo_matrix])
+@pytest.mark.parametrize(
+    "sparse", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.coo_matrix]
+)
 def test_a_pickle_with_sparse_and_chumpy_arrays_is_the_same_model(tmp_path, sparse):
     arrays = made_up_file()
     np.savez(tmp_path / "model.npz", **arrays)
-    chumpy_pickle(tmp_path / "model.pkl", {**arrays, "J_regressor": sparse(arrays["J_regressor"])}, ("v_template", "posedirs"))
+    chumpy_pickle(
+        tmp_path / "model.pkl",
+        {**arrays, "J_regressor": sparse(arrays["J_regressor"])},
+        ("v_template", "posedirs"),
+    )
     one, other = load_smplx(tmp_path / "model.npz"), load_body(tmp_path / "model.pkl")
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         assert np.array_equal(a, b)
@@ -171,7 +208,9 @@ def test_every_pickle_protocol_is_read(tmp_path):
     arrays = made_up_file()
     for protocol in (0, 2, 4, 5):
         (tmp_path / "model.pkl").write_bytes(pickle.dumps(arrays, protocol=protocol))
-        assert np.allclose(load_smplx(tmp_path / "model.pkl").template, arrays["v_template"], atol=ATOL)
+        assert np.allclose(
+            load_smplx(tmp_path / "model.pkl").template, arrays["v_template"], atol=ATOL
+        )
 
 
 def broken(**changes):
@@ -192,7 +231,10 @@ def with_bad_number(key):
         (broken(v_template=np.ones((9, 4))), r"v_template: expected shape \(any, 3\)"),
         (broken(shapedirs=np.ones((9, 3, 12))), "shapedirs: expected 20 or 400 columns"),
         (broken(f=np.full((4, 3), 9, np.uint32)), r"f: expected indices in \[0, 9\)"),
-        (broken(kintree_table=np.zeros((2, 55), np.uint32)), "kintree_table: expected SMPL-X's joint tree"),
+        (
+            broken(kintree_table=np.zeros((2, 55), np.uint32)),
+            "kintree_table: expected SMPL-X's joint tree",
+        ),
         (broken(J_regressor=np.asarray([None] * 3, dtype=object)), "J_regressor: "),
         (broken(posedirs=np.full((9, 3, 486), "a")), "posedirs: expected real numbers"),
         (with_bad_number("posedirs"), "posedirs: expected finite numbers"),

@@ -26,9 +26,13 @@ def test_edges_are_short_and_the_surface_is_the_same(coarse):
     x, corners = np.asarray(fine.template), np.asarray(fine.template)[np.asarray(fine.faces)]
     assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= LONGEST
     assert len(x) > len(coarse.template)
-    assert is_closed(np.asarray(coarse.faces)) and is_closed(np.asarray(fine.faces))  # no T-junction, no crack
+    assert is_closed(np.asarray(coarse.faces)) and is_closed(
+        np.asarray(fine.faces)
+    )  # no T-junction, no crack
     for of in (area, signed_volume):
-        np.testing.assert_allclose(of(fine.template, fine.faces), of(coarse.template, coarse.faces), rtol=1e-5)
+        np.testing.assert_allclose(
+            of(fine.template, fine.faces), of(coarse.template, coarse.faces), rtol=1e-5
+        )
     np.testing.assert_array_equal(x[: len(coarse.template)], coarse.template)
 
 
@@ -38,7 +42,9 @@ def test_midpoints_stay_midpoints_in_every_shape_and_weights_sum_to_one(coarse):
     betas = jnp.asarray([1.0, -2.0, 1.5])
     before, after = shape_body(coarse, betas), shape_body(fine, betas)
     np.testing.assert_allclose(after.joints, before.joints, atol=JOINT_TOLERANCE)
-    np.testing.assert_allclose(area(after.vertices, fine.faces), area(before.vertices, coarse.faces), rtol=1e-5)
+    np.testing.assert_allclose(
+        area(after.vertices, fine.faces), area(before.vertices, coarse.faces), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("longest", [0.0, -1.0, float("nan"), 1e-9])

@@ -35,7 +35,11 @@ def no_cache(monkeypatch, tmp_path):
 
 def test_it_lies_in_the_users_cache_folder_by_version(tmp_path):
     folder = enable_compile_cache()
-    assert folder is not None and folder.parent == tmp_path / "home" / "humangs_jax" and folder.is_dir()
+    assert (
+        folder is not None
+        and folder.parent == tmp_path / "home" / "humangs_jax"
+        and folder.is_dir()
+    )
     assert jax.__version__ in folder.name and jax.config.jax_compilation_cache_dir == str(folder)
     assert not list(folder.iterdir())
 
@@ -49,12 +53,16 @@ def test_the_environment_turns_it_off_or_moves_it(tmp_path, monkeypatch):
     assert folder is not None and folder.parent == tmp_path / "there"
     jax.config.update("jax_compilation_cache_dir", None)
     monkeypatch.delenv(OF_JAX)
-    assert enable_compile_cache(tmp_path / "here").parent == tmp_path / "here"  # an argument comes first
+    assert (
+        enable_compile_cache(tmp_path / "here").parent == tmp_path / "here"
+    )  # an argument comes first
 
 
 def test_a_cache_that_jax_has_already_stays(tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    assert enable_compile_cache() == tmp_path and jax.config.jax_compilation_cache_dir == str(tmp_path)
+    assert enable_compile_cache() == tmp_path and jax.config.jax_compilation_cache_dir == str(
+        tmp_path
+    )
 
 
 def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):
@@ -84,7 +92,13 @@ def test_a_second_program_finds_what_the_first_one_compiled(tmp_path):
     environment |= {VARIABLE: str(tmp_path), "JAX_PLATFORMS": "cpu"}
     seen = []
     for _ in range(2):
-        done = subprocess.run([sys.executable, "-c", USE], env=environment, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", USE], env=environment, capture_output=True, text=True, check=True
+        )
         seen.append({file.name: file.stat().st_mtime_ns for file in tmp_path.glob("jax-*/*-cache")})
-    assert done.stdout.startswith(str(tmp_path)) and done.stdout.endswith(" False\n") and done.stderr == ""
+    assert (
+        done.stdout.startswith(str(tmp_path))
+        and done.stdout.endswith(" False\n")
+        and done.stderr == ""
+    )
     assert len(seen[0]) > 0 and seen[0] == seen[1]

@@ -11,7 +11,15 @@ import pytest
 
 import experiments.systems  # noqa: F401
 from humangs_jax.apps import settings
-from humangs_jax.core.configuration import _PARTS, Range, _ranges, config_from_json, config_to_json, configuration, vary
+from humangs_jax.core.configuration import (
+    _PARTS,
+    Range,
+    _ranges,
+    config_from_json,
+    config_to_json,
+    configuration,
+    vary,
+)
 from humangs_jax.people.on_the_fly import OnTheFlyConfig
 from humangs_jax.training import config
 
@@ -29,18 +37,30 @@ def reachable(cls, found):
 
 
 ALL = set()
-CONFIGURATIONS = (settings.Settings, settings.FrontPoint, config.TrainConfig, settings.RefineConfig, OnTheFlyConfig)
+CONFIGURATIONS = (
+    settings.Settings,
+    settings.FrontPoint,
+    config.TrainConfig,
+    settings.RefineConfig,
+    OnTheFlyConfig,
+)
 for each in (*CONFIGURATIONS, *_PARTS.values()):
     reachable(each, ALL)
 
 
 def is_number(annotation):
-    return annotation in (int, float) or any(is_number(part) for part in typing.get_args(annotation))
+    return annotation in (int, float) or any(
+        is_number(part) for part in typing.get_args(annotation)
+    )
 
 
-@pytest.mark.parametrize("cls", sorted(ALL, key=lambda cls: cls.__name__), ids=lambda cls: cls.__name__)
+@pytest.mark.parametrize(
+    "cls", sorted(ALL, key=lambda cls: cls.__name__), ids=lambda cls: cls.__name__
+)
 def test_every_number_has_a_range(cls):
-    numbers = {name for name, annotation in typing.get_type_hints(cls).items() if is_number(annotation)}
+    numbers = {
+        name for name, annotation in typing.get_type_hints(cls).items() if is_number(annotation)
+    }
     assert numbers == set(_ranges(cls))
 
 
@@ -97,11 +117,32 @@ def test_a_file_names_the_path_of_the_field():
         assert str(caught.value).startswith(said)
     nested = json.loads(config_to_json(settings.PRESETS["best"]))
     nested["runtime"]["body_vertices"] = 0
-    with pytest.raises(ValueError, match=r"config\.runtime\.body_vertices 0: expected 1 to 10,000,000"):
+    with pytest.raises(
+        ValueError, match=r"config\.runtime\.body_vertices 0: expected 1 to 10,000,000"
+    ):
         config_from_json(settings.Settings, json.dumps(nested))
 
 
-HOSTILE = (0, -1, 1, 3, 10**6, 10**9, 2**63, 0.5, -0.5, 1e-300, 1e300, np.nan, np.inf, None, True, "x", [], {})
+HOSTILE = (
+    0,
+    -1,
+    1,
+    3,
+    10**6,
+    10**9,
+    2**63,
+    0.5,
+    -0.5,
+    1e-300,
+    1e300,
+    np.nan,
+    np.inf,
+    None,
+    True,
+    "x",
+    [],
+    {},
+)
 
 
 def leaves(value, path=()):
@@ -113,7 +154,9 @@ def leaves(value, path=()):
 
 
 @pytest.mark.parametrize(
-    "whole", [settings.PRESETS["best"], pytest.param(config.tiny(), marks=pytest.mark.slow)], ids=lambda x: type(x).__name__
+    "whole",
+    [settings.PRESETS["best"], pytest.param(config.tiny(), marks=pytest.mark.slow)],
+    ids=lambda x: type(x).__name__,
 )
 def test_any_value_in_any_field_is_read_or_refused_in_one_line(whole):
     text, refused = config_to_json(whole), 0
@@ -137,7 +180,12 @@ def test_fields_are_varied_by_their_paths():
     run = config.PRESETS["tiny"]()
     varied = vary(run, {"model.runtime.crop": not run.model.runtime.crop, "loss.squared": 0.25})
     assert varied.loss.squared == 0.25 and varied.model.runtime.crop != run.model.runtime.crop
-    assert vary(varied, {"model.runtime.crop": run.model.runtime.crop, "loss.squared": run.loss.squared}) == run
+    assert (
+        vary(
+            varied, {"model.runtime.crop": run.model.runtime.crop, "loss.squared": run.loss.squared}
+        )
+        == run
+    )
     for path, like in {
         "loss.squard": "; did you mean loss.squared?",
         "architecture.encoder.class_token": "; did you mean model.architecture.encoder.transformer.class_token?",
@@ -145,7 +193,9 @@ def test_fields_are_varied_by_their_paths():
         "steps.a": "; did you mean steps?",
         "nonsense": "",
     }.items():
-        with pytest.raises(ValueError, match=re.escape(f"{path}: TrainConfig has no such field{like} (all")):
+        with pytest.raises(
+            ValueError, match=re.escape(f"{path}: TrainConfig has no such field{like} (all")
+        ):
             vary(run, {path: 1.0})
     with pytest.raises(ValueError, match="squared"):
         vary(run, {"loss.squared": -1.0})

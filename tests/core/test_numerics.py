@@ -20,7 +20,9 @@ def test_directions_over_many_decades(scale, seed):
 
 
 @pytest.mark.parametrize("largest", [1e-37, 1e-30, 1e25, 1e37])
-def test_directions_at_the_extremes_of_float32(largest):  # denormals (also of 1 / x) are flushed to 0
+def test_directions_at_the_extremes_of_float32(
+    largest,
+):  # denormals (also of 1 / x) are flushed to 0
     x = jnp.asarray([largest, 0.5 * largest, 0.0], jnp.float32)
     unit = numerics.safe_normalize(x, jnp.asarray([0.0, 0, 1]))
     np.testing.assert_allclose(unit, np.asarray([1, 0.5, 0]) / np.sqrt(1.25), rtol=1e-5)
@@ -47,20 +49,28 @@ def test_absolute_has_no_slope_at_zero():
 
 
 def test_zero_has_the_stated_value():
-    assert (numerics.safe_normalize(jnp.zeros(3), jnp.asarray([0.0, 1, 0])) == jnp.asarray([0.0, 1, 0])).all()
+    assert (
+        numerics.safe_normalize(jnp.zeros(3), jnp.asarray([0.0, 1, 0])) == jnp.asarray([0.0, 1, 0])
+    ).all()
     assert numerics.safe_divide(jnp.ones(1), jnp.zeros(1))[0] == 0
 
 
 @given(st.floats(-12, 12))
 def test_the_inverse_of_the_sigmoid_inverts(x):
-    assert np.isclose(numerics.inverse_sigmoid(jax.nn.sigmoid(jnp.float32(x))), x, atol=0.05, rtol=0)
+    assert np.isclose(
+        numerics.inverse_sigmoid(jax.nn.sigmoid(jnp.float32(x))), x, atol=0.05, rtol=0
+    )
 
 
 def test_narrow_floats_become_float32_and_their_gradients_narrow_again():
     narrow = jnp.asarray([1.0, 2.0], jnp.bfloat16)
     tree = {"a": narrow, "b": jnp.asarray([3.0]), "c": np.asarray([3.0])}
     wide = numerics.at_least_float32(tree)
-    assert {k: leaf.dtype.name for k, leaf in wide.items()} == {"a": "float32", "b": "float32", "c": "float64"}
+    assert {k: leaf.dtype.name for k, leaf in wide.items()} == {
+        "a": "float32",
+        "b": "float32",
+        "c": "float64",
+    }
     gradient = jax.grad(lambda x: jnp.sum(numerics.at_least_float32({"x": x})["x"] ** 2))(narrow)
     assert gradient.dtype == jnp.bfloat16
     np.testing.assert_array_equal(gradient, [2.0, 4.0])

@@ -31,7 +31,9 @@ print(int(kept), faults[-1])
 
 
 def run(mode):
-    done = subprocess.run([sys.executable, "-c", PROGRAM, mode], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, mode], capture_output=True, text=True, check=True
+    )
     return [int(word) for word in done.stdout.split()]
 
 
@@ -56,7 +58,9 @@ def test_the_peak_is_that_of_the_work_inside():
     del kept
 
 
-pytestmark = pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs signals of POSIX")
+pytestmark = pytest.mark.skipif(
+    not hasattr(signal, "pthread_sigmask"), reason="needs signals of POSIX"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -75,7 +79,9 @@ def test_an_interrupt_waits_for_the_end_of_the_block():
     assert done == ["all of it"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     with undisturbed():
         pass
-    thread = threading.Thread(target=lambda: undisturbed().__enter__())  # only the main thread may set handlers
+    thread = threading.Thread(
+        target=lambda: undisturbed().__enter__()
+    )  # only the main thread may set handlers
     thread.start()
     thread.join()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -87,9 +93,13 @@ def test_a_process_that_is_started_deaf_survives_an_interrupt():
     for deaf in (True, False):
         if deaf:
             with started_deaf():
-                program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+                program = subprocess.Popen(
+                    [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+                )
         else:
-            program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+            program = subprocess.Popen(
+                [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+            )
         ends[deaf] = program.communicate()[0]
     assert ends == {True: b"alive\n", False: b""}
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, set())
@@ -118,7 +128,9 @@ def runs(pid):
 def test_workers_of_a_killed_process_end(tmp_path):
     script = tmp_path / "pool.py"
     script.write_text(POOL)
-    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True
+    ) as process:
         worker = int(process.stdout.readline())
         process.send_signal(signal.SIGKILL)
     deadline = time.monotonic() + 60

@@ -24,13 +24,17 @@ def products_that_say_nothing(file):
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         called = node.func if isinstance(node, ast.Call) else None
         product = isinstance(called, ast.Attribute) and called.attr in PRODUCTS
-        of_jax = product and isinstance(called.value, ast.Name) and called.value.id in ("jnp", "lax")
+        of_jax = (
+            product and isinstance(called.value, ast.Name) and called.value.id in ("jnp", "lax")
+        )
         if of_jax and not SAYS & {keyword.arg for keyword in node.keywords}:
             yield f"{file.relative_to(PACKAGE)}:{node.lineno}"
 
 
 def test_every_product_of_jax_says_how_exact_it_is():
-    assert [place for file in sorted(PACKAGE.rglob("*.py")) for place in products_that_say_nothing(file)] == []
+    assert [
+        place for file in sorted(PACKAGE.rglob("*.py")) for place in products_that_say_nothing(file)
+    ] == []
 
 
 def camera():
@@ -39,15 +43,23 @@ def camera():
 
 def colors():
     images, pixels = jnp.ones((VIEWS, SIZE, SIZE, 3)), jnp.ones((VIEWS, POINTS, 2))
-    return lambda seen: photo_colors(images, pixels, seen, "half_pixel"), jnp.ones((VIEWS, POINTS), bool)
+    return lambda seen: photo_colors(images, pixels, seen, "half_pixel"), jnp.ones(
+        (VIEWS, POINTS), bool
+    )
 
 
 def shells():
     points, image = jnp.ones((VIEWS, POINTS, 3)), jnp.ones((VIEWS, SIZE, SIZE))
-    cameras, present, distances = stack_cameras([camera()] * VIEWS), jnp.ones(VIEWS, bool), (0.0, 0.1)
+    cameras, present, distances = (
+        stack_cameras([camera()] * VIEWS),
+        jnp.ones(VIEWS, bool),
+        (0.0, 0.1),
+    )
 
     def sample(images):
-        found = sample_shells(images, image > 0, image, cameras, points, points, distances, present, "half_pixel")
+        found = sample_shells(
+            images, image > 0, image, cameras, points, points, distances, present, "half_pixel"
+        )
         return found.colors
 
     return sample, jnp.ones((VIEWS, SIZE, SIZE, 3))

@@ -34,7 +34,9 @@ def test_what_a_terminal_acts_on_is_escaped(text, shown):
     assert printable(text) == shown and shown.isprintable()
 
 
-@pytest.mark.parametrize("text", ["photo_01.png", "naïve", "写真　三", "صورة", "می‌خواهم", "a\u00a0b", "👩‍🎤"])
+@pytest.mark.parametrize(
+    "text", ["photo_01.png", "naïve", "写真　三", "صورة", "می‌خواهم", "a\u00a0b", "👩‍🎤"]
+)
 def test_words_of_all_languages_stay(text):
     assert printable(text) == text
 
@@ -50,7 +52,9 @@ def test_errors_of_files_are_printable():
 
 def test_one_module_writes_to_the_terminal():
     """Else a call site could forget what `say` does."""
-    writes = re.compile(r"\bprint\(|std(out|err)\.write|\bbar\.write|tqdm\.write|os\.write\([12],|logging\.StreamHandler")
+    writes = re.compile(
+        r"\bprint\(|std(out|err)\.write|\bbar\.write|tqdm\.write|os\.write\([12],|logging\.StreamHandler"
+    )
     found = {
         f"{path.relative_to(PACKAGE)}: {line.strip()}"
         for path in PACKAGE.rglob("*.py")
@@ -99,7 +103,11 @@ def test_what_is_said_beside_a_bar_is_a_line_of_its_own(capsys):
         progress.say("humangs: warning: odd", error=True)
         shown.update(2)
     captured = capsys.readouterr().err
-    assert "humangs: warning: odd" in lines_of(captured) and r"a\x1b[2J\nb" in captured and "\x1b[2J" not in captured
+    assert (
+        "humangs: warning: odd" in lines_of(captured)
+        and r"a\x1b[2J\nb" in captured
+        and "\x1b[2J" not in captured
+    )
 
 
 def test_a_bar_in_a_log_is_a_few_lines(capsys):
@@ -110,7 +118,11 @@ def test_a_bar_in_a_log_is_a_few_lines(capsys):
 
 def test_tables_are_aligned_and_rows_may_end_early():
     rows = [["view", "error", "share"], ["a long name", "1.0 px", "7%", "!"], ["b", "-"]]
-    assert progress.text_table(rows) == ["view          error  share", "a long name  1.0 px     7%  !", "b                 -"]
+    assert progress.text_table(rows) == [
+        "view          error  share",
+        "a long name  1.0 px     7%  !",
+        "b                 -",
+    ]
     assert progress.text_table([["a", "b"], ["cc", "d"]], left=2) == ["a   b", "cc  d"]
 
 
@@ -135,7 +147,10 @@ def test_a_bar_says_why_its_first_item_takes_long(capsys):
     assert seen == [("a", ""), ("b", ""), ("c", "")]
     assert "render:   0%" in before and "compiling, once" in before
     assert "compiling" not in capsys.readouterr().err.rpartition("\r")[2]
-    assert list(progress.bar("abc", shown=False, first="x")) == ["a", "b", "c"] and capsys.readouterr().err == ""
+    assert (
+        list(progress.bar("abc", shown=False, first="x")) == ["a", "b", "c"]
+        and capsys.readouterr().err == ""
+    )
 
 
 def test_long_loops_show_bars_where_a_program_shows_stages(capsys):

@@ -21,9 +21,15 @@ def camera(width=4):
 
 
 def test_leaves_are_named_and_static_fields_belong_to_the_structure():
-    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(camera())]
+    paths = [
+        jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(camera())
+    ]
     assert paths == [".K", ".cam_from_world"]
-    assert jax.tree.structure(camera(4)) == jax.tree.structure(camera(4)) != jax.tree.structure(camera(5))
+    assert (
+        jax.tree.structure(camera(4))
+        == jax.tree.structure(camera(4))
+        != jax.tree.structure(camera(5))
+    )
 
 
 def test_rebuilds_skip_the_shape_checks_that_construction_makes():
@@ -85,7 +91,9 @@ def test_a_batch_can_be_indexed_counted_and_iterated_over():
 def test_an_index_out_of_range_is_refused_where_jax_would_clamp_it():
     cameras = batch()
     for index in (3, -4, np.int64(3), jnp.asarray(3)):
-        with pytest.raises(IndexError, match=rf"Camera: index {int(index)} is out of range for a batch of 3"):
+        with pytest.raises(
+            IndexError, match=rf"Camera: index {int(index)} is out of range for a batch of 3"
+        ):
             cameras[index]
     with pytest.raises(IndexError):
         jax.jit(lambda c: c[3].K)(cameras)
@@ -101,7 +109,11 @@ def test_one_example_is_not_a_batch_but_it_is_there():
 def test_every_kind_of_batch_knows_its_axes():
     ones = lambda *shapes: [jnp.asarray(np.ones(shape, np.float32)) for shape in shapes]
     gaussians = Gaussians(*ones((5, 3), (5, 4), (5, 3), 5, (5, 3)))
-    for one in (BodyPose(*ones((4, 3), 3)), gaussians, Rendering(*ones((2, 2, 3), (2, 2), (2, 2)), jnp.int32(0))):
+    for one in (
+        BodyPose(*ones((4, 3), 3)),
+        gaussians,
+        Rendering(*ones((2, 2, 3), (2, 2), (2, 2)), jnp.int32(0)),
+    ):
         two = jax.tree.map(lambda leaf: np.stack([leaf] * 2), one)
         assert one.batch_shape == () and two.batch_shape == (2,)
         assert jax.tree.structure(two[1]) == jax.tree.structure(one) and two[1].batch_shape == ()
@@ -119,19 +131,57 @@ def test_pytrees_print_on_one_short_line():
 
 # What is handed in is checked by the annotations ----------------------------------------------------------------------
 
-GAUSSIANS = Gaussians(jnp.zeros((7, 3)), jnp.ones((7, 4)), jnp.ones((7, 3)), jnp.ones(7), jnp.ones((7, 3)))
+GAUSSIANS = Gaussians(
+    jnp.zeros((7, 3)), jnp.ones((7, 4)), jnp.ones((7, 3)), jnp.ones(7), jnp.ones((7, 3))
+)
 BATCH = jax.tree.map(lambda x: jnp.stack([x, x]), GAUSSIANS)
 BYTES = jnp.full((7, 3), 200, jnp.uint8)
 FAULTS = {
-    "a trailing axis": (GAUSSIANS, {"opacities": jnp.ones((7, 1))}, r".opacities: expected shape (7,), got (7, 1)"),
-    "a leading axis": (GAUSSIANS, {"scales": jnp.ones((1, 7, 3))}, r".scales: expected shape (7, 3), got (1, 7, 3)"),
-    "first of all": (GAUSSIANS, {"means": jnp.ones((7, 3, 1))}, r".means: expected shape (g, 3), got (7, 3, 1)"),
-    "in a batch": (BATCH, {"opacities": jnp.ones((2, 7, 1))}, r".opacities: expected shape (7,), got (2, 7, 1)"),
-    "too few in a batch": (BATCH, {"colors": jnp.ones((2, 6, 3))}, r".colors: expected shape (2, 7, 3), got (2, 6, 3)"),
-    "bytes": (GAUSSIANS, {"colors": BYTES}, ".colors: expected floating-point numbers, got uint8; colors of 0 to 255 are"),
-    "integers": (GAUSSIANS, {"means": jnp.zeros((7, 3), int)}, ".means: expected floating-point numbers, got int32; "),
-    "booleans": (GAUSSIANS, {"opacities": jnp.ones(7, bool)}, ".opacities: expected floating-point numbers, got bool"),
-    "a list": (GAUSSIANS, {"quats": [[1.0] * 4] * 7}, ".quats: expected an array of shape (7, 4), got list; jnp.asarray"),
+    "a trailing axis": (
+        GAUSSIANS,
+        {"opacities": jnp.ones((7, 1))},
+        r".opacities: expected shape (7,), got (7, 1)",
+    ),
+    "a leading axis": (
+        GAUSSIANS,
+        {"scales": jnp.ones((1, 7, 3))},
+        r".scales: expected shape (7, 3), got (1, 7, 3)",
+    ),
+    "first of all": (
+        GAUSSIANS,
+        {"means": jnp.ones((7, 3, 1))},
+        r".means: expected shape (g, 3), got (7, 3, 1)",
+    ),
+    "in a batch": (
+        BATCH,
+        {"opacities": jnp.ones((2, 7, 1))},
+        r".opacities: expected shape (7,), got (2, 7, 1)",
+    ),
+    "too few in a batch": (
+        BATCH,
+        {"colors": jnp.ones((2, 6, 3))},
+        r".colors: expected shape (2, 7, 3), got (2, 6, 3)",
+    ),
+    "bytes": (
+        GAUSSIANS,
+        {"colors": BYTES},
+        ".colors: expected floating-point numbers, got uint8; colors of 0 to 255 are",
+    ),
+    "integers": (
+        GAUSSIANS,
+        {"means": jnp.zeros((7, 3), int)},
+        ".means: expected floating-point numbers, got int32; ",
+    ),
+    "booleans": (
+        GAUSSIANS,
+        {"opacities": jnp.ones(7, bool)},
+        ".opacities: expected floating-point numbers, got bool",
+    ),
+    "a list": (
+        GAUSSIANS,
+        {"quats": [[1.0] * 4] * 7},
+        ".quats: expected an array of shape (7, 4), got list; jnp.asarray",
+    ),
     "nothing": (GAUSSIANS, {"means": None}, ".means: expected an array of shape (g, 3), got None"),
     "pixels": (camera(), {"width": 64.0}, ".width: expected a whole number, got 64.0"),
 }
@@ -147,14 +197,27 @@ def test_what_fits_has_no_fault():
     none = replace(GAUSSIANS, low_pass=None)
     of_numpy = jax.tree.map(np.asarray, GAUSSIANS)
     half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), GAUSSIANS)
-    for tree in (GAUSSIANS, none, BATCH, of_numpy, half, camera(), batch(), replace(camera(), width=np.int64(4))):
+    for tree in (
+        GAUSSIANS,
+        none,
+        BATCH,
+        of_numpy,
+        half,
+        camera(),
+        batch(),
+        replace(camera(), width=np.int64(4)),
+    ):
         assert shape_fault(tree) is None
 
 
 # Files of jax.export ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tree", [GAUSSIANS, BATCH, camera(), small_avatar(), small_body()], ids=lambda tree: type(tree).__name__)
+@pytest.mark.parametrize(
+    "tree",
+    [GAUSSIANS, BATCH, camera(), small_avatar(), small_body()],
+    ids=lambda tree: type(tree).__name__,
+)
 def test_functions_of_public_classes_come_back_from_files_of_jax_export(tree):
     twice = jax.jit(lambda x: jax.tree.map(lambda leaf: leaf * 2, x))
     data = jax.export.export(twice)(tree).serialize()
@@ -170,6 +233,10 @@ def test_a_structure_comes_back_with_its_static_fields():
 
 
 def test_every_public_pytree_has_a_name_in_files_of_jax_export():
-    public = [value for name in hg.__all__ if isinstance(value := getattr(hg, name), type) and value in pytree._PYTREES]
+    public = [
+        value
+        for name in hg.__all__
+        if isinstance(value := getattr(hg, name), type) and value in pytree._PYTREES
+    ]
     assert len(public) >= 5
     assert {f"humangs_jax.{each.__name__}" for each in public} <= set(pytree._EXPORTABLE)

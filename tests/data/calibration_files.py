@@ -21,7 +21,9 @@ def scene(views=VIEWS):
     K, poses = [], []
     for i in range(views):
         angle, rise = 2 * np.pi * i / views + 0.3, 0.1 + 0.1 * i
-        away = np.asarray([np.sin(angle) * np.cos(rise), np.sin(rise), np.cos(angle) * np.cos(rise)])
+        away = np.asarray(
+            [np.sin(angle) * np.cos(rise), np.sin(rise), np.cos(angle) * np.cos(rise)]
+        )
         right = np.cross(-away, [0, 1, 0])
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(-away, right), -away])
@@ -68,19 +70,33 @@ def write_colmap(folder, K, poses, names, model="PINHOLE", extra=(), seen=None, 
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["# Camera list with one line of data per camera:"]
     for i, k in enumerate(K, 1):
-        focal = [k[0, 0]] if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else [k[0, 0], k[1, 1]]
+        focal = (
+            [k[0, 0]]
+            if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+            else [k[0, 0], k[1, 1]]
+        )
         values = " ".join(repr(float(x)) for x in [*focal, k[0, 2], k[1, 2], *extra])
         lines.append(f"{i} {model} {WIDTH} {HEIGHT} {values}")
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
-    lines = ["# Image list with two lines of data per image:", "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
+    lines = [
+        "# Image list with two lines of data per image:",
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+    ]
     for i, (pose, name) in enumerate(zip(poses, names, strict=True)):
         values = " ".join(repr(float(x)) for x in [*quaternion(pose[:3, :3]), *pose[:3, 3]])
         lines.append(f"{i + 10} {values} {i + 1} {name}")
-        seen_here = [] if seen is None else [f"{x!r} {y!r} {j + 5}" for j, (x, y) in enumerate(seen[i].tolist())]
+        seen_here = (
+            []
+            if seen is None
+            else [f"{x!r} {y!r} {j + 5}" for j, (x, y) in enumerate(seen[i].tolist())]
+        )
         lines.append(" ".join([*seen_here, "3.5 4.5 -1"]) if seen_here else "")
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     if world_points is not None:
-        rows = [f"{j + 5} {x!r} {y!r} {z!r} 128 128 128 0.5 1 2" for j, (x, y, z) in enumerate(world_points.tolist())]
+        rows = [
+            f"{j + 5} {x!r} {y!r} {z!r} 128 128 128 0.5 1 2"
+            for j, (x, y, z) in enumerate(world_points.tolist())
+        ]
         (folder / "points3D.txt").write_text("# 3D point list\n" + "\n".join(rows) + "\n")
 
 
@@ -110,7 +126,9 @@ def write_easymocap(folder, K, poses, names, decimals=9, dist=(0.0,) * 5):
     inner, outer = header, header
     for name, k, pose in zip(names, integer_centers(K), poses, strict=True):
         inner += matrix_yaml(f"K_{name}", k, decimals) + matrix_yaml(f"dist_{name}", dist, decimals)
-        outer += matrix_yaml(f"R_{name}", Rotation.from_matrix(pose[:3, :3]).as_rotvec()[:, None], decimals)
+        outer += matrix_yaml(
+            f"R_{name}", Rotation.from_matrix(pose[:3, :3]).as_rotvec()[:, None], decimals
+        )
         outer += matrix_yaml(f"Rot_{name}", pose[:3, :3], decimals)
         outer += matrix_yaml(f"T_{name}", pose[:3, 3:], decimals)
     (folder / "intri.yml").write_text(inner)
@@ -121,7 +139,9 @@ def write_opencv_yaml(file, K, poses, names):
     """A map for each camera."""
     text = "%YAML:1.0\n---\n# of a rig\n"
     for name, k, pose in zip(names, integer_centers(K), poses, strict=True):
-        inside = matrix_yaml("K", k) + matrix_yaml("R", pose[:3, :3]) + matrix_yaml("T", pose[:3, 3:])
+        inside = (
+            matrix_yaml("K", k) + matrix_yaml("R", pose[:3, :3]) + matrix_yaml("T", pose[:3, 3:])
+        )
         inside += f"imgSize: [ {WIDTH}, {HEIGHT} ]\n" + matrix_yaml("dist", np.zeros(5))
         text += f"{name}:\n" + "".join(f"   {line}\n" for line in inside.splitlines())
     file.write_text(text)
@@ -129,10 +149,20 @@ def write_opencv_yaml(file, K, poses, names):
 
 def write_opencv_json(file, K, poses, names):
     """As cv2.FileStorage writes JSON."""
-    entry = lambda m: {"type_id": "opencv-matrix", "rows": len(m), "cols": m.shape[1], "dt": "d", "data": m.ravel().tolist()}
+    entry = lambda m: {
+        "type_id": "opencv-matrix",
+        "rows": len(m),
+        "cols": m.shape[1],
+        "dt": "d",
+        "data": m.ravel().tolist(),
+    }
     values = {"names": list(names)}
     for name, k, pose in zip(names, integer_centers(K), poses, strict=True):
-        values |= {f"K_{name}": entry(k), f"R_{name}": entry(pose[:3, :3]), f"T_{name}": entry(pose[:3, 3:])}
+        values |= {
+            f"K_{name}": entry(k),
+            f"R_{name}": entry(pose[:3, :3]),
+            f"T_{name}": entry(pose[:3, 3:]),
+        }
     file.write_text(json.dumps(values, indent=4))
 
 
@@ -163,7 +193,11 @@ def write_transforms(file, K, poses, names, **changes):
         }
         for name, k, pose in zip(names, K, poses, strict=True)
     ]
-    file.write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "aabb_scale": 16, "k1": 0.0, **changes, "frames": frames}))
+    file.write_text(
+        json.dumps(
+            {"w": WIDTH, "h": HEIGHT, "aabb_scale": 16, "k1": 0.0, **changes, "frames": frames}
+        )
+    )
 
 
 # Of the scene, with a lens ------------------------------------------------------------------------------------------------
@@ -176,15 +210,30 @@ def tables(title, name="", extra=""):
     """TOML: a table of each camera."""
     lines = ["[metadata]", "adjusted = true"]
     for i, (k, pose) in enumerate(zip(K, POSES, strict=True)):
-        lines += [f"[{title.format(i)}]", *([f'name = "{name.format(NAMES[i])}"'] if name else []), f"size = {SIZE}", extra]
-        lines += [f"matrix = {k.tolist()}", f"distortions = {LENS}", f"translation = {pose[:3, 3].tolist()}"]
+        lines += [
+            f"[{title.format(i)}]",
+            *([f'name = "{name.format(NAMES[i])}"'] if name else []),
+            f"size = {SIZE}",
+            extra,
+        ]
+        lines += [
+            f"matrix = {k.tolist()}",
+            f"distortions = {LENS}",
+            f"translation = {pose[:3, 3].tolist()}",
+        ]
         lines += [f"rotation = {Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()}"]
     return "\n".join(lines)
 
 
 def panoptic():
     rows = zip(NAMES, K, POSES, strict=True)
-    entry = lambda n, k, p: {"name": n, "K": k.tolist(), "R": p[:3, :3].tolist(), "t": p[:3, 3:].tolist(), "distCoef": LENS}
+    entry = lambda n, k, p: {
+        "name": n,
+        "K": k.tolist(),
+        "R": p[:3, :3].tolist(),
+        "t": p[:3, 3:].tolist(),
+        "distCoef": LENS,
+    }
     return {"cameras": [entry(*row) | {"resolution": SIZE, "type": "hd"} for row in rows]}
 
 
@@ -207,29 +256,54 @@ def qualisys():
         turns = " ".join(f'r{i + 1}{j + 1}="{turn[i, j]!r}"' for i in range(3) for j in range(3))
         moved = (k[0, 0], k[1, 1], k[0, 2] + 3, k[1, 2] + 2)
         keys = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-        inner = " ".join(f'{key}="{64 * value!r}"' for key, value in zip(keys, map(float, moved), strict=True))
-        lens = zip(("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2"), LENS, strict=False)
+        inner = " ".join(
+            f'{key}="{64 * value!r}"' for key, value in zip(keys, map(float, moved), strict=True)
+        )
+        lens = zip(
+            (
+                "radialDistortion1",
+                "radialDistortion2",
+                "tangentalDistortion1",
+                "tangentalDistortion2",
+            ),
+            LENS,
+            strict=False,
+        )
         inner += " " + " ".join(f'{key}="{value}"' for key, value in lens)
         at = " ".join(f'{axis}="{float(v)!r}"' for axis, v in zip("xyz", place, strict=True))
         view = f'<fov_video left="3" top="2" right="{2 + SIZE[0]}" bottom="{1 + SIZE[1]}"/>'
-        cameras.append(f'<camera serial="{name}">{view}<transform {at} {turns}/><intrinsic {inner}/></camera>')
+        cameras.append(
+            f'<camera serial="{name}">{view}<transform {at} {turns}/><intrinsic {inner}/></camera>'
+        )
     text = "<calibration><cameras>" + "".join(cameras) + "</cameras></calibration>"
     return text.replace("np.float64(", "").replace(')"', '"')
 
 
 def write_binary(folder, text):
     """The .bin files of a text model of PINHOLE cameras."""
-    lines = lambda name: [x.split() for x in (text / name).read_text().splitlines() if not x.startswith("#")]
+    lines = lambda name: [
+        x.split() for x in (text / name).read_text().splitlines() if not x.startswith("#")
+    ]
     cameras = lines("cameras.txt")
     pack = lambda c: struct.pack("<iiQQ4d", int(c[0]), 1, int(c[2]), int(c[3]), *map(float, c[4:]))
-    (folder / "cameras.bin").write_bytes(struct.pack("<Q", len(cameras)) + b"".join(map(pack, cameras)))
+    (folder / "cameras.bin").write_bytes(
+        struct.pack("<Q", len(cameras)) + b"".join(map(pack, cameras))
+    )
     rows, data = lines("images.txt"), b""
     for image, seen in zip(rows[::2], rows[1::2], strict=True):
-        data += struct.pack("<i7di", int(image[0]), *map(float, image[1:8]), int(image[8])) + image[9].encode() + b"\0"
+        data += (
+            struct.pack("<i7di", int(image[0]), *map(float, image[1:8]), int(image[8]))
+            + image[9].encode()
+            + b"\0"
+        )
         data += struct.pack("<Q", len(seen) // 3)
         for k in range(0, len(seen), 3):
             data += struct.pack("<ddq", float(seen[k]), float(seen[k + 1]), int(seen[k + 2]))
     (folder / "images.bin").write_bytes(struct.pack("<Q", len(rows) // 2) + data)
     points = lines("points3D.txt")
-    pack = lambda p: struct.pack("<Q3d3BdQii", int(p[0]), *map(float, p[1:4]), 9, 9, 9, 0.5, 1, 1, 2)
-    (folder / "points3D.bin").write_bytes(struct.pack("<Q", len(points)) + b"".join(map(pack, points)))
+    pack = lambda p: struct.pack(
+        "<Q3d3BdQii", int(p[0]), *map(float, p[1:4]), 9, 9, 9, 0.5, 1, 1, 2
+    )
+    (folder / "points3D.bin").write_bytes(
+        struct.pack("<Q", len(points)) + b"".join(map(pack, points))
+    )

@@ -5,7 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from humangs_jax.data.calibration.calibration import _squared_reach, distort, read_calibration, undistort, undistort_person
+from humangs_jax.data.calibration.calibration import (
+    _squared_reach,
+    distort,
+    read_calibration,
+    undistort,
+    undistort_person,
+)
 from humangs_jax.data.capture_checks import CaptureError
 from tests.data import calibration_files as written
 
@@ -19,9 +25,19 @@ OTHER_KEYS = 'distance = 2.0\nmodel = "fisheye"'
 FORMATS = {
     "Caliscope": ("camera_array.toml", lambda: written.tables("cameras.{}"), "0123", LENS),
     "Anipose": ("calibration.toml", lambda: written.tables("cam_{}", "{}"), NAMES, LENS),
-    "Pose2Sim": ("Calib.toml", lambda: written.tables("cam_{}", "{}", "fisheye = false"), NAMES, LENS),
+    "Pose2Sim": (
+        "Calib.toml",
+        lambda: written.tables("cam_{}", "{}", "fisheye = false"),
+        NAMES,
+        LENS,
+    ),
     "Panoptic": ("calibration_160906.json", written.panoptic, NAMES, LENS),
-    "TOML, other keys": ("Calib.toml", lambda: written.tables("cam_{}", "{}", OTHER_KEYS), NAMES, LENS),
+    "TOML, other keys": (
+        "Calib.toml",
+        lambda: written.tables("cam_{}", "{}", OTHER_KEYS),
+        NAMES,
+        LENS,
+    ),
     "Panoptic, other keys": (
         "calibration_1.json",
         lambda: {"cameras": [c | OTHERS for c in written.panoptic()["cameras"]]},
@@ -42,8 +58,12 @@ def test_cameras_are_read_as_written(kind, tmp_path):
         found = read_calibration(source, lambda name: (1, 1))
         assert [camera.name for camera in found.cameras] == list(names)
         np.testing.assert_allclose([camera.K for camera in found.cameras], K, atol=EXACT)
-        np.testing.assert_allclose([camera.cam_from_world for camera in found.cameras], POSES, atol=EXACT)
-        np.testing.assert_allclose([camera.distortion for camera in found.cameras], [lens] * 4, atol=EXACT)
+        np.testing.assert_allclose(
+            [camera.cam_from_world for camera in found.cameras], POSES, atol=EXACT
+        )
+        np.testing.assert_allclose(
+            [camera.distortion for camera in found.cameras], [lens] * 4, atol=EXACT
+        )
 
 
 @pytest.mark.parametrize("place", ["frame", "file"])
@@ -58,16 +78,22 @@ def test_a_whole_K_of_a_frame_or_of_the_file(place, tmp_path):
         (frame if place == "frame" else values).setdefault("K", k)
     file.write_text(json.dumps(values))
     found = read_calibration(file, lambda name: SIZE)
-    np.testing.assert_allclose([camera.K for camera in found.cameras], K if place == "frame" else [K[0]] * 4, atol=EXACT)
+    np.testing.assert_allclose(
+        [camera.K for camera in found.cameras], K if place == "frame" else [K[0]] * 4, atol=EXACT
+    )
 
 
 def test_a_binary_model_of_colmap_is_the_text_model(tmp_path):
     world = written.points()
     seen = [written.project(k, pose, world) for k, pose in zip(K, POSES, strict=True)]
-    written.write_colmap(tmp_path / "text", K, POSES, [f"{n}.png" for n in NAMES], seen=seen, world_points=world)
+    written.write_colmap(
+        tmp_path / "text", K, POSES, [f"{n}.png" for n in NAMES], seen=seen, world_points=world
+    )
     (tmp_path / "binary").mkdir()
     written.write_binary(tmp_path / "binary", tmp_path / "text")
-    one, other = (read_calibration(tmp_path / kind, lambda name: (1, 1)) for kind in ("text", "binary"))
+    one, other = (
+        read_calibration(tmp_path / kind, lambda name: (1, 1)) for kind in ("text", "binary")
+    )
     for a, b in zip(one.cameras, other.cameras, strict=True):
         assert (a.name, a.width, a.height) == (b.name, b.width, b.height)
         np.testing.assert_array_equal(a.K, b.K)
@@ -78,29 +104,55 @@ def test_a_binary_model_of_colmap_is_the_text_model(tmp_path):
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         whole = (tmp_path / "binary" / name).read_bytes()
         (tmp_path / "binary" / name).write_bytes(whole[:-5])
-        with pytest.raises(CaptureError, match=f"{name}: not a readable COLMAP model: cut short, or damaged"):
+        with pytest.raises(
+            CaptureError, match=f"{name}: not a readable COLMAP model: cut short, or damaged"
+        ):
             read_calibration(tmp_path / "binary", lambda name: (1, 1))
         (tmp_path / "binary" / name).write_bytes(whole)
 
 
 WRONG = {
-    "ignored": ("a.toml", written.tables("cameras.{}", extra="ignore = true"), "every camera is to be ignored"),
-    "fisheye": ("a.toml", written.tables("cam_{}", extra="fisheye = true"), "fisheye lenses are not supported"),
-    "no place": ("a.toml", written.tables("cam_{}").replace("translation", "other"), r"cam_0\.translation: missing"),
+    "ignored": (
+        "a.toml",
+        written.tables("cameras.{}", extra="ignore = true"),
+        "every camera is to be ignored",
+    ),
+    "fisheye": (
+        "a.toml",
+        written.tables("cam_{}", extra="fisheye = true"),
+        "fisheye lenses are not supported",
+    ),
+    "no place": (
+        "a.toml",
+        written.tables("cam_{}").replace("translation", "other"),
+        r"cam_0\.translation: missing",
+    ),
     "no TOML": ("a.toml", "[cam_0", "not a readable calibration: Expected"),
     "a size": (
         "a.json",
         '{"a": {"K": [1,0,0,0,1,0,0,0,1], "R": [0,0,0], "T": [0,0,0], "width": 0.5, "height": 2}}',
         r"a\.width: expected",
     ),
-    "a matrix": ("a.yml", "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1]}", "expected keys with values"),
+    "a matrix": (
+        "a.yml",
+        "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1]}",
+        "expected keys with values",
+    ),
     "a JSON matrix": (
         "a.json",
         '{"type_id": "opencv-matrix", "rows": 1, "cols": 1, "dt": "d", "data": [1]}',
         "expected keys with",
     ),
-    "entities": ("a.qca.txt", "<!DOCTYPE x [<!ENTITY a 'b'>]>" + written.qualisys(), "XML with entities"),
-    "no focal length": ("a.qca.txt", written.qualisys().replace("focalLengthV", "other"), r"camera 0\.intrinsic\.focalLengthV"),
+    "entities": (
+        "a.qca.txt",
+        "<!DOCTYPE x [<!ENTITY a 'b'>]>" + written.qualisys(),
+        "XML with entities",
+    ),
+    "no focal length": (
+        "a.qca.txt",
+        written.qualisys().replace("focalLengthV", "other"),
+        r"camera 0\.intrinsic\.focalLengthV",
+    ),
     "no list": ("a.json", json.dumps({"cameras": [{"name": "a"}]}), r"cameras\[0\]\.K: missing"),
 }
 
@@ -120,28 +172,47 @@ def test_wrong_files_are_one_line(case, tmp_path):
 def test_dots_land_where_the_pinhole_says():
     K = np.asarray([[110.0, 0, 63.5], [0, 108, 50], [0, 0, 1]])
     coefficients = np.asarray([-0.25, 0.08, 0.004, -0.003, 0.01])
-    dots = np.stack(np.meshgrid(np.arange(-4, 5) * 0.12, np.arange(-3, 4) * 0.12), axis=-1).reshape(-1, 2)
-    pinhole, lens = (plane * np.diag(K)[:2] + K[:2, 2] for plane in (dots, distort(dots, coefficients)))
+    dots = np.stack(np.meshgrid(np.arange(-4, 5) * 0.12, np.arange(-3, 4) * 0.12), axis=-1).reshape(
+        -1, 2
+    )
+    pinhole, lens = (
+        plane * np.diag(K)[:2] + K[:2, 2] for plane in (dots, distort(dots, coefficients))
+    )
     assert np.linalg.norm(pinhole - lens, axis=-1).max() > 4  # the lens matters
     columns, rows = np.meshgrid(np.arange(128) + 0.5, np.arange(100) + 0.5)
-    spots = lambda where: np.exp(-((columns - where[0]) ** 2 + (rows - where[1]) ** 2) / (2 * 1.5**2))
+    spots = lambda where: np.exp(
+        -((columns - where[0]) ** 2 + (rows - where[1]) ** 2) / (2 * 1.5**2)
+    )
     photo = sum(spots(where) for where in lens).astype(np.float32)
     straight = undistort(photo, K, coefficients, fill=0.0)
     for where in pinhole:
         near = straight * (np.hypot(columns - where[0], rows - where[1]) < 5)
         centroid = np.asarray([(near * columns).sum(), (near * rows).sum()]) / near.sum()
-        np.testing.assert_allclose(centroid, where, atol=0.06)  # of bilinear lookups; the dots move by up to 4.9 px
+        np.testing.assert_allclose(
+            centroid, where, atol=0.06
+        )  # of bilinear lookups; the dots move by up to 4.9 px
 
 
-@pytest.mark.parametrize("focal, coefficients", [(400, [-0.1, 0.03, 1e-3, -1e-3, 0]), (60, [-0.3, 0, 0, 0, 0])])
+@pytest.mark.parametrize(
+    "focal, coefficients", [(400, [-0.1, 0.03, 1e-3, -1e-3, 0]), (60, [-0.3, 0, 0, 0, 0])]
+)
 def test_a_person_is_undistorted_as_the_whole_photo_is(focal, coefficients):
     """Also where the lens folds, and with nobody in the photo."""
-    K, coefficients = np.asarray([[focal, 0, 66.0], [0, focal, 50], [0, 0, 1]]), np.asarray(coefficients)
+    K, coefficients = (
+        np.asarray([[focal, 0, 66.0], [0, focal, 50], [0, 0, 1]]),
+        np.asarray(coefficients),
+    )
     random = np.random.default_rng(0)
-    for rows, columns in ((slice(30, 70), slice(50, 75)), (slice(0, 20), slice(100, 130)), (slice(0), slice(0))):
+    for rows, columns in (
+        (slice(30, 70), slice(50, 75)),
+        (slice(0, 20), slice(100, 130)),
+        (slice(0), slice(0)),
+    ):
         mask = np.zeros((100, 130), np.float32)
         mask[rows, columns] = 1
-        image = np.where(mask[..., None] > 0, random.random((100, 130, 3), np.float32), np.float32(1))
+        image = np.where(
+            mask[..., None] > 0, random.random((100, 130, 3), np.float32), np.float32(1)
+        )
         straight, person = undistort_person(image, mask, K, coefficients)
         np.testing.assert_array_equal(person, undistort(mask, K, coefficients, fill=0.0))
         np.testing.assert_allclose(straight, undistort(image, K, coefficients, fill=1.0), atol=1e-6)

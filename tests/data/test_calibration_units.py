@@ -18,13 +18,22 @@ def imported(tmp_path, unit, writer=written.write_calibration_full, name="rig.js
     """A rig whose numbers are in units of so many metres."""
     writer(tmp_path / name, K, written.in_source(POSES, unit), NAMES)
     written.write_photos(tmp_path / "photos", FILES)
-    return import_cameras(tmp_path / name, tmp_path / "photos", tmp_path / "out", **{"up": "+y", **options})
+    return import_cameras(
+        tmp_path / name, tmp_path / "photos", tmp_path / "out", **{"up": "+y", **options}
+    )
 
 
 def write_panoptic(file, K, poses, names):
     rows = zip(names, written.integer_centers(K).tolist(), poses, strict=True)
-    keys = lambda k, pose: {"K": k, "R": pose[:3, :3].tolist(), "t": pose[:3, 3:].tolist(), "distCoef": [0.0] * 5}
-    file.write_text(json.dumps({"cameras": [{"name": name, **keys(k, pose)} for name, k, pose in rows]}))
+    keys = lambda k, pose: {
+        "K": k,
+        "R": pose[:3, :3].tolist(),
+        "t": pose[:3, 3:].tolist(),
+        "distCoef": [0.0] * 5,
+    }
+    file.write_text(
+        json.dumps({"cameras": [{"name": name, **keys(k, pose)} for name, k, pose in rows]})
+    )
 
 
 @pytest.mark.parametrize(("unit", "word"), [(0.01, "centimetres"), (0.001, "millimetres")])
@@ -34,7 +43,9 @@ def test_the_unit_is_the_one_that_puts_the_cameras_near_a_person(unit, word, tmp
     assert f"the unit is taken for {word}: in metres the cameras stand" in str(report)
 
 
-@pytest.mark.parametrize(("unit", "said"), [(0.01, "CMU Panoptic is in centimetres: taken"), (1.0, "taken for metres")])
+@pytest.mark.parametrize(
+    ("unit", "said"), [(0.01, "CMU Panoptic is in centimetres: taken"), (1.0, "taken for metres")]
+)
 def test_panoptic_is_in_centimetres_unless_that_cannot_be(unit, said, tmp_path):
     report = imported(tmp_path, unit, write_panoptic, "calibration_1.json")
     assert report.checks.distance == pytest.approx(2.3, rel=1e-3) and said in str(report)
@@ -49,10 +60,17 @@ def test_a_scale_that_is_given_is_taken_and_metres_need_no_words(tmp_path):
 def multical(relations):
     """The scene as multical writes it; relations: camera -> the one in whose axes it stands, None for the world."""
     index = NAMES.index
-    lens = lambda i: {"model": "standard", "image_size": [written.WIDTH, written.HEIGHT], "dist": [[0.0] * 5], "K": K[i].tolist()}
+    lens = lambda i: {
+        "model": "standard",
+        "image_size": [written.WIDTH, written.HEIGHT],
+        "dist": [[0.0] * 5],
+        "K": K[i].tolist(),
+    }
     poses = {}
     for name, base in relations.items():
-        pose = POSES[index(name)] @ (np.eye(4) if base is None else np.linalg.inv(POSES[index(base)]))
+        pose = POSES[index(name)] @ (
+            np.eye(4) if base is None else np.linalg.inv(POSES[index(base)])
+        )
         key = name if base is None else f"{name}_to_{base}"
         poses[key] = {"R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
     return {"cameras": {name: lens(i) for i, name in enumerate(NAMES)}, "camera_poses": poses}
@@ -84,7 +102,10 @@ def test_cameras_of_multical_stand_relative_to_each_other(relations, tmp_path):
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        (lambda v: v["camera_poses"].pop("d_to_a"), r"camera_poses\.d: missing: where does this camera stand"),
+        (
+            lambda v: v["camera_poses"].pop("d_to_a"),
+            r"camera_poses\.d: missing: where does this camera stand",
+        ),
         (lambda v: v["camera_poses"]["b_to_a"].pop("R"), r"camera_poses\.b_to_a\.R: missing"),
         (lambda v: v["cameras"]["c"].pop("K"), r"cameras\.c\.K: missing"),
         (lambda v: v["cameras"]["c"].update(model="fisheye"), r"cameras\.c\.model: fisheye"),

@@ -6,7 +6,14 @@ import pytest
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.calibration import videos
 from humangs_jax.data.calibration.importing import import_cameras
-from humangs_jax.data.calibration.videos import NOTHING_NEW, PHOTOS, choose_frames, grey_frames, looked_at, write_frames
+from humangs_jax.data.calibration.videos import (
+    NOTHING_NEW,
+    PHOTOS,
+    choose_frames,
+    grey_frames,
+    looked_at,
+    write_frames,
+)
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import load_photos
 from humangs_jax.io.images import read_image
@@ -30,8 +37,12 @@ def write_rig(folder, masks=False):
     for kind in ("videos", "masks") if masks else ("videos",):
         (folder / kind).mkdir()
         for camera, name in enumerate(NAMES):
-            level = lambda frame, kind=kind, camera=camera: 1.0 if kind == "masks" else grey(camera, frame)
-            write_video(folder / kind / f"{name}.mp4", [np.full(shape, level(f)) for f in range(FRAMES)], 30)
+            level = lambda frame, kind=kind, camera=camera: (
+                1.0 if kind == "masks" else grey(camera, frame)
+            )
+            write_video(
+                folder / kind / f"{name}.mp4", [np.full(shape, level(f)) for f in range(FRAMES)], 30
+            )
     return folder / "rig.json", folder / "videos", folder / "new" / "out"
 
 
@@ -42,9 +53,13 @@ def test_frames_of_several_videos_become_a_capture(tmp_path):
     photos = load_photos(rig[2])
     assert photos.frames.tolist() == [0, 0, 1, 1, 2, 2]
     for view in range(6):
-        np.testing.assert_allclose(photos.images[view], grey(view % 2, 2 * (view // 2)), atol=LEVELS)
+        np.testing.assert_allclose(
+            photos.images[view], grey(view % 2, 2 * (view // 2)), atol=LEVELS
+        )
     assert photos.masks is not None and photos.masks.min() > 0.98
-    assert sorted(p.name for p in rig[2].parent.iterdir()) == ["out"]  # nothing is left of the frames
+    assert sorted(p.name for p in rig[2].parent.iterdir()) == [
+        "out"
+    ]  # nothing is left of the frames
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
     report = import_cameras(*rig, masks=tmp_path / "masks", up="+y", frames=1, overwrite=True)
     assert (report.frames, report.views) == (1, 2)
@@ -54,7 +69,10 @@ def test_what_is_wrong_with_a_video_is_one_line(tmp_path):
     rig = write_rig(tmp_path)
     video = rig[1] / "b.mp4"
     whole = video.read_bytes()
-    playlists = (b"#EXTM3U\n#EXTINF:1,\na.mp4\n", b"ffconcat version 1.0\nfile a.mp4\n")  # of a video
+    playlists = (
+        b"#EXTM3U\n#EXTINF:1,\na.mp4\n",
+        b"ffconcat version 1.0\nfile a.mp4\n",
+    )  # of a video
     for content in (b"", whole[: len(whole) // 2], bytes(range(256)) * 40, *playlists):
         video.write_bytes(content)
         for read in (lambda: import_cameras(*rig, up="+y"), lambda: list(grey_frames(video, 480))):
@@ -90,12 +108,16 @@ def test_frames_of_videos_have_a_budget_of_pixels(tmp_path):
     rig, size = write_rig(tmp_path), written.WIDTH * written.HEIGHT
     try:
         set_limits(Limits(video_pixels=7 * size))
-        with pytest.raises(CaptureError, match=r"b.mp4: .* pixels in the frames .*: the limit video_pixels is"):
+        with pytest.raises(
+            CaptureError, match=r"b.mp4: .* pixels in the frames .*: the limit video_pixels is"
+        ):
             import_cameras(*rig, up="+y")
         assert not rig[2].exists() and not list(rig[2].parent.glob("*"))
         assert import_cameras(*rig, up="+y", frames=3).views == 6
         set_limits(Limits(video_pixels=4 * size))
-        with pytest.raises(CaptureError, match=r"a\.mp4: .* pixels in the frames .*: the limit video_pixels is"):
+        with pytest.raises(
+            CaptureError, match=r"a\.mp4: .* pixels in the frames .*: the limit video_pixels is"
+        ):
             list(grey_frames(rig[1] / "a.mp4", 480))
     finally:
         set_limits(None)
@@ -119,7 +141,9 @@ def blurred(frame):
 
 
 def noisy(frame, seed, levels=6):
-    return np.clip(frame + np.random.default_rng(seed).normal(0, levels, frame.shape), 0, 255).astype(np.uint8)
+    return np.clip(
+        frame + np.random.default_rng(seed).normal(0, levels, frame.shape), 0, 255
+    ).astype(np.uint8)
 
 
 def test_sharp_frames_of_every_scene_are_chosen():
@@ -154,7 +178,10 @@ def test_chosen_frames_are_those_of_the_video(tmp_path):
     assert {frame.shape for frame in seen} == {(8, 16)} and len(seen) == len(levels)
     assert np.all(np.diff([int(frame.mean()) for frame in seen]) > 30)
     write_frames(tmp_path / "v.mp4", tmp_path / "f", [1, 4])
-    assert sorted(path.name for path in (tmp_path / "f").iterdir()) == ["frame_00000001.png", "frame_00000004.png"]
+    assert sorted(path.name for path in (tmp_path / "f").iterdir()) == [
+        "frame_00000001.png",
+        "frame_00000004.png",
+    ]
     for frame in (1, 4):  # H.264 is off by a few levels
         image, _ = read_image(tmp_path / "f" / f"frame_{frame:08d}.png")
         np.testing.assert_allclose(image, levels[frame], atol=4 / 255)

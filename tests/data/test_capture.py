@@ -66,7 +66,13 @@ def test_round_trip(tmp_path):
     assert_same(capture, once, HALF_LEVEL)
     save_capture(tmp_path / "b", once)
     assert_same(once, load(tmp_path / "b"), 0)  # a loaded capture is written back exactly
-    assert once.images.dtype == once.masks.dtype == once.betas.dtype == once.displacement.dtype == np.float32
+    assert (
+        once.images.dtype
+        == once.masks.dtype
+        == once.betas.dtype
+        == once.displacement.dtype
+        == np.float32
+    )
     assert once.poses.rotations.dtype == jnp.float32
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]  # nothing temporary stays
 
@@ -81,7 +87,9 @@ def test_a_body_without_displacement_has_none_in_its_file(tmp_path):
 TOO_MANY = "capture.json: 1,008,000,000 pixels in 84 photos of 4000 x 3000: the limit capture_pixels is 1,000,000,000"
 
 
-def test_large_captures_are_read_and_endless_ones_refused_before_their_photos_are(folder, monkeypatch):
+def test_large_captures_are_read_and_endless_ones_refused_before_their_photos_are(
+    folder, monkeypatch
+):
     """60 photos of 12 megapixels are honest work."""
     monkeypatch.setattr(photos_module, "image_size", lambda path: (4000, 3000))
     (folder / "photos").mkdir()
@@ -92,7 +100,9 @@ def test_large_captures_are_read_and_endless_ones_refused_before_their_photos_ar
     check_photos(folder, views, together=False)  # one after the other, as training does
     with pytest.raises(CaptureError, match=TOO_MANY):
         check_photos(folder, views, together=True)
-    with pytest.raises(CaptureError, match=r"17 views of each photo \(17 of 1\): the limit views_per_photo is 16"):
+    with pytest.raises(
+        CaptureError, match=r"17 views of each photo \(17 of 1\): the limit views_per_photo is 16"
+    ):
         check_photos(folder, views[:1] * 17, together=False)
 
 
@@ -100,12 +110,16 @@ def test_masks_put_photos_on_white_once(tmp_path):
     a = arrays()
     on_white = a["images"] * a["masks"][..., None] + 1 - a["masks"][..., None]
     np.testing.assert_allclose(capture_from_arrays(**a).images, on_white, atol=1e-6)
-    np.testing.assert_allclose(capture_from_arrays(**a, background="white").images, a["images"], atol=1e-7)
+    np.testing.assert_allclose(
+        capture_from_arrays(**a, background="white").images, a["images"], atol=1e-7
+    )
     save_capture(tmp_path / "me", capture_from_arrays(**{**a, "masks": None}))
     assert load(tmp_path / "me").masks is None
     mask = a["masks"][0]
     write_png(tmp_path / "me" / "mask.png", mask)
-    edit_description(tmp_path / "me", lambda d: [view.update(mask="mask.png") for view in d["views"]])
+    edit_description(
+        tmp_path / "me", lambda d: [view.update(mask="mask.png") for view in d["views"]]
+    )
     expected = a["images"] * mask[..., None] + 1 - mask[..., None]
     np.testing.assert_allclose(load(tmp_path / "me").images, expected, atol=2 * HALF_LEVEL)
 
@@ -121,7 +135,9 @@ def test_select_and_pose():
     np.testing.assert_array_equal(capture.pose(1).rotations, capture.poses.rotations[1])
     assert capture.pose(1).translation.shape == (3,)
     for frame in (FRAMES, FRAMES + 3):  # JAX would take the last one
-        with pytest.raises(IndexError, match=f"index {frame} is out of range for a batch of {FRAMES}"):
+        with pytest.raises(
+            IndexError, match=f"index {frame} is out of range for a batch of {FRAMES}"
+        ):
             capture.pose(frame)
 
 
@@ -138,7 +154,9 @@ def test_alpha_is_the_mask_and_goes_onto_white(folder):
     capture = load(folder)
     alpha = pixels[..., 3:] / 255
     np.testing.assert_allclose(capture.masks[0], alpha[..., 0], atol=1e-6)
-    np.testing.assert_allclose(capture.images[0], pixels[..., :3] / 255 * alpha + 1 - alpha, atol=1e-6)
+    np.testing.assert_allclose(
+        capture.images[0], pixels[..., :3] / 255 * alpha + 1 - alpha, atol=1e-6
+    )
 
 
 def test_frame_may_be_left_out_for_a_single_pose(folder):
@@ -176,7 +194,9 @@ def test_a_body_file_is_referred_to_by_a_relative_path(folder, tmp_path, monkeyp
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "BODY.npz").write_bytes(b"")
     asked = []
-    monkeypatch.setattr(module, "_load_model", lambda file, name, folder=None: asked.append(name) or tetrahedron())
+    monkeypatch.setattr(
+        module, "_load_model", lambda file, name, folder=None: asked.append(name) or tetrahedron()
+    )
     a = {**arrays(), "body_file": tmp_path / "models" / "BODY.npz"}
     save_capture(tmp_path / "deep" / "er", capture_from_arrays(**a))
     assert np.load(tmp_path / "deep" / "er" / "body.npz")["body"].item() == "../../models/BODY.npz"
@@ -224,9 +244,21 @@ NOT_FINITE = [[float("nan"), 0, 5], [0, 9, 5], [0, 0, 1]]
 
 BAD = {
     "no capture.json": (lambda f: (f / "capture.json").unlink(), "capture.json", "no such file"),
-    "invalid JSON": (lambda f: (f / "capture.json").write_text('{"a": 1,\n"b" 2}'), "capture.json", "line 2"),
-    "binary JSON": (lambda f: (f / "capture.json").write_bytes(b"\xff\xfe\0"), "capture.json", "not a readable text file"),
-    "a JSON list": (lambda f: (f / "capture.json").write_text("[]"), "capture.json", "expected a JSON object"),
+    "invalid JSON": (
+        lambda f: (f / "capture.json").write_text('{"a": 1,\n"b" 2}'),
+        "capture.json",
+        "line 2",
+    ),
+    "binary JSON": (
+        lambda f: (f / "capture.json").write_bytes(b"\xff\xfe\0"),
+        "capture.json",
+        "not a readable text file",
+    ),
+    "a JSON list": (
+        lambda f: (f / "capture.json").write_text("[]"),
+        "capture.json",
+        "expected a JSON object",
+    ),
     "format": (top(format="colmap"), "capture.json: format", "colmap"),
     "version": (top(version=2), "capture.json: version", "expected 1"),
     "background": (top(background="black"), "capture.json: background", "black"),
@@ -235,8 +267,16 @@ BAD = {
     "unknown top key": (top(unit="mm"), "capture.json: unit", "unknown"),
     "unknown view key": (view(1, masks="a.png"), "capture.json: views[1].masks", "unknown"),
     "image not named": (drop(2, "image"), "capture.json: views[2].image", "missing"),
-    "image missing": (lambda f: (f / "images/001.png").unlink(), "images/001.png", "no such image file"),
-    "image unreadable": (lambda f: (f / "images/001.png").write_bytes(b"?"), "images/001.png", "not a readable image"),
+    "image missing": (
+        lambda f: (f / "images/001.png").unlink(),
+        "images/001.png",
+        "no such image file",
+    ),
+    "image unreadable": (
+        lambda f: (f / "images/001.png").write_bytes(b"?"),
+        "images/001.png",
+        "not a readable image",
+    ),
     "image a folder": (view(0, image="images"), "images", "is a folder"),
     "image sizes differ": (
         lambda f: (png("images/001.png", (9, 9, 3))(f), png("masks/001.png", (9, 9))(f)),
@@ -244,13 +284,29 @@ BAD = {
         "9 x 9",
     ),
     "mask size": (png("masks/001.png", (9, 9)), "masks/001.png: size", "9 x 9"),
-    "mask of 0 and 1": (png("masks/001.png", (HEIGHT, WIDTH), 1 / 255), "masks/001.png: values", "255"),
+    "mask of 0 and 1": (
+        png("masks/001.png", (HEIGHT, WIDTH), 1 / 255),
+        "masks/001.png: values",
+        "255",
+    ),
     "mask for some": (drop(1, "mask"), "capture.json: views[1].mask", "all or none"),
     "K shape": (view(1, K=[[1, 0], [0, 1]]), "capture.json: views[1].K", "(3, 3)"),
     "K not finite": (view(1, K=NOT_FINITE), "capture.json: views[1].K", "finite"),
-    "K transposed": (view(1, K=[[9, 0, 0], [0, 9, 0], [5, 5, 1]]), "capture.json: views[1]: K", "fx"),
-    "camera 3 x 4": (view(1, cam_from_world=MIRRORED[:3]), "capture.json: views[1].cam_from_world", "(4, 4)"),
-    "camera mirrored": (view(1, cam_from_world=MIRRORED), "capture.json: views[1]: cam_from_world", "mirrored"),
+    "K transposed": (
+        view(1, K=[[9, 0, 0], [0, 9, 0], [5, 5, 1]]),
+        "capture.json: views[1]: K",
+        "fx",
+    ),
+    "camera 3 x 4": (
+        view(1, cam_from_world=MIRRORED[:3]),
+        "capture.json: views[1].cam_from_world",
+        "(4, 4)",
+    ),
+    "camera mirrored": (
+        view(1, cam_from_world=MIRRORED),
+        "capture.json: views[1]: cam_from_world",
+        "mirrored",
+    ),
     "frame too high": (view(1, frame=FRAMES), "capture.json: views[1].frame", "0 to 1"),
     "frame negative": (view(1, frame=-1), "capture.json: views[1].frame", "0 to 1"),
     "frame true": (view(1, frame=True), "capture.json: views[1].frame", "integer"),
@@ -262,12 +318,32 @@ BAD = {
     "no rotations": (parameters(rotations=None), "body.npz: rotations", "missing"),
     "pickled": (parameters(betas=np.array([None])), "body.npz: betas", "pickled"),
     "body a number": (parameters(body=np.asarray(3)), "body.npz: body", "makehuman"),
-    "rotations shape": (parameters(rotations=np.zeros((FRAMES, JOINTS * 3))), "body.npz: rotations", "(frames, 5, 3)"),
-    "pose NaN": (parameters(rotations=with_nan((FRAMES, JOINTS, 3), (1, 2, 0))), "body.npz: rotations", "[1, 2, 0]"),
-    "translation count": (parameters(translations=np.zeros((5, 3))), "body.npz: translations", "(2, 3)"),
+    "rotations shape": (
+        parameters(rotations=np.zeros((FRAMES, JOINTS * 3))),
+        "body.npz: rotations",
+        "(frames, 5, 3)",
+    ),
+    "pose NaN": (
+        parameters(rotations=with_nan((FRAMES, JOINTS, 3), (1, 2, 0))),
+        "body.npz: rotations",
+        "[1, 2, 0]",
+    ),
+    "translation count": (
+        parameters(translations=np.zeros((5, 3))),
+        "body.npz: translations",
+        "(2, 3)",
+    ),
     "betas too long": (parameters(betas=np.ones(4)), "body.npz: betas", "has 3 such directions"),
-    "betas 2D": (parameters(betas=np.zeros((1, 3))), "body.npz: betas", "a list of numbers, got shape (1, 3)"),
-    "displacement NaN": (parameters(displacement=with_nan((4, 3), (2, 1))), "body.npz: displacement", "[2, 1]"),
+    "betas 2D": (
+        parameters(betas=np.zeros((1, 3))),
+        "body.npz: betas",
+        "a list of numbers, got shape (1, 3)",
+    ),
+    "displacement NaN": (
+        parameters(displacement=with_nan((4, 3), (2, 1))),
+        "body.npz: displacement",
+        "[2, 1]",
+    ),
     "displacement in millimetres": (
         parameters(displacement=np.full((4, 3), -10.0)),
         "body.npz: displacement",
@@ -285,7 +361,9 @@ def test_bad_folder_is_one_line_with_file_and_field(folder, case):
     with pytest.raises(CaptureError) as caught:
         load(folder)
     message = str(caught.value)
-    assert "\n" not in message and message.startswith(f"{folder}/{place}") and expected in message, message
+    assert (
+        "\n" not in message and message.startswith(f"{folder}/{place}") and expected in message
+    ), message
 
 
 def test_no_folder_and_no_model_file(folder, tmp_path):
@@ -301,7 +379,10 @@ def test_no_folder_and_no_model_file(folder, tmp_path):
 
 
 BAD_ARRAYS = {
-    "uint8 range": (dict(images=np.full((VIEWS, HEIGHT, WIDTH, 3), 200)), "images: expected values in [0, 1]"),
+    "uint8 range": (
+        dict(images=np.full((VIEWS, HEIGHT, WIDTH, 3), 200)),
+        "images: expected values in [0, 1]",
+    ),
     "channels": (dict(images=np.zeros((VIEWS, HEIGHT, WIDTH))), "images: expected shape"),
     "mask shape": (dict(masks=np.zeros((VIEWS, WIDTH, HEIGHT))), "masks: expected shape"),
     "K": (dict(K=np.zeros((VIEWS, 3, 3))), "view 0: K"),
@@ -335,7 +416,12 @@ def named(names):
 
 KINDS = {
     "fewer of SMPL-X's": (SMPLX_NAMES, [0.5], None, [0.5]),
-    "SMPL-X's shape, more than the model has, but 0": (SMPLX_NAMES, [0.5, -1, 0, 0], None, [0.5, -1]),
+    "SMPL-X's shape, more than the model has, but 0": (
+        SMPLX_NAMES,
+        [0.5, -1, 0, 0],
+        None,
+        [0.5, -1],
+    ),
     "an expression by name": (SMPLX_NAMES, [2, 0.5], ["expression_0", "shape_1"], [0, 0.5, 2]),
     "all of the body's own": (OWN_NAMES, [1, 2, 3], None, [1, 2, 3]),
     "some of the body's own": (OWN_NAMES, [1, 2], ["height", "sex"], [2, 0, 1]),
@@ -344,8 +430,18 @@ KINDS = {
 }
 """Names of the body's directions, betas, their names, what they mean in the order of the body."""
 WRONG_KINDS = {
-    "SMPL-X's shape on expressions": (SMPLX_NAMES, [1, 1, 1], None, "betas: 3 coefficients, but body 'tiny' has 2"),
-    "SMPL-X's shape for another body": (OWN_NAMES, [1, 1], None, "betas: 'shape_0' is no shape direction of body 'tiny'"),
+    "SMPL-X's shape on expressions": (
+        SMPLX_NAMES,
+        [1, 1, 1],
+        None,
+        "betas: 3 coefficients, but body 'tiny' has 2",
+    ),
+    "SMPL-X's shape for another body": (
+        OWN_NAMES,
+        [1, 1],
+        None,
+        "betas: 'shape_0' is no shape direction of body 'tiny'",
+    ),
     "another body's": (SMPLX_NAMES, [1, 1], ["age", "sex"], "betas: 'age' is no shape direction"),
     "a name too few": (OWN_NAMES, [1, 1], ["age"], "shape_names: expected 2 different names"),
     "a name twice": (OWN_NAMES, [1, 1], ["age", "age"], "shape_names: expected 2 different names"),
@@ -359,16 +455,22 @@ def test_betas_are_of_a_known_kind(kind, tmp_path):
     capture = capture_from_arrays(**given)
     np.testing.assert_array_equal(capture.betas, expected)
     save_capture(tmp_path / "me", capture)
-    again = load_capture(tmp_path / "me", body=named(names[::-1]))  # the file names them: their order is free
+    again = load_capture(
+        tmp_path / "me", body=named(names[::-1])
+    )  # the file names them: their order is free
     full = np.pad(capture.betas, (0, len(names) - len(capture.betas)))
-    np.testing.assert_array_equal(np.pad(again.betas, (0, len(names) - len(again.betas))), full[::-1])
+    np.testing.assert_array_equal(
+        np.pad(again.betas, (0, len(names) - len(again.betas))), full[::-1]
+    )
 
 
 @pytest.mark.parametrize("kind", WRONG_KINDS)
 def test_betas_of_another_kind_are_refused(kind):
     names, betas, their_names, expected = WRONG_KINDS[kind]
     with pytest.raises(CaptureError, match=expected):
-        capture_from_arrays(**{**arrays(), "betas": betas, "shape_names": their_names, "body": named(names)})
+        capture_from_arrays(
+            **{**arrays(), "betas": betas, "shape_names": their_names, "body": named(names)}
+        )
 
 
 # Nothing is written when something is wrong --------------------------------------------------------------------------
@@ -443,13 +545,21 @@ def test_whether_cameras_are_calibrated_is_written_and_read(tmp_path):
     estimated = dataclasses.replace(capture.select([1, 2]), calibrated=False)
     save_capture(tmp_path / "me", estimated)
     found = load_capture(tmp_path / "me")
-    assert not found.calibrated and not load_photos(tmp_path / "me").calibrated and not found.select([0]).calibrated
+    assert (
+        not found.calibrated
+        and not load_photos(tmp_path / "me").calibrated
+        and not found.select([0]).calibrated
+    )
     save_capture(tmp_path / "again", found.resized(16))
     assert not load_capture(tmp_path / "again").calibrated
     save_capture(tmp_path / "other", capture)
     assert "calibrated" not in read_json(tmp_path / "other" / "capture.json")
-    edit_json(tmp_path / "me" / "capture.json", lambda description: description.update(calibrated="no"))
-    with pytest.raises(CaptureError, match=r"capture\.json: calibrated: expected true or false, got 'no'"):
+    edit_json(
+        tmp_path / "me" / "capture.json", lambda description: description.update(calibrated="no")
+    )
+    with pytest.raises(
+        CaptureError, match=r"capture\.json: calibrated: expected true or false, got 'no'"
+    ):
         load_capture(tmp_path / "me")
 
 
@@ -457,7 +567,9 @@ MARKS = ({"calibrated": False}, False), ({"calibrated": True}, True), ({}, True)
 
 
 @pytest.mark.parametrize(("mark", "calibrated"), MARKS)
-def test_of_an_older_capture_the_run_that_made_it_tells_whether_cameras_are_calibrated(mark, calibrated, tmp_path):
+def test_of_an_older_capture_the_run_that_made_it_tells_whether_cameras_are_calibrated(
+    mark, calibrated, tmp_path
+):
     save_capture(tmp_path / "me", load_capture("demo_capture", views=[0]).resized(32))
     write_json(tmp_path / "me" / "start.json", mark)
     assert load_capture(tmp_path / "me").calibrated == calibrated

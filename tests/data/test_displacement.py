@@ -39,7 +39,12 @@ def rasterizer():
 def masks_of(body, rest, poses, frames, cameras):
     return np.stack(
         [
-            np.asarray(rasterizer()(pose_body(body, rest, poses[f]).vertices, body.faces, cameras[i]).face_ids) >= 0
+            np.asarray(
+                rasterizer()(
+                    pose_body(body, rest, poses[f]).vertices, body.faces, cameras[i]
+                ).face_ids
+            )
+            >= 0
             for i, f in enumerate(frames)
         ]
     ).astype(np.float32)
@@ -73,7 +78,9 @@ def dressed(body):
 
 
 def along_normals(body, capture, moved):
-    normals = np.asarray(vertex_normals(shape_body(body, jnp.asarray(capture.betas)).vertices, body.faces))
+    normals = np.asarray(
+        vertex_normals(shape_body(body, jnp.asarray(capture.betas)).vertices, body.faces)
+    )
     return (moved * normals).sum(-1)
 
 
@@ -95,7 +102,10 @@ def test_a_coat_is_found(body, dressed, filled):
 
 def test_the_inset_is_kept(body, dressed, filled):
     capture, worn = dressed[0], free(body) > 0.99
-    near, deep = (along_normals(body, capture, x)[worn] for x in (filled, displacement(body, capture, (0.004, 0.004))))
+    near, deep = (
+        along_normals(body, capture, x)[worn]
+        for x in (filled, displacement(body, capture, (0.004, 0.004)))
+    )
     assert np.median(near - deep) == pytest.approx(0.004, abs=FOUND / 2)
 
 
@@ -110,24 +120,34 @@ def test_only_a_body_that_sticks_out_of_the_masks_needs_it(body, dressed):
 
 
 def test_a_displacement_is_carried_to_the_vertices_of_another_mesh(body, filled):
-    config, small = tiny().with_conventions(body_vertices=200, longest_edge=0.1), decimate(body, 300)
+    config, small = (
+        tiny().with_conventions(body_vertices=200, longest_edge=0.1),
+        decimate(body, 300),
+    )
     gaussians = gaussian_body(small, config)
     assert len(gaussians.template) != len(small.template)
     # the template itself is carried to the template
-    np.testing.assert_array_equal(on_gaussian_body(np.asarray(small.template), small, config), gaussians.template)
+    np.testing.assert_array_equal(
+        on_gaussian_body(np.asarray(small.template), small, config), gaussians.template
+    )
     np.testing.assert_array_equal(on_gaussian_body(filled, body, tiny()), filled)  # the body itself
 
 
 def test_joints_stay(body, dressed):
     betas = jnp.asarray(dressed[0].betas)
-    before, after = subject_rest(body, betas, None), subject_rest(body, betas, jnp.asarray(dressed[1], jnp.float32))
+    before, after = (
+        subject_rest(body, betas, None),
+        subject_rest(body, betas, jnp.asarray(dressed[1], jnp.float32)),
+    )
     np.testing.assert_array_equal(before.joints, after.joints)
     assert np.abs(np.asarray(after.vertices - before.vertices)).max() > COAT / 2
 
 
 SPOILED = {
     "one photo": lambda c: c.select([0]),
-    "a body that is not finite": lambda c: dataclasses.replace(c, betas=np.full_like(c.betas, np.nan)),
+    "a body that is not finite": lambda c: dataclasses.replace(
+        c, betas=np.full_like(c.betas, np.nan)
+    ),
     "all masks empty": lambda c: dataclasses.replace(c, masks=0 * c.masks),
     "masks of all": lambda c: dataclasses.replace(c, masks=np.ones_like(c.masks)),
     "a hole": lambda c: dataclasses.replace(c, masks=c.masks * (np.arange(SIZE) % 40 > 9)),
@@ -148,7 +168,13 @@ def test_the_border_of_a_photo_is_no_edge_of_the_person(body, dressed):
     capture, coat = dressed
     half = SIZE // 2
     cameras = replace(capture.cameras, height=half)
-    upper = dataclasses.replace(capture, images=capture.images[:, :half], masks=capture.masks[:, :half], cameras=cameras)
-    found, true = (along_normals(body, capture, x) for x in (displacement(body, upper, inset=(0.0, 0.0)), coat))
+    upper = dataclasses.replace(
+        capture, images=capture.images[:, :half], masks=capture.masks[:, :half], cameras=cameras
+    )
+    found, true = (
+        along_normals(body, capture, x) for x in (displacement(body, upper, inset=(0.0, 0.0)), coat)
+    )
     errors = np.abs(found - true)
-    assert np.percentile(errors[free(body) > 0.99], 95) < COAT + FOUND  # what no photo shows stays where it was
+    assert (
+        np.percentile(errors[free(body) > 0.99], 95) < COAT + FOUND
+    )  # what no photo shows stays where it was

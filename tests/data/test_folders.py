@@ -41,9 +41,14 @@ def test_photos_win_over_the_clips_beside_them(suffix, rig):
         (rig[1] / "clip.mp4").rename(rig[1] / f"{name}{suffix.upper()}")
     report = imported(rig)
     assert (report.views, report.frames) == (4, 1)
-    assert f"not used: 4 videos beside photos (a{suffix.upper()}, b{suffix.upper()}, c{suffix.upper()} and 1 more)" in str(report)
+    assert (
+        f"not used: 4 videos beside photos (a{suffix.upper()}, b{suffix.upper()}, c{suffix.upper()} and 1 more)"
+        in str(report)
+    )
     assert "not used: 4 videos" in str(look(rig[1]))
-    assert imported(rig, frames=2, overwrite=True).frames == 2  # frames are asked for: of the videos
+    assert (
+        imported(rig, frames=2, overwrite=True).frames == 2
+    )  # frames are asked for: of the videos
     assert "4 photos beside the videos" in str(imported(rig, frames=2, overwrite=True))
 
 
@@ -51,7 +56,9 @@ def test_errors_about_videos_name_no_folder_that_is_gone(rig):
     for file in FILES:
         (rig[1] / file).unlink()
     write_video(rig[1] / "z.mp4", CLIP, 10)
-    with pytest.raises(CaptureError, match=r"rig\.json: a: no photo of this camera in .*photos: expected") as caught:
+    with pytest.raises(
+        CaptureError, match=r"rig\.json: a: no photo of this camera in .*photos: expected"
+    ) as caught:
         imported(rig)
     assert ".video-" not in str(caught.value)
 
@@ -64,7 +71,10 @@ def test_an_m4v_is_a_video(tmp_path):
 
 def test_photos_without_a_camera_are_named(rig):
     written.write_calibration_full(rig[0], *(each[:2] for each in written.scene()), NAMES[:2])
-    assert "warning: not used: 2 photos without a camera in rig.json (c.png, d.png)" in str(imported(rig)).splitlines()
+    assert (
+        "warning: not used: 2 photos without a camera in rig.json (c.png, d.png)"
+        in str(imported(rig)).splitlines()
+    )
 
 
 def test_images_that_colmap_did_not_register_are_named(rig, tmp_path):
@@ -106,7 +116,14 @@ def test_hidden_files_are_no_photos_in_any_layout(rig, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "pattern", ["{name}.mask.png", "{stem}_mask.png", "{stem}-Matte.png", "mask_{stem}.png", "{stem}.segmentation.PNG"]
+    "pattern",
+    [
+        "{name}.mask.png",
+        "{stem}_mask.png",
+        "{stem}-Matte.png",
+        "mask_{stem}.png",
+        "{stem}.segmentation.PNG",
+    ],
 )
 def test_masks_may_say_that_they_are_masks(pattern, rig, tmp_path):
     names = [pattern.format(name=file, stem=file[:-4]) for file in FILES]
@@ -169,4 +186,7 @@ def test_folders_that_are_captures_are_named_and_previews_are_not(rig):
     imported((rig[0], rig[1], rig[1] / "me"))
     written.write_photos(rig[1] / "@eaDir", ["thumb.png"])
     scan = scan_folder(rig[1])
-    assert len(scan.photos) == 4 and unused_line(scan.unused) == "not used: 1 folder that is a capture already (me)"
+    assert (
+        len(scan.photos) == 4
+        and unused_line(scan.unused) == "not used: 1 folder that is a capture already (me)"
+    )

@@ -54,7 +54,9 @@ def test_a_format_of_cameras_is_one_row(tmp_path, made_up, capsys):
     ]
     made_up(
         CAMERAS,
-        CameraFormat("Rig of ours", "made_up:read", files=("*.rig",), up="+y", pixel_centers="half"),
+        CameraFormat(
+            "Rig of ours", "made_up:read", files=("*.rig",), up="+y", pixel_centers="half"
+        ),
         recognizes=lambda source: source.text.startswith("RIG"),
         read=lambda source, format: source.calibration(format, cameras),
     )
@@ -63,12 +65,18 @@ def test_a_format_of_cameras_is_one_row(tmp_path, made_up, capsys):
     assert look(tmp_path).cameras == tmp_path
     for i, source in enumerate((tmp_path, tmp_path / "studio.rig")):
         report = import_cameras(source, tmp_path, tmp_path.with_name(f"out{i}"))
-        assert report.read_as.startswith("read as: Rig of ours (") and "; +y up;" in report.read_as and not report.warnings
+        assert (
+            report.read_as.startswith("read as: Rig of ours (")
+            and "; +y up;" in report.read_as
+            and not report.warnings
+        )
     for command in (("import", "cameras"), ("start",)):
         assert "Rig of ours (*.rig)" in " ".join(help_of(capsys, *command).replace("│", "").split())
     assert "| Rig of ours | `*.rig` |  | +0.5 | +y | camera |\n" in format_table("cameras")
     (tmp_path / "other.txt").write_text("?")
-    with pytest.raises(CaptureError, match=r"not a known format: expected COLMAP.*; Rig of ours \(\*\.rig\)$"):
+    with pytest.raises(
+        CaptureError, match=r"not a known format: expected COLMAP.*; Rig of ours \(\*\.rig\)$"
+    ):
         read_calibration(tmp_path / "other.txt", lambda name: (1, 1))
 
 
@@ -79,7 +87,9 @@ def test_a_format_of_keypoints_is_one_row(tmp_path, made_up, capsys):
         KEYPOINTS,
         SourceFormat("Tracker of ours", "made_up:read", files=("tracks",), content="17 points"),
         recognizes=lambda source: isinstance(source.json, dict) and "tracks" in source.json,
-        read=lambda source, format: detections_of([DetectedImage(source.name, source.path, tuple(people))]),
+        read=lambda source, format: detections_of(
+            [DetectedImage(source.name, source.path, tuple(people))]
+        ),
     )
     (tmp_path / "tracks").mkdir()
     (tmp_path / "tracks" / "front.json").write_text(json.dumps({"tracks": []}))
@@ -94,12 +104,18 @@ def test_a_format_of_keypoints_is_one_row(tmp_path, made_up, capsys):
 
 def test_the_first_row_that_recognizes_a_file_reads_it(tmp_path, made_up):
     """Files that are read together are known by their names, alone or in a folder."""
-    made_up(CAMERAS, CameraFormat("Greedy", "made_up:read"), recognizes=lambda source: True, read=None)
-    written.write_transforms(tmp_path / "transforms.json", *written.scene(), [f"{i}.png" for i in range(4)])
+    made_up(
+        CAMERAS, CameraFormat("Greedy", "made_up:read"), recognizes=lambda source: True, read=None
+    )
+    written.write_transforms(
+        tmp_path / "transforms.json", *written.scene(), [f"{i}.png" for i in range(4)]
+    )
     (tmp_path / "model").mkdir()
     written.write_colmap(tmp_path / "model", *written.scene(), [f"{i}.png" for i in range(4)])
     size = lambda name: (1, 1)
-    assert read_calibration(tmp_path / "transforms.json", size).format == CAMERAS["transforms"].about
+    assert (
+        read_calibration(tmp_path / "transforms.json", size).format == CAMERAS["transforms"].about
+    )
     for source in (tmp_path / "model", tmp_path / "model" / "images.txt"):
         assert read_calibration(source, size).format == CAMERAS["colmap"].about
 
@@ -119,7 +135,9 @@ def test_a_suffix_of_its_own_is_for_files_that_are_no_text(tmp_path, made_up):
         KEYPOINTS,
         SourceFormat("Tables", "made_up:read", (".points",)),
         recognizes=lambda source: source.path.suffix == ".points",
-        read=lambda source, format: detections_of([DetectedImage("front", source.path, tuple(30 * point))]),
+        read=lambda source, format: detections_of(
+            [DetectedImage("front", source.path, tuple(30 * point))]
+        ),
     )
     (tmp_path / "front.points").write_bytes(b"\xff\x00")
     with pytest.raises(CaptureError, match="confidences"):  # it was read

@@ -8,7 +8,13 @@ import pytest
 from changes import edit_json
 
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, read_people, save_keypoints, write_people
+from humangs_jax.data.keypoints.formats import (
+    ImagePeople,
+    SeenPerson,
+    read_people,
+    save_keypoints,
+    write_people,
+)
 from humangs_jax.data.keypoints.keypoints import (
     COCO_17,
     COCO_WHOLEBODY_133,
@@ -22,7 +28,12 @@ from humangs_jax.data.keypoints.keypoints import (
 from humangs_jax.data.keypoints.reading import match_views, read_keypoints
 
 NAMES, SIZE = ("front", "back", "left"), (320, 240)
-CAMERA_NAMES = ("images_cam0_000000", "images_cam0_000001", "images_cam1_000000", "images_cam1_000001")
+CAMERA_NAMES = (
+    "images_cam0_000000",
+    "images_cam0_000001",
+    "images_cam1_000000",
+    "images_cam1_000001",
+)
 
 
 def known(count, views=3, seed=0):
@@ -57,9 +68,16 @@ def flat(values):
 
 
 def openpose_person(values, hands=True):
-    person = {"person_id": [-1], "pose_keypoints_2d": flat(values[:25]), "face_keypoints_2d": [1.0] * 210}
+    person = {
+        "person_id": [-1],
+        "pose_keypoints_2d": flat(values[:25]),
+        "face_keypoints_2d": [1.0] * 210,
+    }
     person |= {"hand_left_keypoints_2d": flat(values[25:46]) if hands else []}
-    return person | {"hand_right_keypoints_2d": flat(values[46:]) if hands else [], "pose_keypoints_3d": []}
+    return person | {
+        "hand_right_keypoints_2d": flat(values[46:]) if hands else [],
+        "pose_keypoints_3d": [],
+    }
 
 
 def openpose(*people):
@@ -68,13 +86,29 @@ def openpose(*people):
 
 def annots(values, filename, number=0):
     """As EasyMocap writes them; hands beside BODY_25."""
-    hands = {"handl2d": values[25:46].tolist(), "handr2d": values[46:].tolist()} if len(values) == 67 else {}
-    person = {"bbox": [0, 0, 9, 9, 1.0], "personID": number, "keypoints": values[: 25 if hands else None].tolist()} | hands
-    return {"height": SIZE[1], "width": SIZE[0], "annots": [person]} | ({"filename": filename} if filename else {})
+    hands = (
+        {"handl2d": values[25:46].tolist(), "handr2d": values[46:].tolist()}
+        if len(values) == 67
+        else {}
+    )
+    person = {
+        "bbox": [0, 0, 9, 9, 1.0],
+        "personID": number,
+        "keypoints": values[: 25 if hands else None].tolist(),
+    } | hands
+    return {"height": SIZE[1], "width": SIZE[0], "annots": [person]} | (
+        {"filename": filename} if filename else {}
+    )
 
 
 def instances(values):
-    return [{"keypoints": values[:, :2].tolist(), "keypoint_scores": values[:, 2].tolist(), "bbox": [[0, 0, 9, 9]]}]
+    return [
+        {
+            "keypoints": values[:, :2].tolist(),
+            "keypoint_scores": values[:, 2].tolist(),
+            "bbox": [[0, 0, 9, 9]],
+        }
+    ]
 
 
 def frames(values, first=0):
@@ -90,16 +124,24 @@ OF_NAMES = lambda values: zip(NAMES, values, strict=True)
 OF_CAMERAS = lambda values: ((i // 2, i % 2, each) for i, each in enumerate(values))
 VIDEO = ("f_0000", "f_0001", "f_0002")
 FOLDERS = {
-    "OpenPose": (OPENPOSE_67, NAMES, lambda v: {f"{n}_keypoints": openpose(openpose_person(x)) for n, x in OF_NAMES(v)}),
+    "OpenPose": (
+        OPENPOSE_67,
+        NAMES,
+        lambda v: {f"{n}_keypoints": openpose(openpose_person(x)) for n, x in OF_NAMES(v)},
+    ),
     "OpenPose of videos": (
         OPENPOSE_67,
         CAMERA_NAMES,
-        lambda v: {f"cam{c}_{f:012d}_keypoints": openpose(openpose_person(x)) for c, f, x in OF_CAMERAS(v)},
+        lambda v: {
+            f"cam{c}_{f:012d}_keypoints": openpose(openpose_person(x)) for c, f, x in OF_CAMERAS(v)
+        },
     ),
     "OpenPose in a folder for each camera": (
         OPENPOSE_67,
         CAMERA_NAMES,
-        lambda v: {f"cam{c}/{f:06d}_keypoints": openpose(openpose_person(x)) for c, f, x in OF_CAMERAS(v)},
+        lambda v: {
+            f"cam{c}/{f:06d}_keypoints": openpose(openpose_person(x)) for c, f, x in OF_CAMERAS(v)
+        },
     ),
     "RTMPose's Halpe in OpenPose's form": (
         HALPE_26,
@@ -109,12 +151,22 @@ FOLDERS = {
     "EasyMocap": (
         OPENPOSE_67,
         CAMERA_NAMES,
-        lambda v: {f"cam{c}/{f:06d}": annots(x, f"images/cam{c}/{f:06d}.jpg") for c, f, x in OF_CAMERAS(v)},
+        lambda v: {
+            f"cam{c}/{f:06d}": annots(x, f"images/cam{c}/{f:06d}.jpg") for c, f, x in OF_CAMERAS(v)
+        },
     ),
     "EasyMocap, Halpe": (HALPE_136, NAMES, lambda v: {n: annots(x, None) for n, x in OF_NAMES(v)}),
-    "OpenPose of one image": (OPENPOSE_67, ("front",), lambda v: {"front_keypoints": openpose(openpose_person(v[0]))}),
+    "OpenPose of one image": (
+        OPENPOSE_67,
+        ("front",),
+        lambda v: {"front_keypoints": openpose(openpose_person(v[0]))},
+    ),
     "MMPose": (COCO_17, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
-    "MMPose's demo": (COCO_17, NAMES, lambda v: {f"results_{n}": demo(instances(x)) for n, x in OF_NAMES(v)}),
+    "MMPose's demo": (
+        COCO_17,
+        NAMES,
+        lambda v: {f"results_{n}": demo(instances(x)) for n, x in OF_NAMES(v)},
+    ),
     "MMPose of a video": (COCO_17, VIDEO, lambda v: {"walk": frames(v)}),
     "MMPose's demo of a video": (COCO_17, VIDEO, lambda v: {"walk": demo(frames(v, 1))}),
     "MMPose of two videos": (
@@ -161,7 +213,11 @@ def test_nobody_is_found_in_a_view(tool, tmp_path):
     values = known(67 if tool == "openpose" else 17)
     for name, each in zip(NAMES, values, strict=True):
         nobody = name == "back"
-        people = openpose(*[] if nobody else [openpose_person(each)]) if tool == "openpose" else instances(each)
+        people = (
+            openpose(*[] if nobody else [openpose_person(each)])
+            if tool == "openpose"
+            else instances(each)
+        )
         write(tmp_path / f"{name}.json", [] if nobody and tool == "mmpose" else people)
     keypoints = read(tmp_path)
     assert keypoints.missing == ("back",) and not keypoints.confidences[1].any()
@@ -201,12 +257,23 @@ def test_whole_body_results_in_parts(tmp_path):
 def test_annotations_tell_visibility(tmp_path, whole):
     values = known(133 if whole else 17)
     values[..., 2] = np.arange(values.shape[1]) % 3  # 0 not labelled, 1 hidden, 2 visible
-    images = [{"id": 5 + i, "file_name": f"{n}.png", "width": 320, "height": 240} for i, n in enumerate(NAMES)]
+    images = [
+        {"id": 5 + i, "file_name": f"{n}.png", "width": 320, "height": 240}
+        for i, n in enumerate(NAMES)
+    ]
     entries = [
-        {"id": i, "image_id": 5 + i, "iscrowd": 0, **(parts(each) if whole else {"keypoints": flat(each)})}
+        {
+            "id": i,
+            "image_id": 5 + i,
+            "iscrowd": 0,
+            **(parts(each) if whole else {"keypoints": flat(each)}),
+        }
         for i, each in enumerate(values)
     ]
-    entries += [{"id": 8, "image_id": 5, "iscrowd": 1, "keypoints": [9.0, 9.0, 2.0] * 17}, {"id": 9, "image_id": 5}]
+    entries += [
+        {"id": 8, "image_id": 5, "iscrowd": 1, "keypoints": [9.0, 9.0, 2.0] * 17},
+        {"id": 9, "image_id": 5},
+    ]
     values[..., 2] /= 2  # hidden is half sure
     file = write(tmp_path / "person_keypoints.json", {"images": images, "annotations": entries})
     check(read(file), values, COCO_WHOLEBODY_133 if whole else COCO_17)
@@ -215,7 +282,10 @@ def test_annotations_tell_visibility(tmp_path, whole):
 def test_fractional_visibilities_are_reliable(tmp_path):
     values = known(17, 1)
     values[..., 2] = 0.25
-    content = {"images": [{"id": 1, "width": 0, "height": 0}], "annotations": [{"image_id": 1, "keypoints": flat(values)}]}
+    content = {
+        "images": [{"id": 1, "width": 0, "height": 0}],
+        "annotations": [{"image_id": 1, "keypoints": flat(values)}],
+    }
     keypoints = read(write(tmp_path / "a.json", content), ("1",))
     np.testing.assert_array_equal(keypoints.confidences, 1)
 
@@ -245,12 +315,16 @@ def people_file(path):
     """A file of `humangs detect`: the second person is not in the second image."""
     rng = np.random.default_rng(2)
     person = lambda: SeenPerson(
-        np.concatenate([rng.integers(0, 800, (33, 2)) / 4, rng.integers(1, 17, (33, 1)) / 16], axis=1),
+        np.concatenate(
+            [rng.integers(0, 800, (33, 2)) / 4, rng.integers(1, 17, (33, 1)) / 16], axis=1
+        ),
         rng.integers(-8, 8, (33, 3)) / 8,
         0.5,
     )
     images = [
-        ImagePeople(f"{name}.jpg", SIZE, tuple(None if (i, j) == (1, 1) else person() for j in range(2)))
+        ImagePeople(
+            f"{name}.jpg", SIZE, tuple(None if (i, j) == (1, 1) else person() for j in range(2))
+        )
         for i, name in enumerate(NAMES)
     ]
     write_people(path, images)
@@ -260,7 +334,9 @@ def people_file(path):
 def test_people_of_our_detector_round_trip_exactly(tmp_path):
     images = people_file(tmp_path / "keypoints.json")
     kind, back = read_people(tmp_path / "keypoints.json")
-    assert kind is MEDIAPIPE_33 and [(i.image, i.size) for i in back] == [(i.image, i.size) for i in images]
+    assert kind is MEDIAPIPE_33 and [(i.image, i.size) for i in back] == [
+        (i.image, i.size) for i in images
+    ]
     for image, again in zip(images, back, strict=True):
         for a, b in zip(image.people, again.people, strict=True):
             assert (a is None) == (b is None)
@@ -277,7 +353,9 @@ def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
         read(tmp_path / where)
     found = read(tmp_path / where, person=1)
     assert found.set is MEDIAPIPE_33 and found.missing == ("back",)
-    np.testing.assert_array_equal(found.points[0], images[0].people[1].points[:, :2])  # no half pixel is added
+    np.testing.assert_array_equal(
+        found.points[0], images[0].people[1].points[:, :2]
+    )  # no half pixel is added
     np.testing.assert_array_equal(found.confidences[2], images[2].people[1].points[:, 2])
 
 
@@ -288,10 +366,22 @@ def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
         (lambda c: c.update(set="faces"), "set: expected one of .*mediapipe33, got 'faces'"),
         (lambda c: c.update(images={}), r"images: expected a list, got \{\}"),
         (lambda c: c["images"][0].pop("people"), r"images\[0\]\.people: missing"),
-        (lambda c: c["images"][0].update(width=0.5), r"images\[0\]\.width: expected an integer, got 0\.5"),
-        (lambda c: c["images"][0]["people"][0]["pixels"].pop(), r"people\[0\]\.pixels: .*\(33, 2\), got \(32, 2\)"),
-        (lambda c: c["images"][0]["people"][0].update(world="no"), r"people\[0\]\.world: expected a list"),
-        (lambda c: c["images"][0].update(people=[[]]), r"people\[0\]: expected a JSON object, got \[\]"),
+        (
+            lambda c: c["images"][0].update(width=0.5),
+            r"images\[0\]\.width: expected an integer, got 0\.5",
+        ),
+        (
+            lambda c: c["images"][0]["people"][0]["pixels"].pop(),
+            r"people\[0\]\.pixels: .*\(33, 2\), got \(32, 2\)",
+        ),
+        (
+            lambda c: c["images"][0]["people"][0].update(world="no"),
+            r"people\[0\]\.world: expected a list",
+        ),
+        (
+            lambda c: c["images"][0].update(people=[[]]),
+            r"people\[0\]: expected a JSON object, got \[\]",
+        ),
     ],
 )
 def test_damaged_files_of_our_detector_are_one_line(tmp_path, change, said):
@@ -330,7 +420,11 @@ CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "im
         (["cam1/12"], CAMERAS, [3]),  # MMPose on videos
         (["000012.png"], CAMERAS, [None]),  # of which camera?
         # a video's frames from 0 and photos from 1, or the other way round: in order, for each video by itself
-        (["f_000000000000", "f_000000000001", "f_000000000002"], ("f_001", "f_002", "f_003"), [0, 1, 2]),
+        (
+            ["f_000000000000", "f_000000000001", "f_000000000002"],
+            ("f_001", "f_002", "f_003"),
+            [0, 1, 2],
+        ),
         (["f_1", "f_3", "f_2"], ("f_000", "f_001", "f_002"), [0, 2, 1]),
         (["b/0", "a/1", "b/1", "a/2"], ("v_a_1", "v_b_1", "v_a_2", "v_b_2"), [1, 0, 3, 2]),
         (["a_0.jpg", "a_1.jpg", "b_0.jpg", "b_1.jpg"], ("a_1", "a_2", "b_0", "b_1"), [0, 1, 2, 3]),
@@ -366,7 +460,11 @@ def test_names(images, names, views):
         ([0, 1, 2], ("f_001", "f_002", "f_003"), [0, 1, 2]),  # ffmpeg counts from 1
         ([1, 2, 3], ("f_000", "f_001", "f_002"), [0, 1, 2]),
         ([0, 1, 2], ("f_100", "f_101", "f_102"), [0, 1, 2]),
-        ([0, 1, 2, 3], ("f_001", "f_002", "f_003"), [None, 0, 1, 2]),  # who knows: the numbers as they are
+        (
+            [0, 1, 2, 3],
+            ("f_001", "f_002", "f_003"),
+            [None, 0, 1, 2],
+        ),  # who knows: the numbers as they are
         ([0, 2, 3], ("f_001", "f_002", "f_003"), [None, 1, 2]),  # gaps
         ([1, 2, 3, 4], ("cam0_rgb", "cam1_rgb", "cam2_rgb", "cam3_rgb"), [0, 1, 2, 3]),
         ([0, 1, 2, 3], ("a1", "b2", "c3", "d4"), [0, 1, 2, 3]),
@@ -381,7 +479,9 @@ def test_numbers(numbers, names, views):
 
 
 def test_numbers_of_several_cameras_are_refused():
-    with pytest.raises(ValueError, match=r"number 12 could be view 'images_cam0_000012' and 'images_cam1_000012'"):
+    with pytest.raises(
+        ValueError, match=r"number 12 could be view 'images_cam0_000012' and 'images_cam1_000012'"
+    ):
         match_views([12], CAMERAS)
 
 
@@ -404,23 +504,77 @@ def test_names_are_different_and_mirrors_are_mutual(keypoint_set):
 def test_points_are_where_the_tools_have_them():
     """Numbers from COCO's, COCO-WholeBody's and OpenPose's pages."""
     for keypoint_set, numbers in (
-        (COCO_17, {0: "nose", 1: "left_eye", 4: "right_ear", 9: "left_wrist", 12: "right_hip", 16: "right_ankle"}),
+        (
+            COCO_17,
+            {
+                0: "nose",
+                1: "left_eye",
+                4: "right_ear",
+                9: "left_wrist",
+                12: "right_hip",
+                16: "right_ankle",
+            },
+        ),
         (
             COCO_WHOLEBODY_133,
-            {17: "left_big_toe", 19: "left_heel", 20: "right_big_toe", 22: "right_heel", 23: "face_0", 90: "face_67"}
-            | {91: "left_hand_root", 95: "left_thumb_tip", 96: "left_index_1", 112: "right_hand_root"}
+            {
+                17: "left_big_toe",
+                19: "left_heel",
+                20: "right_big_toe",
+                22: "right_heel",
+                23: "face_0",
+                90: "face_67",
+            }
+            | {
+                91: "left_hand_root",
+                95: "left_thumb_tip",
+                96: "left_index_1",
+                112: "right_hand_root",
+            }
             | {132: "right_pinky_tip"},
         ),
         (
             OPENPOSE_67,
-            {1: "neck", 2: "right_shoulder", 4: "right_wrist", 5: "left_shoulder", 8: "mid_hip", 9: "right_hip"}
-            | {14: "left_ankle", 15: "right_eye", 18: "left_ear", 19: "left_big_toe", 24: "right_heel"}
-            | {25: "left_hand_root", 46: "right_hand_root", 47: "right_thumb_1", 50: "right_thumb_tip", 66: "right_pinky_tip"},
+            {
+                1: "neck",
+                2: "right_shoulder",
+                4: "right_wrist",
+                5: "left_shoulder",
+                8: "mid_hip",
+                9: "right_hip",
+            }
+            | {
+                14: "left_ankle",
+                15: "right_eye",
+                18: "left_ear",
+                19: "left_big_toe",
+                24: "right_heel",
+            }
+            | {
+                25: "left_hand_root",
+                46: "right_hand_root",
+                47: "right_thumb_1",
+                50: "right_thumb_tip",
+                66: "right_pinky_tip",
+            },
         ),
         (
             MEDIAPIPE_33,
-            {0: "nose", 2: "left_eye", 5: "right_eye", 8: "right_ear", 11: "left_shoulder", 16: "right_wrist"}
-            | {17: "left_pinky_1", 20: "right_index_1", 22: "right_thumb_2", 24: "right_hip", 28: "right_ankle"}
+            {
+                0: "nose",
+                2: "left_eye",
+                5: "right_eye",
+                8: "right_ear",
+                11: "left_shoulder",
+                16: "right_wrist",
+            }
+            | {
+                17: "left_pinky_1",
+                20: "right_index_1",
+                22: "right_thumb_2",
+                24: "right_hip",
+                28: "right_ankle",
+            }
             | {1: "face_42", 6: "face_36", 9: "face_54", 30: "right_heel", 32: "right_foot_index"},
         ),
     ):
@@ -430,7 +584,19 @@ def test_points_are_where_the_tools_have_them():
 
 def test_landmarks_of_the_face_mirror_as_in_300w():
     jaw_brows_nose = ((0, 16), (8, 8), (17, 26), (21, 22), (27, 27), (30, 30), (31, 35), (33, 33))
-    eyes_mouth = ((36, 45), (39, 42), (37, 44), (41, 46), (40, 47), (48, 54), (51, 51), (55, 59), (60, 64), (62, 62), (65, 67))
+    eyes_mouth = (
+        (36, 45),
+        (39, 42),
+        (37, 44),
+        (41, 46),
+        (40, 47),
+        (48, 54),
+        (51, 51),
+        (55, 59),
+        (60, 64),
+        (62, 62),
+        (65, 67),
+    )
     names = COCO_WHOLEBODY_133.names
     for a, b in (*jaw_brows_nose, *eyes_mouth):
         assert COCO_WHOLEBODY_133.mirror[names.index(f"face_{a}")] == names.index(f"face_{b}")
@@ -439,11 +605,27 @@ def test_landmarks_of_the_face_mirror_as_in_300w():
 # Orders of OpenPose's points ------------------------------------------------------------------------------------------
 
 COCO_18 = (
-    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
+    *(
+        "nose",
+        "neck",
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+        "left_shoulder",
+        "left_elbow",
+        "left_wrist",
+    ),
     *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"),
     *("right_eye", "left_eye", "right_ear", "left_ear"),
 )
-TOES = ("left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe", "right_heel")
+TOES = (
+    "left_big_toe",
+    "left_small_toe",
+    "left_heel",
+    "right_big_toe",
+    "right_small_toe",
+    "right_heel",
+)
 ORDERS = {
     "BODY_25": OPENPOSE_67.names[:25],
     "BODY_25B": (*COCO_17.names, "upper_neck", "head_top", *TOES),
@@ -451,10 +633,31 @@ ORDERS = {
     "COCO with a neck": (*COCO_17.names, "neck"),
 }
 STANDING = {
-    **{"nose": (150, 40), "left_eye": (154, 36), "right_eye": (146, 36), "left_ear": (160, 38), "right_ear": (140, 38)},
-    **{"left_shoulder": (168, 64), "right_shoulder": (132, 64), "left_elbow": (176, 92), "right_elbow": (122, 90)},
-    **{"left_wrist": (180, 116), "right_wrist": (104, 70), "left_hip": (162, 116), "right_hip": (138, 116)},
-    **{"left_knee": (164, 158), "right_knee": (134, 156), "left_ankle": (164, 200), "right_ankle": (132, 198)},
+    **{
+        "nose": (150, 40),
+        "left_eye": (154, 36),
+        "right_eye": (146, 36),
+        "left_ear": (160, 38),
+        "right_ear": (140, 38),
+    },
+    **{
+        "left_shoulder": (168, 64),
+        "right_shoulder": (132, 64),
+        "left_elbow": (176, 92),
+        "right_elbow": (122, 90),
+    },
+    **{
+        "left_wrist": (180, 116),
+        "right_wrist": (104, 70),
+        "left_hip": (162, 116),
+        "right_hip": (138, 116),
+    },
+    **{
+        "left_knee": (164, 158),
+        "right_knee": (134, 156),
+        "left_ankle": (164, 200),
+        "right_ankle": (132, 198),
+    },
     **{"left_big_toe": (168, 206), "left_small_toe": (172, 205), "left_heel": (162, 203)},
     **{"right_big_toe": (128, 205), "right_small_toe": (124, 204), "right_heel": (133, 202)},
     **{"neck": (150, 64), "mid_hip": (150, 116), "upper_neck": (150, 56), "head_top": (150, 20)},
@@ -471,7 +674,9 @@ def standing(order, seen=lambda name: True):
 def assert_named(keypoints, seen=lambda name: True):
     """Points have the places of their names."""
     for view in range(len(keypoints.points)):
-        for name, point, confidence in zip(keypoints.set.names, keypoints.points[view], keypoints.confidences[view], strict=True):
+        for name, point, confidence in zip(
+            keypoints.set.names, keypoints.points[view], keypoints.confidences[view], strict=True
+        ):
             if confidence:
                 np.testing.assert_allclose(point - 0.5, STANDING[name], atol=0.51, err_msg=name)
             else:
@@ -481,15 +686,26 @@ def assert_named(keypoints, seen=lambda name: True):
 @pytest.mark.parametrize("seen", ["all", "without legs", "without the head", "some"])
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_order_of_openposes_points_is_told_by_where_they_lie(order, seen, tmp_path):
-    hidden = {"all": (), "without legs": ("knee", "ankle", "toe", "heel"), "without the head": ("eye", "ear", "nose", "head")}
+    hidden = {
+        "all": (),
+        "without legs": ("knee", "ankle", "toe", "heel"),
+        "without the head": ("eye", "ear", "nose", "head"),
+    }
     hidden |= {"some": ("left_elbow", "right_knee", "left_eye", "small_toe")}
     visible = lambda name: not any(part in name for part in hidden[seen])
     for name in NAMES:
-        write(tmp_path / f"{name}_keypoints.json", {"version": 1.3, "people": [{"pose_keypoints_2d": standing(order, visible)}]})
+        write(
+            tmp_path / f"{name}_keypoints.json",
+            {"version": 1.3, "people": [{"pose_keypoints_2d": standing(order, visible)}]},
+        )
     found = read(tmp_path)
-    assert found.set.name == {"BODY_25": "openpose67", "BODY_25B": "openpose_b67"}.get(order, "openpose60")
+    assert found.set.name == {"BODY_25": "openpose67", "BODY_25B": "openpose_b67"}.get(
+        order, "openpose60"
+    )
     assert_named(found, visible)
-    assert [line for line in found.warnings if order in line] == list(found.warnings)[: order != "BODY_25"]
+    assert [line for line in found.warnings if order in line] == list(found.warnings)[
+        : order != "BODY_25"
+    ]
 
 
 def test_easymocaps_25_points_may_be_in_either_order_and_keep_their_hands(tmp_path):
@@ -503,7 +719,10 @@ def test_easymocaps_25_points_may_be_in_either_order_and_keep_their_hands(tmp_pa
 
 def test_an_order_that_is_not_clear_is_the_usual_one_and_said(tmp_path):
     few = lambda name: name in ("nose", "left_wrist", "right_wrist", "left_big_toe", "left_eye")
-    for order, line in (("BODY_25B", "taken for BODY_25, not BODY_25B"), ("COCO with a neck", "taken for OpenPose's COCO, not")):
+    for order, line in (
+        ("BODY_25B", "taken for BODY_25, not BODY_25B"),
+        ("COCO with a neck", "taken for OpenPose's COCO, not"),
+    ):
         people = [{"pose_keypoints_2d": standing(order, few)}]
         found = read(write(tmp_path / "front.json", {"people": people}), ("front",))
         assert any("is not clear" in each and line in each for each in found.warnings)
@@ -511,9 +730,21 @@ def test_an_order_that_is_not_clear_is_the_usual_one_and_said(tmp_path):
 
 def test_frames_of_nodes_are_a_list_of_objects_with_a_canvas(tmp_path):
     """ControlNet's nodes write such files; hands that were not found are null."""
-    person = {"pose_keypoints_2d": standing("OpenPose's COCO"), "hand_left_keypoints_2d": None, "face_keypoints_2d": None}
-    frames = [{"people": [person], "canvas_width": SIZE[0], "canvas_height": SIZE[1]} for _ in NAMES]
+    person = {
+        "pose_keypoints_2d": standing("OpenPose's COCO"),
+        "hand_left_keypoints_2d": None,
+        "face_keypoints_2d": None,
+    }
+    frames = [
+        {"people": [person], "canvas_width": SIZE[0], "canvas_height": SIZE[1]} for _ in NAMES
+    ]
     assert_named(read(write(tmp_path / "poses.json", frames), ("0", "1", "2")))
     assert_named(read(write(tmp_path / "front.json", frames[:1]), ("front",)))
-    nobody = {"people": [{"pose_keypoints_2d": None}], "canvas_width": SIZE[0], "canvas_height": SIZE[1]}
-    assert read(write(tmp_path / "poses.json", [*frames[:2], nobody]), ("0", "1", "2")).missing == ("2",)
+    nobody = {
+        "people": [{"pose_keypoints_2d": None}],
+        "canvas_width": SIZE[0],
+        "canvas_height": SIZE[1],
+    }
+    assert read(write(tmp_path / "poses.json", [*frames[:2], nobody]), ("0", "1", "2")).missing == (
+        "2",
+    )

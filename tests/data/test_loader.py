@@ -16,7 +16,13 @@ from small import small_body
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.loading.captures import find_captures, read_summary
-from humangs_jax.data.loading.examples import StoredSubject, draw_views, nearest_view, shrink, subject_order
+from humangs_jax.data.loading.examples import (
+    StoredSubject,
+    draw_views,
+    nearest_view,
+    shrink,
+    subject_order,
+)
 from humangs_jax.data.photos import read_view
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import write_png
@@ -36,7 +42,9 @@ def write_subject(path, seed, views=VIEWS, masks=True):
     K = intrinsics_from_fov(0.8, SIZE, SIZE)
     cameras = orbit(jnp.zeros(3), 3.0, azimuths, 0.1, K, SIZE, SIZE)
     capture = capture_from_arrays(
-        np.broadcast_to((LEVELS * seed + np.arange(views))[:, None, None, None] / 255, (views, SIZE, SIZE, 3)),
+        np.broadcast_to(
+            (LEVELS * seed + np.arange(views))[:, None, None, None] / 255, (views, SIZE, SIZE, 3)
+        ),
         np.asarray(K),
         np.asarray(cameras.cam_from_world),
         generator.normal(size=(POSES, 2, 3)) * 0.1,
@@ -70,7 +78,9 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def source(folder):
-    return loader_of(CaptureCache(find_captures(folder), BODY), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+    return loader_of(
+        CaptureCache(find_captures(folder), BODY), SAMPLING, SIZE, SIZE // 2, batch_size=2
+    )
 
 
 def greys(views):
@@ -79,17 +89,23 @@ def greys(views):
 
 
 def same(a, b):
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    return all(
+        np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
 
 
 def fake_subject(views, poses, seed=0):
     azimuths = np.random.default_rng(seed).uniform(-np.pi, np.pi, views)
     empty = np.zeros((0,))
-    return StoredSubject(empty, empty, empty, empty, np.arange(views) % poses, azimuths, empty, empty, empty)
+    return StoredSubject(
+        empty, empty, empty, empty, np.arange(views) % poses, azimuths, empty, empty, empty
+    )
 
 
 def test_batches_are_a_function_of_seed_and_step(folder, source):
-    again = loader_of(CaptureCache(find_captures(folder), BODY), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+    again = loader_of(
+        CaptureCache(find_captures(folder), BODY), SAMPLING, SIZE, SIZE // 2, batch_size=2
+    )
     again.batch_at(9)  # whatever was asked for before must not matter
     assert same(source.batch_at(5), again.batch_at(5))
     assert not same(source.batch_at(5), source.batch_at(6))
@@ -111,9 +127,15 @@ def test_views_carry_their_own_pose_camera_and_size(folder, source):
         for views, scale in ((example.inputs, 1.0), (example.targets, 0.5)):
             for i, (subject, view) in enumerate(greys(views)):
                 if subject == 3:
-                    np.testing.assert_array_equal(views.rotations[i], stored.rotations[view % POSES])
-                    np.testing.assert_array_equal(views.cameras.cam_from_world[i], stored.cam_from_world[view])
-                    np.testing.assert_allclose(views.cameras.K[i, :2], scale * stored.K[view, :2], rtol=FLOAT32)
+                    np.testing.assert_array_equal(
+                        views.rotations[i], stored.rotations[view % POSES]
+                    )
+                    np.testing.assert_array_equal(
+                        views.cameras.cam_from_world[i], stored.cam_from_world[view]
+                    )
+                    np.testing.assert_allclose(
+                        views.cameras.K[i, :2], scale * stored.K[view, :2], rtol=FLOAT32
+                    )
         np.testing.assert_allclose(example.inputs.betas, [0.5, -0.5, 0, 0])
 
 
@@ -136,7 +158,9 @@ def test_inputs_of_one_pose_stand_around_the_subject():
         inputs, _ = draw_views(np.random.default_rng(seed), subject, 4, sampling)
         assert len(set(subject.frames[inputs])) == 1
         gaps = np.diff(np.sort(azimuths[inputs]))
-        np.testing.assert_allclose(gaps, np.pi / 2, atol=0.3)  # cameras of a pose stand pi / 6 apart
+        np.testing.assert_allclose(
+            gaps, np.pi / 2, atol=0.3
+        )  # cameras of a pose stand pi / 6 apart
 
 
 def test_mixed_poses_are_mixed():
@@ -156,12 +180,20 @@ def test_nearest_view_wraps_around():
 
 def test_shrinking_averages_boxes():
     images = np.random.default_rng(0).integers(0, 256, (2, 8, 8, 3)).astype(np.uint8)
-    np.testing.assert_allclose(shrink(images, 2)[1, 0, 1], images[1, :4, 4:].mean(axis=(0, 1)) / 255, rtol=1e-5)
-    np.testing.assert_allclose(shrink(images, 3)[..., 1].mean(axis=(1, 2)), images[..., 1].mean(axis=(1, 2)) / 255, rtol=1e-5)
+    np.testing.assert_allclose(
+        shrink(images, 2)[1, 0, 1], images[1, :4, 4:].mean(axis=(0, 1)) / 255, rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        shrink(images, 3)[..., 1].mean(axis=(1, 2)),
+        images[..., 1].mean(axis=(1, 2)) / 255,
+        rtol=1e-5,
+    )
     np.testing.assert_array_equal(shrink(images, 8), images.astype(np.float32) / np.float32(255))
     assert shrink(images[:0], 2).shape == (0, 2, 2, 3)
     for wrong, size in ((images, 9), (images[:, :6], 3)):
-        with pytest.raises(ValueError, match=f"8 x {wrong.shape[1]} cannot be averaged to {size} x {size}"):
+        with pytest.raises(
+            ValueError, match=f"8 x {wrong.shape[1]} cannot be averaged to {size} x {size}"
+        ):
             shrink(wrong, size)
 
 
@@ -179,7 +211,9 @@ def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):
     assert "3 views, but inputs and targets need 4" in source.source.cache.broken[tmp_path / "few"]
     assert "no masks" in source.source.cache.broken[tmp_path / "nomask"]
     assert len(caplog.records) == 3
-    assert all(any(name in r.getMessage() for r in caplog.records) for name in ("few", "nomask", "torn"))
+    assert all(
+        any(name in r.getMessage() for r in caplog.records) for name in ("few", "nomask", "torn")
+    )
 
 
 def test_captures_of_another_body_are_left_out(tmp_path):
@@ -189,7 +223,10 @@ def test_captures_of_another_body_are_left_out(tmp_path):
     edit_npz(tmp_path / "smplx" / "body.npz", body="../SMPLX_NEUTRAL.npz")
     source = loader_of(CaptureCache(find_captures(tmp_path), BODY), SAMPLING, SIZE, SIZE)
     assert [greys(source.source.example(0, index, 2).inputs)[0][0] for index in range(4)] == [1] * 4
-    assert "body: '../SMPLX_NEUTRAL.npz', but all captures of a run" in source.source.cache.broken[tmp_path / "smplx"]
+    assert (
+        "body: '../SMPLX_NEUTRAL.npz', but all captures of a run"
+        in source.source.cache.broken[tmp_path / "smplx"]
+    )
     others = CaptureCache(find_captures(tmp_path), BODY, body_file=tmp_path / "SMPLX_NEUTRAL.npz")
     assert others.summary(1) is not None and others.summary(0) is None
 
@@ -203,16 +240,22 @@ def test_nothing_but_broken_folders_is_an_error_of_the_loop(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limit", [0, 20 * SIZE * SIZE * 4, 1 << 30])
-def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder, monkeypatch, limit):
+def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(
+    folder, monkeypatch, limit
+):
     read = []
 
     def reading(*arguments):
-        if threading.current_thread() is threading.main_thread():  # threads of tests before this one may still be at it
+        if (
+            threading.current_thread() is threading.main_thread()
+        ):  # threads of tests before this one may still be at it
             read.append(arguments)
         return read_view(*arguments)
 
     monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
-    examples = lambda cache: [loader_of(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)]
+    examples = lambda cache: [
+        loader_of(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)
+    ]
     cache = CaptureCache(find_captures(folder), BODY, limit_bytes=limit)
     first = examples(cache)
     counts = [len(read)]
@@ -230,14 +273,20 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
     for batch, same_batch in zip(first, again, strict=True):
         assert same(batch, same_batch)
         for (subject, view), image in zip(
-            [g for row in range(2) for g in greys(jax.tree.map(lambda x, row=row: x[row], batch.inputs))],
+            [
+                g
+                for row in range(2)
+                for g in greys(jax.tree.map(lambda x, row=row: x[row], batch.inputs))
+            ],
             np.asarray(batch.inputs.images).reshape(-1, SIZE, SIZE, 3),
             strict=True,
         ):
             np.testing.assert_array_equal(image, stored[subject].images[view] / np.float32(255))
 
 
-def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(folder, tmp_path, monkeypatch):
+def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(
+    folder, tmp_path, monkeypatch
+):
     """Whatever was asked for before: a resumed run does not know what an earlier one found out."""
     write_subject(tmp_path / "s2", 2)
     folders = (folder / "s0", tmp_path / "s2")
@@ -253,7 +302,12 @@ def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(folde
     examples = [whole.source.example(0, i, 2) for i in range(40)]
     subjects = [greys(example.inputs)[0][0] for example in examples]
     assert 40 > subjects.count(0) > 20 and subjects.count(2) > 0
-    seen = {view for example in examples for views in (example.inputs, example.targets) for view in greys(views)}
+    seen = {
+        view
+        for example in examples
+        for views in (example.inputs, example.targets)
+        for view in greys(views)
+    }
     assert (2, 3) not in seen and (2, 4) in seen
     assert list(whole.source.cache.broken) == [tmp_path / "s2"]
     assert all(same(examples[i], new().source.example(0, i, 2)) for i in range(0, 40, 3))
@@ -262,11 +316,16 @@ def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(folde
 def test_views_whose_mask_is_empty_are_targets_but_no_inputs(folder, tmp_path):
     write_subject(tmp_path / "s2", 2)
     write_png(tmp_path / "s2/masks/003.png", np.zeros((SIZE, SIZE)))
-    source = loader_of(CaptureCache((folder / "s0", tmp_path / "s2"), BODY), SAMPLING, SIZE, SIZE).source
+    source = loader_of(
+        CaptureCache((folder / "s0", tmp_path / "s2"), BODY), SAMPLING, SIZE, SIZE
+    ).source
     examples = [source.example(0, i, 2) for i in range(60)]
     assert (2, 3) not in {view for example in examples for view in greys(example.inputs)}
     assert (2, 3) in {view for example in examples for view in greys(example.targets)}
-    assert source.broken[str(tmp_path / "s2")] == "views[3]: mask: empty: no photo to reconstruct the person from"
+    assert (
+        source.broken[str(tmp_path / "s2")]
+        == "views[3]: mask: empty: no photo to reconstruct the person from"
+    )
 
 
 def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
@@ -286,15 +345,25 @@ def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypa
         return data[:-20] + bytes([data[-20] ^ 1]) + data[-19:]
 
     def edit(**changes):
-        return lambda root: edit_json(root / "capture.json", lambda d: d["views"][4].update(changes))
+        return lambda root: edit_json(
+            root / "capture.json", lambda d: d["views"][4].update(changes)
+        )
 
-    assert "002.png: not a readable image" in broken(lambda root: edit_bytes(root / "images" / "002.png", flip))
+    assert "002.png: not a readable image" in broken(
+        lambda root: edit_bytes(root / "images" / "002.png", flip)
+    )
     cut = lambda root: edit_bytes(root / "masks" / "001.png", lambda data: data[:60])
     assert "001.png: not a readable image" in broken(cut)
-    assert "005.png: no such image file" in broken(lambda root: (root / "images" / "005.png").unlink())
+    assert "005.png: no such image file" in broken(
+        lambda root: (root / "images" / "005.png").unlink()
+    )
     small = np.zeros((SIZE // 2, SIZE, 3), np.float32)
-    assert "003.png: size: (16, 8), but the first" in broken(lambda root: write_png(root / "images" / "003.png", small))
-    assert "000.png: size: (16, 8), but its image" in broken(lambda root: write_png(root / "masks" / "000.png", small[..., 0]))
+    assert "003.png: size: (16, 8), but the first" in broken(
+        lambda root: write_png(root / "images" / "003.png", small)
+    )
+    assert "000.png: size: (16, 8), but its image" in broken(
+        lambda root: write_png(root / "masks" / "000.png", small[..., 0])
+    )
     assert "views[4].frame: expected 0 to 1" in broken(edit(frame=2))
     assert "views[4].K: expected shape (3, 3)" in broken(edit(K=[1, 2]))
     assert "views[4]" in broken(edit(cam_from_world=np.zeros((4, 4)).tolist()))
@@ -305,7 +374,9 @@ def test_some_views_of_a_capture(folder):
     whole, some = (load_capture(folder / "s1", body=BODY, views=v) for v in (None, [4, 1]))
     np.testing.assert_array_equal(some.images, whole.images[[4, 1]])
     np.testing.assert_array_equal(some.masks, whole.masks[[4, 1]])
-    np.testing.assert_array_equal(some.cameras.cam_from_world, whole.cameras.cam_from_world[jnp.asarray([4, 1])])
+    np.testing.assert_array_equal(
+        some.cameras.cam_from_world, whole.cameras.cam_from_world[jnp.asarray([4, 1])]
+    )
     assert some.names == ("004", "001") and some.frames.tolist() == [0, 1]
     np.testing.assert_array_equal(some.poses.rotations, whole.poses.rotations)
 
@@ -338,6 +409,10 @@ def test_the_window_rule_scales_with_the_number_of_views(count):
     for seed in range(200):
         inputs, targets = draw_views(np.random.default_rng(seed), fake_subject(count, 1), 4, WINDOW)
         assert len({*inputs, *targets}) == 8 and min(inputs) >= 0 and max(inputs) < count
-        assert max(7, round(25 * count / 60)) <= inputs[1] - inputs[0] <= max(7, round(59 * count / 60))
+        assert (
+            max(7, round(25 * count / 60))
+            <= inputs[1] - inputs[0]
+            <= max(7, round(59 * count / 60))
+        )
     with pytest.raises(ValueError, match="7 views, but inputs and targets need 8"):
         draw_views(np.random.default_rng(0), fake_subject(7, 1), 4, WINDOW)

@@ -29,7 +29,9 @@ SIZE = 4
 
 def toy_views(values, name):
     """Views whose every leaf tells the numbers `values` (v,)."""
-    fill = lambda *shape: jnp.broadcast_to(values.reshape(-1, *[1] * len(shape)), (len(values), *shape))
+    fill = lambda *shape: jnp.broadcast_to(
+        values.reshape(-1, *[1] * len(shape)), (len(values), *shape)
+    )
     return SubjectViews(
         images=fill(SIZE, SIZE, 3),
         masks=fill(SIZE, SIZE),
@@ -55,7 +57,9 @@ class CountingSource:
             time.sleep(self.delay(index))
         if index == self.broken_at:
             raise ValueError(f"example {index} of {self.name}")
-        views = lambda n: toy_views(jnp.asarray([self.name, index, seed] + [0.0] * n, jnp.float32), "")
+        views = lambda n: toy_views(
+            jnp.asarray([self.name, index, seed] + [0.0] * n, jnp.float32), ""
+        )
         return jax.tree.map(np.asarray, Example(views(input_count), views(1)))
 
     def describe(self, seed, index, input_count):
@@ -64,7 +68,9 @@ class CountingSource:
 
 def content(batch):
     """(source, index) of each row."""
-    return [tuple(row) for row in np.asarray(batch.inputs.translations)[:, :2, 0].astype(int).tolist()]
+    return [
+        tuple(row) for row in np.asarray(batch.inputs.translations)[:, :2, 0].astype(int).tolist()
+    ]
 
 
 def same(a, b):
@@ -137,13 +143,20 @@ print("equal")
 
 @pytest.mark.slow
 def test_batches_lie_on_the_devices_as_the_sharding_says():
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | {
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
+        "JAX_PLATFORMS": "cpu",
+    }
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    done = subprocess.run([sys.executable, "-c", SHARDED], cwd=root, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", SHARDED], cwd=root, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0 and done.stdout.split() == ["equal"], done.stderr[-3000:]
 
 
-@given(st.lists(st.floats(0.01, 100.0), min_size=1, max_size=5), st.integers(0, 5), st.integers(0, 3))
+@given(
+    st.lists(st.floats(0.01, 100.0), min_size=1, max_size=5), st.integers(0, 5), st.integers(0, 3)
+)
 @settings(deadline=None, max_examples=20)
 def test_mixing_is_exact_over_blocks_and_gapless_in_every_source(weights, seed, block):
     counts = block_counts(weights)
@@ -163,7 +176,9 @@ def test_a_mixture_is_a_source_of_its_sources():
     assert isinstance(mixture, Source) and len(mixture) == 14
     assert sorted(mixture.broken) == ["thing of 1.0", "thing of 2.0"]
     drawn = [source_at(4, index, block_counts((3.0, 1.0))) for index in range(16)]
-    assert content(Loader(mixture, 16, seed=4).batch_at(0)) == [(source + 1, number) for source, number in drawn]
+    assert content(Loader(mixture, 16, seed=4).batch_at(0)) == [
+        (source + 1, number) for source, number in drawn
+    ]
     assert drawn != [source_at(5, index, block_counts((3.0, 1.0))) for index in range(16)]
 
 
@@ -188,7 +203,9 @@ def test_people_of_keys_look_like_any_source():
     loader = Loader(source, 2, seed=3)
     batches = dict(loader.batches(0, 4))
     assert all(same(batches[step], loader.batch_at(step)) for step in batches)
-    everything = [leaf for batch in batches.values() for leaf in np.asarray(batch.targets.betas).ravel()]
+    everything = [
+        leaf for batch in batches.values() for leaf in np.asarray(batch.targets.betas).ravel()
+    ]
     assert len(set(everything)) == 8  # never the same example again
     on_host = GeneratedSource(source.make, "train", input_counts=(1, 2), on_host=True)
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(on_host.example(0, 0, 1)))
@@ -210,7 +227,9 @@ def test_a_key_is_its_person_and_appearance(split, number, appearance):
     """The words of keys are (appearance, seed): keys of different splits cannot be equal, whatever the appearance."""
     seed = SPLITS[split][number]
     key = subject_key(seed, appearance)
-    np.testing.assert_array_equal(jax.random.key_data(key), np.asarray([appearance, seed], np.uint32))
+    np.testing.assert_array_equal(
+        jax.random.key_data(key), np.asarray([appearance, seed], np.uint32)
+    )
 
 
 def test_no_key_is_for_nobody():
@@ -226,9 +245,18 @@ def test_people_of_another_split_are_refused(tmp_path):
         (tmp_path / f"{seed:07d}" / "capture.json").write_text("{}")
     (tmp_path / ".0000006.123").mkdir()
     (tmp_path / ".0000006.123" / "capture.json").write_text("{}")  # half written
-    assert [f.name for f in find_people(tmp_path)] == ["0000005", "2000003"]  # no manifest: not ours
-    begin_set(tmp_path, SYNTHETIC, {"generator_version": GENERATOR_VERSION, "split": "train", "settings": {}})
-    with pytest.raises(ValueError, match=r"2000003: a subject of the split 'test', where 'train' was expected"):
+    assert [f.name for f in find_people(tmp_path)] == [
+        "0000005",
+        "2000003",
+    ]  # no manifest: not ours
+    begin_set(
+        tmp_path,
+        SYNTHETIC,
+        {"generator_version": GENERATOR_VERSION, "split": "train", "settings": {}},
+    )
+    with pytest.raises(
+        ValueError, match=r"2000003: a subject of the split 'test', where 'train' was expected"
+    ):
         find_people(tmp_path)
     assert len(find_people(tmp_path, None)) == 2
     (tmp_path / "manifest.json").write_text(json.dumps({"format": "other"}))

@@ -40,9 +40,16 @@ def figure(scale=1):
     """Coverage of a figure of two ellipses and a box, 200 pixels high at scale 1, with soft edges."""
     fine = 4
     y, x = (np.mgrid[: HEIGHT * scale * fine, : WIDTH * scale * fine] + 0.5) / fine / scale
-    parts = [((x - 80) / 18) ** 2 + ((y - 42) / 22) ** 2 < 1, ((x - 80) / 42) ** 2 + ((y - 120) / 62) ** 2 < 1]
+    parts = [
+        ((x - 80) / 18) ** 2 + ((y - 42) / 22) ** 2 < 1,
+        ((x - 80) / 42) ** 2 + ((y - 120) / 62) ** 2 < 1,
+    ]
     whole = parts[0] | parts[1] | ((abs(x - 80) < 24) & (y > 120) & (y < 220))
-    return whole.reshape(HEIGHT * scale, fine, WIDTH * scale, fine).mean(axis=(1, 3)).astype(np.float32)
+    return (
+        whole.reshape(HEIGHT * scale, fine, WIDTH * scale, fine)
+        .mean(axis=(1, 3))
+        .astype(np.float32)
+    )
 
 
 def photo_of(mask, seed=0, background=None):
@@ -52,7 +59,9 @@ def photo_of(mask, seed=0, background=None):
     if background is None:
         noise = ndimage.gaussian_filter(rng.normal(size=size), (3, 3, 0))
         background = np.clip(0.35 + 0.1 * noise / noise.std(), 0, 1)
-    stripes = 0.75 + 0.15 * np.sign(np.sin(np.arange(mask.shape[0]) / 5))[:, None, None] * np.asarray([1, 0.3, -0.5])
+    stripes = 0.75 + 0.15 * np.sign(np.sin(np.arange(mask.shape[0]) / 5))[
+        :, None, None
+    ] * np.asarray([1, 0.3, -0.5])
     return (mask[..., None] * stripes + (1 - mask[..., None]) * background).astype(np.float32)
 
 
@@ -62,7 +71,9 @@ def grown(mask, pixels):
 
 
 @settings(max_examples=12, deadline=None)
-@given(st.floats(1.3, 3.5), st.booleans(), st.integers(0, 1000))  # below, what is found may be under the least that is moved
+@given(
+    st.floats(1.3, 3.5), st.booleans(), st.integers(0, 1000)
+)  # below, what is found may be under the least that is moved
 def test_a_boundary_that_is_off_is_moved_back(pixels, larger, seed):
     mask = figure()
     wrong = grown(mask, pixels if larger else -pixels)
@@ -115,7 +126,11 @@ def before_a_wall(colors, masks, rim=0.0, color=WALL, where=True):
         wall = WALL + 0.01 * np.random.default_rng(i).normal(size=image.shape)
         stripe = (np.clip(rim - signed_distance(mask) + 0.5, 0, 1) * where * (rim > 0))[..., None]
         lit = stripe * color + (1 - stripe) * image
-        photos.append((np.rint(255 * (mask[..., None] * lit + (1 - mask[..., None]) * wall)) / 255).astype(np.float32))
+        photos.append(
+            (np.rint(255 * (mask[..., None] * lit + (1 - mask[..., None]) * wall)) / 255).astype(
+                np.float32
+            )
+        )
     return photos
 
 
@@ -212,7 +227,11 @@ def folder(tmp_path):
     view = {"image": "photo.png", "mask": "mask.png", "K": K, "cam_from_world": pose}
     description = {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": [view]}
     (place / "capture.json").write_text(json.dumps(description))
-    arrays = {"betas": np.zeros(10), "rotations": np.zeros((1, 55, 3)), "translations": np.asarray([[0, 0, 3.0]])}
+    arrays = {
+        "betas": np.zeros(10),
+        "rotations": np.zeros((1, 55, 3)),
+        "translations": np.asarray([[0, 0, 3.0]]),
+    }
     np.savez(place / "body.npz", body="makehuman", **arrays)
     return place, mask
 
@@ -229,7 +248,13 @@ def test_captures_are_read_as_they_are_unless_asked(folder, caplog):
     assert np.abs(fitted.masks[0] - mask).sum() < LEFT * np.abs(plain.masks[0] - mask).sum() / 3
     np.testing.assert_array_equal(fitted.images[0][fitted.masks[0] == 0], 1)
     photo, wrong = read_image(place / "photo.png")[0], read_grey(place / "mask.png")
-    arrays = photo[None], fitted.cameras.K, fitted.cameras.cam_from_world, np.zeros((1, 55, 3)), np.zeros((1, 3))
+    arrays = (
+        photo[None],
+        fitted.cameras.K,
+        fitted.cameras.cam_from_world,
+        np.zeros((1, 55, 3)),
+        np.zeros((1, 3)),
+    )
     same = capture_from_arrays(*arrays, masks=wrong[None], fit_masks=True)
     np.testing.assert_array_equal(same.masks, fitted.masks)
     np.testing.assert_array_equal(same.images, fitted.images)
@@ -246,7 +271,9 @@ def test_masks_of_photos_on_white_are_never_moved(folder, caplog):
 
 
 @pytest.mark.parametrize(("option", "moved"), [((), True), (("--no-fit-masks",), False)])
-def test_reconstruct_moves_masks_unless_told_not_to(option, moved, folder, caplog, monkeypatch, capsys):
+def test_reconstruct_moves_masks_unless_told_not_to(
+    option, moved, folder, caplog, monkeypatch, capsys
+):
     place, _ = folder
     # ends when the capture was read: these are no weights
     ends = "--weights", place / "body.npz", "--out", place / "avatar.npz"
@@ -279,7 +306,9 @@ def test_the_rim_shows_the_person_alone():
     photo = mixed(mask)
     cleaned, mixture = clean_rims(photo, mask), 1 - mask
     seen = (mask > 0.05) & (mixture > CERTAIN)
-    np.testing.assert_allclose(cleaned[seen], np.broadcast_to(SKIN, photo.shape)[seen], atol=ROUNDING)
+    np.testing.assert_allclose(
+        cleaned[seen], np.broadcast_to(SKIN, photo.shape)[seen], atol=ROUNDING
+    )
     np.testing.assert_array_equal(cleaned[mixture < CERTAIN], photo[mixture < CERTAIN])
     assert np.abs(photo - SKIN)[seen].max() > 0.5
 

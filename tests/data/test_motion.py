@@ -15,7 +15,15 @@ from humangs_jax.body.model import RestBody, joint_transforms
 from humangs_jax.cli import animate
 from humangs_jax.cli.options import PartOfMotion
 from humangs_jax.data.formats import MOTIONS, MotionFormat
-from humangs_jax.data.motion import PELVIS, Motion, MotionError, Poses, grounded, load_motion, save_motion
+from humangs_jax.data.motion import (
+    PELVIS,
+    Motion,
+    MotionError,
+    Poses,
+    grounded,
+    load_motion,
+    save_motion,
+)
 from humangs_jax.geometry import quaternion
 
 FLOAT32 = 1e-5
@@ -41,7 +49,11 @@ def upright_poses(columns):
 
 
 def test_our_own_format_round_trips(tmp_path):
-    motion = Motion(jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3)), jnp.float32), 24.0)
+    motion = Motion(
+        jnp.asarray(random((FRAMES, 55, 3)), jnp.float32),
+        jnp.asarray(random((FRAMES, 3)), jnp.float32),
+        24.0,
+    )
     save_motion(tmp_path / "a.npz", motion)
     back = load_motion(tmp_path / "a.npz")
     jax.tree.map(np.testing.assert_array_equal, motion, back)  # fps is part of the structure
@@ -68,16 +80,27 @@ def test_principal_coefficients_of_hands_are_left_flat_and_that_is_said(tmp_path
     parts = smpl_params(left_hand_pose=random((FRAMES, 12), 7))
     rotations = np.asarray(load_motion(write(tmp_path / "a.npz", **parts)).rotations)
     assert not rotations[:, 25:40].any() and rotations[:, 40:].any()
-    assert "left_hand_pose: hands of 12 numbers are principal coefficients of a model: left flat" in caplog.text
+    assert (
+        "left_hand_pose: hands of 12 numbers are principal coefficients of a model: left flat"
+        in caplog.text
+    )
 
 
 def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     """Known to the command's help and to `load_motion`, which finds the one of two formats that a file is by its content."""
-    standing = lambda path, reading: Poses(np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text()))
-    monkeypatch.setitem(MOTIONS, "toy", MotionFormat("made up", standing, (".toy", ".pkl"), lambda path: path.suffix == ".toy"))
+    standing = lambda path, reading: Poses(
+        np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text())
+    )
+    monkeypatch.setitem(
+        MOTIONS,
+        "toy",
+        MotionFormat("made up", standing, (".toy", ".pkl"), lambda path: path.suffix == ".toy"),
+    )
     monkeypatch.setattr(animate, "Animate", animate.Animate)  # reloading replaces it
     importlib.reload(animate)
-    assert ".toy or .pkl: made up" in " ".join(run(monkeypatch, capsys, "animate", "--help")[1].replace("│", " ").split())
+    assert ".toy or .pkl: made up" in " ".join(
+        run(monkeypatch, capsys, "animate", "--help")[1].replace("│", " ").split()
+    )
     (tmp_path / "a.toy").write_text("25")
     assert load_motion(tmp_path / "a.toy").fps == 25.0
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(AIST))
@@ -108,13 +131,17 @@ def test_any_world_is_turned_upright(tmp_path, axis):
     turn = np.asarray(TURNS[axis], float)
     turned = poses.copy()
     for i in range(FRAMES):
-        root = np.asarray(quaternion.matrix_from_axis_angle(jnp.asarray(poses[i, :3], jnp.float32)), float)
+        root = np.asarray(
+            quaternion.matrix_from_axis_angle(jnp.asarray(poses[i, :3], jnp.float32)), float
+        )
         turned[i, :3] = rotation_vector(turn.T @ root)
     turned_trans = (trans + PELVIS) @ turn - PELVIS  # the pelvis moves with the world
     path = write(tmp_path / "a.npz", poses=turned, trans=turned_trans, mocap_framerate=30)
     motion = load_motion(path, up=axis)
     back = quaternion.matrix_from_axis_angle(motion.rotations)
-    expected = quaternion.matrix_from_axis_angle(jnp.asarray(poses.reshape(FRAMES, 55, 3), jnp.float32))
+    expected = quaternion.matrix_from_axis_angle(
+        jnp.asarray(poses.reshape(FRAMES, 55, 3), jnp.float32)
+    )
     np.testing.assert_allclose(back, expected, atol=FLOAT32)
     np.testing.assert_allclose(motion.translations, trans, atol=FLOAT32)
     untouched = load_motion(path, up="y")
@@ -122,7 +149,9 @@ def test_any_world_is_turned_upright(tmp_path, axis):
 
 
 def amass(rotations, translations):
-    return dict(poses=rotations.reshape(len(rotations), -1), trans=translations, mocap_framerate=FPS)
+    return dict(
+        poses=rotations.reshape(len(rotations), -1), trans=translations, mocap_framerate=FPS
+    )
 
 
 def parts(rotations, translations):
@@ -146,9 +175,13 @@ def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, heading):
 
 @pytest.mark.parametrize(("arrays", "usual"), [(amass, "z"), (parts, "y")])
 @pytest.mark.parametrize("up", ["y", "z", "-y"])
-def test_where_the_floor_agrees_another_axis_is_up_and_it_is_said(tmp_path, caplog, arrays, usual, up):
+def test_where_the_floor_agrees_another_axis_is_up_and_it_is_said(
+    tmp_path, caplog, arrays, usual, up
+):
     expected, translations = motions()["walking"]
-    motion = load_motion(write(tmp_path / "a.npz", **arrays(*in_world(expected, translations, UP[up]))))
+    motion = load_motion(
+        write(tmp_path / "a.npz", **arrays(*in_world(expected, translations, UP[up])))
+    )
     np.testing.assert_allclose(motion.translations, translations, atol=2 * FLOAT32)
     said = f"{tmp_path / 'a.npz'}: {up} is up, not {usual}"
     assert [line.startswith(said) for line in caplog.messages] == ([] if up == usual else [True])
@@ -159,13 +192,19 @@ def test_who_stands_still_may_lie_and_that_is_said(tmp_path, caplog):
     motion = load_motion(write(tmp_path / "a.npz", **amass(*still)))
     assert motion.rotations[0, 0, 0] == pytest.approx(-np.pi / 2)
     (line,) = caplog.messages
-    assert line.startswith(f"{tmp_path / 'a.npz'}: z is up, as usual in such files, and people lie along y; ")
+    assert line.startswith(
+        f"{tmp_path / 'a.npz'}: z is up, as usual in such files, and people lie along y; "
+    )
     assert line.endswith("if they should stand: --motion-up=y (in Python up='y')")
     caplog.clear()
     beat = amass(*still) | {"expressions": np.zeros((4, 100))}  # BEAT2's has y up
-    assert not np.any(load_motion(write(tmp_path / "b.npz", **beat)).rotations) and not caplog.messages
+    assert (
+        not np.any(load_motion(write(tmp_path / "b.npz", **beat)).rotations) and not caplog.messages
+    )
     camera = parts(*in_world(*still, UP["-y"]))  # estimators: y points down
-    np.testing.assert_allclose(load_motion(write(tmp_path / "c.npz", **camera)).rotations, 0, atol=FLOAT32)
+    np.testing.assert_allclose(
+        load_motion(write(tmp_path / "c.npz", **camera)).rotations, 0, atol=FLOAT32
+    )
     assert "c.npz: -y is up, not y: people stand along it" in caplog.text
 
 
@@ -173,18 +212,30 @@ def test_a_person_who_stands_still_may_be_turned_by_hand(tmp_path):
     still = np.zeros((4, 55, 3)), np.zeros((4, 3))
     file = write(tmp_path / "a.npz", **amass(*still))
     np.testing.assert_allclose(PartOfMotion(motion_up="y").load(file).rotations, 0, atol=FLOAT32)
-    assert PartOfMotion(motion_up="-z", person=1).options(file) == ("--motion", file, "--motion-up=-z", "--person", "1")
+    assert PartOfMotion(motion_up="-z", person=1).options(file) == (
+        "--motion",
+        file,
+        "--motion-up=-z",
+        "--person",
+        "1",
+    )
 
 
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"poses": np.zeros((4, 165)), "trans": np.zeros((4, 3))}, r"framerate: missing: .* --motion-fps \(in Python fps="),
+        (
+            {"poses": np.zeros((4, 165)), "trans": np.zeros((4, 3))},
+            r"framerate: missing: .* --motion-fps \(in Python fps=",
+        ),
         (
             {"header": "{}", "means": np.zeros((3, 3)), "skinning_weights": np.zeros((3, 2))},
             "motion: this is an avatar: expected",
         ),
-        ({"points": np.zeros((1, 2)), "confidences": np.zeros(1), "set": "coco17"}, "no motion: these are keypoints"),
+        (
+            {"points": np.zeros((1, 2)), "confidences": np.zeros(1), "set": "coco17"},
+            "no motion: these are keypoints",
+        ),
     ],
 )
 def test_what_is_missing_or_no_motion_names_what_to_do(arrays, message, tmp_path):
@@ -192,17 +243,24 @@ def test_what_is_missing_or_no_motion_names_what_to_do(arrays, message, tmp_path
         load_motion(write(tmp_path / "a.npz", **arrays))
 
 
-@pytest.mark.parametrize(("name", "message"), [("a.mp4", "a video: GV"), ("a.MOV", "a video"), ("a.fbx", "open it in Blender")])
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("a.mp4", "a video: GV"), ("a.MOV", "a video"), ("a.fbx", "open it in Blender")],
+)
 def test_files_of_other_kinds_say_how_a_motion_comes_of_them(name, message, tmp_path):
     (tmp_path / name).write_bytes(b"something")
-    with pytest.raises(MotionError, match=f"{name}: no motion: expected a file .*, got .*{message}"):
+    with pytest.raises(
+        MotionError, match=f"{name}: no motion: expected a file .*, got .*{message}"
+    ):
         load_motion(tmp_path / name)
 
 
 def test_a_tilt_is_no_other_axis(tmp_path):
     tilted = np.zeros((4, 55, 3))
     tilted[:, 0, 0] = 0.8  # radians: nearer to z than to y
-    np.testing.assert_allclose(load_motion(write(tmp_path / "a.npz", **parts(tilted, np.zeros((4, 3))))).rotations, tilted)
+    np.testing.assert_allclose(
+        load_motion(write(tmp_path / "a.npz", **parts(tilted, np.zeros((4, 3))))).rotations, tilted
+    )
 
 
 def test_where_no_axis_is_clear_the_format_decides(tmp_path):
@@ -210,7 +268,9 @@ def test_where_no_axis_is_clear_the_format_decides(tmp_path):
     poses[1, 0] = np.pi  # once upright, once upside down
     trans = np.array([[0.0, 0, 1], [0, 0, 1]]) - PELVIS
     amass = load_motion(write(tmp_path / "a.npz", poses=poses, trans=trans, mocap_framerate=30))
-    np.testing.assert_allclose(amass.translations, np.array([[0.0, 1, 0]] * 2) - PELVIS, atol=FLOAT32)
+    np.testing.assert_allclose(
+        amass.translations, np.array([[0.0, 1, 0]] * 2) - PELVIS, atol=FLOAT32
+    )
     parts = dict(global_orient=poses[:, :3], body_pose=poses[:, 3:66], transl=trans)
     other = load_motion(write(tmp_path / "b.npz", **parts))
     np.testing.assert_allclose(other.translations, trans, atol=FLOAT32)
@@ -234,27 +294,51 @@ MATRICES = "expected rotation matrices"
 BAD = {
     "no motion": (dict(vertices=np.zeros(3)), ": no motion: expected one of the keys rotations"),
     "columns": ({**AMASS, "poses": np.zeros((FRAMES, 100))}, f": poses: {COLUMNS} (6, 100)"),
-    "ten joints": ({**AMASS, "poses": np.zeros((FRAMES, 10, 3))}, f": poses: {COLUMNS} (6, 10, 3), 10 joints"),
+    "ten joints": (
+        {**AMASS, "poses": np.zeros((FRAMES, 10, 3))},
+        f": poses: {COLUMNS} (6, 10, 3), 10 joints",
+    ),
     "no frames": ({**AMASS, "poses": np.zeros((0, 165))}, ": poses: expected at least one number"),
     "NaN": ({**AMASS, "poses": NAN}, ": poses: expected finite numbers, got nan at index [2, 7]"),
-    "beyond float32": ({**AMASS, "poses": np.full((FRAMES, 165), 1e300)}, ": poses: expected finite numbers, got 1e+300"),
-    "counts": ({**AMASS, "trans": np.zeros((FRAMES + 1, 3))}, ": trans: expected shape (6, 3), got (7, 3)"),
+    "beyond float32": (
+        {**AMASS, "poses": np.full((FRAMES, 165), 1e300)},
+        ": poses: expected finite numbers, got 1e+300",
+    ),
+    "counts": (
+        {**AMASS, "trans": np.zeros((FRAMES + 1, 3))},
+        ": trans: expected shape (6, 3), got (7, 3)",
+    ),
     "no trans": (without(AMASS, "trans"), ": trans: missing"),
     "no rate": (without(AMASS, "mocap_framerate"), ": mocap_framerate: missing"),
     "rate 0": ({**AMASS, "mocap_framerate": 0}, ": mocap_framerate: expected a positive"),
     "pickled": ({**AMASS, "trans": np.array([None])}, ": trans: a pickled object"),
-    "ours": ({**OURS, "rotations": np.zeros((FRAMES, 165))}, ": rotations: expected shape (any, any, 3)"),
-    "ours, counts": ({**OURS, "translations": np.zeros((1, 3))}, ": translations: expected shape (6, 3)"),
+    "ours": (
+        {**OURS, "rotations": np.zeros((FRAMES, 165))},
+        ": rotations: expected shape (any, any, 3)",
+    ),
+    "ours, counts": (
+        {**OURS, "translations": np.zeros((1, 3))},
+        ": translations: expected shape (6, 3)",
+    ),
     "ours, no fps": (without(OURS, "fps"), ": fps: missing"),
     "aist, scaling": ({**AIST, "smpl_scaling": 0.0}, ": smpl_scaling: expected a positive"),
     "params, body": (
         smpl_params(body_pose=np.zeros((FRAMES, 60))),
         ": body_pose: expected shape (6, 63), or (6, 69) of SMPL, got (6, 60)",
     ),
-    "params, scaled": (smpl_params(global_orient=np.tile(1.04 * np.eye(3), (FRAMES, 1, 1))), f": global_orient: {MATRICES}"),
-    "params, mirrored": (smpl_params(global_orient=np.tile(-np.eye(3), (FRAMES, 1, 1))), f": global_orient: {MATRICES}"),
+    "params, scaled": (
+        smpl_params(global_orient=np.tile(1.04 * np.eye(3), (FRAMES, 1, 1))),
+        f": global_orient: {MATRICES}",
+    ),
+    "params, mirrored": (
+        smpl_params(global_orient=np.tile(-np.eye(3), (FRAMES, 1, 1))),
+        f": global_orient: {MATRICES}",
+    ),
     "params, orient": (without(smpl_params(), "global_orient"), ": global_orient: missing"),
-    "params, hand": (smpl_params(left_hand_pose=np.zeros((2, 45))), ": left_hand_pose: expected shape (6, 45)"),
+    "params, hand": (
+        smpl_params(left_hand_pose=np.zeros((2, 45))),
+        ": left_hand_pose: expected shape (6, 45)",
+    ),
 }
 
 
@@ -293,7 +377,11 @@ def test_other_bad_files(tmp_path, capsys):
     frame = {"root_pose": [0.0] * 3, "body_pose": [[0.0] * 3] * 21, "trans": [0.0] * 3}
     for name, change, problem in (
         ("some", lambda frame: frame.pop("trans"), "9.json: trans: missing, but 8.json has it"),
-        ("ragged", lambda frame: frame.update(body_pose=[[0, 0, 0]]), "body_pose: expected numbers"),
+        (
+            "ragged",
+            lambda frame: frame.update(body_pose=[[0, 0, 0]]),
+            "body_pose: expected numbers",
+        ),
     ):
         (tmp_path / name).mkdir()
         change(other := dict(frame))
@@ -319,16 +407,23 @@ def rest_body():
 
 def test_grounded_stands_on_the_floor_at_the_origin():
     rest = rest_body()
-    motion = Motion(jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3), 3, 2.0), jnp.float32))
+    motion = Motion(
+        jnp.asarray(random((FRAMES, 55, 3)), jnp.float32),
+        jnp.asarray(random((FRAMES, 3), 3, 2.0), jnp.float32),
+    )
     placed = grounded(motion, rest, PARENTS)
     shift = np.asarray(motion.translations - placed.translations)
-    np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=FLOAT32)  # by a constant
+    np.testing.assert_allclose(
+        shift, np.broadcast_to(shift[0], shift.shape), atol=FLOAT32
+    )  # by a constant
     joints = []
     move = jax.jit(joint_transforms, static_argnums=1)
     for i in range(FRAMES):
         pose = placed.pose(i)
         transforms = np.asarray(move(rest.joints, PARENTS, pose.rotations, pose.translation))
-        joints.append(np.einsum("jab,jb->ja", transforms[:, :3, :3], rest.joints) + transforms[:, :3, 3])
+        joints.append(
+            np.einsum("jab,jb->ja", transforms[:, :3, :3], rest.joints) + transforms[:, :3, 3]
+        )
     joints = np.stack(joints)
     np.testing.assert_allclose(joints[0, 0, [0, 2]], 0, atol=FLOAT32)
     sole = float(rest.joints[:, 1].min() - rest.vertices[:, 1].min())
@@ -355,7 +450,9 @@ def test_at_rate_turns_at_an_even_speed():
     motion = Motion(jnp.asarray(vectors, jnp.float32), jnp.zeros((4, 3)), 30.0)
     fast = motion.at_rate(60)
     np.testing.assert_array_equal(fast.rotations[::2], motion.rotations)
-    wanted = quaternion.from_axis_angle(jnp.asarray(np.minimum(2.9 + 0.1 * np.arange(8), 3.5)[:, None] * axis, jnp.float32))
+    wanted = quaternion.from_axis_angle(
+        jnp.asarray(np.minimum(2.9 + 0.1 * np.arange(8), 3.5)[:, None] * axis, jnp.float32)
+    )
     got = quaternion.from_axis_angle(fast.rotations[:, 0])
     np.testing.assert_allclose(np.abs(np.sum(got * wanted, axis=-1)), 1, atol=FLOAT32)
 
@@ -382,4 +479,6 @@ def test_the_shipped_walk(tmp_path):
     assert (joints["right_wrist"][:, 1] > joints["right_shoulder"][:, 1]).any()  # the wave
     step = np.diff(np.concatenate([motion.rotations, motion.rotations[:1]]), axis=0)
     steps = np.linalg.norm(step, axis=-1).max(axis=1)
-    assert steps[-1] <= steps[:-1].max() and steps.max() < 0.5  # the way back to the start is a step like the others
+    assert (
+        steps[-1] <= steps[:-1].max() and steps.max() < 0.5
+    )  # the way back to the start is a step like the others

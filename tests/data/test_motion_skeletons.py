@@ -40,10 +40,15 @@ def person():
 
 def other_person():
     """Longer shins, shorter thighs, wider hips, other arms."""
-    rest, stretch = person(), {"knee": 0.85, "ankle": 1.2, "hip": 1.3, "elbow": 1.1, "wrist": 0.9, "spine2": 1.2}
+    rest, stretch = (
+        person(),
+        {"knee": 0.85, "ankle": 1.2, "hip": 1.3, "elbow": 1.1, "wrist": 0.9, "spine2": 1.2},
+    )
     out = rest.copy()
     for j, parent in enumerate(PARENTS[1:], 1):
-        out[j] = out[parent] + stretch.get(JOINT_NAMES[j].split("_")[-1], 1.0) * (rest[j] - rest[parent])
+        out[j] = out[parent] + stretch.get(JOINT_NAMES[j].split("_")[-1], 1.0) * (
+            rest[j] - rest[parent]
+        )
     return out
 
 
@@ -101,7 +106,9 @@ TURNS = {
 
 
 @pytest.mark.parametrize("turns", TURNS)
-@pytest.mark.parametrize("names", [CMU, LAFAN, CMU | {"spine1": "Waist", "spine2": "Chest", "spine3": "Thorax"}])
+@pytest.mark.parametrize(
+    "names", [CMU, LAFAN, CMU | {"spine1": "Waist", "spine2": "Chest", "spine3": "Thorax"}]
+)
 def test_a_pelvis_with_a_rotation_of_its_own(tmp_path, names, turns):
     """The joints that carry hips and spine turn back: the people are where they were."""
     rest, poses = person().copy(), dance(4, names=names)
@@ -118,9 +125,13 @@ def test_hips_that_hang_on_a_turned_pelvis_itself(tmp_path):
     """The spine alone tells where the pelvis is."""
     rest = person().copy()
     rest[INDEX["spine1"]] = rest[0]
-    (tmp_path / "a.bvh").write_text(write_bvh(rest, np.zeros((4, 55, 3)), CMU, pelvis=TURNS["about x"]))
+    (tmp_path / "a.bvh").write_text(
+        write_bvh(rest, np.zeros((4, 55, 3)), CMU, pelvis=TURNS["about x"])
+    )
     clip = read_bvh(tmp_path / "a.bvh")
-    parents = tuple(0 if name.endswith("UpLeg") else p for name, p in zip(clip.names, clip.parents, strict=True))
+    parents = tuple(
+        0 if name.endswith("UpLeg") else p for name, p in zip(clip.names, clip.parents, strict=True)
+    )
     rotations, _, _ = retargeted(dataclasses.replace(clip, parents=parents), rest)
     np.testing.assert_allclose(rotations, 0, atol=EXACT)
 
@@ -129,7 +140,9 @@ def test_joints_between_those_we_know_turn_bones_too(tmp_path):
     """A joint of no length above the elbow that turns by itself, as some rigs have: the forearm starts where the file's does."""
     rest, poses, bent = person(), dance(3, names=CMU), dance(3, names=CMU)
     arm, elbow = INDEX["left_shoulder"], INDEX["left_elbow"]
-    bent[:, arm] = (Rotation.from_rotvec(poses[:, arm]) * Rotation.from_euler("ZYX", [40, 20, 0], degrees=True)).as_rotvec()
+    bent[:, arm] = (
+        Rotation.from_rotvec(poses[:, arm]) * Rotation.from_euler("ZYX", [40, 20, 0], degrees=True)
+    ).as_rotvec()
     clips = []
     for each in (poses, bent):
         (tmp_path / "a.bvh").write_text(write_bvh(rest, each, CMU))
@@ -138,7 +151,9 @@ def test_joints_between_those_we_know_turn_bones_too(tmp_path):
     shoulder = clips[0].names.index("LeftArm")
     turns[:, shoulder] = clips[0].turns[:, shoulder]  # as if another joint below it had turned
     rotations, translations, _ = retargeted(dataclasses.replace(clips[1], turns=turns), rest)
-    direction = lambda poses: np.diff(places_of(rest, poses, translations + rest[0])[:, [arm, elbow]], axis=1)
+    direction = lambda poses: np.diff(
+        places_of(rest, poses, translations + rest[0])[:, [arm, elbow]], axis=1
+    )
     np.testing.assert_allclose(direction(rotations), direction(bent), atol=EXACT)
 
 
@@ -168,10 +183,13 @@ def test_feet_stay_on_the_ground_on_another_body(tmp_path, names):
     moves[:, 1] = 0.1 - places_of(source, poses, moves)[:, ankle, 1]
     moves[4, 1] += 0.25
     frame = frames_along_bones(source) if names is LAFAN else None
-    rotations, translations, _ = loaded(tmp_path, write_bvh(source, poses, names, frame, moves), rest_joints=target)
+    rotations, translations, _ = loaded(
+        tmp_path, write_bvh(source, poses, names, frame, moves), rest_joints=target
+    )
     ours = places_of(target, rotations, translations + target[0])
     legs = lambda rest: sum(
-        np.linalg.norm(rest[INDEX[f"left_{b}"]] - rest[INDEX[f"left_{a}"]]) for a, b in (("hip", "knee"), ("knee", "ankle"))
+        np.linalg.norm(rest[INDEX[f"left_{b}"]] - rest[INDEX[f"left_{a}"]])
+        for a, b in (("hip", "knee"), ("knee", "ankle"))
     )
     expected = np.where(np.arange(frames) == 4, 0.25 * legs(target) / legs(source), 0)
     feet = ours[:, [ankle, INDEX["right_ankle"]], 1]
@@ -188,11 +206,16 @@ def test_names_of_programs_and_the_tree_of_those_unknown(tmp_path, scheme):
 
 def test_a_foot_without_toes_does_not_follow_the_shin(tmp_path):
     """Where bones lie along one axis in the rest pose nothing tells where it points: as in T-pose on average."""
-    rest, short = person(), {ours: theirs for ours, theirs in LAFAN.items() if not ours.endswith("_foot")}
+    rest, short = (
+        person(),
+        {ours: theirs for ours, theirs in LAFAN.items() if not ours.endswith("_foot")},
+    )
     poses = without_twist(rest, dance(names=short, scale=0.2))
     ankles = [INDEX[f"{side}_ankle"] for side in ("left", "right")]
     poses[:, ankles] = 0
-    rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, short, frames_along_bones(rest)), rest_joints=rest)
+    rotations, _, _ = loaded(
+        tmp_path, write_bvh(rest, poses, short, frames_along_bones(rest)), rest_joints=rest
+    )
     np.testing.assert_allclose(rotations[:, ankles], 0, atol=1e-4)
 
 
@@ -202,7 +225,9 @@ def test_names_with_spaces(tmp_path, gap, brace):
     """As Biped and Rocketbox have them: a name ends with its line, or before a brace."""
     names = {ours: theirs.replace(" ", gap) for ours, theirs in NAMED["Rocketbox"].items()}
     rest, poses = person(), dance(3, names=CMU)
-    text = "\n".join(line.strip(" \t") for line in write_bvh(rest, poses, names).splitlines()).replace("\n{", brace)
+    text = "\n".join(
+        line.strip(" \t") for line in write_bvh(rest, poses, names).splitlines()
+    ).replace("\n{", brace)
     for ending in ("\n", "\r\n"):
         rotations, _, _ = loaded(tmp_path, text.replace("\n", ending), rest_joints=rest)
         np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
@@ -214,12 +239,27 @@ BAD = {
     "cut": ("HIERARCHY ROOT Hips { OFFSET 0 0", "cut short"),
     "open": ("HIERARCHY ROOT Hips { OFFSET 0 0 0 ", "a brace of the joints is open"),
     "no motion": (HEAD, "expected MOTION, Frames: and Frame Time:"),
-    "strange": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n", "expected the names of CMU, Mixamo, Unity"),
-    "few": (HEAD + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0\n", "expected 2 frames of 3 numbers, got 3 numbers"),
-    "nan": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 nan 0\n", "expected finite numbers, got nan"),
+    "strange": (
+        HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n",
+        "expected the names of CMU, Mixamo, Unity",
+    ),
+    "few": (
+        HEAD + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0\n",
+        "expected 2 frames of 3 numbers, got 3 numbers",
+    ),
+    "nan": (
+        HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 nan 0\n",
+        "expected finite numbers, got nan",
+    ),
     "letters": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 x 0\n", "frames: expected numbers"),
-    "time": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0\n0 0 0\n", "a positive Frame Time, got 1 and 0"),
-    "instant": (HEAD + "MOTION\nFrames: 1\nFrame Time: 5e-324\n0 0 0\n", "a positive Frame Time, got 1 and 5e-324"),
+    "time": (
+        HEAD + "MOTION\nFrames: 1\nFrame Time: 0\n0 0 0\n",
+        "a positive Frame Time, got 1 and 0",
+    ),
+    "instant": (
+        HEAD + "MOTION\nFrames: 1\nFrame Time: 5e-324\n0 0 0\n",
+        "a positive Frame Time, got 1 and 5e-324",
+    ),
     "channels": (HEAD.replace("Zrot", "Wrot"), "expected up to 6 channels"),
     "word": (HEAD.replace("CHANNELS", "CHANELS"), "unknown word CHANELS"),
 }
@@ -237,11 +277,20 @@ def test_bad_files_are_one_line(tmp_path, case):
 def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
     with pytest.raises(MotionError, match="bodies of 55 joints, this one has 3"):
         loaded(tmp_path, write_bvh(person(), dance(2), CMU), rest_joints=np.zeros((3, 3)))
-    np.savez(tmp_path / "ten.npz", rotations=np.zeros((4, 10, 3)), translations=np.zeros((4, 3)), fps=30)
+    np.savez(
+        tmp_path / "ten.npz", rotations=np.zeros((4, 10, 3)), translations=np.zeros((4, 3)), fps=30
+    )
     with pytest.raises(MotionError, match=r"ten\.npz: rotations: expected 55 joints, got 10"):
         load_motion(tmp_path / "ten.npz", rest_joints=person())
-    np.savez(tmp_path / "far.npz", rotations=np.zeros((4, 55, 3)), translations=np.full((4, 3), 1e6), fps=30)
-    with pytest.raises(MotionError, match="expected metres, at most 10000 from the origin, got 1e\\+06"):
+    np.savez(
+        tmp_path / "far.npz",
+        rotations=np.zeros((4, 55, 3)),
+        translations=np.full((4, 3), 1e6),
+        fps=30,
+    )
+    with pytest.raises(
+        MotionError, match="expected metres, at most 10000 from the origin, got 1e\\+06"
+    ):
         load_motion(tmp_path / "far.npz")
     (tmp_path / "walk.fbx").write_text("Kaydara")
     with pytest.raises(
@@ -284,7 +333,9 @@ def test_a_glb_in_centimetres_below_a_turned_node(tmp_path):
 def test_a_clip_of_several_is_chosen_by_name_or_number(tmp_path, caplog):
     rest, names = person(), ("Idle", "Run", "Walk")
     clips = [dance(2, seed) for seed in range(3)]
-    write_glb(tmp_path / "a.vrma", rest, clips[0], np.zeros((2, 3)), MIXAMO, more=clips[1:], titles=names)
+    write_glb(
+        tmp_path / "a.vrma", rest, clips[0], np.zeros((2, 3)), MIXAMO, more=clips[1:], titles=names
+    )
     for chosen, poses in ((None, clips[0]), ("run", clips[1]), (2, clips[2])):
         motion = load_motion(tmp_path / "a.vrma", rest_joints=rest, clip=chosen)
         np.testing.assert_allclose(matrices(motion.rotations), matrices(poses), atol=EXACT)
@@ -296,9 +347,17 @@ def test_a_clip_of_several_is_chosen_by_name_or_number(tmp_path, caplog):
 def test_bones_of_a_vrm_are_those_that_it_says(tmp_path):
     rest, poses = person(), dance(3, names=CMU)
     ours = ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot")
-    words = dict(zip(ours, ["Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes"], strict=True))
+    words = dict(
+        zip(
+            ours,
+            ["Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes"],
+            strict=True,
+        )
+    )
     middle = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest"}
-    bones = {o: o.split("_")[0] + words[o.split("_")[1]] if "_" in o else middle.get(o, o) for o in CMU}
+    bones = {
+        o: o.split("_")[0] + words[o.split("_")[1]] if "_" in o else middle.get(o, o) for o in CMU
+    }
     joints = [name for name in JOINT_NAMES if name in CMU]
     human = {bones[name]: {"node": i} for i, name in enumerate(joints)}
     scrambled = {name: f"L_thing {i * 37 % 101}" for i, name in enumerate(joints)}
@@ -314,7 +373,11 @@ def test_glb_files_that_are_no_motion(tmp_path):
     channel = {"sampler": 0, "target": {"node": 0, "path": "rotation"}}
 
     def track(output=turns, channels=(channel,)):
-        return {"animations": [{"channels": list(channels), "samplers": [{"input": times, "output": output}]}]}
+        return {
+            "animations": [
+                {"channels": list(channels), "samplers": [{"input": times, "output": output}]}
+            ]
+        }
 
     for document, problem in (
         ({}, "without an animation"),
@@ -322,7 +385,10 @@ def test_glb_files_that_are_no_motion(tmp_path):
         ({"nodes": [{}]} | track(output=times), "one rotation for each of increasing times"),
         ({"nodes": [{"name": "a"}]} | track(), "expected the names of CMU"),
         ({"nodes": [{}]} | track(channels=()), "turns no joint"),
-        ({"nodes": [{}]} | track(channels=(channel, channel)), "two tracks for the rotation of node 0"),
+        (
+            {"nodes": [{}]} | track(channels=(channel, channel)),
+            "two tracks for the rotation of node 0",
+        ),
     ):
         writer.write(tmp_path / "a.glb", document)
         with pytest.raises(MotionError, match=problem) as caught:
@@ -358,10 +424,16 @@ def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, up):
     assert not [line for line in caplog.messages if " is up, not " in line]
 
 
-def test_people_who_walk_along_another_axis_than_the_rest_pose_are_turned_and_it_is_said(tmp_path, caplog):
+def test_people_who_walk_along_another_axis_than_the_rest_pose_are_turned_and_it_is_said(
+    tmp_path, caplog
+):
     poses, translations = motions()["walking"]
     turned, moved = in_world(poses, translations, UP["z"])
     with caplog.at_level(logging.WARNING):
-        rotations, _, _ = loaded(tmp_path, write_bvh(person(), turned, CMU, moves=moved + person()[0]), rest_joints=person())
+        rotations, _, _ = loaded(
+            tmp_path,
+            write_bvh(person(), turned, CMU, moves=moved + person()[0]),
+            rest_joints=person(),
+        )
     np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
     assert "dance.bvh: z is up, not y as usual" in caplog.text

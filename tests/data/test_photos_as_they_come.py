@@ -49,7 +49,9 @@ def write_phones(folder, masks=False, reach=(0, 0)):
 
 
 def imported(folder, **options):
-    return import_cameras(folder / "rig.json", folder / "photos", folder / "out", up="+y", **options)
+    return import_cameras(
+        folder / "rig.json", folder / "photos", folder / "out", up="+y", **options
+    )
 
 
 def test_photos_of_several_sizes_are_padded_and_cameras_stay(tmp_path):
@@ -70,7 +72,9 @@ def test_photos_of_several_sizes_are_padded_and_cameras_stay(tmp_path):
         assert pixels.shape == (64, 64, 3) and pixels[:, width:].min(initial=255) == 255
 
 
-@pytest.mark.parametrize(("reach", "named"), [((5, 0), "a.png and 1 more"), ((0, 5), "b.PNG and 1 more")])
+@pytest.mark.parametrize(
+    ("reach", "named"), [((5, 0), "a.png and 1 more"), ((0, 5), "b.PNG and 1 more")]
+)
 def test_a_person_who_is_cut_off_by_a_padded_rim_is_warned_of(reach, named, tmp_path):
     write_phones(tmp_path, masks=True, reach=reach)
     (warning,) = imported(tmp_path, masks=tmp_path / "masks").warnings
@@ -80,7 +84,10 @@ def test_a_person_who_is_cut_off_by_a_padded_rim_is_warned_of(reach, named, tmp_
 def test_keypoints_of_the_photos_before_padding_fit(tmp_path):
     write_phones(tmp_path)
     imported(tmp_path)
-    images = [{"id": i, "file_name": n, "width": w, "height": h} for i, (n, (w, h)) in enumerate(SHOWN.items())]
+    images = [
+        {"id": i, "file_name": n, "width": w, "height": h}
+        for i, (n, (w, h)) in enumerate(SHOWN.items())
+    ]
     people = [{"image_id": i, "keypoints": [10.0 + i, 20.0, 2] * 17} for i in range(len(SHOWN))]
     file = tmp_path / "k.json"
     file.write_text(json.dumps({"images": images, "annotations": people}))
@@ -89,7 +96,9 @@ def test_keypoints_of_the_photos_before_padding_fit(tmp_path):
     assert keypoints.points[:, 0].tolist() == [[10.5 + i, 20.5] for i in range(len(SHOWN))]
     images[0]["width"] = 80  # of another photo
     file.write_text(json.dumps({"images": images, "annotations": people}))
-    with pytest.raises(CaptureError, match=r"size of a\.png: 80 x 48, but the capture's photos have 64 x 64"):
+    with pytest.raises(
+        CaptureError, match=r"size of a\.png: 80 x 48, but the capture's photos have 64 x 64"
+    ):
         read_keypoints(file, photos.names, 64, 64)
 
 
@@ -98,7 +107,9 @@ def test_padding_has_the_limits_of_reading(limit, tmp_path):
     write_phones(tmp_path)
     try:
         set_limits(Limits(**limit))
-        with pytest.raises(CaptureError, match=rf"photos: .* padded.*: the limit {next(iter(limit))} is") as caught:
+        with pytest.raises(
+            CaptureError, match=rf"photos: .* padded.*: the limit {next(iter(limit))} is"
+        ) as caught:
             imported(tmp_path)
     finally:
         set_limits(None)
@@ -114,8 +125,13 @@ def test_heic_photos_become_png(tmp_path):
     shutil.copy(HEIC, tmp_path / "photos" / "b.HEIC")
     report = imported(tmp_path)
     assert "written as PNG: 1 HEIC photo" in report.notes and (report.turned, report.heic) == (0, 1)
-    assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == ["a.png", "b.png"]
-    np.testing.assert_allclose(load_photos(tmp_path / "out").images[1], read_image(HEIC)[0], atol=1e-6)
+    assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == [
+        "a.png",
+        "b.png",
+    ]
+    np.testing.assert_allclose(
+        load_photos(tmp_path / "out").images[1], read_image(HEIC)[0], atol=1e-6
+    )
 
 
 # EXIF flags: pixels, masks and cameras of the import agree, and no flag is left for others to obey ---------------------
@@ -137,7 +153,9 @@ def spot(K, pose, lens, size):
 
 def centroid(image, near):
     columns, rows = np.meshgrid(np.arange(image.shape[1]) + 0.5, np.arange(image.shape[0]) + 0.5)
-    weights = image * (np.hypot(columns - near[0], rows - near[1]) < 7)  # a lens leaves white corners
+    weights = image * (
+        np.hypot(columns - near[0], rows - near[1]) < 7
+    )  # a lens leaves white corners
     return np.asarray([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
 
 
@@ -148,17 +166,31 @@ def save(file, image, flag=1):
     Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(file, exif=exif)
 
 
-def phone(tmp_path, flag, lens=0 * LENS, mask=None, calibrated="stored", size=(written.WIDTH, written.HEIGHT), **changes):
+def phone(
+    tmp_path,
+    flag,
+    lens=0 * LENS,
+    mask=None,
+    calibrated="stored",
+    size=(written.WIDTH, written.HEIGHT),
+    **changes,
+):
     """A rig whose photos have a flag, and its import. mask: "stored" or "shown", or "flagged" for stored with the flag."""
     K, poses = written.scene()
     K[:, 0, 2], K[:, 1, 2] = size[0] / 2 + 1.3, size[1] / 2 - 0.8
     shown = size if flag < 5 else size[::-1]
-    changes = {"imgSize": list(size if calibrated == "stored" else shown), "distCoeff": lens.tolist(), **changes}
+    changes = {
+        "imgSize": list(size if calibrated == "stored" else shown),
+        "distCoeff": lens.tolist(),
+        **changes,
+    }
     if calibrated == "shown":  # cameras of the turned photo
         K[:, 0, 2], K[:, 1, 2] = shown[0] / 2 + 1.3, shown[1] / 2 - 0.8
     written.write_calibration_full(tmp_path / "rig.json", K, poses, NAMES, **changes)
     if changes["imgSize"] is None:
-        edit_json(tmp_path / "rig.json", lambda rig: [camera.pop("imgSize") for camera in rig.values()])
+        edit_json(
+            tmp_path / "rig.json", lambda rig: [camera.pop("imgSize") for camera in rig.values()]
+        )
     back = {6: 8, 8: 6}.get(flag, flag)
     for name, k, pose in zip(NAMES, K, poses, strict=True):
         image = spot(k, pose, lens, size if calibrated == "stored" else shown)
@@ -168,14 +200,20 @@ def phone(tmp_path, flag, lens=0 * LENS, mask=None, calibrated="stored", size=(w
             pixels = oriented(image, flag) if mask == "shown" else image
             save(tmp_path / "masks" / f"{name}.png", pixels, flag if mask == "flagged" else 1)
     masks = None if mask is None else tmp_path / "masks"
-    return import_cameras(tmp_path / "rig.json", tmp_path / "photos", tmp_path / "me", masks=masks, up="+y")
+    return import_cameras(
+        tmp_path / "rig.json", tmp_path / "photos", tmp_path / "me", masks=masks, up="+y"
+    )
 
 
 def check_agreement(folder):
     """The spot is where the capture's camera sees the point, in photo and mask; photos are read as written."""
     photos = load_photos(folder)
     for i, name in enumerate(json.loads((folder / "capture.json").read_text())["views"]):
-        expected = written.project(np.asarray(photos.cameras.K[i]), np.asarray(photos.cameras.cam_from_world[i]), POINT[None])
+        expected = written.project(
+            np.asarray(photos.cameras.K[i]),
+            np.asarray(photos.cameras.cam_from_world[i]),
+            POINT[None],
+        )
         image = photos.images[i, ..., 0] if photos.masks is None else photos.masks[i]
         np.testing.assert_allclose(centroid(image, expected[0]), expected[0], atol=OFF)
         assert orientation(folder / name["image"]) == 1
@@ -191,7 +229,9 @@ def test_cameras_of_stored_pixels_are_turned_with_them(flag, lens, tmp_path):
     shown = (written.WIDTH, written.HEIGHT) if flag < 5 else (written.HEIGHT, written.WIDTH)
     assert (report.width, report.height) == shown
     assert report.turned == (0 if flag == 1 else 4)
-    assert any("EXIF orientation" in line for line in (*report.notes, *report.warnings)) == (flag != 1)
+    assert any("EXIF orientation" in line for line in (*report.notes, *report.warnings)) == (
+        flag != 1
+    )
     assert any("sizes do not tell" in warning for warning in report.warnings) == (flag in (2, 3, 4))
     assert any("mirror" in warning for warning in report.warnings) == (flag in (2, 4, 5, 7))
 
@@ -201,7 +241,9 @@ def test_cameras_of_stored_pixels_are_turned_with_them(flag, lens, tmp_path):
     [
         *(("shown", flag) for flag in range(1, 9)),
         *(("flagged", flag) for flag in range(1, 9)),
-        *(("stored", flag) for flag in (1, 5, 6, 7, 8)),  # others cannot be told from masks of the turned photo
+        *(
+            ("stored", flag) for flag in (1, 5, 6, 7, 8)
+        ),  # others cannot be told from masks of the turned photo
     ],
 )
 def test_masks_are_turned_to_their_photo(mask, flag, tmp_path):
@@ -224,15 +266,27 @@ def test_square_photos_are_taken_as_stored_with_a_warning(tmp_path):
 
 
 def test_other_sizes_and_flags_are_refused(tmp_path):
-    with pytest.raises(CaptureError, match=r"a\.png: size: 64 x 48 \(EXIF orientation 6\), was calibrated with 32 x 24"):
+    with pytest.raises(
+        CaptureError,
+        match=r"a\.png: size: 64 x 48 \(EXIF orientation 6\), was calibrated with 32 x 24",
+    ):
         phone(tmp_path, 6, imgSize=[32, 24])
-    with pytest.raises(CaptureError, match=r"was calibrated with 48 x 64: .* turned \(an EXIF orientation that got lost\)"):
+    with pytest.raises(
+        CaptureError,
+        match=r"was calibrated with 48 x 64: .* turned \(an EXIF orientation that got lost\)",
+    ):
         phone(tmp_path, 1, imgSize=[48, 64])
     assert not (tmp_path / "me").exists()
     phone(tmp_path, 1, mask="shown")
     save(tmp_path / "masks" / "a.png", np.zeros((written.HEIGHT, written.WIDTH)), 6)
     with pytest.raises(CaptureError, match=r"a\.png: size: 48 x 64, but its photo has 64 x 48"):
-        import_cameras(tmp_path / "rig.json", tmp_path / "photos", tmp_path / "again", masks=tmp_path / "masks", up="+y")
+        import_cameras(
+            tmp_path / "rig.json",
+            tmp_path / "photos",
+            tmp_path / "again",
+            masks=tmp_path / "masks",
+            up="+y",
+        )
 
 
 def test_photos_of_one_camera_with_different_flags_are_refused(tmp_path):
@@ -240,7 +294,9 @@ def test_photos_of_one_camera_with_different_flags_are_refused(tmp_path):
     written.write_calibration_full(tmp_path / "rig.json", K, poses, ["a"])
     for i, flag in enumerate((1, 3)):
         save(tmp_path / "a" / f"{i}.png", np.zeros((written.HEIGHT, written.WIDTH, 3)), flag)
-    with pytest.raises(CaptureError, match=r"1\.png: EXIF orientation 3, but 0\.png of the same camera has 1"):
+    with pytest.raises(
+        CaptureError, match=r"1\.png: EXIF orientation 3, but 0\.png of the same camera has 1"
+    ):
         import_cameras(tmp_path / "rig.json", tmp_path, tmp_path / "me")
 
 
@@ -256,17 +312,26 @@ def by_hand(tmp_path, turned_K):
         pixels = np.asarray(Image.open(file)) / 255
         save(file, pixels, 6)
     if turned_K:
-        edit_json(tmp_path / "me/capture.json", lambda me: [turn(view["K"]) for view in me["views"]])
+        edit_json(
+            tmp_path / "me/capture.json", lambda me: [turn(view["K"]) for view in me["views"]]
+        )
     return tmp_path / "me"
 
 
 def test_captures_made_by_hand_are_warned_of_or_refused(tmp_path, caplog):
     load_photos(by_hand(tmp_path, turned_K=False))
-    assert [record.getMessage() for record in caplog.records if "EXIF orientation of a.png and 3 more" in record.getMessage()]
+    assert [
+        record.getMessage()
+        for record in caplog.records
+        if "EXIF orientation of a.png and 3 more" in record.getMessage()
+    ]
 
 
 def test_a_hand_made_K_of_the_turned_photo_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match=r"a\.png: orientation: EXIF orientation 6 is ignored, but K is of the turned photo"):
+    with pytest.raises(
+        CaptureError,
+        match=r"a\.png: orientation: EXIF orientation 6 is ignored, but K is of the turned photo",
+    ):
         load_photos(by_hand(tmp_path, turned_K=True))
 
 

@@ -14,7 +14,17 @@ from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import skirt
 from humangs_jax.data.capture import capture_from_arrays
-from humangs_jax.data.skirt import BOTTOM, GAP, HALF, LEGS, ROWS, TOP, find_hem, with_skirt, with_tube
+from humangs_jax.data.skirt import (
+    BOTTOM,
+    GAP,
+    HALF,
+    LEGS,
+    ROWS,
+    TOP,
+    find_hem,
+    with_skirt,
+    with_tube,
+)
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
@@ -48,7 +58,12 @@ def cone(body, hem):
     heights, depths = (np.interp(levels, [0, 0.5, 1], leg[:, i])[:, None] for i in (1, 2))
     turns = np.linspace(0, 2 * np.pi, 49)[:-1]
     grow = (0.6 + 0.4 * levels / hem)[:, None]
-    points = np.stack(np.broadcast_arrays(CONE[0] * grow * np.cos(turns), heights, depths + CONE[1] * grow * np.sin(turns)), -1)
+    points = np.stack(
+        np.broadcast_arrays(
+            CONE[0] * grow * np.cos(turns), heights, depths + CONE[1] * grow * np.sin(turns)
+        ),
+        -1,
+    )
     index = np.arange(points[..., 0].size).reshape(12, -1)
     following = np.roll(index, -1, axis=1)
     faces = [np.stack(x, -1).reshape(-1, 3) for x in (
@@ -59,14 +74,28 @@ def cone(body, hem):
 
 def in_clothes(body, rotations=None, worn=None, grown=0.0):
     """A capture of the body, its skin `grown` along the normals, and of something worn in the T-pose."""
-    pose = BodyPose(jnp.zeros((len(body.parents), 3)) if rotations is None else rotations, jnp.zeros(3))
+    pose = BodyPose(
+        jnp.zeros((len(body.parents), 3)) if rotations is None else rotations, jnp.zeros(3)
+    )
     rest = shape_body(body, jnp.zeros(len(body.shape_names)))
     skin = replace(rest, vertices=rest.vertices + grown * vertex_normals(rest.vertices, body.faces))
     posed = pose_body(body, skin, pose).vertices
-    parts = [(posed, body.faces)] + ([] if worn is None else [(jnp.asarray(worn[0], jnp.float32), jnp.asarray(worn[1]))])
+    parts = [(posed, body.faces)] + (
+        [] if worn is None else [(jnp.asarray(worn[0], jnp.float32), jnp.asarray(worn[1]))]
+    )
     K = intrinsics_from_fov(np.pi / 3, SIZE, SIZE)
-    cameras = orbit(jnp.asarray([0.0, -0.5, 0.0]), 2.4, jnp.linspace(0, 2 * np.pi, VIEWS + 1)[:-1], 0.1, K, SIZE, SIZE)
-    shown = lambda i: np.any([np.asarray(rasterizer()(*part, cameras[i]).face_ids) >= 0 for part in parts], axis=0)
+    cameras = orbit(
+        jnp.asarray([0.0, -0.5, 0.0]),
+        2.4,
+        jnp.linspace(0, 2 * np.pi, VIEWS + 1)[:-1],
+        0.1,
+        K,
+        SIZE,
+        SIZE,
+    )
+    shown = lambda i: np.any(
+        [np.asarray(rasterizer()(*part, cameras[i]).face_ids) >= 0 for part in parts], axis=0
+    )
     masks = np.stack([shown(i) for i in range(VIEWS)]).astype(np.float32)
     return capture_from_arrays(
         np.ones((*masks.shape, 3), np.float32), cameras.K, cameras.cam_from_world, pose.rotations[None], pose.translation[None],
@@ -103,7 +132,11 @@ def test_a_skirt_is_found_and_lies_on_the_masks(body, monkeypatch):
     assert np.median(off) < SURFACE
 
 
-@pytest.mark.parametrize(("degrees", "grown"), [(12, 0.0), (0, 0.025), (-6, 0.04)], ids=["apart", "trousers", "wide trousers"])
+@pytest.mark.parametrize(
+    ("degrees", "grown"),
+    [(12, 0.0), (0, 0.025), (-6, 0.04)],
+    ids=["apart", "trousers", "wide trousers"],
+)
 def test_legs_have_no_skirt(body, degrees, grown):
     assert find_hem(body, in_clothes(body, turned_hips(body, degrees), grown=grown)) is None
 
@@ -134,14 +167,18 @@ def test_a_tube_is_made_of_the_body_and_moves_no_joint(body):
     assert (np.diff(tube[:, :, 1], axis=0) < 0).all()  # rows go down
     normals = np.asarray(vertex_normals(worn.template, worn.faces))[count:].reshape(ROWS, -1, 3)
     middle = GAP // 2
-    assert (normals[:, middle, 2] > 0.7).all() and (normals[:, GAP + HALF + middle, 2] < -0.7).all()  # front and back
+    assert (normals[:, middle, 2] > 0.7).all() and (
+        normals[:, GAP + HALF + middle, 2] < -0.7
+    ).all()  # front and back
 
 
 def test_a_skirt_bends_between_the_legs(body):
     worn, count = with_tube(body, 0.7), len(body.template)
     rest = shape_body(worn, jnp.zeros(len(worn.shape_names)))
     sides = np.asarray(worn.faces)[(np.asarray(worn.faces) >= count).all(-1)]
-    length = lambda x: np.linalg.norm(np.asarray(x)[sides] - np.asarray(x)[np.roll(sides, -1, 1)], axis=-1).max()
+    length = lambda x: np.linalg.norm(
+        np.asarray(x)[sides] - np.asarray(x)[np.roll(sides, -1, 1)], axis=-1
+    ).max()
     posed = pose_body(worn, rest, BodyPose(turned_hips(worn, 30), jnp.zeros(3))).vertices
     assert length(posed) < STRETCH * length(rest.vertices)
     between = np.asarray(posed)[count:].reshape(ROWS, -1, 3)[:, GAP // 2]

@@ -74,12 +74,19 @@ def test_a_spoiled_mask_leaves_its_view_out_by_name(demo, spoiled, caplog):
         left = usable_views(capture)
     assert left.names == tuple(np.delete(demo.names, 1))
     (record,) = caplog.records
-    assert f"1 of 4 views is left out: {demo.names[1]}: " in record.getMessage() and reason in record.getMessage()
+    assert (
+        f"1 of 4 views is left out: {demo.names[1]}: " in record.getMessage()
+        and reason in record.getMessage()
+    )
 
 
 @pytest.mark.parametrize("mask", [*KEPT, None])
 def test_other_masks_are_kept(demo, mask):
-    capture = dataclasses.replace(demo, masks=None) if mask is None else with_mask(demo, 1, KEPT[mask](demo.masks[1]))
+    capture = (
+        dataclasses.replace(demo, masks=None)
+        if mask is None
+        else with_mask(demo, 1, KEPT[mask](demo.masks[1]))
+    )
     assert usable_views(capture) is capture
 
 
@@ -107,8 +114,16 @@ def test_all_that_reads_photos_leaves_it_out(demo):
     capture, usable = with_mask(demo, 1, 0), [0, 2, 3]
     expected = demo.select(usable)
     assert select_views(capture, 3) == select_views(capture, 9) == usable
-    assert Settings().photos(capture).names == Settings(views=9).photos(capture).names == expected.names
-    for views in (standardize(capture, 64), standardize(capture, 64, crop=True), crop_to_person(capture)):
+    assert (
+        Settings().photos(capture).names
+        == Settings(views=9).photos(capture).names
+        == expected.names
+    )
+    for views in (
+        standardize(capture, 64),
+        standardize(capture, 64, crop=True),
+        crop_to_person(capture),
+    ):
         assert len(views.images) == 3
     np.testing.assert_array_equal(standardize(capture, 64).images, standardize(expected, 64).images)
     np.testing.assert_array_equal(crop_to_person(capture).images, crop_to_person(expected).images)
@@ -116,8 +131,16 @@ def test_all_that_reads_photos_leaves_it_out(demo):
 
 def test_no_view_left_is_an_error_that_names_them(demo):
     nobody = dataclasses.replace(demo, masks=0 * demo.masks)
-    for read in (usable_views, lambda c: select_views(c, 2), lambda c: standardize(c, 64), crop_to_person):
-        with pytest.raises(CaptureError, match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty"):
+    for read in (
+        usable_views,
+        lambda c: select_views(c, 2),
+        lambda c: standardize(c, 64),
+        crop_to_person,
+    ):
+        with pytest.raises(
+            CaptureError,
+            match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty",
+        ):
             read(nobody)
 
 
@@ -181,14 +204,18 @@ def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
     doubled, away = demo.select([0, 0, 2, 2]), 1.5
     matrices = np.array(doubled.cameras.cam_from_world)
     matrices[::2, 2, 3] += away
-    capture = dataclasses.replace(doubled, cameras=replace(doubled.cameras, cam_from_world=jnp.asarray(matrices)))
+    capture = dataclasses.replace(
+        doubled, cameras=replace(doubled.cameras, cam_from_world=jnp.asarray(matrices))
+    )
     body = decimate(capture.body, module.SELECTION_VERTICES)
     quality = np.asarray(module.view_quality(body, standardize(capture, module.SELECTION_SIZE)))
     for far, near in ((0, 1), (2, 3)):
         both = (quality[far] > 0) & (quality[near] > 0)
         distance = matrices[near, 2, 3]
         # the rays of the nearer camera spread more, by some degrees
-        assert np.median(quality[far, both] / quality[near, both]) == pytest.approx(distance / (distance + away), rel=0.1)
+        assert np.median(quality[far, both] / quality[near, both]) == pytest.approx(
+            distance / (distance + away), rel=0.1
+        )
 
 
 def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
@@ -242,7 +269,9 @@ def test_gains_are_exactly_one_without_disagreement_or_without_common_points():
     rng = np.random.default_rng(2)
     np.testing.assert_array_equal(gains_of(skin(rng, noise=0.3), np.ones((4, POINTS), bool)), 1)
     apart = np.arange(POINTS) * 4 // POINTS == np.arange(4)[:, None]
-    np.testing.assert_array_equal(gains_of(skin(rng) * np.asarray([0.7, 1, 1, 1.3])[:, None, None], apart), 1)
+    np.testing.assert_array_equal(
+        gains_of(skin(rng) * np.asarray([0.7, 1, 1, 1.3])[:, None, None], apart), 1
+    )
 
 
 def test_photos_with_nothing_in_common_are_not_moved_against_each_other():
@@ -251,7 +280,9 @@ def test_photos_with_nothing_in_common_are_not_moved_against_each_other():
     logs = np.repeat([[0.3], [0.1], [-0.1], [-0.3]], 3, axis=1)
     seen = (np.arange(POINTS) < POINTS // 2) == np.asarray([True, True, False, False])[:, None]
     found = np.log(gains_of(skin(rng) * np.exp(-logs)[:, None], seen))
-    np.testing.assert_allclose(found[:2] - found[:2].mean(0), [[0.1] * 3, [-0.1] * 3], atol=SHRINKING * 0.2)
+    np.testing.assert_allclose(
+        found[:2] - found[:2].mean(0), [[0.1] * 3, [-0.1] * 3], atol=SHRINKING * 0.2
+    )
     np.testing.assert_allclose(found[:2].mean(0), 0, atol=1e-3 * EXPECTED + 1e-9)
 
 
@@ -268,7 +299,9 @@ def test_a_synthetic_capture_stays_as_it_is(demo):
 
 
 def test_a_capture_in_different_exposures_is_made_equal_once(demo):
-    logs = centred(np.asarray([[0.15, 0.1, 0.1], [-0.15, -0.1, -0.2], [0.1, 0.2, 0.15], [-0.1, -0.2, -0.15]]))
+    logs = centred(
+        np.asarray([[0.15, 0.1, 0.1], [-0.15, -0.1, -0.2], [0.1, 0.2, 0.15], [-0.1, -0.2, -0.15]])
+    )
     changed = dataclasses.replace(demo, images=multiplied(demo.images, demo.masks, np.exp(-logs)))
     gains = camera_gains(changed)
     left, before = (np.sqrt(np.mean(np.square(x))) for x in (np.log(gains) - logs, logs))

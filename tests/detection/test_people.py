@@ -43,8 +43,12 @@ MEDIAN_ERROR, LARGEST_ERROR, LEAST_OVERLAP = 0.035, 0.1, 0.9
 def expected(capture, view):
     """Joints in the photo and the person's height, pixels."""
     model = landmark_model(capture.body, NAMES)
-    points, _ = pose_landmarks(model, jnp.asarray(capture.betas), capture.pose(int(capture.frames[view])))
-    transform, K = (np.asarray(x[view]) for x in (capture.cameras.cam_from_world, capture.cameras.K))
+    points, _ = pose_landmarks(
+        model, jnp.asarray(capture.betas), capture.pose(int(capture.frames[view]))
+    )
+    transform, K = (
+        np.asarray(x[view]) for x in (capture.cameras.cam_from_world, capture.cameras.K)
+    )
     seen = (np.asarray(points) @ transform[:3, :3].T + transform[:3, 3]) @ K.T
     return seen[:, :2] / seen[:, 2:], np.ptp(np.flatnonzero((capture.masks[view] > 0.5).any(1)))
 
@@ -58,7 +62,12 @@ def check(person, joints, height, mask):
 
 
 @pytest.mark.parametrize(
-    ("view", "turns"), [(0, 0), (1, 1), *(pytest.param(v, t, marks=pytest.mark.slow) for v in range(4) for t in range(4))]
+    ("view", "turns"),
+    [
+        (0, 0),
+        (1, 1),
+        *(pytest.param(v, t, marks=pytest.mark.slow) for v in range(4) for t in range(4)),
+    ],
 )
 def test_the_person_is_found_whichever_way_up_the_photo_is(networks, demo, view, turns):
     photo = np.ascontiguousarray(np.rot90(demo.images[view], turns), np.float32)
@@ -78,7 +87,9 @@ def test_a_small_person_in_a_large_photo(networks, demo):
     photo = np.full((900, 1400, 3), 0.8, np.float32)
     photo[corner[0] : corner[0] + 205, corner[1] : corner[1] + 205] = small
     mask = np.zeros(photo.shape[:2])
-    mask[corner[0] : corner[0] + 205, corner[1] : corner[1] + 205] = resized(demo.masks[0], 205, 205)
+    mask[corner[0] : corner[0] + 205, corner[1] : corner[1] + 205] = resized(
+        demo.masks[0], 205, 205
+    )
     joints, height = expected(demo, 0)
     (person,) = detect_people(networks, photo)
     assert scale * height / max(photo.shape) < 0.15  # the detector alone needs twice that
@@ -108,10 +119,16 @@ class Drifting(Networks):
 
     def landmarks(self, photo, crop):
         right = crop.side < 1.1 * self.side
-        points = self.hips + np.random.default_rng(0).uniform(-50, 50, (33, 2)) + (0 if right else 40)
-        center, side = (self.hips, self.side) if right else (0.5 * (crop.center + self.hips), 0.9 * crop.side)
+        points = (
+            self.hips + np.random.default_rng(0).uniform(-50, 50, (33, 2)) + (0 if right else 40)
+        )
+        center, side = (
+            (self.hips, self.side) if right else (0.5 * (crop.center + self.hips), 0.9 * crop.side)
+        )
         again = Detection(1.0, center, center - np.asarray([0, side / 2 / ENLARGED]))
-        return Landmarks(points, np.ones(33), np.zeros((33, 3)), 1.0, np.ones((256, 256)), crop, again)
+        return Landmarks(
+            points, np.ones(33), np.zeros((33, 3)), 1.0, np.ones((256, 256)), crop, again
+        )
 
 
 def test_the_landmarks_of_a_crop_that_settled_are_taken():
@@ -121,10 +138,14 @@ def test_the_landmarks_of_a_crop_that_settled_are_taken():
 
 
 @pytest.mark.parametrize(("anybody", "shares"), [(True, {1.0, 0.5}), (False, {1.0, 0.5, 0.25})])
-def test_the_smallest_windows_are_looked_at_only_where_nobody_is_large(anybody, shares, monkeypatch):
+def test_the_smallest_windows_are_looked_at_only_where_nobody_is_large(
+    anybody, shares, monkeypatch
+):
     seen, networks = [], Drifting()
     found = networks.detect if anybody else lambda *_: []
-    monkeypatch.setattr(networks, "detect", lambda photo, window: seen.append(window.side) or found(photo, window))
+    monkeypatch.setattr(
+        networks, "detect", lambda photo, window: seen.append(window.side) or found(photo, window)
+    )
     assert len(detect_people(networks, np.zeros((600, 400, 3), np.float32))) == anybody
     assert {side / 600 for side in seen} == shares
 
@@ -135,7 +156,10 @@ PERSON, ROOM = np.asarray([0.7, 0.5, 0.4], np.float32), np.asarray([0.2, 0.3, 0.
 def scene(scale):
     """Photo, true coverage, and the mask of a network that has one pixel for `scale` of the photo; a body with a thin arm."""
     y, x = np.mgrid[: 60 * scale, : 60 * scale] / scale
-    true = ((np.hypot((x - 30) / 12, (y - 32) / 22) < 1) | ((np.abs(y - 20) < 1.2) & (x > 30) & (x < 54))).astype(np.float32)
+    true = (
+        (np.hypot((x - 30) / 12, (y - 32) / 22) < 1)
+        | ((np.abs(y - 20) < 1.2) & (x > 30) & (x < 54))
+    ).astype(np.float32)
     photo = PERSON * true[..., None] + ROOM * (1 - true[..., None])
     photo += 0.02 * np.random.default_rng(0).normal(size=photo.shape).astype(np.float32)
     coarse = ndimage.gaussian_filter(resized(true, 60, 60), 0.8)
@@ -192,13 +216,17 @@ def test_the_second_point_of_a_detection_is_above_the_middle_of_its_crop(head):
     hips = np.asarray([40.0, 30.0])
     crop = Detection(0.9, hips, hips + head).crop()
     assert crop.side == pytest.approx(2 * ENLARGED * 10)
-    np.testing.assert_allclose(crop.from_photo(hips + head), [0.5, 0.5 - 0.5 / ENLARGED], atol=ROUNDING)
+    np.testing.assert_allclose(
+        crop.from_photo(hips + head), [0.5, 0.5 - 0.5 / ENLARGED], atol=ROUNDING
+    )
 
 
 def test_anchors_are_the_detectors():
     anchors = _anchors()
     assert anchors.shape == (2254, 2)  # 28 * 28 * 2 + 14 * 14 * 2 + 7 * 7 * 6
-    np.testing.assert_allclose(anchors[:3], [[4 / 224] * 2, [4 / 224] * 2, [12 / 224, 4 / 224]], atol=ROUNDING)
+    np.testing.assert_allclose(
+        anchors[:3], [[4 / 224] * 2, [4 / 224] * 2, [12 / 224, 4 / 224]], atol=ROUNDING
+    )
     np.testing.assert_allclose(anchors[-1], [1 - 16 / 224] * 2, atol=ROUNDING)
 
 
@@ -208,7 +236,9 @@ def test_boxes_that_overlap_the_best_are_averaged_by_score():
     boxes[:, 0] = 0.30, 0.32, 0.70
     (best, mean), (other, alone) = _merged(np.asarray([0.6, 0.9, 0.7]), boxes)
     assert (best, other) == (0.9, 0.7)
-    assert mean[0] == pytest.approx((0.6 * 0.30 + 0.9 * 0.32) / 1.5) and alone[0] == pytest.approx(0.70)
+    assert mean[0] == pytest.approx((0.6 * 0.30 + 0.9 * 0.32) / 1.5) and alone[0] == pytest.approx(
+        0.70
+    )
 
 
 def test_landmarks_move_to_the_centroid_of_their_peak_only():
@@ -216,9 +246,13 @@ def test_landmarks_move_to_the_centroid_of_their_peak_only():
     heatmaps[6, 8, 0], heatmaps[6, 9, 0] = 0.6, 0.2
     heatmaps[6, 8, 1] = 0.4  # too low
     heatmaps[0, 15, 3] = 0.9  # at the border
-    points = np.asarray([[7.5, 5.5], [7.5, 5.5], [20.0, 3.0], [15.9, 0.1]]) / 16  # the third: outside of the heatmap
+    points = (
+        np.asarray([[7.5, 5.5], [7.5, 5.5], [20.0, 3.0], [15.9, 0.1]]) / 16
+    )  # the third: outside of the heatmap
     moved = refined(points, heatmaps) * 16
-    np.testing.assert_allclose(moved, [[8.25, 6.0], [7.5, 5.5], [20.0, 3.0], [15.0, 0.0]], atol=ROUNDING)
+    np.testing.assert_allclose(
+        moved, [[8.25, 6.0], [7.5, 5.5], [20.0, 3.0], [15.0, 0.0]], atol=ROUNDING
+    )
 
 
 def test_bilinear_is_linear_between_pixels_and_repeats_or_ends_at_the_edge():
@@ -234,9 +268,19 @@ def test_bilinear_is_linear_between_pixels_and_repeats_or_ends_at_the_edge():
 def test_the_mask_of_a_crop_at_the_size_of_the_photo_is_the_one_at_its_pixels(angle):
     noise = np.random.default_rng(0).uniform(size=(16, 16))
     mask = np.kron(noise, np.ones((16, 16))).astype(np.float32)
-    mask[:2] = mask[-2:] = mask[:, :2] = mask[:, -2:] = 0  # the two differ in how the last half pixel ends
+    mask[:2] = mask[-2:] = mask[:, :2] = mask[:, -2:] = (
+        0  # the two differ in how the last half pixel ends
+    )
     crop = Crop(np.asarray([30.0, 21.0]), 40.0, angle)
-    nobody = Landmarks(np.zeros((33, 2)), np.ones(33), np.zeros((33, 3)), 1.0, mask, crop, Detection(1.0, *np.eye(2)))
+    nobody = Landmarks(
+        np.zeros((33, 2)),
+        np.ones(33),
+        np.zeros((33, 3)),
+        1.0,
+        mask,
+        crop,
+        Detection(1.0, *np.eye(2)),
+    )
     grid = np.stack(np.meshgrid(np.arange(64), np.arange(36)), axis=-1).astype(float)
     expected = mask_at(nobody, grid.reshape(-1, 2)).reshape(36, 64)
     assert expected.max() > 0.9
@@ -252,7 +296,9 @@ def test_bilinear_of_a_photo_of_one_row_or_column(shape):
 
 def test_an_upright_crop_of_the_photos_size_is_the_photo():
     photo = np.random.default_rng(0).uniform(size=(8, 8, 3)).astype(np.float32)
-    np.testing.assert_allclose(sampled(photo, Crop(np.asarray([4.0, 4.0]), 8.0, 0.0), 8), photo, atol=1e-6)
+    np.testing.assert_allclose(
+        sampled(photo, Crop(np.asarray([4.0, 4.0]), 8.0, 0.0), 8), photo, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("size", [(640, 640), (1920, 1080), (300, 4000), (7, 5)])
@@ -261,7 +307,9 @@ def test_windows_cover_the_photo_at_every_scale_and_none_is_beside_it(size):
     sides = sorted({round(window.side, 6) for window in found}, reverse=True)
     assert sides == [round(max(size) * share, 6) for share in (1.0, 0.5, 0.25)]
     for side in sides:
-        low = np.stack([window.center - side / 2 for window in found if round(window.side, 6) == side])
+        low = np.stack(
+            [window.center - side / 2 for window in found if round(window.side, 6) == side]
+        )
         assert ((low < size) & (low + side > 0)).all()
         points = np.random.default_rng(0).uniform(0, size, (200, 2))
         covered = (points[:, None] >= low - ROUNDING) & (points[:, None] <= low + side + ROUNDING)
@@ -269,7 +317,14 @@ def test_windows_cover_the_photo_at_every_scale_and_none_is_beside_it(size):
 
 
 def test_detections_of_one_person_are_one_and_the_best_is_kept():
-    person = lambda score, x, size: Detection(score, np.asarray([x, 50.0]), np.asarray([x, 50.0 - size]))
-    found = [person(0.9, 50.0, 20.0), person(0.8, 53.0, 22.0), person(0.7, 50.0, 40.0), person(0.6, 90.0, 20.0)]
+    person = lambda score, x, size: Detection(
+        score, np.asarray([x, 50.0]), np.asarray([x, 50.0 - size])
+    )
+    found = [
+        person(0.9, 50.0, 20.0),
+        person(0.8, 53.0, 22.0),
+        person(0.7, 50.0, 40.0),
+        person(0.6, 90.0, 20.0),
+    ]
     assert [each.score for each in distinct(found, 200)] == [0.9, 0.7, 0.6]
     assert distinct(found, 20_000) == []  # specks

@@ -37,7 +37,14 @@ def test_the_presets_are_those_of_the_table():
     """Background, crop, mask on prediction, LPIPS, SSIM: docs/evaluation.md."""
     table = {
         "humangs": ("white", WholeFrame(), None, False, ("vgg",), GAUSSIAN),
-        "animatable-gaussians": ("white", WholeFrame(), SquareBox(50, 512), False, ("vgg",), UNIFORM),
+        "animatable-gaussians": (
+            "white",
+            WholeFrame(),
+            SquareBox(50, 512),
+            False,
+            ("vgg",),
+            UNIFORM,
+        ),
         "ghg": ("black", CentredWindow(1000, 500, 1024), None, False, ("alex", "vgg"), UNIFORM),
         "giga": ("black", MaskBox(), None, True, ("alex",), TORCHMETRICS),
         "lhm": ("white", WholeFrame(), None, False, ("squeeze",), TORCHMETRICS),
@@ -45,8 +52,15 @@ def test_the_presets_are_those_of_the_table():
         "lvsm": ("dataset", WholeFrame(), None, False, ("vgg",), GAUSSIAN),
     }
     fields = ("background", "crop", "lpips_crop", "masked", "lpips", "ssim")
-    assert {name: tuple(getattr(p, field) for field in fields) for name, p in PROTOCOLS.items()} == table
-    assert [name for name, p in PROTOCOLS.items() if p.needs_masks] == ["animatable-gaussians", "ghg", "giga", "lhm++"]
+    assert {
+        name: tuple(getattr(p, field) for field in fields) for name, p in PROTOCOLS.items()
+    } == table
+    assert [name for name, p in PROTOCOLS.items() if p.needs_masks] == [
+        "animatable-gaussians",
+        "ghg",
+        "giga",
+        "lhm++",
+    ]
     assert [PROTOCOLS[name].behind for name in ("lhm", "ghg", "lvsm")] == [1.0, 0.0, 1.0]
     assert typing.get_args(typing.get_type_hints(Evaluate)["protocol"]) == tuple(PROTOCOLS)
 
@@ -56,7 +70,9 @@ def test_the_square_box(seed):
     """Padded by hand, resampled by scipy: sample i of n lies at (i + 1/2) of / n - 1/2, and the rim goes on as it is."""
     image, mask = blob(seed, 130, 110)
     (top, bottom), (left, right) = bounds(mask > 0.5)
-    np.testing.assert_array_equal(MaskBox().cut(image, mask, 0.0), image[top : bottom + 1, left : right + 1])
+    np.testing.assert_array_equal(
+        MaskBox().cut(image, mask, 0.0), image[top : bottom + 1, left : right + 1]
+    )
     margin, side = 9, 64
     (top, bottom), (left, right) = bounds(mask > 0)
     rows = slice(max(0, top - margin), min(130, bottom + margin))
@@ -70,7 +86,11 @@ def test_the_square_box(seed):
     at = (np.arange(side) + 0.5) * largest / side - 0.5
     grid = np.meshgrid(at, at, indexing="ij")
     expected = np.stack(
-        [ndimage.map_coordinates(square[..., c].astype(float), grid, order=1, mode="nearest") for c in range(3)], axis=-1
+        [
+            ndimage.map_coordinates(square[..., c].astype(float), grid, order=1, mode="nearest")
+            for c in range(3)
+        ],
+        axis=-1,
     )
     np.testing.assert_allclose(SquareBox(margin, side).cut(image, mask, 1.0), expected, atol=1e-5)
 
@@ -83,7 +103,9 @@ def test_the_centred_window(seed):
     for (first, last), size, side in zip(bounds(mask > 0), wanted, mask.shape, strict=True):
         before = (size - (last + 1 - first)) // 2
         after = size - (last - first) - before
-        corner.append(0 if first - before < 0 else side - size if last + after > side else first - before)
+        corner.append(
+            0 if first - before < 0 else side - size if last + after > side else first - before
+        )
     expected = image[corner[0] : corner[0] + 70, corner[1] : corner[1] + 30]
     found = CentredWindow(70, 30, 100).cut(image, mask, 0.0)
     assert found.shape == (70, 30, 3)
@@ -93,4 +115,8 @@ def test_the_centred_window(seed):
 def test_the_centred_window_is_of_the_published_size():
     image, mask = blob(1, 256, 256)
     assert PROTOCOLS["ghg"].crop.cut(image, mask, 0.0).shape == (1000, 500, 3)
-    assert CentredWindow().cut(image[:, :100], mask[:, :100] + 1, 0.0).shape == (1000, 400, 3)  # narrower than the window
+    assert CentredWindow().cut(image[:, :100], mask[:, :100] + 1, 0.0).shape == (
+        1000,
+        400,
+        3,
+    )  # narrower than the window

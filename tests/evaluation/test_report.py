@@ -8,7 +8,10 @@ import humangs_jax as hg
 from experiments import chromium
 from humangs_jax.evaluation.cases import Case, Predicted
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing())),
+]
 
 TABLE = "[...document.querySelectorAll('#images tbody tr')]"
 
@@ -24,7 +27,9 @@ def found():
 
     def method(case, background):
         noise = rng.uniform(0.02, 0.3, (3, 1, 1, 1)) * rng.standard_normal(case.truth.images.shape)
-        return Predicted(np.clip(case.truth.images + noise, 0, 1).astype(np.float32), None, (0, 1, 2))
+        return Predicted(
+            np.clip(case.truth.images + noise, 0, 1).astype(np.float32), None, (0, 1, 2)
+        )
 
     return hg.evaluate(cases, method=method, page_images=5)
 
@@ -49,7 +54,10 @@ def column(browser, heading):
 
 
 def press(browser, heading):
-    browser.run("[...document.querySelectorAll('#images th button')].find((b) => b.textContent === given[0]).click()", heading)
+    browser.run(
+        "[...document.querySelectorAll('#images th button')].find((b) => b.textContent === given[0]).click()",
+        heading,
+    )
 
 
 def test_the_worst_comes_first_and_columns_sort(browser, found):
@@ -60,7 +68,9 @@ def test_the_worst_comes_first_and_columns_sort(browser, found):
     press(browser, "person")
     assert column(browser, "person") == ["<b>bob</b>"] * 3 + ["ann"] * 3  # as text, not as HTML
     press(browser, "foreground PSNR")
-    assert column(browser, "foreground PSNR") == sorted(column(browser, "foreground PSNR"), key=float)
+    assert column(browser, "foreground PSNR") == sorted(
+        column(browser, "foreground PSNR"), key=float
+    )
     assert browser.run("return document.querySelectorAll('#images th[aria-sort]').length") == 1
     press(browser, "PSNR")
     assert column(browser, "PSNR")[0] == f"{expected[0]:.2f}"
@@ -72,8 +82,12 @@ def test_images_load_and_grow(browser):
         await Promise.all([...document.images].map((image) => image.decode()));
         return {TABLE}.map((row) => [...row.querySelectorAll("img")].map((image) => image.naturalWidth));"""
     )
-    assert [len(row) for row in pictures] == [5] * 5 + [0] and min(min(row) for row in pictures[:5]) > 60
-    assert "the 5 worst of them" in browser.run("return document.getElementById('shown').textContent")
+    assert [len(row) for row in pictures] == [5] * 5 + [0] and min(
+        min(row) for row in pictures[:5]
+    ) > 60
+    assert "the 5 worst of them" in browser.run(
+        "return document.getElementById('shown').textContent"
+    )
     browser.run(f"{TABLE}[0].querySelectorAll('img')[3].click()")
     large = "return [document.getElementById('large').hidden, document.querySelectorAll('#large img').length]"
     assert browser.run(large) == [False, 3]
@@ -82,9 +96,13 @@ def test_images_load_and_grow(browser):
 
 
 def test_one_person_alone_and_means_with_intervals(browser, found):
-    browser.run("const s = document.getElementById('person'); s.value = 'ann'; s.dispatchEvent(new Event('change'))")
+    browser.run(
+        "const s = document.getElementById('person'); s.value = 'ann'; s.dispatchEvent(new Event('change'))"
+    )
     assert column(browser, "person") == ["ann"] * 3
-    browser.run("const s = document.getElementById('person'); s.value = ''; s.dispatchEvent(new Event('change'))")
+    browser.run(
+        "const s = document.getElementById('person'); s.value = ''; s.dispatchEvent(new Event('change'))"
+    )
     assert len(column(browser, "person")) == 6
     means = browser.run("return document.getElementById('means').innerText")
     psnr = found.means["psnr"]
@@ -95,7 +113,12 @@ def test_one_person_alone_and_means_with_intervals(browser, found):
 
 
 def test_the_page_asks_for_nothing(browser):
-    assert browser.run("return performance.getEntriesByType('resource').filter((e) => !e.name.startsWith('data:')).length") == 0
+    assert (
+        browser.run(
+            "return performance.getEntriesByType('resource').filter((e) => !e.name.startsWith('data:')).length"
+        )
+        == 0
+    )
     with pytest.raises(RuntimeError, match="fetch"):
         browser.run("await fetch('http://127.0.0.1:1/')")
     assert len(browser.problems()) > 0  # the browser's own protest

@@ -55,8 +55,14 @@ def psnr(x, y):
 
 def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
     found = hg.evaluate(cases(people), method=predicting(people), protocol="lhm")
-    expected = {name: [psnr(*pair) for pair in zip(p, c.images, strict=True)] for name, (c, p) in people.items()}
-    assert [(row.person, row.frame, row.view) for row in found.rows][1:3] == [("ann", 0, "left"), ("ann", 1, "back")]
+    expected = {
+        name: [psnr(*pair) for pair in zip(p, c.images, strict=True)]
+        for name, (c, p) in people.items()
+    }
+    assert [(row.person, row.frame, row.view) for row in found.rows][1:3] == [
+        ("ann", 0, "left"),
+        ("ann", 1, "back"),
+    ]
     scored = [row.scores["psnr"] for row in found.rows]
     np.testing.assert_allclose(scored, [*expected["ann"], *expected["bob"]], atol=1e-4)
     mean = found.means["psnr"]
@@ -64,11 +70,17 @@ def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
     assert mean.low < mean.mean < mean.high and mean.over == "people"
     assert "lpips_squeeze" in found.reasons and found.means["lpips_squeeze"] is None
     text = found.summary()
-    assert "8 images of 2 people" in text and "no weights of LPIPS squeeze were given" in text and "IoU" in text
+    assert (
+        "8 images of 2 people" in text
+        and "no weights of LPIPS squeeze were given" in text
+        and "IoU" in text
+    )
     files = {kind: tmp_path / f"a.{kind}" for kind in ("json", "html", "csv", "markdown", "latex")}
     found.write(**files)
     report = json.loads(files["json"].read_text())
-    assert report["means"]["psnr"]["mean"] == mean.mean and report["order"].startswith("mean over the images of a frame")
+    assert report["means"]["psnr"]["mean"] == mean.mean and report["order"].startswith(
+        "mean over the images of a frame"
+    )
     assert list(evaluation.COLUMNS)[-2:] == ["patch_lpips_squeeze", "patches"]
     assert report["protocol"] == {
         "name": "lhm",
@@ -83,7 +95,9 @@ def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
         },
     }
     assert len(report["images"]) == 8 and report["images"][0]["scores"]["lpips_squeeze"] is None
-    assert files["csv"].read_text().count("\n") == 9 and files["markdown"].read_text().count("\n") == 5
+    assert (
+        files["csv"].read_text().count("\n") == 9 and files["markdown"].read_text().count("\n") == 5
+    )
     assert files["latex"].read_text().count(r"\\") == 4
     page = files["html"].read_text()
     assert page.count("data:image/jpeg") == 3 * 8 and "http" not in page.replace("http-equiv", "")
@@ -105,15 +119,23 @@ def test_people_who_are_scored_are_kept(people, tmp_path):
             raise KeyboardInterrupt
         return predicting(people)(case, background)
 
-    run = lambda **options: hg.evaluate(cases(people), method=method, keep=tmp_path / "kept", **{"page_images": 5, **options})
+    run = lambda **options: hg.evaluate(
+        cases(people), method=method, keep=tmp_path / "kept", **{"page_images": 5, **options}
+    )
     with pytest.raises(KeyboardInterrupt):
         run()
     stop.clear()
     found, plain = run(), hg.evaluate(cases(people), method=predicting(people), page_images=5)
     assert asked == ["ann", "bob", "bob"]
-    assert found.rows == plain.rows and found.about == plain.about and found.reasons == plain.reasons
-    assert found.gallery.shots == plain.gallery.shots and found.gallery.inputs == plain.gallery.inputs
-    with pytest.raises(ValueError, match=r"written with settings other than asked for now \(images 5 -> 6\)"):
+    assert (
+        found.rows == plain.rows and found.about == plain.about and found.reasons == plain.reasons
+    )
+    assert (
+        found.gallery.shots == plain.gallery.shots and found.gallery.inputs == plain.gallery.inputs
+    )
+    with pytest.raises(
+        ValueError, match=r"written with settings other than asked for now \(images 5 -> 6\)"
+    ):
         run(page_images=6)
 
 
@@ -125,17 +147,28 @@ def test_scores_of_other_photos_views_or_people_are_never_taken_for_kept_ones(pe
     (ann, _), (bob, _) = people["ann"], people["bob"]
     brighter = dataclasses.replace(ann, images=np.clip(ann.images + 0.1, 0, 1))
     renamed = Case("ann", bob)
-    run = lambda *cases, **options: hg.evaluate(cases, method=white, keep=tmp_path / "kept", page_images=0, **options).rows
+    run = lambda *cases, **options: (
+        hg.evaluate(cases, method=white, keep=tmp_path / "kept", page_images=0, **options).rows
+    )
     plain = lambda *cases: hg.evaluate(cases, method=white, page_images=0).rows
     first = Case("ann", ann)
     assert run(first) == plain(first)
-    for other in (Case("ann", brighter), renamed, Case("ann", ann.select([0, 2])), Case("eve", ann)):
+    for other in (
+        Case("ann", brighter),
+        renamed,
+        Case("ann", ann.select([0, 2])),
+        Case("eve", ann),
+    ):
         assert run(other) == plain(other) != plain(first)
         assert run(other, first) == plain(other, first)
 
 
-def test_a_folder_of_scores_made_with_other_inputs_weights_or_body_is_refused(people, folders, tmp_path):
-    run = lambda **options: hg.evaluate(folders, **{"method": white, "keep": tmp_path / "kept", "page_images": 0, **options})
+def test_a_folder_of_scores_made_with_other_inputs_weights_or_body_is_refused(
+    people, folders, tmp_path
+):
+    run = lambda **options: hg.evaluate(
+        folders, **{"method": white, "keep": tmp_path / "kept", "page_images": 0, **options}
+    )
     views = {name: {"context": [0], "target": [1]} for name in people}
     run(inputs=1)
     said = "written with settings other than asked for now "
@@ -152,16 +185,24 @@ def test_a_folder_of_scores_made_with_other_inputs_weights_or_body_is_refused(pe
 def test_scores_of_images_that_were_drawn_again_are_not_kept(people, folders, tmp_path):
     theirs = tmp_path / "theirs"
     write_predictions(theirs, people)
-    run = lambda: [row.scores["psnr"] for row in hg.evaluate(folders, predictions=theirs, keep=tmp_path / "kept").rows]
+    run = lambda: [
+        row.scores["psnr"]
+        for row in hg.evaluate(folders, predictions=theirs, keep=tmp_path / "kept").rows
+    ]
     before = run()
     write_png(theirs / "bob" / "left.png", np.zeros((40, 32, 3)))
     after = run()
-    assert [old == new for old, new in zip(before, after, strict=True)] == [True] * 5 + [False] + [True] * 2
+    assert [old == new for old, new in zip(before, after, strict=True)] == [True] * 5 + [False] + [
+        True
+    ] * 2
 
 
 def test_weights_of_other_values_have_another_key():
     config = hg.reconstruct  # any object that prints
-    keys = [method_key(1, None, ({"params": {"a": np.full(2, x)}}, config), None, None)[0] for x in (1.0, 1.0, 2.0)]
+    keys = [
+        method_key(1, None, ({"params": {"a": np.full(2, x)}}, config), None, None)[0]
+        for x in (1.0, 1.0, 2.0)
+    ]
     assert keys[0] == keys[1] != keys[2]
 
 
@@ -169,7 +210,11 @@ def write_predictions(folder, people, alpha=False):
     for name, (capture, predicted) in people.items():
         (folder / name).mkdir(parents=True)
         for view, image in zip(capture.names, predicted, strict=True):
-            pixels = np.concatenate([image, np.full((*image.shape[:2], 1), 1.0)], axis=-1) if alpha else image
+            pixels = (
+                np.concatenate([image, np.full((*image.shape[:2], 1), 1.0)], axis=-1)
+                if alpha
+                else image
+            )
             write_png(folder / name / f"{view}.png", pixels)
 
 
@@ -180,7 +225,8 @@ def folders(people, tmp_path, monkeypatch):
         save_capture(tmp_path / "people" / name, capture)
     load = hg.load_capture
     monkeypatch.setattr(
-        "humangs_jax.evaluation.cases.load_capture", lambda path, body=None: load(path, body=body or small_body())
+        "humangs_jax.evaluation.cases.load_capture",
+        lambda path, body=None: load(path, body=body or small_body()),
     )
     return tmp_path / "people"
 
@@ -190,8 +236,13 @@ def test_predictions_are_found_by_file_name(people, folders, tmp_path):
     for alpha in (False, True):
         write_predictions(tmp_path / f"theirs{alpha}", people, alpha)
         found = hg.evaluate(folders, predictions=tmp_path / f"theirs{alpha}")
-        expected = [psnr(np.rint(255 * p) / 255, np.rint(255 * c.images) / 255) for c, p in people.values()]
-        assert len(found.rows) == 8 and abs(np.mean([r.scores["psnr"] for r in found.rows]) - np.mean(expected)) < 0.5
+        expected = [
+            psnr(np.rint(255 * p) / 255, np.rint(255 * c.images) / 255) for c, p in people.values()
+        ]
+        assert (
+            len(found.rows) == 8
+            and abs(np.mean([r.scores["psnr"] for r in found.rows]) - np.mean(expected)) < 0.5
+        )
         assert ("iou" in found.reasons) is not alpha and (found.means["iou"] is not None) is alpha
         assert any("Compared on all views" in note for note in found.notes())
     one = tmp_path / "numbered"
@@ -201,7 +252,9 @@ def test_predictions_are_found_by_file_name(people, folders, tmp_path):
     assert len(hg.evaluate(folders / "bob", predictions=one).rows) == 4
     (tmp_path / "theirsFalse" / "bob" / "left.png").unlink()
     found = hg.evaluate(folders, predictions=tmp_path / "theirsFalse")
-    assert len(found.rows) == 7 and [file.endswith("bob/left.png") for file in found.missing] == [True]
+    assert len(found.rows) == 7 and [file.endswith("bob/left.png") for file in found.missing] == [
+        True
+    ]
     assert "1 prediction missing:" in found.summary()
 
 
@@ -221,22 +274,32 @@ def test_what_is_wrong_is_one_line(people, folders, tmp_path):
     with pytest.raises(FileNotFoundError, match="no such folder of predictions"):
         hg.evaluate(folders, predictions=theirs)
     theirs.mkdir()
-    with pytest.raises(ValueError, match=r"no prediction was found; 8 were expected: .*ann/front\.png"):
+    with pytest.raises(
+        ValueError, match=r"no prediction was found; 8 were expected: .*ann/front\.png"
+    ):
         hg.evaluate(folders, predictions=theirs)
     write_predictions(theirs, {"ann": people["ann"]})
     write_png(theirs / "ann" / "back.png", np.zeros((20, 30, 3)))
-    with pytest.raises(ValueError, match=r"ann/back\.png: size 30 x 20, but the true image has 32 x 40"):
+    with pytest.raises(
+        ValueError, match=r"ann/back\.png: size 30 x 20, but the true image has 32 x 40"
+    ):
         hg.evaluate(folders, predictions=theirs)
     write_png(theirs / "ann" / "back.png", np.zeros((40, 32, 4)))
-    with pytest.raises(ValueError, match="1 of 4 images have an alpha channel: expected all or none"):
+    with pytest.raises(
+        ValueError, match="1 of 4 images have an alpha channel: expected all or none"
+    ):
         hg.evaluate(folders, predictions=theirs)
     with pytest.raises(ValueError, match="avatar and weights: expected one of them"):
         hg.evaluate(folders, avatar=tmp_path, weights="w.safetensors")
-    with pytest.raises(ValueError, match=r"one avatar for 2 people: expected a folder with PERSON\.npz"):
+    with pytest.raises(
+        ValueError, match=r"one avatar for 2 people: expected a folder with PERSON\.npz"
+    ):
         hg.evaluate(folders, avatar=tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"no prediction was found; 2 were expected: .*ann\.npz"):
         hg.evaluate(folders, avatar=theirs)
-    with pytest.raises(ValueError, match="no protocol 'ours': expected one of humangs, animatable-gaussians"):
+    with pytest.raises(
+        ValueError, match="no protocol 'ours': expected one of humangs, animatable-gaussians"
+    ):
         hg.evaluate(folders, predictions=theirs, protocol="ours")
     masks = capture_from(people["ann"][0].images)
     with pytest.raises(ValueError, match="ann: the protocol needs a mask for every view"):
@@ -248,7 +311,10 @@ def test_which_views_are_inputs_and_which_are_compared(people, folders, tmp_path
     one = lambda *arguments, **options: find_people(*arguments, **options).load(0)
     case = one(capture, 2)
     assert case.inputs.names == ("front", "left") and case.truth.names == ("back", "right")
-    assert one(folders, reconstructs=False).truth.names == NAMES and one(folders, 1).truth.names == NAMES[1:]
+    assert (
+        one(folders, reconstructs=False).truth.names == NAMES
+        and one(folders, 1).truth.names == NAMES[1:]
+    )
     (tmp_path / "views.json").write_text('{"ann": {"context": [3, 0], "target": [1]}}')
     indices = read_evaluation(tmp_path / "views.json")
     case = one(folders, indices=indices)
@@ -308,7 +374,9 @@ def test_people_of_one_name_are_told_apart():
     paths = [Path("/data/Actor01/Sequence1"), Path("/data/Actor02/Sequence1")]
     assert _short_names(paths) == ("Actor01_Sequence1", "Actor02_Sequence1")
     assert _short_names([Path("a/x"), Path("a/y")]) == ("x", "y")
-    assert _short_names([Path("a"), Path("a")]) == ("0000", "0001") and _short_names([Path("scene")]) == ("scene",)
+    assert _short_names([Path("a"), Path("a")]) == ("0000", "0001") and _short_names(
+        [Path("scene")]
+    ) == ("scene",)
 
 
 def test_a_source_gives_people(people):
@@ -317,7 +385,9 @@ def test_a_source_gives_people(people):
     assert found.names == ("0000", "0001", "0002")
     case = found.load(1)
     assert case.truth.frames.tolist() == [0, 0, 1] and case.inputs.frames.tolist() == [0, 0]
-    np.testing.assert_array_equal(case.truth.poses.rotations[0], people["ann"][0].poses.rotations[1])
+    np.testing.assert_array_equal(
+        case.truth.poses.rotations[0], people["ann"][0].poses.rotations[1]
+    )
     np.testing.assert_array_equal(case.truth.images[2], people["ann"][0].images[0])
     seen = []
 
@@ -335,9 +405,20 @@ def test_the_command(people, folders, tmp_path, humangs):
     out = tmp_path / "out"
     out.mkdir()
     options = ("--predictions", tmp_path / "theirs", "--protocol", "lhm++")
-    code, printed, error = run(folders, *options, "--json", out / "a.json", "--html", out / "a.html", "--csv", out / "a.csv")
+    code, printed, error = run(
+        folders,
+        *options,
+        "--json",
+        out / "a.json",
+        "--html",
+        out / "a.html",
+        "--csv",
+        out / "a.csv",
+    )
     assert code == 0, error
-    assert "theirs, protocol lhm++: 8 images of 2 people" in printed and str(out / "a.html") in printed
+    assert (
+        "theirs, protocol lhm++: 8 images of 2 people" in printed and str(out / "a.html") in printed
+    )
     assert json.loads((out / "a.json").read_text())["means"]["iou"]["count"] == 2
 
 
@@ -349,19 +430,29 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
     avatar.save(tmp_path / "demo_capture.npz")
     for protocol, background in (("humangs", 1.0), ("ghg", 0.0)):
         by_weights = hg.evaluate("demo_capture", weights=weights, protocol=protocol, page_images=0)
-        by_avatar = hg.evaluate("demo_capture", avatar=tmp_path / "demo_capture.npz", protocol=protocol)
+        by_avatar = hg.evaluate(
+            "demo_capture", avatar=tmp_path / "demo_capture.npz", protocol=protocol
+        )
         by_folder = hg.evaluate("demo_capture", avatar=tmp_path, protocol=protocol)
         assert by_weights.rows == by_avatar.rows == by_folder.rows and len(by_weights.rows) == 6
         assert by_weights.means["psnr"].mean > 24 and by_weights.means["iou"].mean > 0.9
         corner = by_avatar.gallery.shots
         assert len(corner) == 6 and by_weights.gallery.shots == {}
         dimmed = replace(avatar.gaussians, opacities=jnp.zeros_like(avatar.gaussians.opacities))
-        nobody = hg.evaluate("demo_capture", avatar=replace(avatar, gaussians=dimmed), protocol=protocol)
+        nobody = hg.evaluate(
+            "demo_capture", avatar=replace(avatar, gaussians=dimmed), protocol=protocol
+        )
         truth = hg.load_capture("demo_capture/held_out")
-        expected = truth.images if background else np.clip(truth.images - (1 - truth.masks[..., None]), 0, 1)
+        expected = (
+            truth.images
+            if background
+            else np.clip(truth.images - (1 - truth.masks[..., None]), 0, 1)
+        )
         if protocol == "humangs":
             found = [row.scores["psnr"] for row in nobody.rows]
-            np.testing.assert_allclose(found, [psnr(x, np.ones_like(x)) for x in expected], atol=1e-3)
+            np.testing.assert_allclose(
+                found, [psnr(x, np.ones_like(x)) for x in expected], atol=1e-3
+            )
         assert nobody.means["iou"].mean == 0
 
 
@@ -379,7 +470,9 @@ def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, mo
         return score(predicted, truth, *rest)
 
     monkeypatch.setattr(evaluation, "score_views", score_views)
-    run = lambda *more: cli.execute(["evaluate", str(folders), "--predictions", str(tmp_path / "theirs"), *more])
+    run = lambda *more: cli.execute(
+        ["evaluate", str(folders), "--predictions", str(tmp_path / "theirs"), *more]
+    )
     kept = lambda: [file.name for file in (tmp_path / "cache").rglob("person_*.json")]
     assert run() == cli.INTERRUPTED and [name[:11] for name in kept()] == ["person_ann_"]
     interrupting.clear()

@@ -12,7 +12,14 @@ from skimage.metrics import structural_similarity
 
 from humangs_jax.evaluation import scores
 from humangs_jax.evaluation.scores import PROTOCOLS, CentredWindow
-from humangs_jax.losses.losses import GAUSSIAN, TORCHMETRICS, UNIFORM, boundary_band, mean_similarity, similarity_map
+from humangs_jax.losses.losses import (
+    GAUSSIAN,
+    TORCHMETRICS,
+    UNIFORM,
+    boundary_band,
+    mean_similarity,
+    similarity_map,
+)
 from humangs_jax.losses.perceptual import lpips
 
 DECIBELS = 1e-4
@@ -27,7 +34,11 @@ def torchmetrics_ssim(x, y):
     moment = lambda a: np.stack(
         [
             np.einsum(
-                "yxij,ij->yx", np.lib.stride_tricks.sliding_window_view(np.pad(a[..., c], 5, mode="reflect"), (11, 11)), kernel
+                "yxij,ij->yx",
+                np.lib.stride_tricks.sliding_window_view(
+                    np.pad(a[..., c], 5, mode="reflect"), (11, 11)
+                ),
+                kernel,
             )
             for c in range(3)
         ]
@@ -42,7 +53,9 @@ def torchmetrics_ssim(x, y):
 
 
 SSIM = {
-    GAUSSIAN: lambda x, y: structural_similarity(x, y, win_size=11, gaussian_weights=True, data_range=1, channel_axis=-1),
+    GAUSSIAN: lambda x, y: structural_similarity(
+        x, y, win_size=11, gaussian_weights=True, data_range=1, channel_axis=-1
+    ),
     UNIFORM: lambda x, y: structural_similarity(x, y, data_range=1, channel_axis=-1),
     TORCHMETRICS: torchmetrics_ssim,
 }
@@ -56,9 +69,13 @@ def test_ssim_of_a_padded_image_is_that_of_the_image(window):
     with jax.enable_x64(True):
         pad = lambda x: jnp.asarray(np.pad(x, [(0, 16), (0, 24), (0, 0)], constant_values=0.3))
         size = jnp.asarray([48, 40])
-        similarity = jax.jit(lambda x, y: mean_similarity(similarity_map(x, y, window), size - window.size + 1))
+        similarity = jax.jit(
+            lambda x, y: mean_similarity(similarity_map(x, y, window), size - window.size + 1)
+        )
         assert abs(float(similarity(pad(predicted), pad(truth))) - expected) < 1e-12
-    row = scores.pair_scores(jnp.asarray(predicted), jnp.asarray(truth), jnp.asarray([48, 40]), window)
+    row = scores.pair_scores(
+        jnp.asarray(predicted), jnp.asarray(truth), jnp.asarray([48, 40]), window
+    )
     assert abs(float(row["ssim"]) - expected) < bound(1e-6)
 
 
@@ -77,7 +94,9 @@ def networks():
 def test_lpips_of_a_padded_image_is_that_of_the_image(networks, net):
     (predicted, truth, _), size = (x[0] for x in random_views(5, 1, 64, 64)), (61, 50)
     pair = [x[: size[0], : size[1]] for x in (predicted, truth)]
-    padded = [np.pad(x, [(0, 64 - size[0]), (0, 64 - size[1]), (0, 0)], constant_values=0.7) for x in pair]
+    padded = [
+        np.pad(x, [(0, 64 - size[0]), (0, 64 - size[1]), (0, 0)], constant_values=0.7) for x in pair
+    ]
     found = scores._lpips(networks[net], *padded, jnp.asarray(size))
     np.testing.assert_allclose(found, jax.jit(lpips)(networks[net], *pair), rtol=1e-5)
 
@@ -93,7 +112,9 @@ def test_backgrounds_masks_and_crops_of_every_protocol():
     weight = masks[..., None]
     for name, protocol in PROTOCOLS.items():
         protocol = dataclasses.replace(protocol, lpips=("alex",))
-        if name == "ghg":  # the window of a smaller image: programs are those of the other protocols
+        if (
+            name == "ghg"
+        ):  # the window of a smaller image: programs are those of the other protocols
             protocol = dataclasses.replace(protocol, crop=CentredWindow(110, 70, 128))
         white = protocol.background != "black"
         ours = predicted if white else np.clip(predicted - (1 - weight), 0, 1)
@@ -103,13 +124,17 @@ def test_backgrounds_masks_and_crops_of_every_protocol():
             ours = ours * weight + white * (1 - weight)
         pair = (ours, true)
         assert row["psnr_fg"] == pytest.approx(psnr(*pair, masks), abs=DECIBELS)
-        assert row["psnr_boundary"] == pytest.approx(psnr(*pair, boundary_band(masks)), abs=DECIBELS)
+        assert row["psnr_boundary"] == pytest.approx(
+            psnr(*pair, boundary_band(masks)), abs=DECIBELS
+        )
         if name == "ghg":
             pair = tuple(protocol.crop.cut(x, masks, 0.0) for x in pair)
         elif name == "giga":
             pair = tuple(x[box] for x in pair)
         assert row["psnr"] == pytest.approx(psnr(*pair), abs=DECIBELS), name
-        assert abs(row["ssim"] - SSIM[protocol.ssim](*(x.astype(float) for x in pair))) < bound(1e-6), name
+        assert abs(row["ssim"] - SSIM[protocol.ssim](*(x.astype(float) for x in pair))) < bound(
+            1e-6
+        ), name
         union = (alpha > 0.5) | (masks > 0.5)
         assert row["iou"] == pytest.approx(((alpha > 0.5) & (masks > 0.5)).sum() / union.sum())
         assert row["foreground"] == pytest.approx(masks.mean()) and row["lpips_alex"] is None
@@ -123,7 +148,11 @@ def test_soft_masks_count_once(name, monkeypatch):
     monkeypatch.setattr(scores, "person_scores", lambda *_: ({}, np.zeros((1, 1), bool)))
     color, mask = np.asarray([0.2, 0.5, 0.9], np.float32), ellipse(40, 32)
     photo = color * mask[..., None] + 1 - mask[..., None]
-    list(scores.score_views((0 * photo + color)[None], capture_from(photo[None], mask[None]), PROTOCOLS[name]))
+    list(
+        scores.score_views(
+            (0 * photo + color)[None], capture_from(photo[None], mask[None]), PROTOCOLS[name]
+        )
+    )
     np.testing.assert_allclose(seen[0][0], seen[0][1], atol=1e-6)
 
 
@@ -132,9 +161,16 @@ def test_lpips_sees_its_own_crop(monkeypatch):
     protocol = dataclasses.replace(PROTOCOLS["animatable-gaussians"], lpips=("squeeze",))
     seen = []
     monkeypatch.setattr(scores, "_lpips", lambda _, *pair: seen.append(pair) or 0.5)
-    (row,) = scores.score_views(predicted, capture_from(truth, masks), protocol, networks={"squeeze": random_lpips("squeeze")})
+    (row,) = scores.score_views(
+        predicted,
+        capture_from(truth, masks),
+        protocol,
+        networks={"squeeze": random_lpips("squeeze")},
+    )
     for image, shown in zip((predicted, truth), seen[0], strict=False):
-        np.testing.assert_array_equal(shown[:512, :512], protocol.lpips_crop.cut(image[0], masks[0], 1.0))
+        np.testing.assert_array_equal(
+            shown[:512, :512], protocol.lpips_crop.cut(image[0], masks[0], 1.0)
+        )
     assert row["lpips_squeeze"] == 0.5 and seen[0][2].tolist() == [512, 512]
 
 
@@ -144,7 +180,9 @@ def test_patches_are_those_that_are_more_than_half_person(networks):
     predicted, truth, masks = (x[0] for x in random_views(4, 1, 200, 152))
     masks = np.clip(2 * masks, 0, 1)
     protocol = dataclasses.replace(PROTOCOLS["lvsm"], lpips=("alex",))
-    (row,) = scores.score_views(predicted[None], capture_from(truth[None], masks[None]), protocol, networks=networks)
+    (row,) = scores.score_views(
+        predicted[None], capture_from(truth[None], masks[None]), protocol, networks=networks
+    )
     found = []
     for top in range(0, 200 - 63, 32):
         for left in range(0, 152 - 63, 32):
@@ -152,7 +190,9 @@ def test_patches_are_those_that_are_more_than_half_person(networks):
             if masks[patch].mean() > 0.5:
                 pair = predicted[patch], truth[patch]
                 similarity = SSIM[GAUSSIAN](*(x.astype(float) for x in pair))
-                found.append((psnr(*pair), similarity, float(jax.jit(lpips)(networks["alex"], *pair))))
+                found.append(
+                    (psnr(*pair), similarity, float(jax.jit(lpips)(networks["alex"], *pair)))
+                )
     expected = np.mean(found, axis=0)
     assert row["patches"] == len(found) and 2 < len(found) < 12
     assert row["patch_psnr"] == pytest.approx(expected[0], abs=DECIBELS)
@@ -165,7 +205,9 @@ def test_patches_that_are_mostly_background_do_not_count():
     predicted, truth, masks = (x.copy() for x in random_views(5, 1))
     masks[:, :40], masks[:, 40:] = 1, 0
     (row,) = scores.score_views(predicted, capture_from(truth, masks), PROTOCOLS["lvsm"])
-    assert row["patches"] == 1 and row["patch_psnr"] == pytest.approx(psnr(predicted[0, :64, :64], truth[0, :64, :64]))
+    assert row["patches"] == 1 and row["patch_psnr"] == pytest.approx(
+        psnr(predicted[0, :64, :64], truth[0, :64, :64])
+    )
 
 
 def test_a_photo_on_white_is_the_same_person_on_black():
@@ -196,13 +238,21 @@ def test_what_is_not_defined_is_none_and_says_why():
     predicted, truth, masks = random_views(6, 1, 40, 32)
     protocol = PROTOCOLS["humangs"]
     (bare,) = scores.score_views(predicted, capture_from(truth), protocol)
-    assert bare["psnr"] > 10 and [name for name, x in bare.items() if x is not None] == ["psnr", "ssim"]
+    assert bare["psnr"] > 10 and [name for name, x in bare.items() if x is not None] == [
+        "psnr",
+        "ssim",
+    ]
     reasons = scores.missing_reasons(protocol, {}, masks=False, alpha=False)
     assert set(reasons) == set(bare) - {"psnr", "ssim"}
-    assert "no weights of LPIPS vgg" in reasons["lpips_vgg"] and reasons["semi_transparent"] == "the true images have no masks"
+    assert (
+        "no weights of LPIPS vgg" in reasons["lpips_vgg"]
+        and reasons["semi_transparent"] == "the true images have no masks"
+    )
     assert "alpha" in scores.missing_reasons(protocol, {}, masks=True, alpha=False)["iou"]
     (nobody,) = scores.score_views(predicted, capture_from(truth, 0 * masks), PROTOCOLS["giga"])
-    assert [name for name, x in nobody.items() if x is not None] == ["foreground"] and nobody["foreground"] == 0
+    assert [name for name, x in nobody.items() if x is not None] == ["foreground"] and nobody[
+        "foreground"
+    ] == 0
     (small,) = scores.score_views(predicted, capture_from(truth, masks), protocol)
     assert small["patches"] == 0 and small["patch_psnr"] is None and small["psnr_fg"] > 0
     with pytest.raises(ValueError, match="needs a mask for every view"):
@@ -210,14 +260,18 @@ def test_what_is_not_defined_is_none_and_says_why():
     with pytest.raises(ValueError, match=r"\(1, 39, 32, 3\), the true ones \(1, 40, 32, 3\)"):
         list(scores.score_views(predicted[:, 1:], capture_from(truth), protocol))
     predicted[0, 3, 4, 1] = np.nan
-    with pytest.raises(ValueError, match=r"predicted images: expected finite numbers, but 1 of 3840 are not"):
+    with pytest.raises(
+        ValueError, match=r"predicted images: expected finite numbers, but 1 of 3840 are not"
+    ):
         list(scores.score_views(predicted, capture_from(truth), protocol))
 
 
 def test_the_headline_is_the_mean_over_views():
     predicted, truth, masks = random_views(7, 2)
     found = scores.score(predicted, capture_from(truth, masks))
-    assert found.psnr == pytest.approx(np.mean([psnr(*pair) for pair in zip(predicted, truth, strict=True)]), abs=1e-4)
+    assert found.psnr == pytest.approx(
+        np.mean([psnr(*pair) for pair in zip(predicted, truth, strict=True)]), abs=1e-4
+    )
     assert found.foreground == pytest.approx(masks.mean())
     with pytest.raises(ValueError, match="mask for every view"):
         scores.score(predicted, capture_from(truth))

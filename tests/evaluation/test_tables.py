@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from humangs_jax.evaluation.run import csv_text, latex_table, markdown_table, shown_mean
-from humangs_jax.evaluation.scores import Mean, Scored, bootstrap, mean_scores, overall_means, person_means
+from humangs_jax.evaluation.scores import (
+    Mean,
+    Scored,
+    bootstrap,
+    mean_scores,
+    overall_means,
+    person_means,
+)
 
 ROWS = [
     Scored("a", 0, "x", {"psnr": 10.0, "patch_psnr": None}),
@@ -19,9 +26,15 @@ ROWS = [
 
 def test_means_are_over_images_then_frames_then_people():
     people = person_means(ROWS)
-    assert people["a"] == {"psnr": (12 + 20) / 2, "patch_psnr": 3.0} and people["b"]["patch_psnr"] is None
+    assert (
+        people["a"] == {"psnr": (12 + 20) / 2, "patch_psnr": 3.0}
+        and people["b"]["patch_psnr"] is None
+    )
     means = overall_means(ROWS)
-    assert means["psnr"].mean == (16 + 30) / 2 and (means["psnr"].count, means["psnr"].over) == (2, "people")
+    assert means["psnr"].mean == (16 + 30) / 2 and (means["psnr"].count, means["psnr"].over) == (
+        2,
+        "people",
+    )
     assert means["patch_psnr"] == Mean(3.0, None, None, 1, "people")
     one = overall_means(ROWS[:3])["psnr"]
     assert (one.mean, one.count, one.over) == (16.0, 2, "frames")
@@ -31,7 +44,10 @@ def test_means_are_over_images_then_frames_then_people():
 
 
 def test_a_score_that_one_lacks_has_no_plain_mean():
-    assert mean_scores([{"psnr": 1.0, "lpips": 1.0}, {"psnr": 3.0, "lpips": None}]) == {"psnr": 2.0, "lpips": None}
+    assert mean_scores([{"psnr": 1.0, "lpips": 1.0}, {"psnr": 3.0, "lpips": None}]) == {
+        "psnr": 2.0,
+        "lpips": None,
+    }
 
 
 def test_the_interval_covers_the_true_mean_as_often_as_it_says():
@@ -47,7 +63,10 @@ def test_the_interval_covers_the_true_mean_as_often_as_it_says():
 
 def test_tables_of_people():
     assert shown_mean(Mean(12.3456, 11.0, 13.0, 4, "people"), "psnr") == "12.35 [11.00, 13.00]"
-    assert markdown_table(["person", "PSNR"], [["a|b", "1.00"]]) == "| person | PSNR |\n| --- | ---: |\n| a\\|b | 1.00 |\n"
+    assert (
+        markdown_table(["person", "PSNR"], [["a|b", "1.00"]])
+        == "| person | PSNR |\n| --- | ---: |\n| a\\|b | 1.00 |\n"
+    )
     lines = latex_table(["person", "PSNR"], [["a_b & 5%", "1.00"], ["mean", "-"]]).splitlines()
     assert lines[0] == r"\begin{tabular}{lr}" and lines[4] == r"a\_b \& 5\% & 1.00 \\"
     assert lines[-2:] == [r"\bottomrule", r"\end{tabular}"]
@@ -57,10 +76,25 @@ def test_the_csv_reads_back():
     rows = [*ROWS, Scored('c, "d"', 2, "x", {"psnr": 1 / 3, "patch_psnr": None})]
     found = list(csv.DictReader(io.StringIO(csv_text(rows))))
     assert [row["person"] for row in found] == ["a", "a", "a", "b", 'c, "d"']
-    assert float(found[-1]["psnr"]) == 1 / 3 and found[-1]["patch_psnr"] == "" and found[2]["frame"] == "1"
+    assert (
+        float(found[-1]["psnr"]) == 1 / 3
+        and found[-1]["patch_psnr"] == ""
+        and found[2]["frame"] == "1"
+    )
 
 
-HOSTILE = ("=1+1", "@SUM(A1)", "+cmd", "-2", " =1", "\uff1d1", "\t=1", "<img src=x onerror=alert(1)>", "a|b", "a\nb\x1b[2J")
+HOSTILE = (
+    "=1+1",
+    "@SUM(A1)",
+    "+cmd",
+    "-2",
+    " =1",
+    "\uff1d1",
+    "\t=1",
+    "<img src=x onerror=alert(1)>",
+    "a|b",
+    "a\nb\x1b[2J",
+)
 HOSTILE += ("[here](javascript:alert(1))", "\\|`x`", "\\input{secret}")
 
 
@@ -72,14 +106,22 @@ def test_names_are_names_in_every_table(name):
     for cell in (rows[1][0], rows[1][2]):
         assert cell.isprintable() and cell.lstrip()[0] not in "=+-@\uff1d"
     lines = markdown_table(["person", "PSNR"], [[name, "1.00"]]).splitlines()
-    assert len(lines) == 3 and lines[2].isprintable() and "<" not in lines[2] and "](" not in lines[2]
+    assert (
+        len(lines) == 3 and lines[2].isprintable() and "<" not in lines[2] and "](" not in lines[2]
+    )
     unescaped = lines[2].replace("\\\\", "").replace("\\|", "")
     assert unescaped.count("|") == 3 and "`" not in unescaped.replace("\\`", "")
-    (row,) = [line for line in latex_table(["person", "PSNR"], [[name, "1.00"]]).splitlines() if "1.00" in line]
+    (row,) = [
+        line
+        for line in latex_table(["person", "PSNR"], [[name, "1.00"]]).splitlines()
+        if "1.00" in line
+    ]
     assert "\\input" not in row and row.isprintable()
 
 
 @pytest.mark.parametrize("name", ["0012", "front", "a_b", "naïve 写真"])
 def test_usual_names_stay(name):
-    assert csv_text([Scored(name, 0, name, {"psnr": 1.0})]).splitlines()[1] == f"{name},0,{name},1.0"
+    assert (
+        csv_text([Scored(name, 0, name, {"psnr": 1.0})]).splitlines()[1] == f"{name},0,{name},1.0"
+    )
     assert f"| {name} |" in markdown_table(["person"], [[name]])

@@ -31,13 +31,27 @@ def with_rule_in_batch(size, batched, a):
 
 PRODUCTS = {
     "a product": (lambda a: a @ a, 1),
-    "one of three axes": (lambda a: jnp.einsum("bij,bjk->bik", jnp.stack([a, a]), jnp.stack([a, a])), 2),
+    "one of three axes": (
+        lambda a: jnp.einsum("bij,bjk->bik", jnp.stack([a, a]), jnp.stack([a, a])),
+        2,
+    ),
     "its gradient": (jax.grad(lambda a: jnp.sum(a @ a)), 2),
-    "recomputed for the gradient": (jax.grad(jax.checkpoint(lambda a: jnp.sum(jnp.sin(a @ a) @ a))), 5),
+    "recomputed for the gradient": (
+        jax.grad(jax.checkpoint(lambda a: jnp.sum(jnp.sin(a @ a) @ a))),
+        5,
+    ),
     "of what nobody reads": (lambda a: (a @ a, a)[1], 0),
     "in a loop": (lambda a: jax.lax.fori_loop(0, 7, lambda _, x: x @ a, a), 7),
-    "in loops": (lambda a: jax.lax.scan(lambda x, _: (jax.lax.map(lambda y: y @ a, x[None])[0], None), a, length=5), 5),
-    "in a branch": (lambda a: jax.lax.cond(a[0, 0] > 0, lambda x: x @ x @ x, lambda x: x @ x, a), 2),
+    "in loops": (
+        lambda a: jax.lax.scan(
+            lambda x, _: (jax.lax.map(lambda y: y @ a, x[None])[0], None), a, length=5
+        ),
+        5,
+    ),
+    "in a branch": (
+        lambda a: jax.lax.cond(a[0, 0] > 0, lambda x: x @ x @ x, lambda x: x @ x, a),
+        2,
+    ),
     "under vmap": (jax.vmap(lambda a: a @ a, axis_size=3, in_axes=None), 1),
     "with a rule for vmap": (with_rule, 1),
 }
@@ -58,7 +72,10 @@ def test_loops_of_unknown_length_count_once():
 def test_a_convolution_and_its_gradients(stride):
     image, kernel = jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 5))
     apply = functools.partial(
-        jax.lax.conv_general_dilated, window_strides=(stride, stride), padding="SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        jax.lax.conv_general_dilated,
+        window_strides=(stride, stride),
+        padding="SAME",
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
     )
     expected = 2 * (8 // stride) ** 2 * 9 * 3 * 5
     assert count(apply, image, kernel).convolutions == expected
@@ -80,10 +97,17 @@ def test_messages_of_one_device():
         summed = jax.lax.fori_loop(0, 5, lambda _, y: jax.lax.psum(y, "d"), whole)
         return jax.lax.psum_scatter(summed, "d", tiled=True)
 
-    costs = count(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False), jnp.zeros((64, 8)))
+    costs = count(
+        jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False),
+        jnp.zeros((64, 8)),
+    )
     whole = 4 * 64 * 8
     assert costs.messages == {"all_gather": 1, "psum": 5, "reduce_scatter": 1}
-    assert costs.sent == {"all_gather": whole * 3 // 4, "psum": 5 * 2 * whole * 3 // 4, "reduce_scatter": whole * 3 // 4}
+    assert costs.sent == {
+        "all_gather": whole * 3 // 4,
+        "psum": 5 * 2 * whole * 3 // 4,
+        "reduce_scatter": whole * 3 // 4,
+    }
 
 
 def test_temporaries():

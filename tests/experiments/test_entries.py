@@ -39,12 +39,16 @@ def restored_options():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_it_runs(name, tmp_path, capsys):
-    options = [word.replace("FOLDER", str(tmp_path)) for word in CASES[name].split()] + LAST.get(name, [])
+    options = [word.replace("FOLDER", str(tmp_path)) for word in CASES[name].split()] + LAST.get(
+        name, []
+    )
     assert call(function_of(name), [*options, "--json", str(tmp_path / "out.json")]) == 0
     assert "| " in capsys.readouterr().out
     stored = json.loads((tmp_path / "out.json").read_text())
     assert stored["numbers"] and stored["machine"]["cores"]
-    pictures = [word for word in options if word.startswith(str(tmp_path)) and word[-4:] in (".png", ".jpg")]
+    pictures = [
+        word for word in options if word.startswith(str(tmp_path)) and word[-4:] in (".png", ".jpg")
+    ]
     assert all((tmp_path / picture).is_file() for picture in pictures)
 
 

@@ -22,7 +22,13 @@ class Some:
     people: int = 2
 
 
-def toy(run: Run, folder: Path, some: Some = Some(3), sizes: tuple[float, ...] = (1.5,), way: Literal["a", "b"] = "a") -> None:
+def toy(
+    run: Run,
+    folder: Path,
+    some: Some = Some(3),
+    sizes: tuple[float, ...] = (1.5,),
+    way: Literal["a", "b"] = "a",
+) -> None:
     """A toy.
 
     Options:
@@ -30,8 +36,12 @@ def toy(run: Run, folder: Path, some: Some = Some(3), sizes: tuple[float, ...] =
         and more
     sizes: in metres
     """
-    rows = run.rows({str(i): lambda i=i: made(i) for i in range(some.people)}, {"way": way, "sizes": sizes})
-    run.show(f"{folder} {sizes}\n\n| a |\n|---|\n| 1 |", means([{"x": row} for row in rows.values()]))
+    rows = run.rows(
+        {str(i): lambda i=i: made(i) for i in range(some.people)}, {"way": way, "sizes": sizes}
+    )
+    run.show(
+        f"{folder} {sizes}\n\n| a |\n|---|\n| 1 |", means([{"x": row} for row in rows.values()])
+    )
 
 
 made = float
@@ -57,14 +67,21 @@ def test_rows_of_the_same_settings_are_kept(tmp_path, monkeypatch, capsys):
     assert asked == [0, 1, 2]
     stored = json.loads(out.read_text())
     assert stored["rows"] == {"0": 0, "1": 1, "2": 2} and stored["numbers"]["toy"] == {"x": 0.5}
-    assert stored["script"] == "python -m experiments toy" and stored["versions"]["jax"] and stored["date"]
+    assert (
+        stored["script"] == "python -m experiments toy"
+        and stored["versions"]["jax"]
+        and stored["date"]
+    )
     call(toy, ["x", "--people", "1", "--way", "b", "--json", str(out)])
     assert asked == [0, 1, 2, 0] and "other settings" in capsys.readouterr().out
     for text in ("not json", "[]", '{"psnr": 1}'):
         out.write_text(text)
         with pytest.raises(SystemExit):
             call(toy, ["x", "--json", str(out)])
-        assert "a.json: expected the JSON of an earlier run" in capsys.readouterr().err.splitlines()[-1]
+        assert (
+            "a.json: expected the JSON of an earlier run"
+            in capsys.readouterr().err.splitlines()[-1]
+        )
 
 
 def test_pictures_come_beside_rows_and_are_made_again():
@@ -84,7 +101,10 @@ def test_a_table_goes_to_the_page_that_shows_it(tmp_path, monkeypatch):
     (tmp_path / "README.md").write_text("")
     monkeypatch.setattr(results, "REPOSITORY", tmp_path)
     assert call(toy, ["x", "--publish", "--people", "1"]) == 0
-    assert page.read_text() == "before\n<!-- table: toy -->\nx (1.5,)\n\n| a |\n| --- |\n| 1 |\n<!-- end -->\nafter\n"
+    assert (
+        page.read_text()
+        == "before\n<!-- table: toy -->\nx (1.5,)\n\n| a |\n| --- |\n| 1 |\n<!-- end -->\nafter\n"
+    )
     written = json.loads((tmp_path / "docs/results/toy.json").read_text())
     assert written["numbers"] == {"x": 0} and written["arguments"] == "x --publish --people 1"
     with pytest.raises(SystemExit):
@@ -93,11 +113,23 @@ def test_a_table_goes_to_the_page_that_shows_it(tmp_path, monkeypatch):
 
 def test_the_list_imports_nothing_heavy_and_the_readme_has_all_names():
     code = "import sys; sys.argv[1:] = []; from experiments.harness import main; main(); print(sorted(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=results.REPOSITORY)
-    assert not {"jax", "numpy", "matplotlib"} & set(done.stdout.splitlines()[-1].replace("'", "").strip("[]").split(", "))
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=results.REPOSITORY,
+    )
+    assert not {"jax", "numpy", "matplotlib"} & set(
+        done.stdout.splitlines()[-1].replace("'", "").strip("[]").split(", ")
+    )
     readme = (harness.FOLDER / "README.md").read_text()
     for name, (_, line) in listed().items():
         assert f"{name} " in done.stdout and line, name
         assert f"`{name}" in readme, name
     for folder, pattern in (("results", "*.json"), ("images", "*.*")):
-        assert [x.name for x in (results.REPOSITORY / "docs" / folder).glob(pattern) if x.name not in readme] == []
+        assert [
+            x.name
+            for x in (results.REPOSITORY / "docs" / folder).glob(pattern)
+            if x.name not in readme
+        ] == []

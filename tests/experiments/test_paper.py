@@ -36,11 +36,20 @@ PEOPLE = 20
 
 def run(psnr, photos=4, done=True, seed=0, counts=(), curve=(10.0, 12.0, 12.1)):
     """A row whose test people have these scores, but for what differs between them."""
-    spread = np.random.default_rng(0).normal(0, 2, PEOPLE)  # shared by all runs: people differ more than variants
+    spread = np.random.default_rng(0).normal(
+        0, 2, PEOPLE
+    )  # shared by all runs: people differ more than variants
     noise = np.random.default_rng(seed + 1).normal(0, 0.05, PEOPLE)
     values = (psnr + spread + noise).tolist()
-    scores = {"psnr": values, "psnr_fg": values, "ssim": [0.9] * PEOPLE, "lpips_alex": [0.1] * PEOPLE}
-    by_count = {str(count): {"reconstruction": scores, "animation": scores} for count in (photos, *counts)}
+    scores = {
+        "psnr": values,
+        "psnr_fg": values,
+        "ssim": [0.9] * PEOPLE,
+        "lpips_alex": [0.1] * PEOPLE,
+    }
+    by_count = {
+        str(count): {"reconstruction": scores, "animation": scores} for count in (photos, *counts)
+    }
     return {
         "curve": list(curve), "validation": curve[-1], "done": done, "photos": photos, "steps": 40, "operations": 2e15,
         "parameters": 1000, "cpu_seconds": 60.0, **({"scores": by_count} if done else {}),
@@ -48,12 +57,17 @@ def run(psnr, photos=4, done=True, seed=0, counts=(), curve=(10.0, 12.0, 12.1)):
 
 
 def seeded(psnr, spread=0.1, **others):
-    return {str(seed): run(psnr + spread * step, seed=seed, **others) for seed, step in enumerate((-1, 0, 1))}
+    return {
+        str(seed): run(psnr + spread * step, seed=seed, **others)
+        for seed, step in enumerate((-1, 0, 1))
+    }
 
 
 @pytest.fixture
 def report():
-    painted = {"reconstruction": run(9.0)["scores"]["4"]["reconstruction"]} | {"animation": run(8.0)["scores"]["4"]["animation"]}
+    painted = {"reconstruction": run(9.0)["scores"]["4"]["reconstruction"]} | {
+        "animation": run(8.0)["scores"]["4"]["animation"]
+    }
     runs = {
         "paper": seeded(15.0, counts=(1, 2, 6, *bench.NEAR)),
         "ghg": seeded(14.0, counts=(1, 2, 6, *bench.NEAR)),
@@ -63,7 +77,11 @@ def report():
         "humanram": {"0": run(5.0, curve=(5.0, 9.0))},
     }
     settings = {"round_steps": 10, "people": 4, "test_people": PEOPLE}
-    return {"settings": settings, "painted": {"validation": 8.0, "test": {"4": painted}}, "runs": runs}
+    return {
+        "settings": settings,
+        "painted": {"validation": 8.0, "test": {"4": painted}},
+        "runs": runs,
+    }
 
 
 def test_the_reference_is_the_papers_network_in_small():
@@ -74,31 +92,58 @@ def test_the_reference_is_the_papers_network_in_small():
     assert encoder.texture == theirs[0].texture and encoder.upsampler.features == "intermediate"
     assert dataclasses.replace(encoder.transformer, **sizes) == theirs[0].transformer
     assert (reader.clone(output_width=768), decoder.clone(hidden=256)) == theirs[1:]
-    assert small.with_conventions(image_size=512, body_vertices=None).conventions == published.conventions
+    assert (
+        small.with_conventions(image_size=512, body_vertices=None).conventions
+        == published.conventions
+    )
     config = bench.configuration(bench.variants()[bench.REFERENCE], 0, 100, perceptual=True)
     loss, optimizer = config.loss, config.optimizer
-    assert (loss.squared, loss.vgg16, loss.tightness, loss.structural, loss.silhouette) == (1, 1, 0.1, 0, 0)
+    assert (loss.squared, loss.vgg16, loss.tightness, loss.structural, loss.silhouette) == (
+        1,
+        1,
+        0.1,
+        0,
+        0,
+    )
     assert (optimizer.learning_rate, optimizer.weight_decay, config.batch_size) == (4e-4, 0.05, 8)
 
 
 def test_variants_differ_from_the_reference_in_what_they_are_about():
     queue = bench.variants()
     models = [(variant.model, json.dumps(str(variant.fields))) for variant in queue.values()]
-    assert len(set(models)) == len(models) and len({bench.folder_of(name) for name in queue}) == len(queue)
+    assert len(set(models)) == len(models) and len(
+        {bench.folder_of(name) for name in queue}
+    ) == len(queue)
     back, cross = queue["back_projection"].model, queue["cross_attention"].model
-    assert back.with_parts(reader=cross.architecture.reader) == cross  # they differ in the reader alone
+    assert (
+        back.with_parts(reader=cross.architecture.reader) == cross
+    )  # they differ in the reader alone
     assert all(bench.configuration(x, 0, 8).loss.squared == 1 for x in queue.values())
     order = train_all.queue(3)
     assert order[0] == ("paper", 0) and len(set(order)) == len(order) == 3 * len(queue)
-    assert {name for name, _ in order[-3:]} == {"gps"} and bench.tests_of("gps", queue["gps"]) == ("4",)
-    assert order.index(("paper", 2)) < order.index(("no global token", 0)) < order.index(("lvsm", 1))
-    assert bench.tests_of("lhm", queue["lhm"]) == ("1",) and len(bench.tests_of("ghg", queue["ghg"])) == 8
+    assert {name for name, _ in order[-3:]} == {"gps"} and bench.tests_of("gps", queue["gps"]) == (
+        "4",
+    )
+    assert (
+        order.index(("paper", 2)) < order.index(("no global token", 0)) < order.index(("lvsm", 1))
+    )
+    assert (
+        bench.tests_of("lhm", queue["lhm"]) == ("1",)
+        and len(bench.tests_of("ghg", queue["ghg"])) == 8
+    )
 
 
 def test_a_run_ends_when_a_round_gains_nothing_and_counts_if_it_beats_the_painted_body():
     enough = lambda *curve: bench.enough(list(curve), 8.0)
-    assert not enough() and not enough(9.0) and not enough(9.0, 9.5) and not enough(5.0, 5.1)  # below the painted body
-    assert enough(10.0) and enough(9.0, 9.1) and enough(9.0, 9.5, 9.4) and enough(*[1.0] * bench.MOST_ROUNDS)
+    assert (
+        not enough() and not enough(9.0) and not enough(9.0, 9.5) and not enough(5.0, 5.1)
+    )  # below the painted body
+    assert (
+        enough(10.0)
+        and enough(9.0, 9.1)
+        and enough(9.0, 9.5, 9.4)
+        and enough(*[1.0] * bench.MOST_ROUNDS)
+    )
     rising = run(1.0, curve=(9.0, 9.9))
     assert bench.is_trained(rising, 7.9) and not bench.is_trained(rising, 8.0)
     assert not bench.is_trained(rising | {"done": False}, 1.0)
@@ -110,21 +155,36 @@ def test_a_run_ends_when_a_round_gains_nothing_and_counts_if_it_beats_the_painte
 def test_an_interval_covers_people_and_seeds(report):
     runs = report["runs"]
     found = bench.difference(runs, ("paper", 4), ("ghg", 4))
-    assert found.mean == pytest.approx(1.0, abs=0.05) and found.seeds == (3, 3) and found.people == PEOPLE
+    assert (
+        found.mean == pytest.approx(1.0, abs=0.05)
+        and found.seeds == (3, 3)
+        and found.people == PEOPLE
+    )
     # 3 pairs of groups with a standard deviation of 0.1: 8 degrees or so; people are paired, so that their spread does not count
     by_hand = 2.4 * 0.1 * (2 / 3) ** 0.5
     assert found.half == pytest.approx(by_hand, rel=0.15)
-    alone = bench.difference({name: {"0": runs[name]["0"]} for name in runs}, ("paper", 4), ("ghg", 4))
+    alone = bench.difference(
+        {name: {"0": runs[name]["0"]} for name in runs}, ("paper", 4), ("ghg", 4)
+    )
     assert alone.half is None and str(alone) == f"{alone.mean:+.2f}"
     assert bench.difference(runs, ("lhm", 1), ("paper", 4)).half > found.half  # one seed of three
 
 
 def test_verdicts_follow_from_intervals_and_need_trained_runs_of_three_seeds(report):
     pair = lambda a, b, count=4: claims.Pair((a, count), (b, count))
-    assert claims.judge(report, [pair("paper", "ghg"), pair("paper", "ghg", 1)]) == (claims.REPRODUCED, "")
-    assert claims.judge(report, [pair("paper", "ghg"), pair("paper", "giga")]) == (claims.CONTRADICTED, "")
+    assert claims.judge(report, [pair("paper", "ghg"), pair("paper", "ghg", 1)]) == (
+        claims.REPRODUCED,
+        "",
+    )
+    assert claims.judge(report, [pair("paper", "ghg"), pair("paper", "giga")]) == (
+        claims.CONTRADICTED,
+        "",
+    )
     report["runs"]["ghg"] = seeded(15.0, counts=(1, 2, 6, *bench.NEAR))
-    assert claims.judge(report, [pair("paper", "ghg")]) == (claims.NOT_TESTED, "an interval contains 0")
+    assert claims.judge(report, [pair("paper", "ghg")]) == (
+        claims.NOT_TESTED,
+        "an interval contains 0",
+    )
     verdict = claims.judge(report, [claims.Pair(("paper", 4), ("lhm", 1)), pair("paper", "lvsm")])
     assert verdict == (claims.NOT_TESTED, "`lhm` has 1 of 3 seeds, `lvsm` is not trained: 40 steps")
     assert "not trained: 0 steps" in claims.judge(report, [pair("paper", "gst")])[1]
@@ -133,9 +193,13 @@ def test_verdicts_follow_from_intervals_and_need_trained_runs_of_three_seeds(rep
 
 
 def test_every_claim_is_judged_and_names_variants_that_exist(report):
-    known = {(name, test) for name, x in bench.variants().items() for test in bench.tests_of(name, x)}
+    known = {
+        (name, test) for name, x in bench.variants().items() for test in bench.tests_of(name, x)
+    }
     for claim in claims.claims():
-        assert all({(name, str(test)) for name, test in (pair.a, pair.b)} <= known for pair in claim.pairs), claim.claim
+        assert all(
+            {(name, str(test)) for name, test in (pair.a, pair.b)} <= known for pair in claim.pairs
+        ), claim.claim
     rows = claims.judged(report, claims.claims())
     assert {row[3] for row in rows} == set(claims.VERDICTS)
 
@@ -145,7 +209,11 @@ def test_the_page_of_the_paper_says_what_the_results_say():
     rows = claims.judged(report, [*claims.claims(), *claims.of_cost(cost_numbers)])
     assert {row[0]: row[3] for row in rows} == bench.results("paper_claims")["verdicts"]
     page = bench.PAGE.read_text()
-    verdicts = [line.split("|")[4].split(":")[0].strip() for line in page.splitlines() if line.count("|") == 5]
+    verdicts = [
+        line.split("|")[4].split(":")[0].strip()
+        for line in page.splitlines()
+        if line.count("|") == 5
+    ]
     places = [claims.VERDICTS.index(verdict) for verdict in verdicts if verdict in claims.VERDICTS]
     assert places == sorted(places) and len(places) == len(rows)  # contradictions first
 
@@ -163,7 +231,12 @@ def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
     folder = people.write_plain(tmp_path / "p", "demo", 1, 6, size=64)
     near = people.write_plain(tmp_path / "near", "demo", 1, 6, 4, near=True)
     capture, close = (load_capture(next(x.glob("3*"))) for x in (folder, near))
-    assert capture.images.shape == (12, 64, 64, 3) and close.images.shape == (6, people.SIZE, people.SIZE, 3)
+    assert capture.images.shape == (12, 64, 64, 3) and close.images.shape == (
+        6,
+        people.SIZE,
+        people.SIZE,
+        3,
+    )
     assert close.masks.mean() > 1.3 * capture.masks.mean()
     assert load_capture(next(near.glob("3*")) / "held_out").frame_count == 2
     body = load_body()
@@ -173,13 +246,18 @@ def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
     make = lambda **how: people.on_disk(folder, **how)(config)
     both, one = make(), make(one_pose=True)
     targets = lambda source: {
-        x.targets.rotations.tobytes() != x.inputs.rotations[:1].tobytes() for i in range(12) for x in [source.example(0, i, 4)]
+        x.targets.rotations.tobytes() != x.inputs.rotations[:1].tobytes()
+        for i in range(12)
+        for x in [source.example(0, i, 4)]
     }
     assert targets(one) == {False} and targets(both) == {False, True}
     colored = make(recolored=True)
     plain, changed = both.example(0, 3, 4), colored.example(0, 3, 4)
     orders = itertools.permutations(range(3))
-    assert any(np.array_equal(plain.inputs.images[..., list(order)], changed.inputs.images) for order in orders)
+    assert any(
+        np.array_equal(plain.inputs.images[..., list(order)], changed.inputs.images)
+        for order in orders
+    )
     assert len({colored.example(0, i, 4).inputs.images.tobytes() for i in range(6)}) > 1
 
 
@@ -192,9 +270,14 @@ def test_the_queue_trains_and_goes_on(tmp_path, monkeypatch):
     report = json.loads((out / "results.json").read_text())
     row = report["runs"]["gps"]["0"]
     assert row["done"] and row["steps"] == 4 * len(row["curve"]) + 1 and row["operations"] > 0
-    assert list(row["scores"]["4"]) == ["reconstruction"] and len(row["scores"]["4"]["reconstruction"]["lpips_alex"]) == 2
+    assert (
+        list(row["scores"]["4"]) == ["reconstruction"]
+        and len(row["scores"]["4"]["reconstruction"]["lpips_alex"]) == 2
+    )
     before = (out / "results.json").stat().st_mtime_ns
-    assert call(train_all.paper, [str(out), "--quick", "--only", "gps"]) == 0  # nothing is left to do
+    assert (
+        call(train_all.paper, [str(out), "--quick", "--only", "gps"]) == 0
+    )  # nothing is left to do
     assert (out / "results.json").stat().st_mtime_ns == before
 
 
@@ -203,8 +286,18 @@ def measured_as(names, psnr=20.0):
 
     def measure(name, people, photos, varying=False):
         asked.append((name, people, photos, varying))
-        scores = {"psnr": psnr + photos + len(people.name if people else ""), "ssim": 0.9, "lpips_vgg": None}
-        found = {"photos": photos, "reconstruction": scores, "animation": scores, "model_s": 0.5, "frame_s": 0.01}
+        scores = {
+            "psnr": psnr + photos + len(people.name if people else ""),
+            "ssim": 0.9,
+            "lpips_vgg": None,
+        }
+        found = {
+            "photos": photos,
+            "reconstruction": scores,
+            "animation": scores,
+            "model_s": 0.5,
+            "frame_s": 0.01,
+        }
         return found if people and name in names else None
 
     return measure, asked
@@ -214,14 +307,27 @@ def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
     measure, asked = measured_as(["mine"])
     data, other, third = (tmp_path / name for name in ("p", "walking", "hats"))
     options = tables.Compared(data=data, other=(other, third))
-    texts = {name: table(["mine", "lhm"], measure, options) for name, table in tables.TABLES.items()}
+    texts = {
+        name: table(["mine", "lhm"], measure, options) for name, table in tables.TABLES.items()
+    }
     assert "| mine | 4 photos | 25.00 / 0.900 / - | 0.50 | 0.010 |" in texts["animation"]
-    assert ("mine", data, 4, True) in asked and ("mine", data, 4, False) in asked  # table 1 shows varying poses
+    assert ("mine", data, 4, True) in asked and (
+        "mine",
+        data,
+        4,
+        False,
+    ) in asked  # table 1 shows varying poses
     assert "| HumanGS | paper | 25.24 / 0.960 / 0.040 | 0.29 | 0.048 |" in texts["animation"]
     assert "| mine | standard | 22.00 / 0.900 / - |" in texts["views"]
     assert "| LVSM | paper | 24.38 / 0.960 / 0.036 | - |" in texts["reconstruction"]
-    assert "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |" in texts["domains"]
-    assert "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |" in texts["gaussians"]
+    assert (
+        "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |"
+        in texts["domains"]
+    )
+    assert (
+        "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |"
+        in texts["gaussians"]
+    )
 
 
 @pytest.mark.slow
@@ -233,9 +339,16 @@ def test_the_cost_of_the_readers_is_measured(tmp_path):
     assert [(row["views"], row["vertices"]) for row in rows] == [(1, 1000), (2, 1000), (1, 3000)]
     attention = [row["cross-attention"]["operations"] for row in rows]
     tokens, width = 8 * 8, 128
-    by_hand = 2 * 1000 * (39 * width + 2 * width**2 + 8 * width**2) + 4 * tokens * width**2 + 4 * 1000 * tokens * width
+    by_hand = (
+        2 * 1000 * (39 * width + 2 * width**2 + 8 * width**2)
+        + 4 * tokens * width**2
+        + 4 * 1000 * tokens * width
+    )
     assert attention[0] == pytest.approx(by_hand, rel=0.01)
-    assert all(row["back-projection"]["operations"] < 0.02 * row["cross-attention"]["operations"] for row in rows)
+    assert all(
+        row["back-projection"]["operations"] < 0.02 * row["cross-attention"]["operations"]
+        for row in rows
+    )
     assert files[1].stat().st_size > 1000
 
 
@@ -246,7 +359,11 @@ def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are():
     assert not set(frames[context]) & set(frames[target]) and len(target) == 32
     few = np.repeat([0, 1, 2], 4)  # the last pose is new
     context, target = rows.varied(few, 4)
-    assert few[context].tolist() == [0, 1, 0, 1] and len(set(context)) == 4 and few[target].tolist() == [2] * 4
+    assert (
+        few[context].tolist() == [0, 1, 0, 1]
+        and len(set(context)) == 4
+        and few[target].tolist() == [2] * 4
+    )
     assert rows.varied(np.zeros(8, int), 4) == ([], [])
 
 
@@ -256,9 +373,17 @@ def test_people_with_many_targets_come_in_parts(monkeypatch):
         return argparse.Namespace(names=("a", "b", "c"), load=load)
 
     monkeypatch.setattr(rows, "find_people", find)
-    views = {name: {"context": [0], "target": list(range(1, 1 + count))} for name, count in (("a", 450), ("c", 10))}
+    views = {
+        name: {"context": [0], "target": list(range(1, 1 + count))}
+        for name, count in (("a", 450), ("c", 10))
+    }
     found = list(rows.cases("somewhere", 4, None, views))
-    assert [(name, len(target)) for name, target in found] == [("a", 200), ("a", 200), ("a", 50), ("c", 10)]
+    assert [(name, len(target)) for name, target in found] == [
+        ("a", 200),
+        ("a", 200),
+        ("a", 50),
+        ("c", 10),
+    ]
     assert [x for name, target in found if name == "a" for x in target] == views["a"]["target"]
 
 
@@ -275,7 +400,12 @@ def checkpoint(path):
     encoder, reader, decoder = paper_parts(tiny().model.architecture)
     encoder, reader = encoder.clone(patch_size=64), reader.clone(sample_rgb=False, shells=())
     decoder = decoder.clone(frame="canonical", residual_color=False)
-    state = to_release(init_humangs(jax.random.key(0), published().with_parts(encoder=encoder, reader=reader, decoder=decoder)))
+    state = to_release(
+        init_humangs(
+            jax.random.key(0),
+            published().with_parts(encoder=encoder, reader=reader, decoder=decoder),
+        )
+    )
     state |= {"tpose_lbs_weights": np.zeros((10, 55), np.float32)}
     save_file({key: np.array(value) for key, value in state.items()}, path)
     return path
@@ -286,22 +416,55 @@ def checkpoint(path):
 def test_a_table_is_one_command_on_the_layout_of_its_data(layout, tmp_path, monkeypatch, capsys):
     """Rows: a checkpoint that was converted; of THuman also the weights that are shipped and a network trained by the command."""
     table, how = LAYOUTS[layout]
-    raw, converted, out = tmp_path / "raw", tmp_path / "converted.safetensors", tmp_path / "out.json"
+    raw, converted, out = (
+        tmp_path / "raw",
+        tmp_path / "converted.safetensors",
+        tmp_path / "out.json",
+    )
     data, body = made_up.WRITERS[layout](raw, vertices=800, **how), raw / "body.npz"
-    code, _, error = run_command(monkeypatch, capsys, "convert", checkpoint(tmp_path / "a.safetensors"), "--out", converted)
+    code, _, error = run_command(
+        monkeypatch, capsys, "convert", checkpoint(tmp_path / "a.safetensors"), "--out", converted
+    )
     assert code == 0, error
-    rows_wanted, options = ["converted"], ["--body", str(body), "--weights", f"converted={converted}", "--only", table]
+    rows_wanted, options = (
+        ["converted"],
+        ["--body", str(body), "--weights", f"converted={converted}", "--only", table],
+    )
     if layout == "thuman":
         for name, near in (("scenes", False), ("near", True)):
-            settings = Settings("thuman", size=64, views=10, factors=(2.0, 2.0) if near else (1.0, 1.75), supersample=1)
-            preprocess(data, tmp_path / name, str(body), dataclasses.replace(settings, train=1, test=1), progress=False)
+            settings = Settings(
+                "thuman",
+                size=64,
+                views=10,
+                factors=(2.0, 2.0) if near else (1.0, 1.75),
+                supersample=1,
+            )
+            preprocess(
+                data,
+                tmp_path / name,
+                str(body),
+                dataclasses.replace(settings, train=1, test=1),
+                progress=False,
+            )
         (tmp_path / "config.json").write_text(config_to_json(dataclasses.replace(tiny(), steps=2)))
         data, rows_wanted = tmp_path / "scenes" / "test.json", ["converted", "mine", rows.SHIPPED]
-        options += ["--other", str(tmp_path / "near" / "test.json"), "--train", str(tmp_path / "mine")]
-        options += ["--train-on", str(tmp_path / "scenes" / "train.json"), "--config", str(tmp_path / "config.json")]
+        options += [
+            "--other",
+            str(tmp_path / "near" / "test.json"),
+            "--train",
+            str(tmp_path / "mine"),
+        ]
+        options += [
+            "--train-on",
+            str(tmp_path / "scenes" / "train.json"),
+            "--config",
+            str(tmp_path / "config.json"),
+        ]
     else:
         # the shipped network takes long, and is a row of the other layout
-        monkeypatch.setattr(tables, "trained", lambda *given: {"converted": rows.trained(*given)["converted"]})
+        monkeypatch.setattr(
+            tables, "trained", lambda *given: {"converted": rows.trained(*given)["converted"]}
+        )
     if layout == "thuman4":
         chosen = tmp_path / "indices.json"
         chosen.write_text(json.dumps({"subject00": {"context": [0, 1, 2, 3], "target": [4, 8]}}))
@@ -310,19 +473,43 @@ def test_a_table_is_one_command_on_the_layout_of_its_data(layout, tmp_path, monk
     text = capsys.readouterr().out
     numbers = json.loads(out.read_text())["numbers"]["tables"]["rows"]
     assert all(f"| {name} | 4 photos |" in text for name in rows_wanted) and f"**{table}**" in text
-    key = {"avatarrex": "avatarrex_zzr, 4, varying poses", "thuman4": "subject00, 4", "thuman": "scenes, 4"}[layout]
+    key = {
+        "avatarrex": "avatarrex_zzr, 4, varying poses",
+        "thuman4": "subject00, 4",
+        "thuman": "scenes, 4",
+    }[layout]
     found = numbers[f"converted, {key}"]
-    tasks = {"avatarrex": {"animation"}, "thuman4": {"reconstruction", "animation"}, "thuman": {"reconstruction"}}[layout]
-    assert {task for task in bench.TASKS if found[task]} == tasks and all(0 < found[task][0] < 60 for task in tasks)
+    tasks = {
+        "avatarrex": {"animation"},
+        "thuman4": {"reconstruction", "animation"},
+        "thuman": {"reconstruction"},
+    }[layout]
+    assert {task for task in bench.TASKS if found[task]} == tasks and all(
+        0 < found[task][0] < 60 for task in tasks
+    )
     if layout == "thuman":
         assert numbers["converted, near, 4"]["reconstruction"] != found["reconstruction"]
 
 
 def test_a_system_without_animation_has_a_row_and_one_without_scores_of_the_first_people_has_none():
-    scores, options = {"psnr": 20.0, "ssim": 0.9}, tables.Compared(data=Path("a"), other=(Path("b"),))
-    found = {"photos": 4, "reconstruction": scores, "animation": None, "model_s": 1.5, "frame_s": 0.5}
-    measure = lambda name, people, photos, varying=False: found if name == "lvsm" or people == Path("b") else None
-    shown = {name: tables.TABLES[name](["lvsm", "others alone"], measure, options) for name in tables.TABLES}
+    scores, options = (
+        {"psnr": 20.0, "ssim": 0.9},
+        tables.Compared(data=Path("a"), other=(Path("b"),)),
+    )
+    found = {
+        "photos": 4,
+        "reconstruction": scores,
+        "animation": None,
+        "model_s": 1.5,
+        "frame_s": 0.5,
+    }
+    measure = lambda name, people, photos, varying=False: (
+        found if name == "lvsm" or people == Path("b") else None
+    )
+    shown = {
+        name: tables.TABLES[name](["lvsm", "others alone"], measure, options)
+        for name in tables.TABLES
+    }
     assert "| lvsm | 4 photos | - | 1.5 | 0.50 |" in shown["animation"]
     assert "| lvsm | 4 photos | 20.00 / 0.900 / - | 20.00 / 0.900 / - |" in shown["domains"]
     assert not any("others alone" in text for text in shown.values())
@@ -330,7 +517,9 @@ def test_a_system_without_animation_has_a_row_and_one_without_scores_of_the_firs
 
 def test_people_of_one_name_are_refused(tmp_path):
     options = tables.Compared(data=tmp_path / "a" / "x", near=tmp_path / "b" / "x")
-    with pytest.raises(ValueError, match="people in folders of one name: x, x: expected a name for each"):
+    with pytest.raises(
+        ValueError, match="people in folders of one name: x, x: expected a name for each"
+    ):
         tables.settings_of(options, ())
     assert tables.title(tmp_path / "scenes" / "test.json") == "scenes"
 
@@ -339,11 +528,25 @@ def test_people_of_one_name_are_refused(tmp_path):
 def test_training_at_the_published_size_starts():
     """A step of both stages of `--config paper`, on shapes alone: eight people at 256 pixels, then four at 512."""
     config, body = read_config("paper"), load_body()
-    state, networks = jax.eval_shape(lambda: init_state(config)), jax.eval_shape(lambda: random_networks(config))
-    assert sum(x.size for x in jax.tree.leaves(state.variables["params"])) == pytest.approx(98.8e6, rel=1e-3)
+    state, networks = (
+        jax.eval_shape(lambda: init_state(config)),
+        jax.eval_shape(lambda: random_networks(config)),
+    )
+    assert sum(x.size for x in jax.tree.leaves(state.variables["params"])) == pytest.approx(
+        98.8e6, rel=1e-3
+    )
     for start, people_a_step, side in ((0, 8, 256), (60_000, 4, 512)):
         part = config.at(start)
         batch = abstract_batch(part, len(body.parents), body.shape_directions.shape[-1])
-        assert batch.inputs.images.shape == batch.targets.images.shape == (people_a_step, 4, side, side, 3)
-        new, metrics = jax.eval_shape(functools.partial(update, config=part), state, batch, body, networks, seed_numbers(0))
-        assert jax.tree.map(jnp.shape, new.params) == jax.tree.map(jnp.shape, state.params) and metrics["loss"].shape == ()
+        assert (
+            batch.inputs.images.shape
+            == batch.targets.images.shape
+            == (people_a_step, 4, side, side, 3)
+        )
+        new, metrics = jax.eval_shape(
+            functools.partial(update, config=part), state, batch, body, networks, seed_numbers(0)
+        )
+        assert (
+            jax.tree.map(jnp.shape, new.params) == jax.tree.map(jnp.shape, state.params)
+            and metrics["loss"].shape == ()
+        )

@@ -40,8 +40,12 @@ def test_scores_by_task_are_means_over_views():
     truth, drawn = rng.random((2, 3, 48, 48, 3)).astype(np.float32)
     held_out = capture_from(truth, np.ones((3, 48, 48), np.float32), frames)
     found = subjects.score_tasks(drawn + 0.5, held_out)
-    assert found["novel"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 0), abs=1e-4)
-    assert found["animation"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 1), abs=1e-4)
+    assert found["novel"]["psnr"] == pytest.approx(
+        mean_psnr(drawn + 0.5, truth, frames == 0), abs=1e-4
+    )
+    assert found["animation"]["psnr"] == pytest.approx(
+        mean_psnr(drawn + 0.5, truth, frames == 1), abs=1e-4
+    )
     assert found["novel"]["lpips"] is None
     weights = random_lpips("alex")
     found = subjects.score_tasks(drawn + 0.5, held_out, weights)["animation"]["lpips"]
@@ -51,7 +55,11 @@ def test_scores_by_task_are_means_over_views():
 
 @pytest.mark.parametrize("function", [quality.evaluation_views, bodies.evaluation_bodies])
 def test_wrong_options_are_one_line(function, capsys):
-    for said, option in {"--views": "--views=5", "--subjects": "--subjects=0", "reach beyond": "--first=999999"}.items():
+    for said, option in {
+        "--views": "--views=5",
+        "--subjects": "--subjects=0",
+        "reach beyond": "--first=999999",
+    }.items():
         with pytest.raises(SystemExit) as exit_:
             run(function, option)
         assert exit_.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
@@ -67,17 +75,42 @@ def mean_psnr(drawn, truth, chosen):
 def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch):
     """People, reconstruction and drawing are real; every reported number is that of the images that were drawn."""
     made, ours, painted = [], [], []
-    make, draw, paint = subjects.make_evaluation_subject, quality.draw_views, quality.draw_painted_body
-    kept = lambda seen, images, truth: seen.append((images, truth.images, np.asarray(truth.frames))) or images
-    monkeypatch.setattr(subjects, "make_evaluation_subject", lambda *a: made.append(a[0]) or make(*a))
-    observed = lambda avatar, truth: SimpleNamespace(images=kept(ours, draw(avatar, truth).images, truth))
+    make, draw, paint = (
+        subjects.make_evaluation_subject,
+        quality.draw_views,
+        quality.draw_painted_body,
+    )
+    kept = lambda seen, images, truth: (
+        seen.append((images, truth.images, np.asarray(truth.frames))) or images
+    )
+    monkeypatch.setattr(
+        subjects, "make_evaluation_subject", lambda *a: made.append(a[0]) or make(*a)
+    )
+    observed = lambda avatar, truth: SimpleNamespace(
+        images=kept(ours, draw(avatar, truth).images, truth)
+    )
     monkeypatch.setattr(quality, "draw_views", observed)
-    monkeypatch.setattr(quality, "draw_painted_body", lambda colors, truth: kept(painted, paint(colors, truth), truth))
+    monkeypatch.setattr(
+        quality,
+        "draw_painted_body",
+        lambda colors, truth: kept(painted, paint(colors, truth), truth),
+    )
     out, first, second = tmp_path / "a.json", 2_000_000, 2_000_001
 
     def evaluated(*views):
         made.clear()
-        run(quality.evaluation_views, "--subjects", 2, "--weights", weights, "--json", out, *SMALL, "--views", *views)
+        run(
+            quality.evaluation_views,
+            "--subjects",
+            2,
+            "--weights",
+            weights,
+            "--json",
+            out,
+            *SMALL,
+            "--views",
+            *views,
+        )
         assert made == [first, second]
         return json.loads(out.read_text())["numbers"]["evaluation_views"]
 
@@ -89,21 +122,30 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
     for count, those in (("1", slice(2)), ("2", slice(2, 4))):
         for task, frames in (("novel", lambda x: x == 0), ("animation", lambda x: x != 0)):
             for key, seen in (("psnr", ours), ("baseline_psnr", painted)):
-                expected = np.mean([mean_psnr(images, truth, frames(at)) for images, truth, at in seen[those]])
+                expected = np.mean(
+                    [mean_psnr(images, truth, frames(at)) for images, truth, at in seen[those]]
+                )
                 assert numbers["by_views"][count][task][key] == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.slow
 def test_bodies_see_the_same_photos(weights, tmp_path, monkeypatch):
     seen, held_out = [], []
-    drawings = {"ours": lambda views: np.clip(views.images + 0.1, 0, 1), "painted": lambda views: 0.5 * views.images}
+    drawings = {
+        "ours": lambda views: np.clip(views.images + 0.1, 0, 1),
+        "painted": lambda views: 0.5 * views.images,
+    }
 
     def reconstructed(variables, config, capture):
         assert config.conventions.body_vertices is None and config.conventions.longest_edge is None
         seen.append((len(capture.body.template), capture.images))
-        return SimpleNamespace(gaussians=SimpleNamespace(means=np.zeros((3 * len(capture.body.template), 3))))
+        return SimpleNamespace(
+            gaussians=SimpleNamespace(means=np.zeros((3 * len(capture.body.template), 3)))
+        )
 
-    drawn = lambda avatar, views: held_out.append(views) or SimpleNamespace(images=drawings["ours"](views))
+    drawn = lambda avatar, views: (
+        held_out.append(views) or SimpleNamespace(images=drawings["ours"](views))
+    )
     for name, fake in {
         "SMPLX_SEED_VERTICES": 600,
         "reconstruct": reconstructed,
@@ -113,7 +155,18 @@ def test_bodies_see_the_same_photos(weights, tmp_path, monkeypatch):
     }.items():
         monkeypatch.setattr(bodies, name, fake)
     out = tmp_path / "a.json"
-    run(bodies.evaluation_bodies, "--subjects", 1, "--views", 1, "--weights", weights, "--json", out, *SMALL)
+    run(
+        bodies.evaluation_bodies,
+        "--subjects",
+        1,
+        "--views",
+        1,
+        "--weights",
+        weights,
+        "--json",
+        out,
+        *SMALL,
+    )
     assert [count for count, _ in seen] == [13380, 1796, 3345, 836]
     assert all(np.array_equal(images, seen[0][1]) for _, images in seen)
     found = json.loads(out.read_text())["numbers"]["evaluation_bodies"]["bodies"]
@@ -127,7 +180,20 @@ def test_bodies_see_the_same_photos(weights, tmp_path, monkeypatch):
 
 @pytest.mark.slow  # a person made, reconstructed and drawn
 def test_the_shipped_weights_beat_the_painted_body(tmp_path):
-    options = ("--subjects", 1, "--held-out", 1, "--poses", 1, "--pose-views", 1, "--size", 128, "--views", 4)
+    options = (
+        "--subjects",
+        1,
+        "--held-out",
+        1,
+        "--poses",
+        1,
+        "--pose-views",
+        1,
+        "--size",
+        128,
+        "--views",
+        4,
+    )
     out, plot = tmp_path / "a.json", tmp_path / "plot.png"
     run(quality.evaluation_views, *options, "--json", out)
     tasks = json.loads(out.read_text())["numbers"]["evaluation_views"]["by_views"]["4"]
@@ -141,9 +207,17 @@ def test_the_shipped_weights_beat_the_painted_body(tmp_path):
 
 def people(**psnrs):
     """Scores by number of photos and seed; seeds count from 1."""
-    base = {"ssim": 0.9, "lpips": None, "baseline_ssim": 0.8, "baseline_psnr_fg": 9.0, "baseline_psnr": 15.0}
+    base = {
+        "ssim": 0.9,
+        "lpips": None,
+        "baseline_ssim": 0.8,
+        "baseline_psnr_fg": 9.0,
+        "baseline_psnr": 15.0,
+    }
     scores = lambda psnr: base | {"psnr": psnr, "psnr_fg": psnr - 6, "baseline_lpips": None}
-    rows = lambda values: {seed: {"novel": scores(x), "animation": scores(x - 1)} for seed, x in enumerate(values, 1)}
+    rows = lambda values: {
+        seed: {"novel": scores(x), "animation": scores(x - 1)} for seed, x in enumerate(values, 1)
+    }
     return {int(count[1:]): rows(values) for count, values in psnrs.items()}
 
 
@@ -151,7 +225,11 @@ def test_it_is_told_where_more_photos_are_worse():
     said = quality.verdict(people(v1=[20], v2=[21], v4=[22]), 4, "novel")
     assert "never worse" in said and "1 of 1 people" in said
     said = quality.verdict(people(v1=[20], v2=[19.5], v4=[14]), 4, "animation")
-    assert "by 0.50 dB from 1 to 2" in said and "by 5.50 dB from 2 to 4" in said and "0 of 1 people" in said
+    assert (
+        "by 0.50 dB from 1 to 2" in said
+        and "by 5.50 dB from 2 to 4" in said
+        and "0 of 1 people" in said
+    )
 
 
 def test_the_section_has_means():
@@ -164,7 +242,9 @@ def test_the_section_has_means():
 
 
 def test_loosest_and_worst_people_are_listed_apart():
-    rows = [{"512 0 novel": {"before": {"psnr_fg": float(i)}}, "loose": -float(i)} for i in range(12)]
+    rows = [
+        {"512 0 novel": {"before": {"psnr_fg": float(i)}}, "loose": -float(i)} for i in range(12)
+    ]
     groups = appearance.groups_of(rows, "before")
     assert groups == {"all": rows, "10 loosest": rows[:10], "5 worst": rows[:5]}
     assert list(appearance.groups_of(rows[:10], "before")) == ["all"]
@@ -176,4 +256,7 @@ def test_a_body_that_is_off_is_off_by_the_same_in_all_poses():
     for array in (moved.rotations, moved.translation):
         np.testing.assert_array_equal(array[0], array[2])
         assert np.asarray(array).any()
-    assert np.asarray(betas).any() and not np.asarray(body_off(poses, jnp.zeros(5), 0.0, seed=1)[1]).any()
+    assert (
+        np.asarray(betas).any()
+        and not np.asarray(body_off(poses, jnp.zeros(5), 0.0, seed=1)[1]).any()
+    )

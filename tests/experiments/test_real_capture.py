@@ -87,6 +87,14 @@ def test_cameras_are_compared_after_one_similarity():
 
 
 def test_rows_are_means_over_their_cases_in_the_table_of_their_kind():
-    cases = {"33": {"iou": 0.7, "psnr": 19.5, "each_iou": [0.7, 0.8]}, "66": {"iou": 0.8, "psnr": 20.5, "each_iou": [0.9]}}
-    text = section({"calibrated, fit, detected": cases, "start": {"0": {"first": 125.0, "load": 2.0}}})
-    assert "| calibrated, fit, detected | 2 | 0.750 | - | 20.0 | - |" in text and "| start | 1 | 125 | - | - | - | 2 |" in text
+    cases = {
+        "33": {"iou": 0.7, "psnr": 19.5, "each_iou": [0.7, 0.8]},
+        "66": {"iou": 0.8, "psnr": 20.5, "each_iou": [0.9]},
+    }
+    text = section(
+        {"calibrated, fit, detected": cases, "start": {"0": {"first": 125.0, "load": 2.0}}}
+    )
+    assert (
+        "| calibrated, fit, detected | 2 | 0.750 | - | 20.0 | - |" in text
+        and "| start | 1 | 125 | - | - | - | 2 |" in text
+    )

@@ -11,9 +11,26 @@ from experiments.harness import call
 @pytest.mark.slow
 def test_counts_and_shares(tmp_path):
     out = tmp_path / "out.json"
-    shared = ["--preset", "tiny", "--size", "256", "--repeats", "1", "--views", "2", "--json", str(out)]
+    shared = [
+        "--preset",
+        "tiny",
+        "--size",
+        "256",
+        "--repeats",
+        "1",
+        "--views",
+        "2",
+        "--json",
+        str(out),
+    ]
     # fewer vertices than pixels of a map
-    assert call(reconstruction.reconstruction_benchmark, [*shared, "--memory", "1", "2", "--memory-size", "64"]) == 0
+    assert (
+        call(
+            reconstruction.reconstruction_benchmark,
+            [*shared, "--memory", "1", "2", "--memory-size", "64"],
+        )
+        == 0
+    )
     numbers = json.loads(out.read_text())["numbers"]
     found, memory = numbers["reconstruction_benchmark"], numbers["reconstruction_memory"]
     assert 0 < found["foreground"]["flops"] < found["all"]["flops"]

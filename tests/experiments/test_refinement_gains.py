@@ -15,18 +15,34 @@ from humangs_jax.body.model import rest_pose, shape_body
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
-SCORES = {"psnr": 27.44, "ssim": 0.9464, "psnr_fg": 18.75, "semi_transparent": 0.1, "psnr_boundary": 15.0, "lpips": None}
+SCORES = {
+    "psnr": 27.44,
+    "ssim": 0.9464,
+    "psnr_fg": 18.75,
+    "semi_transparent": 0.1,
+    "psnr_boundary": 15.0,
+    "lpips": None,
+}
 
 
 def test_gains_are_means_and_the_least_of_a_person():
     def row(*psnrs):
-        return {"256": {seconds: {"novel": {"psnr": psnr}} for seconds, psnr in zip(("0", "5"), psnrs, strict=True)}}
+        return {
+            "256": {
+                seconds: {"novel": {"psnr": psnr}}
+                for seconds, psnr in zip(("0", "5"), psnrs, strict=True)
+            }
+        }
 
     cell = refinement_means([row(20.0, 22.0), row(24.0, 24.5)])["256"]["5"]
     assert cell["novel"]["psnr"] == 23.25 and cell["least_gain"] == 0.5
 
 
-TIMES = {"reconstruct": (11.63, 0.291), "animate": (2.07, 0.0341), "render_held_out": (6.87, 0.1236)}
+TIMES = {
+    "reconstruct": (11.63, 0.291),
+    "animate": (2.07, 0.0341),
+    "render_held_out": (6.87, 0.1236),
+}
 DEMO = SCORES | {
     "views": {"input": 4, "held_out": 6},
     "image_size": [256, 256],
@@ -63,11 +79,15 @@ def test_details_are_squares_around_the_joints():
     body = load_body()
     rest = shape_body(body, jnp.zeros(2))
     head = rest.joints[body.joint_names.index("left_eye")]
-    cameras = orbit(head, 1.5, jnp.asarray([0.0, np.pi]), 0.0, intrinsics_from_fov(0.8, 64, 64), 64, 64)
+    cameras = orbit(
+        head, 1.5, jnp.asarray([0.0, np.pi]), 0.0, intrinsics_from_fov(0.8, 64, 64), 64, 64
+    )
     images = np.zeros((2, 64, 64, 3), np.float32)
     images[0, 24:40, 24:40] = [1, 0, 0]  # the middle of the picture: the face
     poses = jax.tree.map(lambda x: x[None], rest_pose(body))
-    capture = Capture(images, None, cameras, np.zeros(2, int), body, np.zeros(2, np.float32), poses, ("a", "b"))
+    capture = Capture(
+        images, None, cameras, np.zeros(2, int), body, np.zeros(2, np.float32), poses, ("a", "b")
+    )
     found = details(images[0], capture, 0)
     assert found.shape == (len(DETAILS), DETAIL_PIXELS, DETAIL_PIXELS, 3)
     np.testing.assert_allclose(found[0][40:56, 40:56].mean((0, 1)), [1, 0, 0], atol=0.01)

@@ -21,7 +21,9 @@ TABLE = "| run | PSNR | name |\n| --- | ---: | --- |\n| a | 1.0 | x |\n| b | 2.0
 def page(tmp_path):
     path = tmp_path / "docs" / "page.md"
     path.parent.mkdir()
-    path.write_text("before\n<!-- table: x -->\nold\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n")
+    path.write_text(
+        "before\n<!-- table: x -->\nold\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n"
+    )
     return path
 
 
@@ -29,7 +31,9 @@ def test_the_docs_show_what_is_in_their_json_files():
     assert render_pages(REPOSITORY, write=False) == []
 
 
-@pytest.mark.parametrize("path", sorted((REPOSITORY / "docs" / "results").glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((REPOSITORY / "docs" / "results").glob("*.json")), ids=lambda path: path.stem
+)
 def test_every_result_says_what_made_it(path):
     result = json.loads(path.read_text())
     assert result["script"]
@@ -40,10 +44,16 @@ def test_every_result_says_what_made_it(path):
 def section_of(name, numbers):
     """The text that the experiment behind a table makes of its numbers."""
     if name.startswith("refinement"):
-        return refinement.refinement_section(numbers["means"], numbers["settings"], numbers["people"])
+        return refinement.refinement_section(
+            numbers["means"], numbers["settings"], numbers["people"]
+        )
     if name.startswith("tradeoff"):
         result = stored("tradeoff")["numbers"]
-        table = tradeoff_report.preset_table if name == "tradeoff_presets" else tradeoff_report.point_table
+        table = (
+            tradeoff_report.preset_table
+            if name == "tradeoff_presets"
+            else tradeoff_report.point_table
+        )
         return table(tradeoff_report.rows_of(result), result)
     makers = {"paper": train_all.table, "paper_cost": cost.text_of}
     return (makers | {"splatting_tradeoff": splatting.knobs_table})[name](numbers)
@@ -53,7 +63,14 @@ def stored(name):
     return json.loads((REPOSITORY / "docs" / "results" / f"{name}.json").read_text())
 
 
-TABLES = ("refinement", "refinement_few", "refinement_off", "tradeoff", "tradeoff_presets", "splatting_tradeoff")
+TABLES = (
+    "refinement",
+    "refinement_few",
+    "refinement_off",
+    "tradeoff",
+    "tradeoff_presets",
+    "splatting_tradeoff",
+)
 
 
 @pytest.mark.parametrize("name", [*TABLES, "paper", "paper_cost"])
@@ -61,30 +78,53 @@ def test_a_table_is_what_its_experiment_makes_of_the_numbers(name):
     assert section_of(name, stored(name)["numbers"]) == text_of(stored(name)["blocks"])
 
 
-@pytest.mark.parametrize(("pattern", "begins"), [("*.jpg", b"\xff\xd8\xff"), ("*.png", b"\x89PNG"), ("*.gif", b"GIF8")])
+@pytest.mark.parametrize(
+    ("pattern", "begins"), [("*.jpg", b"\xff\xd8\xff"), ("*.png", b"\x89PNG"), ("*.gif", b"GIF8")]
+)
 def test_images_are_what_their_names_say(pattern, begins):
     images = list((REPOSITORY / "docs/images").glob(pattern))
-    assert images and not [image.name for image in images if not image.read_bytes().startswith(begins)]
+    assert images and not [
+        image.name for image in images if not image.read_bytes().startswith(begins)
+    ]
 
 
 def test_sections_are_data_and_text_again():
     text = f"One line,\nanother.\n\n{TABLE}\n\nMore."
     blocks = blocks_of(text)
-    assert blocks[1] == {"header": ["run", "PSNR", "name"], "align": "lrl", "rows": [["a", "1.0", "x"], ["b", "2.0", "y"]]}
+    assert blocks[1] == {
+        "header": ["run", "PSNR", "name"],
+        "align": "lrl",
+        "rows": [["a", "1.0", "x"], ["b", "2.0", "y"]],
+    }
     assert text_of(json.loads(json_text(blocks))) == text
 
 
 def test_a_result_is_written_beside_its_page(page, monkeypatch):
     monkeypatch.setattr(
-        sys, "argv", [str(REPOSITORY / "experiments" / "a.py"), "--size", "2", "/some/where/file.npz", "a=/b c/d.npz"]
+        sys,
+        "argv",
+        [
+            str(REPOSITORY / "experiments" / "a.py"),
+            "--size",
+            "2",
+            "/some/where/file.npz",
+            "a=/b c/d.npz",
+        ],
     )
     publish(page, "x", TABLE, {"psnr": 1.0})
     assert page.read_text() == (
         f"before\n<!-- table: x -->\n{TABLE}\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n"
     )
     result = json.loads((page.parent / "results" / "x.json").read_text())
-    assert (result["script"], result["arguments"]) == ("experiments/a.py", "--size 2 file.npz a=d.npz")
-    assert result["numbers"] == {"psnr": 1.0} and result["machine"]["cores"] > 0 and result["versions"]["jax"]
+    assert (result["script"], result["arguments"]) == (
+        "experiments/a.py",
+        "--size 2 file.npz a=d.npz",
+    )
+    assert (
+        result["numbers"] == {"psnr": 1.0}
+        and result["machine"]["cores"] > 0
+        and result["versions"]["jax"]
+    )
 
 
 def test_results_of_a_readme_are_in_its_docs(page):
@@ -99,16 +139,22 @@ def test_what_differs_is_reported_and_rendered(page):
     publish(page, "x", TABLE)
     publish(page, "y", "text")
     page.write_text(page.read_text().replace("1.0", "9.9"))
-    assert render_pages(page.parents[1], write=False) == ["page.md: differs from docs/results; run experiments/render_tables.py"]
+    assert render_pages(page.parents[1], write=False) == [
+        "page.md: differs from docs/results; run experiments/render_tables.py"
+    ]
     assert "9.9" in page.read_text()
     assert render_pages(page.parents[1], write=True) == [] and TABLE in page.read_text()
-    page.write_text(page.read_text().replace("table: y", "table: z").replace("<!-- end -->\nafter", ""))
+    page.write_text(
+        page.read_text().replace("table: y", "table: z").replace("<!-- end -->\nafter", "")
+    )
     assert [re.sub(r".*: ", "", fault) for fault in render_pages(page.parents[1], write=False)] == [
         "a table marker without its end",
         "shown on no page",
     ]
     page.write_text(page.read_text() + "<!-- end -->\n")
-    assert any("no docs/results/z.json" in fault for fault in render_pages(page.parents[1], write=False))
+    assert any(
+        "no docs/results/z.json" in fault for fault in render_pages(page.parents[1], write=False)
+    )
 
 
 def test_ends_are_where_the_loss_crosses_the_bound():

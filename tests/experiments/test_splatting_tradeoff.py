@@ -18,5 +18,15 @@ def test_errors_are_of_the_image_and_of_the_worst_gradient():
 
 
 def test_the_front_holds_what_nothing_beats():
-    assert staircase([(1, 100), (0.5, 40), (0.6, 39), (0.8, 60), (0.8, 55), (1.2, 99)]) == [(0.5, 40), (0.8, 60), (1, 100)]
-    assert [splatting.short(v) for v in (1 / 64, 0.05, 1e-3, 8, 2.5)] == ["1/64", "0.05", "0.001", "8", "2.5"]
+    assert staircase([(1, 100), (0.5, 40), (0.6, 39), (0.8, 60), (0.8, 55), (1.2, 99)]) == [
+        (0.5, 40),
+        (0.8, 60),
+        (1, 100),
+    ]
+    assert [splatting.short(v) for v in (1 / 64, 0.05, 1e-3, 8, 2.5)] == [
+        "1/64",
+        "0.05",
+        "0.001",
+        "8",
+        "2.5",
+    ]

@@ -26,13 +26,23 @@ ATTENDING = ("cross_attention", "lhm_views", "lhm_plus")
 OURS = (*ATTENDING, *ONE_PHOTO, "ghg")
 VERTICES, JOINTS, TEXELS = 21, 3, 8
 """Vertices: not a multiple of what pools or groups have."""
-PER_VIEW = ("images", "cameras", "posed_vertices", "position_maps", "depth_maps", "foreground", "posed_normals")
+PER_VIEW = (
+    "images",
+    "cameras",
+    "posed_vertices",
+    "position_maps",
+    "depth_maps",
+    "foreground",
+    "posed_normals",
+)
 
 
 def photos(name, **changes):
     inputs = random_inputs(views=1 if name in ONE_PHOTO else 2, vertices=VERTICES, **changes)
     rng = np.random.default_rng(2)
-    weights = rng.dirichlet([1, 1, 1], (TEXELS, TEXELS)) * (np.arange(TEXELS) > 0)[:, None, None]  # a row shows nothing
+    weights = (
+        rng.dirichlet([1, 1, 1], (TEXELS, TEXELS)) * (np.arange(TEXELS) > 0)[:, None, None]
+    )  # a row shows nothing
     corners = rng.integers(0, VERTICES, (TEXELS, TEXELS, 3))
     texels = Texels(jnp.asarray(corners, jnp.int32), jnp.asarray(weights, jnp.float32))
     skinning = jnp.asarray(rng.dirichlet([1] * JOINTS, VERTICES), jnp.float32)
@@ -46,7 +56,9 @@ def in_order(inputs, order):
 
 def outputs_of(name, inputs, config=None):
     config = config or small_system(name)
-    return jax.jit(lambda v, x: apply_humangs(v, x, config)[0].gaussians)(random_variables(config), inputs)
+    return jax.jit(lambda v, x: apply_humangs(v, x, config)[0].gaussians)(
+        random_variables(config), inputs
+    )
 
 
 def close(a, b, bound=2e-5):
@@ -89,7 +101,9 @@ def test_every_parameter_has_a_finite_gradient(name):
 def test_cameras_and_poses_of_the_photos_are_irrelevant(name):
     inputs, others = photos(name), photos(name, seed=1)
     geometry = ("posed_vertices", "position_maps", "depth_maps", "posed_normals")
-    changed = replace(inputs, cameras=others.cameras, **{field: getattr(others, field) for field in geometry})
+    changed = replace(
+        inputs, cameras=others.cameras, **{field: getattr(others, field) for field in geometry}
+    )
     given, moved = (outputs_of(name, x) for x in (inputs, changed))
     close(given, moved, bound=0)
     other_photo = outputs_of(name, replace(inputs, images=others.images))
@@ -100,7 +114,9 @@ def test_cameras_and_poses_of_the_photos_are_irrelevant(name):
 def test_a_second_photo_is_refused(name):
     config = small_system(name)
     with pytest.raises(ValueError, match="2 photos: this system takes 1"):
-        jax.eval_shape(lambda v: apply_humangs(v, random_inputs(views=2), config)[0], random_variables(config))
+        jax.eval_shape(
+            lambda v: apply_humangs(v, random_inputs(views=2), config)[0], random_variables(config)
+        )
 
 
 @pytest.mark.slow
@@ -119,14 +135,18 @@ def test_background_tokens_are_left_out_alike_by_encoder_and_reader():
     inputs = replace(inputs, foreground=inputs.foreground.at[:, :16].set(False))
     packed = config.with_conventions(tokens="foreground")
     roomy = outputs_of("", inputs, packed)
-    close(roomy, outputs_of("", inputs, packed.with_runtime(token_capacity=16)))  # 2 views, 2 of 4 rows of 4 patches
+    close(
+        roomy, outputs_of("", inputs, packed.with_runtime(token_capacity=16))
+    )  # 2 views, 2 of 4 rows of 4 patches
     dropped = outputs_of("", inputs, packed.with_runtime(token_capacity=15))
     assert np.abs(dropped.colors - roomy.colors).max() > 1e-5
 
 
 def test_attention_needs_a_token_a_patch_and_whole_heads():
     config = small_system("cross_attention")
-    encoder = dataclasses.replace(config.architecture.encoder, upsampler=UpsamplerConfig(hidden=8, features="final"))
+    encoder = dataclasses.replace(
+        config.architecture.encoder, upsampler=UpsamplerConfig(hidden=8, features="final")
+    )
     with pytest.raises(ValueError, match=r"encoder\.upsampler must be None"):
         random_variables(config.with_parts(encoder=encoder))
     for reader in (CrossAttentionReader, TwoStreamReader):
@@ -162,7 +182,9 @@ def test_a_group_token_moves_only_its_group():
 def test_a_body_that_has_no_room_in_the_groups_is_refused():
     config = small_system("gst")
     inputs, tokens = random_inputs(views=1, vertices=65), jnp.zeros((5, 4, WIDTH))
-    with pytest.raises(ValueError, match=r"a body of 65 vertices: 4 groups of decoder\.group_size 16 have 64"):
+    with pytest.raises(
+        ValueError, match=r"a body of 65 vertices: 4 groups of decoder\.group_size 16 have 64"
+    ):
         jax.eval_shape(lambda v: decode(v, tokens, inputs, config), random_variables(config))
 
 
@@ -183,8 +205,12 @@ def test_a_seen_texel_has_the_color_of_the_pixel_that_sees_it_best_and_every_mea
         away = cameras[view].center - points
         away = (away / jnp.linalg.norm(away, axis=-1, keepdims=True)).reshape(-1, TEXELS, TEXELS, 3)
         framed = jnp.all((pixels > 0) & (pixels < 32), axis=-1).reshape(away.shape[:-1])
-        facing.append(np.asarray(jnp.where(framed & texels.covered, jnp.sum(away * normals, axis=-1), 0)))
-    expected = np.where((facing[0] >= facing[1]).reshape(-1, 1), *colors).reshape(textures.colors.shape)
+        facing.append(
+            np.asarray(jnp.where(framed & texels.covered, jnp.sum(away * normals, axis=-1), 0))
+        )
+    expected = np.where((facing[0] >= facing[1]).reshape(-1, 1), *colors).reshape(
+        textures.colors.shape
+    )
     seen = np.maximum(*facing) > 0
     np.testing.assert_array_equal(textures.seen, seen)
     assert 0 < seen.mean() < 1
@@ -192,12 +218,16 @@ def test_a_seen_texel_has_the_color_of_the_pixel_that_sees_it_best_and_every_mea
 
     gaussians = decode(random_variables(config), textures, inputs, config).gaussians
     base = texels.interpolate(inputs.canonical_vertices / unit)
-    distances = np.linalg.norm(np.asarray(gaussians.means / unit).reshape(5, TEXELS, TEXELS, 3) - base, axis=-1)
+    distances = np.linalg.norm(
+        np.asarray(gaussians.means / unit).reshape(5, TEXELS, TEXELS, 3) - base, axis=-1
+    )
     shown = np.broadcast_to(texels.covered, distances.shape)
     steps = np.broadcast_to(np.asarray(DISTANCES)[:, None, None], distances.shape)
     np.testing.assert_allclose(distances[shown], steps[shown], atol=1e-5)
     opaque = np.asarray(gaussians.opacities).reshape(distances.shape) > 0
-    np.testing.assert_array_equal(opaque[0], texels.covered)  # filled from neighbours where no photo sees it
+    np.testing.assert_array_equal(
+        opaque[0], texels.covered
+    )  # filled from neighbours where no photo sees it
     np.testing.assert_array_equal(opaque[1:], seen[1:])
 
 
@@ -216,8 +246,12 @@ def test_unseen_texels_are_filled_from_their_neighbours():
 def test_shells_and_maps_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="expected ascending distances, the first 0"):
         ShellTextureReader(shells=(0.01, 0.02))
-    with pytest.raises(ValueError, match=r"maps of 6 x 6: a U-Net of 3 scales needs multiples of 4"):
-        jax.eval_shape(lambda: UNet((2, 2, 2), (1,)).init(jax.random.key(0), jnp.zeros((1, 6, 6, 1))))
+    with pytest.raises(
+        ValueError, match=r"maps of 6 x 6: a U-Net of 3 scales needs multiples of 4"
+    ):
+        jax.eval_shape(
+            lambda: UNet((2, 2, 2), (1,)).init(jax.random.key(0), jnp.zeros((1, 6, 6, 1)))
+        )
     inputs, config = photos("ghg"), small_system("ghg")
     with pytest.raises(ValueError, match="shell textures need texels"):
         read({}, encode({}, inputs, config), replace(inputs, texels=None), config)
@@ -227,6 +261,8 @@ def test_every_system_has_both_sizes_of_the_same_parts():
     for make in SYSTEMS.values():
         published, bench = make("published"), make("bench")
         assert bench.conventions.image_size == 32 < published.conventions.image_size
-        kinds = lambda config: [type(part) for part in (config.architecture.reader, config.architecture.decoder)]
+        kinds = lambda config: [
+            type(part) for part in (config.architecture.reader, config.architecture.decoder)
+        ]
         assert kinds(published) == kinds(bench)
     assert SYSTEMS["lhm_plus"]("bench").architecture.reader.pooling == 4

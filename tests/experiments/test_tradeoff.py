@@ -10,7 +10,14 @@ from experiments.tradeoff_report import points
 def row(name, reconstruct, frame, psnr, start="network", steps=0):
     scores = {task: {"psnr": psnr, "ssim": 0.9, "psnr_fg": psnr - 6} for task in report.TASKS}
     settings = {"refine_iterations": 0, "refine_steps": steps}
-    return {"name": name, "reconstruct": reconstruct, "frame": frame, "start": start, "size": 512, "settings": settings} | scores
+    return {
+        "name": name,
+        "reconstruct": reconstruct,
+        "frame": frame,
+        "start": start,
+        "size": 512,
+        "settings": settings,
+    } | scores
 
 
 def test_the_front_has_what_nothing_else_beats():
@@ -23,17 +30,31 @@ def test_the_front_has_what_nothing_else_beats():
         row("naive", 0.1, 0.1, 30, start="vertex-color baseline"),
         row("large", 0.1, 0.1, 30) | {"size": 1024},
     ]
-    assert [r["name"] for r in report.front_of(rows)] == ["fast", "slow", "slower to draw, better", "refined"]
+    assert [r["name"] for r in report.front_of(rows)] == [
+        "fast",
+        "slow",
+        "slower to draw, better",
+        "refined",
+    ]
     assert [report.kind(r) for r in rows[:3]] == ["feed-forward", "feed-forward", "refined"]
 
 
 def test_the_points_are_many_and_change_one_knob_each():
     found = points()
-    names, knobs = [p.name for p in found], {p.knob for p in found} - {"default", "combined", "preset"}
+    names, knobs = (
+        [p.name for p in found],
+        {p.knob for p in found} - {"default", "combined", "preset"},
+    )
     assert len(set(names)) == len(names) >= 60 and len(knobs) >= 8
     default = found[0]
-    assert len({(p.settings, p.size, p.start) for p in found if p.knob != "preset"}) == len(found) - 4
-    for each in (p for p in found if p.knob in ("photos", "photo size", "precision", "splat preset", "frame size")):
+    assert (
+        len({(p.settings, p.size, p.start) for p in found if p.knob != "preset"}) == len(found) - 4
+    )
+    for each in (
+        p
+        for p in found
+        if p.knob in ("photos", "photo size", "precision", "splat preset", "frame size")
+    ):
         changed = [
             (each.size, default.size),
             (each.settings.views, default.settings.views),

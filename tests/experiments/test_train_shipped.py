@@ -20,7 +20,9 @@ HALF_PRECISION = 2**-11
 """Relative: the file has float16."""
 
 
-@pytest.mark.parametrize(("given", "expected"), [("shipped", "shipped"), ("old.safetensors", Path("old.safetensors"))])
+@pytest.mark.parametrize(
+    ("given", "expected"), [("shipped", "shipped"), ("old.safetensors", Path("old.safetensors"))]
+)
 def test_the_shipped_weights_have_a_name(given, expected):
     wanted = typing.get_type_hints(train_shipped.main)["init_weights"]
 
@@ -32,7 +34,10 @@ def test_the_shipped_weights_have_a_name(given, expected):
 
 def test_the_mean_of_the_first_and_the_trained_weights(tmp_path):
     random = np.random.default_rng(0)
-    first, last = (jax.tree.map(lambda x: random.normal(size=x.shape), expected_variables(tiny())) for _ in range(2))
+    first, last = (
+        jax.tree.map(lambda x: random.normal(size=x.shape), expected_variables(tiny()))
+        for _ in range(2)
+    )
     save_weights(tmp_path / "weights.safetensors", last, tiny())
     train_shipped.write_mean(tmp_path, first, 0.25)
     mean, model = load_weights(tmp_path / "mean.safetensors")
@@ -50,7 +55,10 @@ def test_wrong_first_weights_are_an_error(tmp_path):
 
 def test_a_share_of_the_learning_rate_is_that_share_of_an_update(monkeypatch):
     state = TrainState(jnp.zeros((), jnp.int32), {"a": jnp.ones(3)}, {}, (), None)
-    step_on = lambda state, *_: (replace(state, step=state.step + 1, params={"a": state.params["a"] + 4}), {})
+    step_on = lambda state, *_: (
+        replace(state, step=state.step + 1, params={"a": state.params["a"] + 4}),
+        {},
+    )
     monkeypatch.setattr(train_by_clock, "update", step_on)
     step = train_by_clock.stepper(tiny())
     for at, decay in ((0, 0.1), (100_000, train_by_clock.EMA)):

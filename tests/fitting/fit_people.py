@@ -15,7 +15,13 @@ from humangs_jax.body.landmarks import LandmarkModel, landmark_model, pose_landm
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, SurfacePoints
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, SIDES, Keypoints, mirrored_name
+from humangs_jax.data.keypoints.keypoints import (
+    COCO_17,
+    COCO_WHOLEBODY_133,
+    SIDES,
+    Keypoints,
+    mirrored_name,
+)
 from humangs_jax.fitting.person_moments import PersonViews
 from humangs_jax.fitting.residuals.keypoints import make_observations
 from humangs_jax.fitting.state import MIRROR, pose_prior
@@ -55,9 +61,19 @@ SIZE = 512
 VIEWS = 4
 
 POSES = {
-    "standing": {"left_shoulder": (0, 0, -1.2), "left_elbow": (0, -0.4, 0), "left_hip": (-0.3, 0, 0), "left_knee": (0.5, 0, 0)},
+    "standing": {
+        "left_shoulder": (0, 0, -1.2),
+        "left_elbow": (0, -0.4, 0),
+        "left_hip": (-0.3, 0, 0),
+        "left_knee": (0.5, 0, 0),
+    },
     "arms above head": {"left_shoulder": (0, -0.2, 1.3), "left_elbow": (0, -0.3, 0)},
-    "crouching": {"left_hip": (-1.6, 0.2, 0.1), "left_knee": (1.9, 0, 0), "left_ankle": (-0.5, 0, 0), "spine1": (0.3, 0, 0)},
+    "crouching": {
+        "left_hip": (-1.6, 0.2, 0.1),
+        "left_knee": (1.9, 0, 0),
+        "left_ankle": (-0.5, 0, 0),
+        "spine1": (0.3, 0, 0),
+    },
     "lying": {"pelvis": (-np.pi / 2, 0, 0), "left_shoulder": (0, 0, -1.0)},
     "facing away": {"pelvis": (0, 3.0, 0), "left_elbow": (0, -1.0, 0)},
 }
@@ -69,7 +85,9 @@ def rotations_of(pose):
     for name, vector in POSES[pose].items():
         rotations[JOINT_NAMES.index(name)] = vector
         if name.startswith("left_"):
-            rotations[JOINT_NAMES.index(name.replace("left", "right"))] = MIRROR * np.asarray(vector)
+            rotations[JOINT_NAMES.index(name.replace("left", "right"))] = MIRROR * np.asarray(
+                vector
+            )
     return rotations
 
 
@@ -84,15 +102,23 @@ def model_of(names=COCO_WHOLEBODY_133.names):
 
 
 def betas_of(seed):
-    return np.random.default_rng(seed).normal(0, 0.7, default_body().shape_directions.shape[-1]).astype(np.float32)
+    return (
+        np.random.default_rng(seed)
+        .normal(0, 0.7, default_body().shape_directions.shape[-1])
+        .astype(np.float32)
+    )
 
 
 @functools.partial(jax.jit, static_argnames="views")
 def _truth(model, betas, rotations, translations, turn, views):
-    landmarks, joints = jax.vmap(lambda r, t: pose_landmarks(model, betas, BodyPose(r, t)))(rotations, translations)
+    landmarks, joints = jax.vmap(lambda r, t: pose_landmarks(model, betas, BodyPose(r, t)))(
+        rotations, translations
+    )
     azimuths = turn + jnp.arange(views) * (2 * jnp.pi / views)
     K = intrinsics_from_fov(1.0, SIZE, SIZE)
-    place = lambda center: orbit(center, jnp.full(views, 3.4), azimuths, jnp.full(views, 0.15), K, SIZE, SIZE)
+    place = lambda center: orbit(
+        center, jnp.full(views, 3.4), azimuths, jnp.full(views, 0.15), K, SIZE, SIZE
+    )
     return landmarks, joints, jax.vmap(place)(joints.mean(1))
 
 
@@ -102,7 +128,9 @@ def observe(poses, *, seed=0, views=VIEWS, noise=0.0, outliers=0.0, model=None):
     rotations = np.stack([rotations_of(pose) for pose in poses])
     translations = rng.uniform(-0.5, 0.5, (len(poses), 3)).astype(np.float32)
     betas = betas_of(seed)
-    landmarks, joints, cameras = _truth(model, betas, rotations, translations, rng.uniform(0, 6), views)
+    landmarks, joints, cameras = _truth(
+        model, betas, rotations, translations, rng.uniform(0, 6), views
+    )
     K, pose = np.asarray(cameras.K), np.asarray(cameras.cam_from_world)
     seen = np.einsum("mcab,mkb->mcka", pose[..., :3, :3], landmarks) + pose[..., None, :3, 3]
     pixels = seen[..., :2] / seen[..., 2:] * K[..., None, [0, 1], [0, 1]] + K[..., None, :2, 2]
@@ -124,7 +152,9 @@ def _landmarks(names):
     return jax.jit(jax.vmap(lambda pose: pose_landmarks(model, jnp.zeros(4), pose)[0]))
 
 
-def person(seed, frames, views, *, still=False, even=False, moving=False, outliers=0.0, kind=COCO_17):
+def person(
+    seed, frames, views, *, still=False, even=False, moving=False, outliers=0.0, kind=COCO_17
+):
     """A capture and noisy keypoints of it, views of a frame one after the other, named m0v0, m0v1, ...
 
     still: cameras are the same for all frames. even: evenly spaced around the person. moving: from one pose to another in 8
@@ -139,13 +169,18 @@ def person(seed, frames, views, *, still=False, even=False, moving=False, outlie
         rotations[:, 0] = rotations[0, 0]
         whole, share = np.divmod(np.arange(frames) / 8, 1)
         share = (1 - np.cos(np.pi * share[:, None, None])) / 2
-        rotations = rotations[whole.astype(int)] * (1 - share) + rotations[whole.astype(int) + 1] * share
+        rotations = (
+            rotations[whole.astype(int)] * (1 - share) + rotations[whole.astype(int) + 1] * share
+        )
     poses = jax.vmap(BodyPose)(jnp.asarray(rotations, jnp.float32), jnp.zeros((frames, 3)))
     cameras = _cameras(rng, frames, views, still, even)
     landmarks = np.asarray(_landmarks(kind.names)(poses))
     frame_of = np.repeat(np.arange(frames), views)
     matrices = np.asarray(cameras.cam_from_world)
-    local = np.einsum("vab,vkb->vka", matrices[:, :3, :3], landmarks[frame_of]) + matrices[:, None, :3, 3]
+    local = (
+        np.einsum("vab,vkb->vka", matrices[:, :3, :3], landmarks[frame_of])
+        + matrices[:, None, :3, 3]
+    )
     points = local[..., :2] / local[..., 2:] * np.asarray(cameras.K)[0, 0, 0] + PHOTO_SIZE / 2
     points += rng.normal(0, NOISE, points.shape)
     wild = rng.random(points.shape[:2]) < outliers
@@ -160,7 +195,9 @@ def person(seed, frames, views, *, still=False, even=False, moving=False, outlie
         poses=poses,
         names=tuple(f"m{m}v{v}" for m in range(frames) for v in range(views)),
     )
-    return capture, Keypoints(points.astype(np.float32), np.ones(points.shape[:2], np.float32), kind)
+    return capture, Keypoints(
+        points.astype(np.float32), np.ones(points.shape[:2], np.float32), kind
+    )
 
 
 def _cameras(rng, frames, views, still, even):
@@ -168,12 +205,32 @@ def _cameras(rng, frames, views, still, even):
     starts = np.full(frames, 0.3) if still else rng.uniform(0, 2 * np.pi, frames)
     uneven = 0 if even else rng.uniform(-0.3, 0.3, views)
     azimuths = (starts[:, None] + (np.arange(views) + uneven) * 2 * np.pi / views).ravel()
-    return orbit(jnp.asarray([0.0, -0.3, 0.0]), 2.8, jnp.asarray(azimuths, jnp.float32), 0.1, K, PHOTO_SIZE, PHOTO_SIZE)
+    return orbit(
+        jnp.asarray([0.0, -0.3, 0.0]),
+        2.8,
+        jnp.asarray(azimuths, jnp.float32),
+        0.1,
+        K,
+        PHOTO_SIZE,
+        PHOTO_SIZE,
+    )
 
 
 # As a detector sees them: pixels, and 3D landmarks with the errors that it makes ---------------------------------------
 
-PARTS = ("eye", "ear", "shoulder", "elbow", "wrist", "index_1", "hip", "knee", "ankle", "heel", "big_toe")
+PARTS = (
+    "eye",
+    "ear",
+    "shoulder",
+    "elbow",
+    "wrist",
+    "index_1",
+    "hip",
+    "knee",
+    "ankle",
+    "heel",
+    "big_toe",
+)
 NAMES = ("nose", *(f"{side}_{part}" for part in PARTS for side in SIDES))
 MIRRORED = [NAMES.index(mirrored_name(name)) for name in NAMES]
 FOCAL, PHONE, DISTANCE = 1680.0, (1088, 1920), 3.6
@@ -197,10 +254,19 @@ def cameras_around(views, seed=0):
     matrices = []
     for azimuth in 2 * np.pi * (np.arange(views) + rng.uniform(-0.25, 0.25, views)) / max(views, 3):
         pitch, roll = rng.normal(0.1, 0.1), rng.normal(0, 0.03)
-        rotation = turned([0, 0, roll]) @ turned([pitch, 0, 0]) @ turned([np.pi, 0, 0]) @ turned([0, azimuth, 0])
+        rotation = (
+            turned([0, 0, roll])
+            @ turned([pitch, 0, 0])
+            @ turned([np.pi, 0, 0])
+            @ turned([0, azimuth, 0])
+        )
         matrix = np.eye(4)
         matrix[:3, :3] = rotation
-        matrix[:3, 3] = [rng.uniform(-0.2, 0.2), rng.uniform(-0.1, 0.1), DISTANCE * rng.uniform(0.9, 1.2)]
+        matrix[:3, 3] = [
+            rng.uniform(-0.2, 0.2),
+            rng.uniform(-0.1, 0.1),
+            DISTANCE * rng.uniform(0.9, 1.2),
+        ]
         matrices.append(matrix)
     return np.asarray(matrices)
 
@@ -212,12 +278,18 @@ def seen_by(landmarks, matrices, *, seed=0, pixels=0.0, world=0.0, turn=0.0, siz
     rng, views = np.random.default_rng(seed), len(matrices)
     landmarks = np.broadcast_to(landmarks, (views, *landmarks.shape[-2:]))
     local = np.einsum("cab,ckb->cka", matrices[:, :3, :3], landmarks) + matrices[:, None, :3, 3]
-    points = local[..., :2] / local[..., 2:] * FOCAL + np.asarray(PHONE) / 2 + rng.normal(0, 1, (*local.shape[:2], 2)) * pixels
+    points = (
+        local[..., :2] / local[..., 2:] * FOCAL
+        + np.asarray(PHONE) / 2
+        + rng.normal(0, 1, (*local.shape[:2], 2)) * pixels
+    )
     hips = local[:, [NAMES.index("left_hip"), NAMES.index("right_hip")]].mean(1)
     own = []
     for each, middle in zip(local, hips, strict=True):
         x, y, z = middle
-        look = turned([0, np.arctan2(x, z), 0]) @ turned([-np.arctan2(y, np.hypot(x, z)), 0, 0])  # z to the ray
+        look = turned([0, np.arctan2(x, z), 0]) @ turned(
+            [-np.arctan2(y, np.hypot(x, z)), 0, 0]
+        )  # z to the ray
         own.append((each - middle) @ look @ turned(np.deg2rad(turn) * rng.normal(0, 1, 3)))
     own = size * np.asarray(own) + world * rng.normal(0, 1, local.shape)
     return PersonViews(

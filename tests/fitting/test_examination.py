@@ -28,7 +28,9 @@ from humangs_jax.fitting.swaps import Swap
 from humangs_jax.io.images import read_image
 
 FRAMES, VIEWS = 4, 4
-NOSE, LEFT_WRIST, RIGHT_WRIST = (COCO_17.names.index(name) for name in ("nose", "left_wrist", "right_wrist"))
+NOSE, LEFT_WRIST, RIGHT_WRIST = (
+    COCO_17.names.index(name) for name in ("nose", "left_wrist", "right_wrist")
+)
 RAYLEIGH = {0.5: 1.177, 0.9: 2.146}
 """Quantiles of the length of a vector whose two components have a standard deviation of 1."""
 
@@ -59,9 +61,13 @@ def test_a_good_fit_and_one_with_outliers(good):
     assert [view.frame for view in report.views] == capture.frames.tolist()
     assert all(view.keypoints == 17 and view.outliers == 0 for view in report.views)
     for field, share in (("median", 0.5), ("high", 0.9)):
-        assert np.mean([getattr(view, field) for view in report.views]) == pytest.approx(RAYLEIGH[share] * NOISE, rel=0.12)
+        assert np.mean([getattr(view, field) for view in report.views]) == pytest.approx(
+            RAYLEIGH[share] * NOISE, rel=0.12
+        )
     errors = np.linalg.norm(examination.landmarks - keypoints.points, axis=-1)
-    np.testing.assert_allclose([np.median(own) for own in errors], [view.median for view in report.views], rtol=1e-5)
+    np.testing.assert_allclose(
+        [np.median(own) for own in errors], [view.median for view in report.views], rtol=1e-5
+    )
 
     def displace(points, confidences):
         points[5, NOSE] += 40
@@ -71,8 +77,13 @@ def test_a_good_fit_and_one_with_outliers(good):
 
     examination = examine(capture, with_points(keypoints, displace))
     assert np.argwhere(examination.outliers).tolist() == [[5, NOSE], [9, LEFT_WRIST]]
-    assert not examination.compared[9, NOSE] and examination.compared.sum() == examination.compared.size - 1
-    assert examination.report.views[9].keypoints == 16 and examination.report.views[9].outliers == pytest.approx(1 / 16)
+    assert (
+        not examination.compared[9, NOSE]
+        and examination.compared.sum() == examination.compared.size - 1
+    )
+    assert examination.report.views[9].keypoints == 16 and examination.report.views[
+        9
+    ].outliers == pytest.approx(1 / 16)
     assert examination.report.ok  # a detector may err at times
 
 
@@ -80,10 +91,15 @@ def test_a_good_fit_and_one_with_outliers(good):
 def test_a_camera_that_was_moved(good):
     capture, keypoints = good
     matrices = capture.cameras.cam_from_world.at[6, 0, 3].add(0.3)
-    report = examine(dataclasses.replace(capture, cameras=replace(capture.cameras, cam_from_world=matrices)), keypoints).report
+    report = examine(
+        dataclasses.replace(capture, cameras=replace(capture.cameras, cam_from_world=matrices)),
+        keypoints,
+    ).report
     cause, warning = report.warnings
     assert cause.startswith("camera m1v2 is off by ")
-    assert warning.startswith("body and keypoints disagree in view m1v2: ") and f"warning: {warning}" in str(report)
+    assert warning.startswith(
+        "body and keypoints disagree in view m1v2: "
+    ) and f"warning: {warning}" in str(report)
     assert np.argmax([view.median for view in report.views]) == 6
 
 
@@ -105,7 +121,9 @@ def test_exchanged_hands_are_told_and_explain_the_sides_of_their_view_and_no_cam
     capture, keypoints = person(0, 1, 2, kind=KeypointSet("wrists", names, (1, 0, 3, 2, 4)))
     cameras, other = Swap("cameras", ("m0v0", "m0v1")), Swap("sides", ("m0v0",))
     either = Swap("sides", ("m0v0",), instead=("m0v1",))
-    monkeypatch.setattr(fit_capture, "find_swaps", lambda *_: (cameras, Swap("sides", ("m0v1",)), either, other))
+    monkeypatch.setattr(
+        fit_capture, "find_swaps", lambda *_: (cameras, Swap("sides", ("m0v1",)), either, other)
+    )
 
     def exchange(points, _):
         points[1, 2:4] = points[1, [3, 2]]
@@ -119,7 +137,9 @@ def test_exchanged_hands_are_told_and_explain_the_sides_of_their_view_and_no_cam
 
 def test_joints_that_turn_too_far(good):
     capture, keypoints = good
-    bent = turned(turned(capture, "left_knee", 2, (-0.9, 0.0, 0.0)), "right_elbow", 0, (0.0, -0.27, 0.0))
+    bent = turned(
+        turned(capture, "left_knee", 2, (-0.9, 0.0, 0.0)), "right_elbow", 0, (0.0, -0.27, 0.0)
+    )
     for joint, beyond in (("left_knee", 0.049), ("right_knee", 0.051)):
         bent = turned(bent, joint, 1, (-0.15 - beyond, 0.0, 0.0))
     examination = examine(bent, keypoints)
@@ -128,7 +148,9 @@ def test_joints_that_turn_too_far(good):
     assert found[0, "right_elbow", "y"] == pytest.approx(np.rad2deg(0.27 - 0.15), abs=0.01)
     assert (1, "right_knee", "x") in found and (1, "left_knee", "x") not in found
     (warning,) = [warning for warning in examination.report.warnings if "beyond" in warning]
-    assert warning == "left_knee is 43 degrees beyond its limit about x, in frame 2"  # the elbow by 7 is no matter
+    assert (
+        warning == "left_knee is 43 degrees beyond its limit about x, in frame 2"
+    )  # the elbow by 7 is no matter
 
 
 def test_frames_and_views_without_keypoints(good):
@@ -138,7 +160,9 @@ def test_frames_and_views_without_keypoints(good):
         confidences[[1, 8, 9, 10, 11]] = 0
 
     examination = examine(capture, with_points(keypoints, hide))
-    assert examination.report.views[1].keypoints == 0 and np.isnan(examination.report.views[1].median)
+    assert examination.report.views[1].keypoints == 0 and np.isnan(
+        examination.report.views[1].median
+    )
     assert examination.report.warnings == ("no keypoints in view m0v1, m2v0, m2v1, m2v2, m2v3",)
     assert "nan" not in str(examination.report)
     nothing = examine(capture, with_points(keypoints, lambda _, confidences: confidences.fill(0)))
@@ -151,7 +175,9 @@ def test_frames_without_views(good):
     capture, keypoints = good
     some = [0, 1, 2, 3, 8, 9, 10, 11]
     chosen = with_points(keypoints, lambda points, confidences: None)
-    chosen = dataclasses.replace(chosen, points=chosen.points[some], confidences=chosen.confidences[some])
+    chosen = dataclasses.replace(
+        chosen, points=chosen.points[some], confidences=chosen.confidences[some]
+    )
     record = record_of(capture, keypoints, np.arange(FRAMES * VIEWS), noise=np.ones(FRAMES))
     examination = examine(capture.select(some), chosen, record)
     assert [view.frame for view in examination.report.views] == [0] * 4 + [2] * 4
@@ -169,7 +195,9 @@ def test_the_table_is_of_the_views_that_fit_worst():
     text = str(examine(capture, with_points(keypoints, displace)).report)
     rows = [line for line in text.splitlines() if line[:1] == "m" and line[2:3] == "v"]
     assert len(rows) == ROWS and "... " in text and "3 more that fit better" in text
-    assert any(row.startswith("m4v1") for row in rows) and any(row.startswith("m8v2") and "0" in row for row in rows)
+    assert any(row.startswith("m4v1") for row in rows) and any(
+        row.startswith("m8v2") and "0" in row for row in rows
+    )
     assert "worst in frame 4" in text
 
 
@@ -186,7 +214,12 @@ def test_undetermined_joints_are_named_in_groups():
     determined[1, [index("right_index1"), index("left_eye")]] = 0
     joint_std[:2, index("left_ankle")] = 2 * UNSURE
     found = undetermined_joints(JOINT_NAMES, joint_std[:2], determined[:2])
-    assert found == ("left hand", "left_ankle", "left_eye (in 1 of 2 frames)", "right_index1 (in 1 of 2 frames)")
+    assert found == (
+        "left hand",
+        "left_ankle",
+        "left_eye (in 1 of 2 frames)",
+        "right_index1 (in 1 of 2 frames)",
+    )
 
 
 def test_warnings_stay_few():
@@ -195,8 +228,12 @@ def test_warnings_stay_few():
     found = keypoint_warnings(fits, np.full(1, 5.0), [], swaps)
     assert len(found) == NAMED + 3
     assert found[NAMED] == "7 more views or pairs of views seem exchanged"
-    assert found[NAMED + 1].endswith("in view v20, v21, v22, v23, v24 and 5 more: median error 21 to 30 px")
-    assert found[NAMED + 2] == "many keypoints are outliers in view v1, v3, v5, v7, v9 and 5 more: 50%"
+    assert found[NAMED + 1].endswith(
+        "in view v20, v21, v22, v23, v24 and 5 more: median error 21 to 30 px"
+    )
+    assert (
+        found[NAMED + 2] == "many keypoints are outliers in view v1, v3, v5, v7, v9 and 5 more: 50%"
+    )
 
 
 # Of what a fit kept --------------------------------------------------------------------------------------------------
@@ -204,10 +241,14 @@ def test_warnings_stay_few():
 
 def record_of(capture, keypoints, order, **changes):
     shape = (FRAMES, len(default_body().joint_names))
-    values: dict = dict(noise=np.full(FRAMES, 2.0), joint_std=np.full(shape, 0.001), determined=np.ones(shape))
+    values: dict = dict(
+        noise=np.full(FRAMES, 2.0), joint_std=np.full(shape, 0.001), determined=np.ones(shape)
+    )
     values |= {"shape_covariance": np.eye(4)} | changes
     names = tuple(capture.names[i] for i in order)
-    shuffled = dataclasses.replace(keypoints, points=keypoints.points[order], confidences=keypoints.confidences[order])
+    shuffled = dataclasses.replace(
+        keypoints, points=keypoints.points[order], confidences=keypoints.confidences[order]
+    )
     return FitRecord(shuffled, names, **values)
 
 
@@ -244,7 +285,9 @@ def drawn(sheet, color):
 
 
 @pytest.mark.slow
-def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_lines_lead_to_the_body(tmp_path):
+def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_lines_lead_to_the_body(
+    tmp_path,
+):
     """One view at twice its size, with a left wrist, and a right one that is an outlier."""
     capture, keypoints = person(30, 1, 1)
     keypoints = dataclasses.replace(keypoints, confidences=np.zeros_like(keypoints.confidences))
@@ -253,14 +296,18 @@ def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_line
     examination = examine(capture, keypoints)
     far = np.zeros_like(examination.outliers)
     far[0, RIGHT_WRIST] = True
-    fit_sheet(capture, keypoints, dataclasses.replace(examination, outliers=far), tmp_path / "fit.png")
+    fit_sheet(
+        capture, keypoints, dataclasses.replace(examination, outliers=far), tmp_path / "fit.png"
+    )
     image, _ = read_image(tmp_path / "fit.png")
     top = image.shape[0] - 512 - GAP
     blue = drawn(image[top : top + 60], LEFT)
     assert len(blue) > 30
     np.testing.assert_allclose(blue.mean(0), [2 * 16 - 0.5, 2 * 32 - 0.5 + GAP], atol=1.0)
     y, x = top + 2 * 16, GAP + 2 * 224
-    assert (image[y - 1 : y + 1, x - 1 : x + 1, 2] > 0.9).all()  # the white photo, or the line, but no red disc
+    assert (
+        image[y - 1 : y + 1, x - 1 : x + 1, 2] > 0.9
+    ).all()  # the white photo, or the line, but no red disc
     around = image[y - 8 : y + 8, x - 8 : x + 8]
     assert ((around[..., 0] - around[..., 2]) > 0.3).sum() > 10 and RIGHT[0] > RIGHT[2]
     x, y = 2 * examination.landmarks[0, LEFT_WRIST] + [GAP, top]
@@ -273,6 +320,13 @@ def test_of_many_views_an_evenly_chosen_few_are_drawn(tmp_path, monkeypatch):
     capture, keypoints = person(31, 9, 3)
     examination = examine(capture, keypoints)
     overlays = []
-    monkeypatch.setattr(module, "_overlay", lambda capture, view: overlays.append(view) or np.ones((128, 128, 3)))
+    monkeypatch.setattr(
+        module, "_overlay", lambda capture, view: overlays.append(view) or np.ones((128, 128, 3))
+    )
     fit_sheet(capture, keypoints, examination, tmp_path / "fit.png")
-    assert len(overlays) == module.VIEWS and overlays[0] == 0 and overlays[-1] == 26 and np.diff(overlays).max() <= 2
+    assert (
+        len(overlays) == module.VIEWS
+        and overlays[0] == 0
+        and overlays[-1] == 26
+        and np.diff(overlays).max() <= 2
+    )

@@ -33,7 +33,12 @@ def folder(tmp_path_factory):
     K, pose = np.asarray(seen.K)[frames, views], np.asarray(seen.cam_from_world)[frames, views]
     images = np.full((len(order), SIZE, SIZE, 3), 0.5, np.float32)
     rest = np.zeros((len(FRAMES), 55, 3)), np.zeros((len(FRAMES), 3))
-    save_capture(path, capture_from_arrays(images, K, pose, *rest, frames=[int(f) for f in frames], body=default_body()))
+    save_capture(
+        path,
+        capture_from_arrays(
+            images, K, pose, *rest, frames=[int(f) for f in frames], body=default_body()
+        ),
+    )
     (path / "body.npz").unlink()
     points, confidences = (np.asarray(x)[frames, views] for x in (seen.points, seen.confidences))
     return path, Keypoints(points, confidences, COCO_WHOLEBODY_133), joints
@@ -49,7 +54,11 @@ def test_views_are_sorted_by_their_frames(folder, fitted):
     errors = 1000 * np.linalg.norm(np.asarray(fitted.fit.joints) - folder[2], axis=-1)
     assert errors.mean() < 10
     report = fitted.report
-    assert fitted.capture.frame_count == len(FRAMES) and report.ok and len(report.views) == 4 * len(FRAMES)
+    assert (
+        fitted.capture.frame_count == len(FRAMES)
+        and report.ok
+        and len(report.views) == 4 * len(FRAMES)
+    )
     assert report.errors["keypoint_error_px"].after == pytest.approx(1.1774 * 2.0, rel=0.1)
     assert json.loads(json.dumps(report.to_json()))["views"][0]["name"] == fitted.capture.names[0]
 
@@ -60,7 +69,9 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     described = (path / "capture.json").read_text()
     with pytest.raises(CaptureError, match="humangs fit"):
         load_capture(path)
-    write_fitted(path, check_place(path, None, overwrite=False), fitted.capture, fitted.report, fitted.record)
+    write_fitted(
+        path, check_place(path, None, overwrite=False), fitted.capture, fitted.report, fitted.record
+    )
     again = load_capture(path)
     np.testing.assert_array_equal(again.poses.rotations, fitted.capture.poses.rotations)
     np.testing.assert_array_equal(again.betas, fitted.capture.betas)
@@ -84,7 +95,9 @@ def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path,
     write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
     before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
     moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
-    capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
+    capture = dataclasses.replace(
+        fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved)
+    )
     with monkeypatch.context() as broken, pytest.raises(OSError, match="disk full"):
         broken.setattr(files, "write_json", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
         write_fitted(path, path, capture, fitted.report)
@@ -110,7 +123,9 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
     moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
     kept = np.full(fitted.capture.body.template.shape, 0.01, np.float32)
     capture = dataclasses.replace(
-        fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved), displacement=kept
+        fitted.capture,
+        cameras=replace(fitted.capture.cameras, cam_from_world=moved),
+        displacement=kept,
     )
     target = check_place(folder[0], tmp_path / "out", overwrite=False)
     write_fitted(folder[0], target, capture, fitted.report)
@@ -119,7 +134,10 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
     np.testing.assert_array_equal(again.displacement, kept)
     np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
     assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
-    with pytest.raises(ValueError, match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "):
+    with pytest.raises(
+        ValueError,
+        match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images ",
+    ):
         check_place(folder[0], target, overwrite=False)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "diary.txt").write_text("mine")
@@ -169,11 +187,18 @@ def test_frames_that_views_hardly_show_are_named(folder):
     frames = load_photos(folder[0]).frames
     confidences[frames == 1] = 0
     confidences[np.flatnonzero(frames == 3)[1:]] = 0
-    found = fit_photos(load_photos(folder[0]), Keypoints(points, confidences, folder[1].set), default_body())
+    found = fit_photos(
+        load_photos(folder[0]), Keypoints(points, confidences, folder[1].set), default_body()
+    )
     blind, single = found.report.warnings[-2:]
     assert blind.startswith("frame 1: 0 keypoints are seen")
     assert single.startswith("frame 3: seen by one view")
-    assert [v.keypoints > 0 for v in found.report.views if v.frame == 3] == [True, False, False, False]
+    assert [v.keypoints > 0 for v in found.report.views if v.frame == 3] == [
+        True,
+        False,
+        False,
+        False,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -209,7 +234,9 @@ def test_a_damaged_record_is_one_error(folder, fitted, tmp_path):
 
 def test_a_record_that_lacks_a_key_names_it_and_who_writes_such_files(tmp_path):
     np.savez(tmp_path / "fit.npz", set=np.asarray("coco17"), names=np.asarray(["a"]))
-    with pytest.raises(CaptureError, match="points: missing: expected a file that `humangs fit` wrote"):
+    with pytest.raises(
+        CaptureError, match="points: missing: expected a file that `humangs fit` wrote"
+    ):
         read_fit_record(tmp_path / "fit.npz")
 
 
@@ -217,10 +244,15 @@ def test_expressions_are_not_fitted_as_shape(folder, monkeypatch):
     """Of SMPL-X, whose directions are those of the shape and then those of the face."""
     fitted_to, body = [], default_body()
     names = (*(f"shape_{i}" for i in range(body.shape_directions.shape[-1] - 1)), "expression_0")
-    monkeypatch.setattr(fit_capture, "landmark_model", lambda body, *_: fitted_to.append(body) or 1 / 0)
+    monkeypatch.setattr(
+        fit_capture, "landmark_model", lambda body, *_: fitted_to.append(body) or 1 / 0
+    )
     with pytest.raises(ZeroDivisionError):
         fit_photos(load_photos(folder[0]), folder[1], replace(body, shape_names=names))
-    assert fitted_to[0].shape_names == names[:-1] and fitted_to[0].shape_directions.shape[-1] == len(names) - 1
+    assert (
+        fitted_to[0].shape_names == names[:-1]
+        and fitted_to[0].shape_directions.shape[-1] == len(names) - 1
+    )
 
 
 def test_a_body_whose_root_is_not_first_is_refused(folder):

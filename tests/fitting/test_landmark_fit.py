@@ -18,7 +18,12 @@ from humangs_jax.fitting import landmark_fit
 from humangs_jax.fitting.fit_capture import fit_uncertainty
 from humangs_jax.fitting.landmark_fit import fit_landmarks
 from humangs_jax.fitting.report import limit_violations
-from humangs_jax.fitting.residuals.keypoints import PLACE_STD, group_by_frame, keypoint_residuals, world_residuals
+from humangs_jax.fitting.residuals.keypoints import (
+    PLACE_STD,
+    group_by_frame,
+    keypoint_residuals,
+    world_residuals,
+)
 from humangs_jax.fitting.state import pose_prior
 from humangs_jax.geometry.mesh import smallest_turns
 
@@ -53,7 +58,9 @@ def test_frames_are_a_batch(monkeypatch):
     with pytest.raises(Reached) as caught:
         fit_landmarks(model_of(), seen)
     assert caught.value.args[0].batch_shape == (2,)
-    with pytest.raises(ValueError, match=r"observations.K: expected shape \(2, 4, 3, 3\), got \(2, 3, 3, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"observations.K: expected shape \(2, 4, 3, 3\), got \(2, 3, 3, 3\)"
+    ):
         fit_landmarks(model_of(), replace(seen, K=seen.K[:, :3]))
 
 
@@ -78,13 +85,17 @@ def test_keypoints_with_noise_give_it_within_the_limits_of_joints(noisy):
     assert (np.abs(np.asarray(fit.noise) - 2.0) < 0.5).all()
     some = np.asarray([NAMES.index("standing"), NAMES.index("crouching")])
     within = jax.tree.map(lambda leaf: leaf[some], fit.poses)
-    assert all(each.degrees < np.degrees(0.15) for each in limit_violations(model_of().joint_names, within))
+    assert all(
+        each.degrees < np.degrees(0.15) for each in limit_violations(model_of().joint_names, within)
+    )
 
 
 @pytest.mark.slow
 def test_a_view_without_keypoints_is_left_out(noisy):
     joints, _, seen, _ = noisy
-    blind = replace(seen, confidences=seen.confidences.at[:, 1].set(0.0), points=seen.points.at[:, 1].set(1e6))
+    blind = replace(
+        seen, confidences=seen.confidences.at[:, 1].set(0.0), points=seen.points.at[:, 1].set(1e6)
+    )
     fit = fit_landmarks(model_of(), blind)
     assert mean_mm(fit, joints) < 1.5 * NOISY_MM
 
@@ -103,10 +114,18 @@ def test_a_frame_without_keypoints_is_as_the_prior_has_it_and_the_others_do_not_
 
 def test_a_confidence_of_a_quarter_is_a_quarter_of_the_cost():
     seen = jax.tree.map(lambda leaf: leaf[0], observe(NAMES[:1])[2])
-    seen = replace(seen, world=jnp.asarray(np.random.default_rng(0).normal(size=(*seen.points.shape[:2], 3)), jnp.float32))
+    seen = replace(
+        seen,
+        world=jnp.asarray(
+            np.random.default_rng(0).normal(size=(*seen.points.shape[:2], 3)), jnp.float32
+        ),
+    )
     quarter = replace(seen, confidences=seen.confidences / 4)
     for residuals in (keypoint_residuals, world_residuals):
-        cost, less = (np.square(residuals(model_of(), x, jnp.ones((133, 3)), 5.0)).sum() for x in (seen, quarter))
+        cost, less = (
+            np.square(residuals(model_of(), x, jnp.ones((133, 3)), 5.0)).sum()
+            for x in (seen, quarter)
+        )
         assert 0 < less == pytest.approx(cost / 4, rel=1e-5)
 
 
@@ -116,11 +135,18 @@ def test_predicted_deviations_are_of_the_size_of_the_errors(noisy):
     found = fit_uncertainty(model_of(), seen, fit)
     errors = np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1)
     ratio = np.sqrt((errors**2).mean() / (found.joint_std**2).mean())
-    assert 0.3 < ratio < 1.5  # landmarks of hips and shoulders are trusted less than these true ones deserve
+    assert (
+        0.3 < ratio < 1.5
+    )  # landmarks of hips and shoulders are trusted less than these true ones deserve
     names = model_of().joint_names
-    share = {name: found.determined[:, names.index(name)].mean() for name in ("left_eye", "left_knee", "left_shoulder")}
+    share = {
+        name: found.determined[:, names.index(name)].mean()
+        for name in ("left_eye", "left_knee", "left_shoulder")
+    }
     assert share["left_eye"] == 0 < 0.3 < share["left_knee"] and share["left_shoulder"] > 0.7
-    np.testing.assert_allclose(found.joint_covariances, found.joint_covariances.swapaxes(-1, -2), atol=1e-12)
+    np.testing.assert_allclose(
+        found.joint_covariances, found.joint_covariances.swapaxes(-1, -2), atol=1e-12
+    )
     assert np.linalg.eigvalsh(found.joint_covariances).min() > 0
 
 
@@ -169,7 +195,9 @@ def test_vmap_over_people_is_a_loop(monkeypatch):
     together = jax.vmap(lambda seen: fit_landmarks(model_of(), seen))(batch)
     for i, seen in enumerate(several):
         alone = fit_landmarks(model_of(), seen)
-        difference = np.linalg.norm(np.asarray(together.joints[i]) - np.asarray(alone.joints), axis=-1)
+        difference = np.linalg.norm(
+            np.asarray(together.joints[i]) - np.asarray(alone.joints), axis=-1
+        )
         assert difference.max() < SAME_PATH
 
 
@@ -187,7 +215,9 @@ def test_a_fit_that_knows_the_places_recovers_the_body_and_one_that_does_not_is_
     plain = landmark_model(default_body(), MEDIAPIPE_33.names)
     joints, _, seen = observe(("standing",), noise=1.0, model=knowing)
     common = np.asarray(plain.known, np.float32)
-    seen = replace(seen, confidences=seen.confidences * common)  # without the points of the face that only places have
+    seen = replace(
+        seen, confidences=seen.confidences * common
+    )  # without the points of the face that only places have
     errors = {}
     for name, model in (("knowing", knowing), ("plain", plain)):
         fit = fit_landmarks(model, seen)
@@ -196,7 +226,13 @@ def test_a_fit_that_knows_the_places_recovers_the_body_and_one_that_does_not_is_
     assert errors["plain"] > BIASED * errors["knowing"]
 
 
-MOVED = {"hip": (-20, 10, 25), "shoulder": (-10, 35, 0), "ear": (-30, 0, 30), "ankle": (0, 10, -10), "nose": (0, 10, 20)}
+MOVED = {
+    "hip": (-20, 10, 25),
+    "shoulder": (-10, 35, 0),
+    "ear": (-30, 0, 30),
+    "ankle": (0, 10, -10),
+    "nose": (0, 10, 20),
+}
 """Millimetres by which a detector sees landmarks of the left side beside where the body has them."""
 LESS, CLOSER, HARMLESS = 0.9, 0.7, 1.1
 """Most of the error of the joints of a fit that finds the places, over one that does not; of the error of the places over their
@@ -206,14 +242,20 @@ to 10.3 mm, and 11.2 to 11.7 mm."""
 
 def test_a_set_without_a_table_has_places_that_change_nothing():
     kind = COCO_17
-    rest = lambda model: pose_landmarks(model, jnp.zeros(1), BodyPose(0.3 * jnp.ones((55, 3)), jnp.zeros(3)))[0]
-    plain, placed = (landmark_model(default_body(), kind.names, places) for places in ((), kind.places))
+    rest = lambda model: pose_landmarks(
+        model, jnp.zeros(1), BodyPose(0.3 * jnp.ones((55, 3)), jnp.zeros(3))
+    )[0]
+    plain, placed = (
+        landmark_model(default_body(), kind.names, places) for places in ((), kind.places)
+    )
     known = np.asarray(plain.known)
     np.testing.assert_allclose(rest(placed)[known], rest(plain)[known], atol=1e-5)
     moved = placed.moved(jnp.full((len(kind_groups(placed)), 3), 0.01))
     apart = placed.by_landmark(jnp.full((len(kind_groups(placed)), 3), 0.01))
     row = {name: kind.names.index(name) for name in ("left_hip", "right_hip")}
-    np.testing.assert_allclose(apart[[row["left_hip"], row["right_hip"]]], [[0.01] * 3, [-0.01, 0.01, 0.01]])
+    np.testing.assert_allclose(
+        apart[[row["left_hip"], row["right_hip"]]], [[0.01] * 3, [-0.01, 0.01, 0.01]]
+    )
     steps = np.linalg.norm(np.asarray(rest(moved) - rest(placed)), axis=-1)
     np.testing.assert_allclose(steps, np.linalg.norm(apart, axis=-1), atol=1e-5)
     own = kind.adapted(kind.offsets + apart, np.ones(len(kind.names)))
@@ -222,7 +264,10 @@ def test_a_set_without_a_table_has_places_that_change_nothing():
 
 
 def kind_groups(model):
-    return {kind_of(model.names[row]): group for row, (group, _) in zip(model.placed, model.groups, strict=True)}
+    return {
+        kind_of(model.names[row]): group
+        for row, (group, _) in zip(model.placed, model.groups, strict=True)
+    }
 
 
 @pytest.mark.slow
@@ -239,12 +284,17 @@ def test_several_frames_show_where_a_detector_sees_its_landmarks():
         joints, _, seen = observe(frames, noise=1.0, model=model)
         for finds, of in ((True, plain), (False, landmark_model(default_body(), kind.names))):
             fit = fit_landmarks(of, seen)
-            errors[biased, finds] = 1000 * np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1).mean()
+            errors[biased, finds] = (
+                1000 * np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1).mean()
+            )
             found = fit.state.places
             if biased and finds:
                 off = np.linalg.norm(PLACE_STD * np.asarray(found) - truth, axis=-1).mean()
     assert found is None
-    assert errors[True, True] < LESS * errors[True, False] and errors[False, True] < HARMLESS * errors[False, False]
+    assert (
+        errors[True, True] < LESS * errors[True, False]
+        and errors[False, True] < HARMLESS * errors[False, False]
+    )
     assert off < CLOSER * np.linalg.norm(truth, axis=-1).mean()
 
 
@@ -257,9 +307,13 @@ def test_a_landmark_that_the_detector_hardly_finds_counts_less_and_few_keypoints
         _, _, seen = observe(tuple(POSES)[:frames], noise=1.0, model=model)
         worse = rng.normal(0, 6.0, seen.points.shape) * wrists[:, None]
         certainty[frames] = np.asarray(
-            fit_landmarks(model, replace(seen, points=seen.points + worse.astype(np.float32))).certainty
+            fit_landmarks(
+                model, replace(seen, points=seen.points + worse.astype(np.float32))
+            ).certainty
         )
-    relative = {frames: each[wrists].mean() / each[~wrists].mean() for frames, each in certainty.items()}
+    relative = {
+        frames: each[wrists].mean() / each[~wrists].mean() for frames, each in certainty.items()
+    }
     assert relative[len(POSES)] < 0.4 < relative[1] < 1
 
 
@@ -298,12 +352,16 @@ def test_of_one_view_depths_are_better_where_the_detector_sees_them():
 def test_size_and_place_in_space_do_not_count_and_unseen_landmarks_neither():
     model, seed = model_of(), 1
     _, _, seen = observe(WORLD_POSES, seed=seed, views=1)
-    landmarks = jnp.asarray(np.random.default_rng(0).normal(0, 0.5, (len(model.names), 3)), jnp.float32)
+    landmarks = jnp.asarray(
+        np.random.default_rng(0).normal(0, 0.5, (len(model.names), 3)), jnp.float32
+    )
     rotation = seen.cam_from_world[0, :, :3, :3]
     world = 1.7 * jnp.einsum("cab,kb->cka", rotation, landmarks) - 2.0
     first = jax.tree.map(lambda leaf: leaf[0], seen)
     hidden = first.confidences.at[:, :5].set(0.0)
-    residuals = lambda world: world_residuals(model, replace(first, confidences=hidden, world=world), landmarks, 5.0)
+    residuals = lambda world: world_residuals(
+        model, replace(first, confidences=hidden, world=world), landmarks, 5.0
+    )
     np.testing.assert_allclose(residuals(world), 0, atol=2e-2)  # the size has a floor of 5 cm
     np.testing.assert_array_equal(residuals(world.at[:, :5].add(9.0))[:, :5], 0)
     assert float(jnp.abs(residuals(world.at[:, 8].add(0.5))).max()) > 0.5
@@ -311,7 +369,10 @@ def test_size_and_place_in_space_do_not_count_and_unseen_landmarks_neither():
 
 def test_landmarks_of_a_file_come_into_the_axes_of_the_camera(tmp_path):
     """The detector looks at the middle of the hips, which here is far from the middle of the photo."""
-    rng, hips = np.random.default_rng(0), [MEDIAPIPE_33.names.index(f"{side}_hip") for side in ("left", "right")]
+    rng, hips = (
+        np.random.default_rng(0),
+        [MEDIAPIPE_33.names.index(f"{side}_hip") for side in ("left", "right")],
+    )
     points = rng.normal(0, 0.3, (2, 33, 3))
     points[:, hips[1]] = -points[:, hips[0]]
     middle = np.asarray([1.2, -0.8, 3.0])
@@ -319,27 +380,50 @@ def test_landmarks_of_a_file_come_into_the_axes_of_the_camera(tmp_path):
     ray = middle / np.linalg.norm(middle)
     side = np.cross([0, 0, 1], ray)
     turn = Rotation.from_rotvec(side / np.linalg.norm(side) * np.arccos(ray[2])).as_matrix()
-    pixels = (points * [1, 1, 0] + middle) @ K.T  # in a plane before the camera, so that the middle of the hips stays there
+    pixels = (
+        points * [1, 1, 0] + middle
+    ) @ K.T  # in a plane before the camera, so that the middle of the hips stays there
     pixels = pixels[..., :2] / pixels[..., 2:]
     seen = lambda i: SeenPerson(np.column_stack([pixels[i], np.ones(33)]), points[i] @ turn, 1.0)
     images = [ImagePeople(f"{i:03d}.png", (64, 64), (seen(i),)) for i in range(2)]
     write_people(tmp_path / "keypoints.json", images)
     capture = capture_from_arrays(
-        np.ones((2, 64, 64, 3)), K, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 55, 3)), np.zeros((2, 3)), frames=[0, 1]
+        np.ones((2, 64, 64, 3)),
+        K,
+        np.tile(np.eye(4), (2, 1, 1)),
+        np.zeros((2, 55, 3)),
+        np.zeros((2, 3)),
+        frames=[0, 1],
     )
     keypoints = read_keypoints(tmp_path / "keypoints.json", capture.names, 64, 64)
     observations, _ = group_by_frame(capture, keypoints)
-    np.testing.assert_allclose(observations.world[:, 0], points, atol=1e-3)  # the file has tenths of a millimetre
+    np.testing.assert_allclose(
+        observations.world[:, 0], points, atol=1e-3
+    )  # the file has tenths of a millimetre
     few = [i for i, name in enumerate(MEDIAPIPE_33.names) if not name.endswith("hip")]
-    for rows in ([hips[0], few[0]], few):  # one hip is enough; without any it is the middle of what is seen
+    for rows in (
+        [hips[0], few[0]],
+        few,
+    ):  # one hip is enough; without any it is the middle of what is seen
         confidences = np.zeros((2, 33))
         confidences[:, rows] = 1
-        own = group_by_frame(capture, dataclasses.replace(keypoints, confidences=confidences))[0].world
+        own = group_by_frame(capture, dataclasses.replace(keypoints, confidences=confidences))[
+            0
+        ].world
         shown = keypoints.points[:, rows[:1] if hips[0] in rows else rows].mean(axis=1)
         rays = np.column_stack([(shown - 32) / 100, np.ones(2)])
-        axes = smallest_turns(np.asarray([0.0, 0, 1]), rays / np.linalg.norm(rays, axis=1, keepdims=True))
-        np.testing.assert_allclose(own[:, 0], np.einsum("nab,nkb->nka", axes, keypoints.world), atol=1e-5)
+        axes = smallest_turns(
+            np.asarray([0.0, 0, 1]), rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        )
+        np.testing.assert_allclose(
+            own[:, 0], np.einsum("nab,nkb->nka", axes, keypoints.world), atol=1e-5
+        )
     one_moment = capture_from_arrays(
-        np.ones((2, 64, 64, 3)), K, np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 55, 3)), np.zeros((1, 3)), frames=[0, 0]
+        np.ones((2, 64, 64, 3)),
+        K,
+        np.tile(np.eye(4), (2, 1, 1)),
+        np.zeros((1, 55, 3)),
+        np.zeros((1, 3)),
+        frames=[0, 0],
     )
     assert group_by_frame(one_moment, keypoints)[0].world is None

@@ -6,7 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fit_people import FOCAL, MIRRORED, NAMES, cameras_around, default_body, errors_of, person, posed, seen_by
+from fit_people import (
+    FOCAL,
+    MIRRORED,
+    NAMES,
+    cameras_around,
+    default_body,
+    errors_of,
+    person,
+    posed,
+    seen_by,
+)
 
 from humangs_jax.apps.check import check_capture
 from humangs_jax.body.model import BodyPose, shape_body
@@ -31,7 +41,9 @@ NOISY_DEGREES, NOISY_METRES = 3.5, 0.25
 
 
 @pytest.mark.parametrize(("views", "pose"), [(4, "crouching"), (3, "standing"), (8, "standing")])
-def test_exact_landmarks_give_exact_cameras_of_a_person_who_stands_upright_and_looks_at_plus_z(views, pose):
+def test_exact_landmarks_give_exact_cameras_of_a_person_who_stands_upright_and_looks_at_plus_z(
+    views, pose
+):
     matrices = cameras_around(views)
     found = cameras_from_person(seen_by(posed(pose), matrices))
     angles, centers, _ = errors_of(found, matrices)
@@ -57,7 +69,9 @@ def test_the_height_sets_the_scale():
     matrices, seen = cameras_around(3), seen_by(posed(), cameras_around(3), size=0.9)
     found = {height: cameras_from_person(seen, height=height) for height in (None, 1.5, 1.8)}
     scales = {height: 1 / errors_of(each, matrices)[2] for height, each in found.items()}
-    assert scales[None] == pytest.approx(0.9, rel=0.03) and scales[1.8] / scales[1.5] == pytest.approx(1.2, rel=1e-4)
+    assert scales[None] == pytest.approx(0.9, rel=0.03) and scales[1.8] / scales[
+        1.5
+    ] == pytest.approx(1.2, rel=1e-4)
     assert any("height is not given" in line for line in found[None].warnings)
 
 
@@ -78,7 +92,9 @@ def test_the_order_of_photos_does_not_matter():
     first, second = cameras_from_person(seen), cameras_from_person(seen.select(order))
     focal = lambda found: np.asarray([float(camera.K[0, 0]) for camera in found.cameras])
     np.testing.assert_allclose(focal(first)[order], focal(second), rtol=5e-3)
-    ours, theirs = (np.asarray([c.cam_from_world for c in found.cameras])[:, 2, 3] for found in (first, second))
+    ours, theirs = (
+        np.asarray([c.cam_from_world for c in found.cameras])[:, 2, 3] for found in (first, second)
+    )
     np.testing.assert_allclose(ours[order], theirs, rtol=0.02)
 
 
@@ -95,15 +111,26 @@ def test_one_photo_is_enough_for_its_own_camera():
     found = cameras_from_person(seen_by(posed(), matrices))
     true = np.linalg.norm(matrices[0][:3, 3])
     assert found.moments == 1
-    assert np.linalg.norm(np.asarray(found.cameras[0].cam_from_world)[:3, 3]) == pytest.approx(true, rel=0.15)
+    assert np.linalg.norm(np.asarray(found.cameras[0].cam_from_world)[:3, 3]) == pytest.approx(
+        true, rel=0.15
+    )
 
 
 def test_photos_of_several_moments_are_told_and_stand_alone():
-    changes = (("standing", 0, 0.0), ("crouching", 0, 0.4), ("standing", 5, 0.5), ("crouching", 7, 0.5))
+    changes = (
+        ("standing", 0, 0.0),
+        ("crouching", 0, 0.4),
+        ("standing", 5, 0.5),
+        ("crouching", 7, 0.5),
+    )
     seen = seen_by(np.stack([posed(*change) for change in changes]), cameras_around(4))
     assert explain(seen).trial is None
     found = cameras_from_person(seen)
-    assert found.moments == 4 and len(found.cameras) == 4 and found.landmarks.shape == (4, len(NAMES), 3)
+    assert (
+        found.moments == 4
+        and len(found.cameras) == 4
+        and found.landmarks.shape == (4, len(NAMES), 3)
+    )
 
 
 def test_a_photo_of_another_moment_is_left_out_by_name():
@@ -124,25 +151,37 @@ def cameras_at(*azimuths):
     return matrices
 
 
-@pytest.mark.parametrize("azimuths", [(0, 1), (0, 0.5, 1), (0, 0.5, 1, 1.5), (40, 40.6, 41.2, 42, 42.4)])
+@pytest.mark.parametrize(
+    "azimuths", [(0, 1), (0, 0.5, 1), (0, 0.5, 1, 1.5), (40, 40.6, 41.2, 42, 42.4)]
+)
 def test_photos_from_one_side_stand_alone_and_are_said_to_be_from_one_side(azimuths):
     found = cameras_from_person(seen_by(posed(), cameras_at(*azimuths)))
     assert found.moments == len(azimuths) == len(found.views)
-    assert any(line.startswith("all photos are from one side (directions differ by") for line in found.warnings)
+    assert any(
+        line.startswith("all photos are from one side (directions differ by")
+        for line in found.warnings
+    )
 
 
 def test_photos_from_one_side_and_one_of_another_moment_stand_alone():
     landmarks = np.stack([posed()] * 3 + [posed("crouching", 0, 0.4)])
     found = cameras_from_person(seen_by(landmarks, cameras_at(0, 0.5, 1, 90)))
     assert found.moments == 4 and found.views == (0, 1, 2, 3)
-    assert any(line.startswith("p0.jpg, p1.jpg, p2.jpg are from one side") for line in found.warnings)
+    assert any(
+        line.startswith("p0.jpg, p1.jpg, p2.jpg are from one side") for line in found.warnings
+    )
 
 
 @pytest.mark.parametrize("other", [None, 2, 11])
 def test_of_many_photos_a_few_decide_and_the_others_are_compared_with_them(other):
     count = DECIDING + 4
     matrices = cameras_around(count)
-    landmarks = np.stack([posed("crouching", 0, 0.4) if view == other else posed("standing") for view in range(count)])
+    landmarks = np.stack(
+        [
+            posed("crouching", 0, 0.4) if view == other else posed("standing")
+            for view in range(count)
+        ]
+    )
     seen = seen_by(landmarks, matrices, **NOISE)
     points, world = seen.points.copy(), seen.world.copy()
     points[5], world[5] = points[5][MIRRORED], world[5][MIRRORED]
@@ -175,7 +214,9 @@ def test_cameras_take_few_steps_and_so_little_time(views, monkeypatch):
     """Steps are counted, since seconds depend on the machine; each is some milliseconds."""
     steps, solve = [], person_bundle.solve
     monkeypatch.setattr(person_bundle, "solve", lambda *given: steps.append(1) or solve(*given))
-    cameras_from_person(seen_by(posed("standing", 1, 0.2), cameras_around(views, 1), seed=1, **NOISE))
+    cameras_from_person(
+        seen_by(posed("standing", 1, 0.2), cameras_around(views, 1), seed=1, **NOISE)
+    )
     assert len(steps) < 15 * (views + 2)
 
 
@@ -183,16 +224,27 @@ def test_what_cannot_be_used_is_refused_by_name():
     seen = seen_by(posed(), cameras_around(4))
     hidden = seen.visibility.copy()
     hidden[1, 4:] = 0
-    with pytest.raises(ValueError, match=r"p1\.jpg: 4 landmarks of the person are seen, expected 6 or more"):
+    with pytest.raises(
+        ValueError, match=r"p1\.jpg: 4 landmarks of the person are seen, expected 6 or more"
+    ):
         cameras_from_person(dataclasses.replace(seen, visibility=hidden))
     with pytest.raises(ValueError, match="height 178: expected metres"):
         cameras_from_person(seen, height=178.0)
-    with pytest.raises(ValueError, match=r"p0\.jpg: all landmarks of the person lie within 16 pixels"):
+    with pytest.raises(
+        ValueError, match=r"p0\.jpg: all landmarks of the person lie within 16 pixels"
+    ):
         cameras_from_person(dataclasses.replace(seen, points=np.zeros_like(seen.points)))
     with pytest.raises(ValueError, match="no photo of the person"):
         cameras_from_person(seen.select([]))
-    for change in ({"sizes": seen.sizes[:3]}, {"photos": seen.photos[1:]}, {"names": seen.names[1:]}):
-        with pytest.raises(ValueError, match="expected points, visibility, world, sizes, focal and photos of 4 views"):
+    for change in (
+        {"sizes": seen.sizes[:3]},
+        {"photos": seen.photos[1:]},
+        {"names": seen.names[1:]},
+    ):
+        with pytest.raises(
+            ValueError,
+            match="expected points, visibility, world, sizes, focal and photos of 4 views",
+        ):
             cameras_from_person(dataclasses.replace(seen, **change))
 
 
@@ -208,15 +260,21 @@ def test_a_person_of_another_height_looks_the_same():
         frames=np.zeros(1, np.int32),
         body=body,
         betas=np.zeros(body.shape_directions.shape[-1], np.float32),
-        poses=jax.vmap(BodyPose)(jnp.zeros((1, len(body.parents), 3)), -rest.joints[:1] + jnp.asarray([0.1, 0.2, 0.0])),
+        poses=jax.vmap(BodyPose)(
+            jnp.zeros((1, len(body.parents), 3)), -rest.joints[:1] + jnp.asarray([0.1, 0.2, 0.0])
+        ),
         names=("a",),
         displacement=np.full(body.template.shape, 0.01, np.float32),
     )
     tall = scaled_to_height(capture, 1.9)
-    np.testing.assert_allclose(tall.displacement, 0.01 * 1.9 / np.ptp(rest.vertices[:, 1]), rtol=1e-5)
+    np.testing.assert_allclose(
+        tall.displacement, 0.01 * 1.9 / np.ptp(rest.vertices[:, 1]), rtol=1e-5
+    )
 
     def of(capture):
-        vertices = np.asarray(shape_body(body, jnp.asarray(capture.betas)).vertices + capture.poses.translation[0])
+        vertices = np.asarray(
+            shape_body(body, jnp.asarray(capture.betas)).vertices + capture.poses.translation[0]
+        )
         seen = vertices @ np.asarray(capture.cameras.cam_from_world[0, :3, :3]).T + np.asarray(
             capture.cameras.cam_from_world[0, :3, 3]
         )
@@ -241,14 +299,23 @@ def turned(capture, views, vector):
     """Cameras turned by a rotation vector in their axes, degrees."""
     rotations = np.zeros((capture.view_count, 3), np.float32)
     rotations[views] = np.radians(vector)
-    turns = transform.make(quaternion.matrix_from_axis_angle(jnp.asarray(rotations)), jnp.zeros((len(rotations), 3)))
-    return dataclasses.replace(capture, cameras=replace(capture.cameras, cam_from_world=turns @ capture.cameras.cam_from_world))
+    turns = transform.make(
+        quaternion.matrix_from_axis_angle(jnp.asarray(rotations)), jnp.zeros((len(rotations), 3))
+    )
+    return dataclasses.replace(
+        capture,
+        cameras=replace(capture.cameras, cam_from_world=turns @ capture.cameras.cam_from_world),
+    )
 
 
 def off(capture, truth):
     """(v,) degrees between the cameras of two captures."""
-    between = capture.cameras.cam_from_world[:, :3, :3] @ jnp.swapaxes(truth.cameras.cam_from_world[:, :3, :3], -1, -2)
-    return np.degrees(np.linalg.norm(quaternion.to_axis_angle(quaternion.from_matrix(between)), axis=-1))
+    between = capture.cameras.cam_from_world[:, :3, :3] @ jnp.swapaxes(
+        truth.cameras.cam_from_world[:, :3, :3], -1, -2
+    )
+    return np.degrees(
+        np.linalg.norm(quaternion.to_axis_angle(quaternion.from_matrix(between)), axis=-1)
+    )
 
 
 @pytest.mark.parametrize(("views", "seed"), [(3, 1), (6, 0)])
@@ -257,17 +324,27 @@ def test_a_camera_turned_by_a_degree_is_named_and_turned_back_and_right_ones_are
     assert find_camera_errors(truth, keypoints) == ()
     for vector in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, -0.6, 0.5)):
         (error,) = find_camera_errors(turned(truth, [1], vector), keypoints)
-        assert error.views == (1,) and error.names[0] == "m0v1" and str(error).startswith("camera m0v1")
-        assert error.degrees == pytest.approx(1.0, abs=TURN) and f"{error.degrees:.1f} degrees" in str(error)
+        assert (
+            error.views == (1,)
+            and error.names[0] == "m0v1"
+            and str(error).startswith("camera m0v1")
+        )
+        assert error.degrees == pytest.approx(
+            1.0, abs=TURN
+        ) and f"{error.degrees:.1f} degrees" in str(error)
         assert off(mended(turned(truth, [1], vector), (error,)), truth).max() < ROLL
 
 
 def test_all_moments_of_a_camera_that_stands_still_count_and_two_cameras_may_be_off():
     truth, keypoints = person(3, 4, 4, still=True, even=True)
     assert find_camera_errors(truth, keypoints) == ()
-    wrong = turned(turned(truth, range(1, 16, 4), (1.0, 0.0, 0.3)), range(2, 16, 4), (-0.8, 0.3, 0.0))
+    wrong = turned(
+        turned(truth, range(1, 16, 4), (1.0, 0.0, 0.3)), range(2, 16, 4), (-0.8, 0.3, 0.0)
+    )
     errors = find_camera_errors(wrong, keypoints)
-    assert sorted(error.views[0] for error in errors) == [1, 2] and all(len(error.views) == 4 for error in errors)
+    assert sorted(error.views[0] for error in errors) == [1, 2] and all(
+        len(error.views) == 4 for error in errors
+    )
     assert off(mended(wrong, errors), truth).max() < TURN
 
 
@@ -284,7 +361,9 @@ def late(keypoints, cameras, frames):
 def test_a_camera_that_is_late_is_named_and_no_camera_that_is_right(seed, by):
     truth, keypoints = person(seed, 24, VIEWS, still=True, moving=True, outliers=0.05)
     found = find_camera_errors(truth, late(keypoints, [1], [by]))
-    assert [(error.names, error.late, error.degrees) for error in found] == ([(("m0v1",), by, 0.0)] if by else [])
+    assert [(error.names, error.late, error.degrees) for error in found] == (
+        [(("m0v1",), by, 0.0)] if by else []
+    )
     when = {3: "3 frames late", -2: "2 frames early"}
     assert by == 0 or str(found[0]) == f"camera m0v1 is {when[by]}"
 
@@ -301,10 +380,14 @@ def test_a_turned_camera_is_not_taken_for_a_late_one_and_both_are_found():
 def test_of_a_person_who_stands_nobody_is_late():
     truth, keypoints = person(3, 1, VIEWS)
     keypoints = dataclasses.replace(
-        keypoints, points=np.tile(keypoints.points, (24, 1, 1)), confidences=np.tile(keypoints.confidences, (24, 1))
+        keypoints,
+        points=np.tile(keypoints.points, (24, 1, 1)),
+        confidences=np.tile(keypoints.confidences, (24, 1)),
     )
     repeated = truth.select(np.tile(np.arange(VIEWS), 24))
-    repeated = dataclasses.replace(repeated, frames=np.repeat(np.arange(24), VIEWS).astype(np.int32))
+    repeated = dataclasses.replace(
+        repeated, frames=np.repeat(np.arange(24), VIEWS).astype(np.int32)
+    )
     assert find_camera_errors(repeated, keypoints) == ()
 
 
@@ -322,7 +405,9 @@ def test_outliers_exchanged_sides_and_another_person_are_no_camera_errors():
     swapped[1] = swapped[1][list(keypoints.set.mirror)]
     other[1] = person(5, 1, 6)[1].points[1] + 40.0
     for wrong in (swapped, other):
-        assert find_camera_errors(truth, Keypoints(wrong, keypoints.confidences, keypoints.set)) == ()
+        assert (
+            find_camera_errors(truth, Keypoints(wrong, keypoints.confidences, keypoints.set)) == ()
+        )
     nothing = Keypoints(points, np.zeros_like(keypoints.confidences), keypoints.set)
     assert find_camera_errors(truth, nothing) == ()
 
@@ -333,7 +418,9 @@ def test_landmarks_that_the_detector_hardly_sees_turn_no_camera():
     points = np.array(keypoints.points)
     points[1] += [3.0, 0.0]
     for certainty, named in ((1.0, True), (0.1, False)):
-        found = find_camera_errors(truth, Keypoints(points, certainty * keypoints.confidences, keypoints.set))
+        found = find_camera_errors(
+            truth, Keypoints(points, certainty * keypoints.confidences, keypoints.set)
+        )
         assert bool(found) is named, certainty
 
 
@@ -342,19 +429,32 @@ def test_a_fit_turns_the_camera_back_and_says_so_and_check_names_it(tmp_path):
     truth, keypoints = person(1, 1, 4)
     wrong = turned(truth, [2], (1.0, 0.0, 0.5))
     photos = Photos(wrong.images, None, wrong.cameras, wrong.frames, wrong.names)
-    fitted, left = (fit_photos(photos, keypoints, truth.body, fixed_cameras=fixed) for fixed in (False, True))
+    fitted, left = (
+        fit_photos(photos, keypoints, truth.body, fixed_cameras=fixed) for fixed in (False, True)
+    )
     assert off(fitted.capture, truth).max() < ROLL < off(left.capture, truth).max()
-    assert "camera m0v2 is off by 1" in str(fitted.report) and not any("camera" in w for w in fitted.report.warnings)
+    assert "camera m0v2 is off by 1" in str(fitted.report) and not any(
+        "camera" in w for w in fitted.report.warnings
+    )
     assert any("camera m0v2 is off by" in warning for warning in left.report.warnings)
-    assert any("camera m0v2" in warning for warning in examine(left.capture, keypoints).report.warnings)
-    assert fitted.report.errors["keypoint_error_px"].after < left.report.errors["keypoint_error_px"].after
+    assert any(
+        "camera m0v2" in warning for warning in examine(left.capture, keypoints).report.warnings
+    )
+    assert (
+        fitted.report.errors["keypoint_error_px"].after
+        < left.report.errors["keypoint_error_px"].after
+    )
     # a body that is wider than the masks: cameras stay only where the keypoints say that they are right
     masks = np.zeros(truth.images.shape[:3], np.float32)
-    said = lambda capture, known: str(check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known))
+    said = lambda capture, known: str(
+        check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known)
+    )
     assert "--fixed-cameras" not in said(wrong, keypoints) + said(truth, None)
 
 
-def test_cameras_that_were_found_from_the_person_are_not_turned_back_by_the_same_keypoints(monkeypatch):
+def test_cameras_that_were_found_from_the_person_are_not_turned_back_by_the_same_keypoints(
+    monkeypatch,
+):
     truth, keypoints = person(1, 1, 4)
     wrong = turned(truth, [2], (1.0, 0.0, 0.5))
     looked_for, fitted = [], []

@@ -16,7 +16,14 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.fitting import refine as module
-from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, Score, refine_capture, start_state, usual_config
+from humangs_jax.fitting.refine import (
+    CaptureRefineConfig,
+    Scene,
+    Score,
+    refine_capture,
+    start_state,
+    usual_config,
+)
 from humangs_jax.fitting.residuals.silhouettes import (
     BodyView,
     body_boundary,
@@ -45,12 +52,26 @@ def truth():
     K = intrinsics_from_fov(0.9, SIZE, SIZE)
     cameras = orbit(translation, 2.6, jnp.asarray([0.2, 2.2, 4.4]), 0.1, K, SIZE, SIZE)
     vertices = jax.jit(lambda: pose_body(body, shape_body(body, jnp.zeros(3)), pose).vertices)()
-    large = [rasterize_mesh(vertices, body.faces, cameras[i].resized(2 * SIZE, 2 * SIZE)).face_ids for i in range(VIEWS)]
-    masks = np.stack([(np.asarray(ids) >= 0).reshape(SIZE, 2, SIZE, 2).mean((1, 3)) for ids in large]).astype(np.float32)
+    large = [
+        rasterize_mesh(vertices, body.faces, cameras[i].resized(2 * SIZE, 2 * SIZE)).face_ids
+        for i in range(VIEWS)
+    ]
+    masks = np.stack(
+        [(np.asarray(ids) >= 0).reshape(SIZE, 2, SIZE, 2).mean((1, 3)) for ids in large]
+    ).astype(np.float32)
     images = np.repeat(1 - masks[..., None], 3, axis=-1)
     poses = jax.tree.map(lambda leaf: leaf[None], pose)
     names = ("front", "left", "right")
-    return Capture(images, masks, cameras, np.zeros(VIEWS, np.int32), body, np.zeros(3, np.float32), poses, names)
+    return Capture(
+        images,
+        masks,
+        cameras,
+        np.zeros(VIEWS, np.int32),
+        body,
+        np.zeros(3, np.float32),
+        poses,
+        names,
+    )
 
 
 def turned(capture, degrees, axis=(0, 1, 0)):
@@ -65,12 +86,16 @@ def augmented():
     rng = np.random.default_rng(1)
     axes = rng.normal(size=(VIEWS + 22, 3))
     axes = jnp.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True), jnp.float32)
-    turns = transform.make(quaternion.matrix_from_axis_angle(jnp.radians(2.0) * axes[:VIEWS]), jnp.zeros(3))
+    turns = transform.make(
+        quaternion.matrix_from_axis_angle(jnp.radians(2.0) * axes[:VIEWS]), jnp.zeros(3)
+    )
     capture = truth()
     K = capture.cameras.K * jnp.asarray([[1.05, 1, 1], [1, 1.05, 1], [1, 1, 1]])
     rotations = capture.poses.rotations.at[0, :22].add(jnp.radians(3.0) * axes[VIEWS:])
     cameras = replace(capture.cameras, K=K, cam_from_world=turns @ capture.cameras.cam_from_world)
-    return dataclasses.replace(capture, cameras=cameras, poses=replace(capture.poses, rotations=rotations))
+    return dataclasses.replace(
+        capture, cameras=cameras, poses=replace(capture.poses, rotations=rotations)
+    )
 
 
 @jax.jit
@@ -80,7 +105,10 @@ def _joints(body, betas, pose):
 
 def aligned_error(capture):
     """Mean distance of body joints from the truth after the best rigid motion, metres."""
-    a, b = (np.asarray(_joints(c.body, jnp.asarray(c.betas), c.pose(0)))[:22] for c in (capture, truth()))
+    a, b = (
+        np.asarray(_joints(c.body, jnp.asarray(c.betas), c.pose(0)))[:22]
+        for c in (capture, truth())
+    )
     a, b = a - a.mean(0), b - b.mean(0)
     u, _, vt = np.linalg.svd(b.T @ a)
     return np.linalg.norm(a @ ((u * [1, 1, np.linalg.det(u @ vt)]) @ vt).T - b, axis=-1).mean()
@@ -91,7 +119,9 @@ def keypoints(confidence=1.0):
     model, capture = landmark_model(default_body(), COCO_17.names), truth()
     landmarks, _ = pose_landmarks(model, jnp.zeros(3), capture.pose(0))
     points = np.stack([project(capture.cameras[i], landmarks)[0] for i in range(VIEWS)])
-    return Keypoints(points.astype(np.float32), np.full(points.shape[:2], confidence, np.float32), COCO_17)
+    return Keypoints(
+        points.astype(np.float32), np.full(points.shape[:2], confidence, np.float32), COCO_17
+    )
 
 
 @pytest.mark.slow
@@ -112,7 +142,9 @@ def test_silhouettes_mend_cameras_focal_length_and_pose():
 
 @pytest.mark.slow
 def test_keypoints_alone_mend_them_too_and_with_masks_both_errors_fall():
-    alone = refine_capture(dataclasses.replace(augmented(), masks=None), keypoints=keypoints(), config=CONFIG)
+    alone = refine_capture(
+        dataclasses.replace(augmented(), masks=None), keypoints=keypoints(), config=CONFIG
+    )
     assert alone.report.kept and "silhouette_iou" not in alone.report.errors
     error = alone.report.errors["keypoint_error_px"]
     assert error.after < 0.2 * error.before
@@ -128,7 +160,9 @@ def test_a_start_that_is_right_stays():
     refined = refine_capture(truth(), config=CONFIG)
     assert not refined.report.kept and refined.capture is truth()
     assert all(change.before == change.after for change in refined.report.errors.values())
-    assert "no sufficient improvement" in str(refined.report) and "moved:" not in str(refined.report)
+    assert "no sufficient improvement" in str(refined.report) and "moved:" not in str(
+        refined.report
+    )
 
 
 @pytest.mark.slow
@@ -143,7 +177,10 @@ def test_views_with_an_empty_mask_take_no_part():
     masks[2] = 0
     refined = refine_capture(dataclasses.replace(augmented(), masks=masks), config=CONFIG)
     assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
+    assert all(
+        np.isfinite(leaf).all()
+        for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras))
+    )
 
 
 @pytest.mark.slow
@@ -159,7 +196,9 @@ def test_nothing_to_refine_by_is_an_error_and_keypoints_of_other_views_are():
     for masks in (None, np.zeros((VIEWS, SIZE, SIZE), np.float32)):
         blind = dataclasses.replace(truth(), masks=masks)
         for known in (None, keypoints(confidence=0.0)):
-            with pytest.raises(CaptureError, match="masks: none shows anybody, and there are no keypoints"):
+            with pytest.raises(
+                CaptureError, match="masks: none shows anybody, and there are no keypoints"
+            ):
                 refine_capture(blind, keypoints=known)
     with pytest.raises(ValueError, match="of 3 views, but the capture has 2"):
         refine_capture(truth().select([0, 1]), keypoints=keypoints())
@@ -180,21 +219,37 @@ def test_nothing_to_refine_by_is_an_error_and_keypoints_of_other_views_are():
 )
 def test_small_gains_are_kept_where_keypoints_do_not_get_worse(before, after, kept):
     score = lambda loss, keypoints: Score(np.zeros(1), 1 - loss, keypoints, loss)
-    assert module._better(score(*after), score(*before), module.DEFAULT_CONFIG.keypoints_worse) is kept
+    assert (
+        module._better(score(*after), score(*before), module.DEFAULT_CONFIG.keypoints_worse) is kept
+    )
     bare = module._better(score(*after), score(*before), np.inf)
     assert bare is (kept or after == (0.20, 6.0))
 
 
 def test_a_displacement_of_the_shape_before_is_left_out():
-    start = dataclasses.replace(truth(), displacement=np.zeros(truth().body.template.shape, np.float32))
+    start = dataclasses.replace(
+        truth(), displacement=np.zeros(truth().body.template.shape, np.float32)
+    )
     origin = module.capture_origin(start, start.cameras, CONFIG)
-    best, score = module.moved_capture(start, origin, start_state(origin, CONFIG)), Score(np.zeros(VIEWS), 0.9, None, 0.1)
-    told = [module._report(start, *pair, score, "").notes for pair in ((best, score), (start, score))]
-    assert best.displacement is None and ["left out" in " ".join(notes) for notes in told] == [True, False]
+    best, score = (
+        module.moved_capture(start, origin, start_state(origin, CONFIG)),
+        Score(np.zeros(VIEWS), 0.9, None, 0.1),
+    )
+    told = [
+        module._report(start, *pair, score, "").notes for pair in ((best, score), (start, score))
+    ]
+    assert best.displacement is None and ["left out" in " ".join(notes) for notes in told] == [
+        True,
+        False,
+    ]
 
 
 def test_settings_suit_what_is_known():
-    alone, both, bare = usual_config(False), usual_config(True), usual_config(True, fixed_cameras=True, bare=True)
+    alone, both, bare = (
+        usual_config(False),
+        usual_config(True),
+        usual_config(True, fixed_cameras=True, bare=True),
+    )
     assert vars(alone.std) == vars(CaptureRefineConfig().std)
     assert (
         both.std.betas > alone.std.betas
@@ -202,7 +257,11 @@ def test_settings_suit_what_is_known():
         and both.std.clothing == alone.std.clothing
         and not both.fixed_cameras
     )
-    assert bare.fixed_cameras and bare.std.clothing < 0.002 and bare.robust_scales[0] == bare.robust_scales[1]
+    assert (
+        bare.fixed_cameras
+        and bare.std.clothing < 0.002
+        and bare.robust_scales[0] == bare.robust_scales[1]
+    )
 
 
 def test_keypoints_of_long_narrow_photos_are_where_they_are():
@@ -214,7 +273,11 @@ def test_keypoints_of_long_narrow_photos_are_where_they_are():
     scene = Scene(capture, known, CONFIG)
     assert scene.score(capture).keypoints < 0.01
     width, height = scene.cameras.width, scene.cameras.height
-    np.testing.assert_allclose(np.asarray(scene.observations.points)[:, 0] / [width, height], known.points / [90, 600], atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(scene.observations.points)[:, 0] / [width, height],
+        known.points / [90, 600],
+        atol=1e-5,
+    )
 
 
 @pytest.mark.slow
@@ -226,7 +289,11 @@ def test_keypoints_weigh_by_the_noise_that_the_body_finds():
     for each in (known, biased):
         scene = Scene(truth(), each, CONFIG)
         expected = scene.observations.noise
-        noises.append(np.asarray(scene.look(start_state(scene.origin, CONFIG), 5.0).keypoints.noise / expected))
+        noises.append(
+            np.asarray(
+                scene.look(start_state(scene.origin, CONFIG), 5.0).keypoints.noise / expected
+            )
+        )
     assert noises[0] == pytest.approx(0.5) and (noises[1] > 5).all()
 
 
@@ -241,7 +308,9 @@ COUNT = 90
 def camera(x=0.0, z=DISTANCE):
     matrix = np.eye(4)
     matrix[:3, 3] = [x, 0, z]
-    return Camera.from_opencv([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]], matrix, SIDE, SIDE)
+    return Camera.from_opencv(
+        [[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]], matrix, SIDE, SIDE
+    )
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +321,12 @@ def sphere():
 
 def boundary_of(sphere, camera):
     vertices, faces = sphere
-    return body_boundary(view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, body_edges(faces), COUNT)
+    return body_boundary(
+        view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera),
+        faces,
+        body_edges(faces),
+        COUNT,
+    )
 
 
 def disc(radius, x=SIDE / 2):
@@ -266,7 +340,10 @@ def test_edges_of_a_tetrahedron_have_two_faces_each_and_of_a_triangle_one():
     edges = body_edges(tetrahedron)
     assert len(edges.ends) == 6
     for ends, faces in zip(edges.ends, edges.faces, strict=True):
-        assert set(faces) == {f for f in range(4) if set(ends) <= set(tetrahedron[f])} and len(set(faces)) == 2
+        assert (
+            set(faces) == {f for f in range(4) if set(ends) <= set(tetrahedron[f])}
+            and len(set(faces)) == 2
+        )
     assert set(body_edges(tetrahedron[:1]).faces[:, 1]) == {-1}
 
 
@@ -291,7 +368,13 @@ def test_a_sphere_s_boundary_is_the_circle_of_its_tangents(sphere):
 def test_what_leaves_the_image_or_is_behind_the_camera_is_no_boundary(sphere):
     cut = boundary_of(sphere, camera(x=-1.0))
     assert len(cut.positions) == COUNT and (cut.positions > 0).all()
-    assert np.abs(np.linalg.norm(cut.positions - [SIDE / 2 - FOCAL / DISTANCE, SIDE / 2], axis=1) - IMAGE_RADIUS).max() < 3
+    assert (
+        np.abs(
+            np.linalg.norm(cut.positions - [SIDE / 2 - FOCAL / DISTANCE, SIDE / 2], axis=1)
+            - IMAGE_RADIUS
+        ).max()
+        < 3
+    )
     assert len(boundary_of(sphere, camera(z=-DISTANCE)).positions) == 0
 
 
@@ -301,7 +384,9 @@ def test_an_edge_before_the_body_is_no_boundary():
     vertices = np.concatenate([square, 0.3 * square - [0, 0, 0.5]]).astype(np.float32)
     faces = np.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     image = view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
-    outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(2)  # normals of a flat mesh do not show its border
+    outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(
+        2
+    )  # normals of a flat mesh do not show its border
     image = BodyView(image.pixels, image.depths, outwards.astype(np.float32), image.covered)
     boundary = body_boundary(image, faces, body_edges(faces), COUNT)
     assert len(boundary.positions) == COUNT and boundary.ends.max() < 4
@@ -328,10 +413,14 @@ def test_points_find_the_mask_in_reach_and_tell_how_far_outside_they_are(sphere)
     matches = match(boundary, mask, other, 10.0, COUNT)
     assert matches.weights.shape == (2 * COUNT,) and float(matches.weights.mean()) == 1.0
     off = distances(matches, jnp.asarray(boundary.positions, jnp.float32))
-    np.testing.assert_allclose(off, -gap, atol=0.35)  # inside; polygons and the nearest of 90 points make up the rest
+    np.testing.assert_allclose(
+        off, -gap, atol=0.35
+    )  # inside; polygons and the nearest of 90 points make up the rest
     assert float(match(boundary, mask, other, 2.0, COUNT).weights.sum()) == 0, "out of reach"
     empty = np.zeros((SIDE, SIDE), np.float32)
-    assert float(match(boundary, empty, mask_boundary(empty, COUNT), 10.0, COUNT).weights.sum()) == 0
+    assert (
+        float(match(boundary, empty, mask_boundary(empty, COUNT), 10.0, COUNT).weights.sum()) == 0
+    )
 
 
 def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sphere):
@@ -342,7 +431,9 @@ def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sph
         mask = disc(IMAGE_RADIUS + gap)
         matches = match(boundary, mask, mask_boundary(mask, COUNT), 10.0, COUNT)
         thick = jnp.full(len(pixels), clothes)
-        residuals = silhouette_residuals(matches, pixels, thick, jnp.asarray(1.0), (jnp.asarray(10.0), jnp.asarray(3.0)), 40.0)
+        residuals = silhouette_residuals(
+            matches, pixels, thick, jnp.asarray(1.0), (jnp.asarray(10.0), jnp.asarray(3.0)), 40.0
+        )
         return float(jnp.sum(jnp.square(residuals)))
 
     assert cost(4.0, 4.0) < 0.02 * cost(4.0, 0.0)

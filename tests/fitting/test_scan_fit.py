@@ -37,7 +37,14 @@ from humangs_jax.fitting.scan_files import (
     render_scan_views,
     sample_scan,
 )
-from humangs_jax.fitting.scan_fit import Start, body_in_scan, facing_back, fit_scan, search_starts, start_state
+from humangs_jax.fitting.scan_fit import (
+    Start,
+    body_in_scan,
+    facing_back,
+    fit_scan,
+    search_starts,
+    start_state,
+)
 from humangs_jax.fitting.state import pose_prior
 from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import project
@@ -46,7 +53,12 @@ from humangs_jax.io.mesh import GREY
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-NAMES = ("nose", "left_ear", "right_ear", *(f"{side}_{part}" for part in LIMBS for side in ("left", "right")))
+NAMES = (
+    "nose",
+    "left_ear",
+    "right_ear",
+    *(f"{side}_{part}" for part in LIMBS for side in ("left", "right")),
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -62,7 +74,9 @@ def truth(body):
     """A person's vertices in a pose, normals and landmarks, metres; and the similarity to the scan's coordinates."""
     rng = np.random.default_rng(5)
     prior = pose_prior(body.joint_names)
-    rotations = np.clip(prior.mean + 0.4 * prior.std * rng.normal(size=(55, 3)), prior.lower, prior.upper)
+    rotations = np.clip(
+        prior.mean + 0.4 * prior.std * rng.normal(size=(55, 3)), prior.lower, prior.upper
+    )
     rotations[0] = 0
     pose = BodyPose(jnp.asarray(rotations, jnp.float32), jnp.zeros(3))
     betas = jnp.asarray(rng.normal(0, 0.4, 22), jnp.float32)
@@ -74,7 +88,9 @@ def truth(body):
         return vertices, vertex_normals(vertices, body.faces), pose_landmarks(model, betas, pose)[0]
 
     vertices, normals, landmarks = (np.asarray(x, np.float64) for x in posed(betas, pose))
-    place = Similarity(40.0, Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix(), np.asarray([300.0, -20.0, 7.0]))
+    place = Similarity(
+        40.0, Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix(), np.asarray([300.0, -20.0, 7.0])
+    )
     return vertices, normals, landmarks, place
 
 
@@ -103,16 +119,25 @@ def bare(tmp_path_factory, body, truth):
 def test_a_body_that_the_last_round_still_moved_is_said_to():
     points = np.eye(3)
     scan = Scan(points, points, False, 0.0)
-    moving = lambda *costs: "still moving" in str(scan_fit._report(scan, False, 1.0, "y", points[0], 1.0, jnp.asarray(costs)))
+    moving = lambda *costs: (
+        "still moving"
+        in str(scan_fit._report(scan, False, 1.0, "y", points[0], 1.0, jnp.asarray(costs)))
+    )
     assert moving(1.0, 0.9) and not moving(1.0, 0.99) and not moving(0.0, 0.0)
 
 
 @pytest.mark.slow
-def test_a_bare_body_is_found_whatever_its_scale_turn_and_place_and_stands_in_our_world(bare, truth):
+def test_a_bare_body_is_found_whatever_its_scale_turn_and_place_and_stands_in_our_world(
+    bare, truth
+):
     assert off(bare, truth).mean() < 8
     assert np.quantile(np.abs(bare.distances), 0.9) < 0.003
     report = bare.report
-    assert report.errors["scan_near_body"].after > 0.97 and report.ok and "still moving" not in str(report)
+    assert (
+        report.errors["scan_near_body"].after > 0.97
+        and report.ok
+        and "still moving" not in str(report)
+    )
     assert abs(report.errors["scan_outside_median_mm"].after) < 1.5
     assert "given joints" in str(report)
     scan = bare.world_from_scan(truth[3](truth[0]))
@@ -128,7 +153,9 @@ def test_clothes_are_outside(body, truth, tmp_path):
     layer = 0.015 * np.asarray(surface.covered)[:, None]
     path = written(tmp_path / "dressed.ply", truth[0] + layer * truth[1], body, truth[3])
     fit = fit_scan(path, body=body, joints=given_joints(truth), clothed=True)
-    inside = np.einsum("na,na->n", truth[3].inverse()(body_in_scan(fit)) - truth[0], truth[1])[layer[:, 0] > 0.014]
+    inside = np.einsum("na,na->n", truth[3].inverse()(body_in_scan(fit)) - truth[0], truth[1])[
+        layer[:, 0] > 0.014
+    ]
     assert np.median(inside) < 0.010
     assert np.median(fit.distances) > 0
 
@@ -137,10 +164,18 @@ def test_clothes_are_outside(body, truth, tmp_path):
 def test_results_are_written_whole(bare, tmp_path):
     save_scan_fit(tmp_path / "fit", bare)
     arrays, pickled = read_npz(tmp_path / "fit" / "body.npz")
-    assert arrays["rotations"].shape == (1, 55, 3) and arrays["translations"].shape == (1, 3) and not pickled
+    assert (
+        arrays["rotations"].shape == (1, 55, 3)
+        and arrays["translations"].shape == (1, 3)
+        and not pickled
+    )
     report = json.loads((tmp_path / "fit" / "scan_fit.json").read_text())
     np.testing.assert_allclose(report["world_from_scan"], bare.world_from_scan.matrix())
-    assert report["fitted"] == "scan" and report["start"] == "landmarks" and report["errors"] == bare.report.to_json()["errors"]
+    assert (
+        report["fitted"] == "scan"
+        and report["start"] == "landmarks"
+        and report["errors"] == bare.report.to_json()["errors"]
+    )
     mesh = trimesh.load(tmp_path / "fit" / "body_in_scan.ply", process=False)
     np.testing.assert_allclose(mesh.vertices, body_in_scan(bare), rtol=1e-4)
     with pytest.raises(ValueError, match="not empty"):
@@ -169,7 +204,9 @@ def test_what_are_no_joints_or_too_few_is_refused(body, truth, tmp_path):
         with pytest.raises(ValueError, match=rf"joints\.json.*{message}"):
             read_joints(tmp_path / "joints.json")
     path = written(tmp_path / "bare.ply", truth[0], body, truth[3])
-    some = {name: point for name, point in given_joints(truth).items() if name in ("left_hip", "nose")}
+    some = {
+        name: point for name, point in given_joints(truth).items() if name in ("left_hip", "nose")
+    }
     with pytest.raises(ValueError, match="at least three points"):
         fit_scan(path, body=body, joints=some)
     with pytest.raises(ValueError, match="height 170"):
@@ -181,7 +218,9 @@ def test_the_search_has_the_turn_and_the_scale_among_its_starts(body, truth):
     vertices, _, _, place = truth
     surface = body_surface(body, ("nose",), 1500)
     starts = search_starts(surface, sample_scan(place(vertices), np.asarray(body.faces), 4000), 8)
-    angles = [np.degrees(np.arccos((np.trace(s.align.rotation @ place.rotation) - 1) / 2)) for s in starts]
+    angles = [
+        np.degrees(np.arccos((np.trace(s.align.rotation @ place.rotation) - 1) / 2)) for s in starts
+    ]
     best = starts[int(np.argmin(angles))]
     assert min(angles) < 30
     assert best.align.scale * place.scale == pytest.approx(1, abs=0.2)
@@ -191,7 +230,10 @@ def test_the_search_has_the_turn_and_the_scale_among_its_starts(body, truth):
 def test_facing_back_twice_is_facing_forward(body):
     surface = body_surface(body, ("nose",), 1500)
     prior = pose_prior(body.joint_names)
-    rotations, pelvis = np.clip(0 * prior.mean, prior.lower, prior.upper), np.asarray(surface.landmarks.joints[0])
+    rotations, pelvis = (
+        np.clip(0 * prior.mean, prior.lower, prior.upper),
+        np.asarray(surface.landmarks.joints[0]),
+    )
     start = Start(Similarity(2.0, np.eye(3), np.asarray([0.1, 0.2, 0.3])), rotations, 0.0)
     once = facing_back(surface, start, rotations, pelvis, 1.0)
     twice = facing_back(surface, once, rotations, pelvis, 1.0)
@@ -255,10 +297,19 @@ def boxes(folder):
         box = trimesh.creation.box((1, 1, 1)).subdivide()
         box.apply_translation([2.0 * i, 0, 0])
         start = sum(map(len, vertices))
-        lines += [f"o box{i}", f"g part{i}", *(f"v {x} {y} {z}" for x, y, z in box.vertices), f"usemtl paint{i % 2}"]
-        lines += ["f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[:40]]
+        lines += [
+            f"o box{i}",
+            f"g part{i}",
+            *(f"v {x} {y} {z}" for x, y, z in box.vertices),
+            f"usemtl paint{i % 2}",
+        ]
+        lines += [
+            "f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[:40]
+        ]
         lines += ["s off", f"usemtl paint{(i + 1) % 2}"]
-        lines += ["f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[40:]]
+        lines += [
+            "f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[40:]
+        ]
         vertices.append(box.vertices)
         faces.append(box.faces + start)
     (folder / "boxes.mtl").write_text("newmtl paint0\nKd 1 0 0\nnewmtl paint1\nKd 0 1 0\n")
@@ -271,7 +322,9 @@ def test_objects_and_materials_in_turn_keep_every_face(tmp_path):
     triangles = lambda corners: np.sort(np.round(corners.reshape(len(corners), -1), 6), axis=0)
     for colors in (False, True):
         mesh = read_mesh(tmp_path / "boxes.obj", colors=colors)
-        np.testing.assert_allclose(triangles(mesh.vertices[mesh.faces]), triangles(vertices[faces]), atol=1e-6)
+        np.testing.assert_allclose(
+            triangles(mesh.vertices[mesh.faces]), triangles(vertices[faces]), atol=1e-6
+        )
 
 
 def textured(folder, name="skin.png"):
@@ -281,18 +334,25 @@ def textured(folder, name="skin.png"):
     (folder / "ball.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
     lines = ["mtllib ball.mtl", "usemtl skin", *(f"v {x} {y} {z}" for x, y, z in ball.vertices)]
     lines += [f"vt {x / 2 + 0.5} {y / 2 + 0.5}" for x, y, _ in ball.vertices]
-    lines += ["f " + " ".join(f"{corner + 1}/{corner + 1}" for corner in face) for face in ball.faces]
+    lines += [
+        "f " + " ".join(f"{corner + 1}/{corner + 1}" for corner in face) for face in ball.faces
+    ]
     (folder / "ball.obj").write_text("\n".join(lines))
     return folder / "ball.obj"
 
 
-def test_a_scan_has_the_colors_of_its_texture_and_is_grey_with_a_warning_without_it(tmp_path, caplog):
+def test_a_scan_has_the_colors_of_its_texture_and_is_grey_with_a_warning_without_it(
+    tmp_path, caplog
+):
     red = read_mesh(textured(tmp_path), colors=True).visual.vertex_colors
     assert (red == [255, 0, 0, 255]).all() and not caplog.records
     grey = read_mesh(textured(tmp_path, "moved.png"), colors=True).visual.vertex_colors
     assert (grey[:, :3] == GREY).all()
     (record,) = caplog.records
-    assert "ball.obj: left out 'moved.png':" in record.getMessage() and "no such file" in record.getMessage()
+    assert (
+        "ball.obj: left out 'moved.png':" in record.getMessage()
+        and "no such file" in record.getMessage()
+    )
 
 
 def test_what_is_no_scan_is_refused_by_name(tmp_path):
@@ -327,7 +387,9 @@ def blocks(path, up=2):
     body, head = trimesh.creation.box((40, 40, 150)), trimesh.creation.icosphere(2, 25)
     head.apply_translation([0, 0, 95])
     mesh = trimesh.util.concatenate([body.subdivide(), head])
-    mesh.apply_transform({2: np.eye(4), 0: trimesh.geometry.align_vectors([0, 0, 1], [1, 0, 0])}[up])
+    mesh.apply_transform(
+        {2: np.eye(4), 0: trimesh.geometry.align_vectors([0, 0, 1], [1, 0, 0])}[up]
+    )
     mesh.apply_translation([500, 20, -30])
     mesh.visual.vertex_colors = np.tile([255, 0, 0, 255], (len(mesh.vertices), 1))
     mesh.export(path)
@@ -338,7 +400,9 @@ def blocks(path, up=2):
 @pytest.mark.parametrize("up", [2, 0])
 def test_images_show_the_scan_upright_and_in_its_colors(tmp_path, up):
     blocks(tmp_path / "scan.ply", up)
-    photos = load_photos(render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64))
+    photos = load_photos(
+        render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64)
+    )
     rows, columns = np.nonzero(photos.masks[0])
     assert np.ptp(rows) > 35 and np.ptp(rows) > 2.5 * np.ptp(columns)
     inside = photos.images[0][photos.masks[0] > 0.9]
@@ -386,7 +450,11 @@ def case(problem):
     normals = rng.normal(size=(600, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     matches = ScanMatches(
-        jnp.asarray(rows, jnp.int32), number(rng.normal(size=(600, 3))), number(normals), jnp.full(600, 0.02), jnp.ones(600)
+        jnp.asarray(rows, jnp.int32),
+        number(rng.normal(size=(600, 3))),
+        number(normals),
+        jnp.full(600, 0.02),
+        jnp.ones(600),
     )
     given = Given(jnp.zeros((2, 3)), jnp.ones(2), number(0.1), number(1.8), number(1))
     state = start_state(problem, problem.prior.mean)
@@ -396,7 +464,9 @@ def case(problem):
 def test_the_surface_is_the_bodys(body):
     surface = body_surface(body, ("nose",), 13380)
     rng = np.random.default_rng(0)
-    pose = BodyPose(jnp.asarray(0.3 * rng.normal(size=(55, 3)), jnp.float32), jnp.asarray([0.1, 0.2, 0.3]))
+    pose = BodyPose(
+        jnp.asarray(0.3 * rng.normal(size=(55, 3)), jnp.float32), jnp.asarray([0.1, 0.2, 0.3])
+    )
     betas = jnp.asarray(rng.normal(size=22), jnp.float32)
     true = pose_body(body, shape_body(body, betas), pose)
     vertices, normals = pose_surface(surface, betas, pose)
@@ -420,7 +490,9 @@ def test_columns_of_the_jacobian_are_derivatives(problem, case):
     """XLA's CPU compiler got them wrong where the distances were sums over an axis."""
     matches, given, tolerances, state = case
     leaves, tree = jax.tree.flatten(state)
-    residuals = lambda y: scan_residuals(problem, matches, given, tolerances, jax.tree.unflatten(tree, y))["surface"]
+    residuals = lambda y: scan_residuals(
+        problem, matches, given, tolerances, jax.tree.unflatten(tree, y)
+    )["surface"]
     columns = jax.jit(jax.jacfwd(residuals))(leaves)
     one = jax.jit(lambda y, direction: jax.jvp(residuals, (y,), (direction,))[1])
     for i in (0, len(leaves) - 1):  # shape and size
@@ -438,7 +510,9 @@ def test_a_smaller_scan_is_no_nearer(problem, case):
     posed, _ = pose_surface(problem.surface, *problem.body(state))
     exact = dataclasses.replace(matches, points=posed[matches.rows])
     assert np.abs(away(state, exact)).max() < 1e-3
-    half = dataclasses.replace(state, log_scale=jnp.float32(np.log(0.5) / 0.05))  # metres per unit of the frame
+    half = dataclasses.replace(
+        state, log_scale=jnp.float32(np.log(0.5) / 0.05)
+    )  # metres per unit of the frame
     twice = dataclasses.replace(matches, points=2 * posed[matches.rows] + 0.01 * matches.normals)
     np.testing.assert_allclose(away(half, twice), 0.01 / 0.02, atol=1e-3)
 

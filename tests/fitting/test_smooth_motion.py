@@ -30,13 +30,17 @@ def true_poses():
 
 @jax.jit
 def landmarks_of(rotations, translations):
-    return jax.vmap(lambda r, t: pose_landmarks(MODEL, jnp.zeros(1), BodyPose(r, t)))(rotations, translations)
+    return jax.vmap(lambda r, t: pose_landmarks(MODEL, jnp.zeros(1), BodyPose(r, t)))(
+        rotations, translations
+    )
 
 
 @jax.jit
 def states_of(rotations, translations):
     origin = keypoint_problem(MODEL).origin
-    states = jax.vmap(lambda r, t: state_of(origin, jnp.zeros(1), BodyPose(r, t)))(rotations, translations)
+    states = jax.vmap(lambda r, t: state_of(origin, jnp.zeros(1), BodyPose(r, t)))(
+        rotations, translations
+    )
     return replace(states, betas=states.betas[0])
 
 
@@ -49,7 +53,9 @@ def seen_by(landmarks, seed=0):
     pixels = local[..., :2] / local[..., 2:] * float(K[0, 0]) + SIZE / 2
     pixels = pixels + np.random.default_rng(seed).normal(0, NOISE, pixels.shape)
     still = lambda x: np.broadcast_to(x, (FRAMES, *x.shape))
-    seen = make_observations(pixels, np.ones(pixels.shape[:-1]), still(np.asarray(camera.K)), still(pose))
+    seen = make_observations(
+        pixels, np.ones(pixels.shape[:-1]), still(np.asarray(camera.K)), still(pose)
+    )
     return replace(seen, noise=jnp.full(FRAMES, NOISE))
 
 
@@ -59,7 +65,10 @@ def walk():
     rotations, translations = true_poses()
     landmarks, joints = (np.asarray(x) for x in landmarks_of(rotations, translations))
     rng = np.random.default_rng(1)
-    near = rotations + rng.normal(0, 0.01, rotations.shape), translations + rng.normal(0, 0.003, translations.shape)
+    near = (
+        rotations + rng.normal(0, 0.01, rotations.shape),
+        translations + rng.normal(0, 0.003, translations.shape),
+    )
     return seen_by(landmarks), tuple(np.asarray(x, np.float32) for x in near), joints
 
 
@@ -70,7 +79,16 @@ def smoothed(seen, start, spoilt=(), model=MODEL):
     nothing = jnp.zeros((FRAMES, 1, 3))
     poses = jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations))
     state = states_of(rotations, translations)
-    fit = LandmarkFit(state.betas, poses, jnp.zeros((FRAMES, 8, 3)), nothing, seen.noise, state, jnp.zeros(()), jnp.ones(8))
+    fit = LandmarkFit(
+        state.betas,
+        poses,
+        jnp.zeros((FRAMES, 8, 3)),
+        nothing,
+        seen.noise,
+        state,
+        jnp.zeros(()),
+        jnp.ones(8),
+    )
     return smooth_motion(model, seen, fit, STD)
 
 
@@ -124,16 +142,18 @@ def test_somebody_else_in_one_frame_does_not_move_the_others(walk):
 
 
 @pytest.mark.slow
-def test_smoothness_that_the_keypoints_contradict_by_the_certainty_that_the_fit_found_is_not_forced(walk):
+def test_smoothness_that_the_keypoints_contradict_by_the_certainty_that_the_fit_found_is_not_forced(
+    walk,
+):
     """Six times the expected acceleration: less is expected then, and keypoints are followed as by frames one by one."""
     rotations, translations = (x.copy() for x in walk[1])
     translations[:, 1] += 0.015 * (np.arange(FRAMES) % 2)
     landmarks, joints = (np.asarray(x) for x in landmarks_of(rotations, translations))
     fit = smoothed(seen_by(landmarks), (rotations, translations))
     assert float(fit.smoothness) == pytest.approx(4 * STD) and centimetres(fit, joints).max() < 1.0
-    assert next(iter(_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), STD))).startswith(
-        "smoothness 0.003: the keypoints contradict it"
-    )
+    assert next(
+        iter(_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), STD))
+    ).startswith("smoothness 0.003: the keypoints contradict it")
     # what the model supposed of its landmarks before the fit is asked neither in the search nor where its result is accepted
     supposed = replace(MODEL, certainty=jnp.full(8, 1e-3))
     again = smoothed(seen_by(landmarks), (rotations, translations), model=supposed)
@@ -149,8 +169,14 @@ def bridged(seen, state):
 
 def test_frames_without_keypoints_are_bridged_on_the_shortest_way(walk):
     """A quarter, a half and three quarters of the way from frame 1 to frame 5; behind the last one the pose stays."""
-    rotations, translations = np.zeros((FRAMES, 4, 3), np.float32), np.zeros((FRAMES, 3), np.float32)
-    rotations[1, :, 1], rotations[5, :, 1] = 3.0, 2 * np.pi - 3.0 - 2 * np.pi  # 16 degrees apart, the short way round
+    rotations, translations = (
+        np.zeros((FRAMES, 4, 3), np.float32),
+        np.zeros((FRAMES, 3), np.float32),
+    )
+    rotations[1, :, 1], rotations[5, :, 1] = (
+        3.0,
+        2 * np.pi - 3.0 - 2 * np.pi,
+    )  # 16 degrees apart, the short way round
     translations[5, 0] = 4.0
     poses = bridged(without(walk[0], (2, 3, 4, 6)), states_of(rotations, translations))
     np.testing.assert_allclose(poses.translation[:, 0], [0, 0, 1, 2, 3, 4, 4], atol=1e-5)

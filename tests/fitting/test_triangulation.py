@@ -105,7 +105,10 @@ def test_one_view_has_no_points_in_space_and_parallel_rays_stay_finite():
 def test_a_point_behind_a_camera_is_no_match():
     _, seen = scene(views=2)
     one = jax.tree.map(lambda leaf: leaf[0], seen)
-    rotation, translation = np.asarray(one.cam_from_world[0, :3, :3]), np.asarray(one.cam_from_world[0, :3, 3])
+    rotation, translation = (
+        np.asarray(one.cam_from_world[0, :3, :3]),
+        np.asarray(one.cam_from_world[0, :3, 3]),
+    )
     behind = -rotation.T @ translation - 3 * rotation[2]
     errors = reprojection_errors(one, jnp.asarray(np.broadcast_to(behind, (133, 3)), jnp.float32))
     assert (np.asarray(errors)[0] > 1e5).all()
@@ -134,7 +137,9 @@ def random_similarity(seed):
 def test_the_similarity_between_points_is_found_and_those_without_weight_do_not_count(seed):
     true, points = random_similarity(seed), np.random.default_rng(seed).normal(size=(6, 3))
     target = true(points)
-    np.testing.assert_allclose(align_points(points, target, np.ones(6)).matrix(), true.matrix(), atol=1e-9 * true.scale)
+    np.testing.assert_allclose(
+        align_points(points, target, np.ones(6)).matrix(), true.matrix(), atol=1e-9 * true.scale
+    )
     target[5] += 100
     found = align_points(points, target, np.asarray([1.0, 1, 1, 1, 1, 0]))
     np.testing.assert_allclose(found.matrix(), true.matrix(), atol=1e-9 * true.scale)
@@ -142,7 +147,9 @@ def test_the_similarity_between_points_is_found_and_those_without_weight_do_not_
 
 def test_mirrored_points_get_a_proper_rotation():
     points = np.random.default_rng(0).normal(size=(8, 3))
-    assert np.linalg.det(align_points(points, points * [-1, 1, 1], np.ones(8)).rotation) == pytest.approx(1)
+    assert np.linalg.det(
+        align_points(points, points * [-1, 1, 1], np.ones(8)).rotation
+    ) == pytest.approx(1)
 
 
 def test_a_wild_point_is_outweighed():
@@ -157,14 +164,20 @@ def test_a_wild_point_is_outweighed():
 
 
 def test_similarities_compose_and_invert():
-    first, second, points = random_similarity(3), random_similarity(4), np.random.default_rng(3).normal(size=(5, 3))
+    first, second, points = (
+        random_similarity(3),
+        random_similarity(4),
+        np.random.default_rng(3).normal(size=(5, 3)),
+    )
     np.testing.assert_allclose(second.after(first)(points), second(first(points)), rtol=1e-12)
     np.testing.assert_allclose(first.inverse()(first(points)), points, rtol=1e-10)
     homogeneous = np.concatenate([points, np.ones((5, 1))], axis=1)
     np.testing.assert_allclose((homogeneous @ first.matrix().T)[:, :3], first(points), rtol=1e-12)
 
 
-@pytest.mark.parametrize("points", [np.eye(3)[:2], np.outer(np.arange(4.0), [1, 2, 3])], ids=["two", "on a line"])
+@pytest.mark.parametrize(
+    "points", [np.eye(3)[:2], np.outer(np.arange(4.0), [1, 2, 3])], ids=["two", "on a line"]
+)
 def test_points_that_say_nothing_are_refused(points):
     with pytest.raises(ValueError, match="three points"):
         align_points(points, points, np.ones(len(points)))
@@ -177,7 +190,11 @@ MIRROR = list(COCO_17.mirror)
 
 def seen(capture, keypoints):
     photos = Photos(capture.images, None, capture.cameras, capture.frames, capture.names)
-    return (*group_by_frame(photos, keypoints)[:1], keypoints.set, group_by_frame(photos, keypoints)[1])
+    return (
+        *group_by_frame(photos, keypoints)[:1],
+        keypoints.set,
+        group_by_frame(photos, keypoints)[1],
+    )
 
 
 def found(capture, keypoints):
@@ -209,7 +226,9 @@ def test_sides_of_single_views(views, outliers):
     assert {(swap.kind, swap.views, swap.instead) for swap in swaps} == {
         ("sides", (capture.names[view],), ()) for view in swapped
     }
-    assert "view m1v0: left and right of the keypoints seem exchanged" in [str(swap) for swap in swaps]
+    assert "view m1v0: left and right of the keypoints seem exchanged" in [
+        str(swap) for swap in swaps
+    ]
 
 
 @pytest.mark.slow
@@ -227,7 +246,12 @@ def test_of_four_views_two_and_two():
     capture, keypoints = person(12, 4, 4)
     swaps = found(capture, changed(keypoints, flipped=[0, 3]))
     assert len(swaps) == 2
-    assert {name for swap in swaps for name in (*swap.views, *swap.instead)} == {"m0v0", "m0v1", "m0v2", "m0v3"}
+    assert {name for swap in swaps for name in (*swap.views, *swap.instead)} == {
+        "m0v0",
+        "m0v1",
+        "m0v2",
+        "m0v3",
+    }
     assert {frozenset(swap.views) for swap in swaps} in (
         {frozenset(("m0v0",)), frozenset(("m0v3",))},
         {frozenset(("m0v1",)), frozenset(("m0v2",))},
@@ -240,7 +264,12 @@ def test_cameras_of_two_views(views):
     order = np.arange(4 * views)
     order[[0, 2]] = [2, 0]
     (swap,) = found(capture, changed(keypoints, order))
-    assert (swap.kind, swap.views, swap.instead, swap.frames) == ("cameras", ("m0v0", "m0v2"), (), 1)
+    assert (swap.kind, swap.views, swap.instead, swap.frames) == (
+        "cameras",
+        ("m0v0", "m0v2"),
+        (),
+        1,
+    )
     assert str(swap) == "the cameras (or the photos) of views m0v0 and m0v2 seem exchanged"
 
 
@@ -293,19 +322,30 @@ def test_one_view_and_views_that_are_missing():
 def test_hands_at_each_others_wrists():
     capture, keypoints = person(0, 1, 3, kind=COCO_WHOLEBODY_133)
     assert find_exchanged_hands(keypoints, capture.names) == ()
-    hands = [i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))]
+    hands = [
+        i
+        for i, name in enumerate(COCO_WHOLEBODY_133.names)
+        if name in (*hand_names("left"), *hand_names("right"))
+    ]
     points = keypoints.points.copy()
     points[2, hands] = points[2, np.asarray(COCO_WHOLEBODY_133.mirror)[hands]]
     exchanged = dataclasses.replace(keypoints, points=points)
     (swap,) = find_exchanged_hands(exchanged, capture.names)
-    assert str(swap) == "view m0v2: the keypoints of the hands seem exchanged: each lies at the other wrist"
+    assert (
+        str(swap)
+        == "view m0v2: the keypoints of the hands seem exchanged: each lies at the other wrist"
+    )
     assert find_exchanged_hands(person(0, 1, 2)[1], capture.names) == ()
 
 
 @pytest.mark.slow
 def test_where_hands_are_exchanged_the_body_is_right():
     capture, keypoints = person(0, 1, 3, kind=COCO_WHOLEBODY_133)
-    hands = [i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))]
+    hands = [
+        i
+        for i, name in enumerate(COCO_WHOLEBODY_133.names)
+        if name in (*hand_names("left"), *hand_names("right"))
+    ]
     points = keypoints.points.copy()
     points[2, hands] = points[2, np.asarray(COCO_WHOLEBODY_133.mirror)[hands]]
     exchanged = dataclasses.replace(keypoints, points=points)
@@ -326,12 +366,16 @@ MIRRORED = np.asarray(COCO_17.mirror)
 def seen_in(people, views=4, seed=0):
     """Views of people (n, 17, 3) metres, each in another order; the order of view 0 is the given one."""
     rng = np.random.default_rng(seed)
-    cameras = orbit(jnp.zeros(3), 3.5, AROUND[:views], 0.1, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE)
+    cameras = orbit(
+        jnp.zeros(3), 3.5, AROUND[:views], 0.1, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE
+    )
     found, orders = [], []
     for v in range(views):
         K, transform = np.asarray(cameras.K[v], float), np.asarray(cameras.cam_from_world[v], float)
         local = people @ transform[:3, :3].T + transform[:3, 3]
-        pixels = (local @ K.T)[..., :2] / local[..., 2:] + rng.normal(0, NOISE, (*people.shape[:2], 2))
+        pixels = (local @ K.T)[..., :2] / local[..., 2:] + rng.normal(
+            0, NOISE, (*people.shape[:2], 2)
+        )
         order = np.arange(len(people)) if v == 0 else rng.permutation(len(people))
         rows = np.concatenate([pixels, np.ones((*people.shape[:2], 1))], axis=-1)[order]
         found.append(Seen(K, transform, tuple(rows)))
@@ -342,9 +386,13 @@ def seen_in(people, views=4, seed=0):
 def somebody(seed, x=0.0):
     """A standing person: left and right are 30 cm apart."""
     rng = np.random.default_rng(seed)
-    height = np.asarray([0.8, *[0.85] * 2, *[0.8] * 2, *[0.6] * 2, *[0.3] * 2, *[0.05] * 2, *[0.0] * 2, *[-0.4] * 2])
+    height = np.asarray(
+        [0.8, *[0.85] * 2, *[0.8] * 2, *[0.6] * 2, *[0.3] * 2, *[0.05] * 2, *[0.0] * 2, *[-0.4] * 2]
+    )
     height = np.concatenate([height, [-0.8] * 2])
-    side = np.asarray([0.0] + [1, -1] * 8) * np.asarray([0, *[0.04] * 4, *[0.2] * 2, *[0.3] * 4, *[0.13] * 6])
+    side = np.asarray([0.0] + [1, -1] * 8) * np.asarray(
+        [0, *[0.04] * 4, *[0.2] * 2, *[0.3] * 4, *[0.13] * 6]
+    )
     points = np.stack([side + x, height, rng.normal(0, 0.08, 17)], axis=-1)
     return points + rng.normal(0, 0.03, (17, 3))
 
@@ -381,10 +429,17 @@ def test_somebody_whom_one_view_alone_shows_stays_alone():
 def test_people_are_followed_over_time_by_where_they_are():
     at = lambda x: Match((0, 0), (False, False), 0.0, np.asarray([x, 0.0, 0.0]))
     alone = Match((0, None), (False, False), float("inf"), np.full(3, np.nan))
-    a, b, later = in_order_of_time([[at(0.0), at(1.0)], [at(1.2), at(0.1)], [at(0.2), alone, at(5.0)]])
+    a, b, later = in_order_of_time(
+        [[at(0.0), at(1.0)], [at(1.2), at(0.1)], [at(0.2), alone, at(5.0)]]
+    )
     assert [m.center[0] for m in a if m] == [0.0, 1.0] and a[2:] == [None, None]
     assert [m.center[0] for m in b if m] == [0.1, 1.2]
-    assert later[0].center[0] == 0.2 and later[1] is None and later[2] is alone and later[3].center[0] == 5.0
+    assert (
+        later[0].center[0] == 0.2
+        and later[1] is None
+        and later[2] is alone
+        and later[3].center[0] == 5.0
+    )
 
 
 def places(*xs):
@@ -397,14 +452,20 @@ def places(*xs):
         ((0.0,), (0.9,), [0]),
         ((0.0, 0.8), (0.3, 1.1), [0, 1]),
         ((0.0, 0.8), (1.1, 0.3), [1, 0]),
-        ((0.0, 1.0), (-1.4, -0.4), [None, None]),  # one walked to where the other was, whose way is too long
+        (
+            (0.0, 1.0),
+            (-1.4, -0.4),
+            [None, None],
+        ),  # one walked to where the other was, whose way is too long
         ((0.0, 0.4), (0.2, 9.0), [None, None]),  # who of them went away?
         ((0.0,), (0.1, 0.2), [None]),
     ],
 )
 def test_of_ways_that_are_as_short_none_is_taken(before, after, linked):
     _, second = in_order_of_time([places(*before), places(*after)])
-    found = [None if match is None else after.index(match.center[0]) for match in second[: len(before)]]
+    found = [
+        None if match is None else after.index(match.center[0]) for match in second[: len(before)]
+    ]
     assert found == linked
 
 
@@ -417,13 +478,21 @@ def test_whom_space_does_not_link_the_photo_of_one_camera_links():
     views, _ = seen_in(np.stack([somebody(0, -0.5), somebody(1, 0.5)]), 1)
     first, second = views[0].people
     guest = first - SIDEWAYS
-    shown = [[views[0]], [views[0]._replace(people=(second + 0.05 * SIDEWAYS, guest, first - 0.05 * SIDEWAYS))]]
+    shown = [
+        [views[0]],
+        [views[0]._replace(people=(second + 0.05 * SIDEWAYS, guest, first - 0.05 * SIDEWAYS))],
+    ]
     alone = lambda i: Match((i,), (False,), float("inf"), np.full(3, np.nan))
     matches = [[alone(0), alone(1)], [alone(0), alone(1), alone(2)]]
-    assert [[m and m.members[0] for m in frame] for frame in in_order_of_time(matches, shown)] == [[0, 1, None], [2, 0, 1]]
+    assert [[m and m.members[0] for m in frame] for frame in in_order_of_time(matches, shown)] == [
+        [0, 1, None],
+        [2, 0, 1],
+    ]
     assert len(in_order_of_time(matches)[0]) == 5  # without the photos nobody is linked
     turned = views[0]._replace(cam_from_world=np.diag([-1.0, 1, -1, 1]) @ views[0].cam_from_world)
-    away = in_order_of_time(matches, [shown[0], [shown[1][0]._replace(cam_from_world=turned.cam_from_world)]])
+    away = in_order_of_time(
+        matches, [shown[0], [shown[1][0]._replace(cam_from_world=turned.cam_from_world)]]
+    )
     assert len(away[0]) == 5
 
 
@@ -440,6 +509,10 @@ def test_colors_match_people_at_any_exposure_or_not_at_all(exposure):
     rng = np.random.default_rng(0)
     people = np.asarray([[[0.5, 0.2, 0.2], [0.1, 0.1, 0.3]], [[0.3, 0.5, 0.3], [0.5, 0.45, 0.4]]])
     seen = people[::-1] * exposure + rng.normal(0, 0.005, people.shape)
-    assert match_colors(people, seen) in ((1, 0), None) and (match_colors(people, seen) or exposure < 0.5)
+    assert match_colors(people, seen) in ((1, 0), None) and (
+        match_colors(people, seen) or exposure < 0.5
+    )
     greys = np.full((2, 2, 3), 0.8) * np.asarray([1.0, 0.65])[:, None, None]
-    assert match_colors(greys, greys[:1] * exposure) is None  # a dark photo of the light one, or the dark one
+    assert (
+        match_colors(greys, greys[:1] * exposure) is None
+    )  # a dark photo of the light one, or the dark one

@@ -32,7 +32,9 @@ def test_orbit_looks_at_its_target_right_side_up():
 def test_rays_pass_through_the_pixel_centres_they_belong_to():
     c = ring()[3]
     origin, directions = pixel_rays(c)
-    assert np.allclose(c.world_from_cam @ c.cam_from_world, np.eye(4), atol=ATOL) and np.allclose(origin, c.center)
+    assert np.allclose(c.world_from_cam @ c.cam_from_world, np.eye(4), atol=ATOL) and np.allclose(
+        origin, c.center
+    )
     assert np.allclose(np.linalg.norm(directions, axis=-1), 1, atol=ATOL)
     uv, _ = cameras.project(c, origin + 1.7 * directions[5, 9])
     assert np.allclose(uv, [9.5, 5.5], atol=1e-3)
@@ -52,14 +54,18 @@ def test_resizing_and_units_keep_the_image():
 
 def test_from_opencv_is_traced_and_differentiated():
     def depth(K, matrix):
-        return cameras.project(Camera.from_opencv(K, matrix, 32, 24), jnp.asarray([0.2, 1.0, 2.0]))[0].sum()
+        return cameras.project(Camera.from_opencv(K, matrix, 32, 24), jnp.asarray([0.2, 1.0, 2.0]))[
+            0
+        ].sum()
 
     K32, matrix = jnp.asarray(K, jnp.float32), jnp.eye(4)
     value, (by_K, by_matrix) = jax.jit(jax.value_and_grad(depth, argnums=(0, 1)))(K32, matrix)
     np.testing.assert_allclose(value, depth(K32, matrix), rtol=1e-6)
     np.testing.assert_allclose(by_K[0, 0], 0.2 / 2, rtol=1e-6)
     assert np.abs(by_matrix[:3, 3]).max() > 1
-    assert jax.vmap(lambda K: Camera.from_opencv(K, matrix, 32, 24))(jnp.stack([K32] * 3)).K.shape == (3, 3, 3)
+    assert jax.vmap(lambda K: Camera.from_opencv(K, matrix, 32, 24))(
+        jnp.stack([K32] * 3)
+    ).K.shape == (3, 3, 3)
     with pytest.raises(ValueError, match=r"K: expected shape \(3, 3\)"):
         jax.jit(lambda K: Camera.from_opencv(K, matrix, 32, 24).K)(jnp.eye(4))
 
@@ -94,11 +100,19 @@ def test_a_camera_keeps_float64_where_jax_has_it(kind):
         assert made.K.dtype == made.cam_from_world.dtype == jnp.float64 and made.K[0, 0] == focal
         traced = jax.jit(lambda K: Camera.from_opencv(K, matrix, 32, 24).K)(jnp.asarray(intrinsics))
         assert traced.dtype == jnp.float64 and traced[0, 0] == focal
-        assert Camera.from_opencv(intrinsics.astype(np.float32), matrix.astype(np.float32), 32, 24).K.dtype == jnp.float32
+        assert (
+            Camera.from_opencv(
+                intrinsics.astype(np.float32), matrix.astype(np.float32), 32, 24
+            ).K.dtype
+            == jnp.float32
+        )
         assert cameras.intrinsics_from_fov(np.float64(0.7), 64, 48)[1, 1] == 24 / np.tan(0.35)
         around = cameras.orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 0.1, made.K, 32, 24)
         assert around.cam_from_world.dtype == around.K.dtype == jnp.float64
-    for single in (Camera.from_opencv(intrinsics, matrix, 32, 24), Camera.from_opencv(K.astype(np.float16), matrix, 32, 24)):
+    for single in (
+        Camera.from_opencv(intrinsics, matrix, 32, 24),
+        Camera.from_opencv(K.astype(np.float16), matrix, 32, 24),
+    ):
         assert single.K.dtype == single.cam_from_world.dtype == jnp.float32
 
 
@@ -107,7 +121,9 @@ def test_sides_are_whole_numbers_of_pixels():
     sides = cameras._pixels(64.0, np.int64(48).item())
     assert sides == (64, 48) and all(type(side) is int for side in sides)
     for wrong in ((32.5, 24), (32, 24.5), (float("nan"), 24), (32, float("inf"))):
-        with pytest.raises((ValueError, OverflowError), match=r"whole numbers of pixels, got|at least 1"):
+        with pytest.raises(
+            (ValueError, OverflowError), match=r"whole numbers of pixels, got|at least 1"
+        ):
             cameras._pixels(*wrong)
 
 
@@ -125,7 +141,9 @@ def test_the_field_of_view_is_an_argument_of_transformations_too():
         return cameras.intrinsics_from_fov(angle, 64, 48)[1, 1]
 
     assert np.isclose(jax.jit(focal)(0.7), focal(0.7), rtol=1e-6)
-    assert np.isclose(jax.grad(focal)(0.7), (focal(0.701) - focal(0.699)) / 0.002, rtol=1e-2)  # of float32 differences
+    assert np.isclose(
+        jax.grad(focal)(0.7), (focal(0.701) - focal(0.699)) / 0.002, rtol=1e-2
+    )  # of float32 differences
 
 
 def test_neighbours_along_the_curve_are_neighbours_in_space():
@@ -135,4 +153,6 @@ def test_neighbours_along_the_curve_are_neighbours_in_space():
     ordered = np.asarray(positions)[np.argsort(ranks)]
     steps = np.linalg.norm(np.diff(ordered, axis=0), axis=-1).mean()
     assert steps < 0.4 * np.linalg.norm(np.diff(positions, axis=0), axis=-1).mean()
-    assert along_curve(jnp.asarray([[-9.0, -9.0, -9.0], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]]), 1.0).tolist() == [0, 1, 2]
+    assert along_curve(
+        jnp.asarray([[-9.0, -9.0, -9.0], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]]), 1.0
+    ).tolist() == [0, 1, 2]

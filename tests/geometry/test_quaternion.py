@@ -53,7 +53,9 @@ def test_between_turns_one_direction_into_the_other_the_short_way(seed, batch, c
     b = b / jnp.linalg.norm(b, axis=-1, keepdims=True)
     q = quaternion.between(a, b)
     turned = jnp.einsum("...ij,...j->...i", quaternion.to_matrix(q), a)
-    assert close(turned, b, atol=1e-4 if case == "almost opposite" else 1e-5)  # a + b, 0.01 long, has five digits
+    assert close(
+        turned, b, atol=1e-4 if case == "almost opposite" else 1e-5
+    )  # a + b, 0.01 long, has five digits
     assert close(jnp.linalg.norm(q, axis=-1), jnp.ones(batch))
     assert np.all(q[..., 0] >= 0)  # at most half a turn
     if case == "same":
@@ -74,13 +76,19 @@ def test_axis_angle_agrees_with_the_matrix_exponential(seed, exponent):
     skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     m = quaternion.matrix_from_axis_angle(jnp.asarray(v, jnp.float32))
     assert close(m, expm(skew), atol=5e-6)
-    assert close(quaternion.to_matrix(quaternion.from_axis_angle(jnp.asarray(v, jnp.float32))), expm(skew), atol=5e-6)
+    assert close(
+        quaternion.to_matrix(quaternion.from_axis_angle(jnp.asarray(v, jnp.float32))),
+        expm(skew),
+        atol=5e-6,
+    )
 
 
 def test_derivative_at_no_rotation_is_the_generator():
     both = lambda v: (quaternion.matrix_from_axis_angle(v), quaternion.from_axis_angle(v))
     matrix, q = jax.jit(jax.jacfwd(both))(jnp.zeros(3))
-    assert close(matrix[..., 2], jnp.asarray([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]])) and close(q[1:], 0.5 * jnp.eye(3))
+    assert close(matrix[..., 2], jnp.asarray([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]])) and close(
+        q[1:], 0.5 * jnp.eye(3)
+    )
 
 
 @pytest.mark.slow
@@ -99,16 +107,22 @@ def test_interpolation_goes_the_shortest_way_at_an_even_speed():
     a[1], b[1] = 0, 0
     share = np.linspace(0, 1, 20, dtype=np.float32)
     got = Rotation.from_rotvec(np.asarray(jax.jit(quaternion.interpolate)(a, b, share)))
-    ways = [Slerp([0, 1], Rotation.from_rotvec([x, y]))(t) for x, y, t in zip(a, b, share, strict=True)]
+    ways = [
+        Slerp([0, 1], Rotation.from_rotvec([x, y]))(t) for x, y, t in zip(a, b, share, strict=True)
+    ]
     assert max((one.inv() * other).magnitude() for one, other in zip(got, ways, strict=True)) < 1e-5
 
 
-FLOAT32_TOLERANCE = 2e-5  # a dozen roundings of 6e-8 in each of six sweeps, relative to the largest singular value
+FLOAT32_TOLERANCE = (
+    2e-5  # a dozen roundings of 6e-8 in each of six sweeps, relative to the largest singular value
+)
 FLOAT64_TOLERANCE = 1e-13
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, FLOAT32_TOLERANCE), (np.float64, FLOAT64_TOLERANCE)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [(np.float32, FLOAT32_TOLERANCE), (np.float64, FLOAT64_TOLERANCE)]
+)
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 2**31), stretch=st.floats(0, 6))
 def test_factors_rebuild_the_gram_matrix(dtype, tolerance, seed, stretch):
@@ -117,7 +131,9 @@ def test_factors_rebuild_the_gram_matrix(dtype, tolerance, seed, stretch):
     with jax.enable_x64(dtype == np.float64):
         u, s = map(np.asarray, left_singular_vectors(jnp.asarray(m)))
     gram = np.einsum("bik,bjk->bij", m.astype(np.float64), m.astype(np.float64))
-    rebuilt = np.einsum("bik,bk,bjk->bij", u.astype(np.float64), s.astype(np.float64) ** 2, u.astype(np.float64))
+    rebuilt = np.einsum(
+        "bik,bk,bjk->bij", u.astype(np.float64), s.astype(np.float64) ** 2, u.astype(np.float64)
+    )
     scale = np.abs(gram).max(axis=(1, 2), keepdims=True)
     assert np.abs(rebuilt - gram).max() <= bound(tolerance) * scale.max()
     assert np.abs(np.einsum("bki,bkj->bij", u, u) - np.eye(3)).max() < bound(tolerance) * 10
@@ -127,7 +143,23 @@ def test_factors_rebuild_the_gram_matrix(dtype, tolerance, seed, stretch):
 
 
 def test_degenerate_matrices_give_rotations():
-    cases = np.stack([np.zeros((3, 3)), np.eye(3), np.outer([1, 2, 3], [1, 0, 1]), np.diag([1, 1e-20, 0]), -np.eye(3)])
-    for m, u, s in zip(cases, *map(np.asarray, jax.jit(left_singular_vectors)(jnp.asarray(cases, jnp.float32))), strict=True):
-        assert np.allclose(u.T @ u, np.eye(3), atol=FLOAT32_TOLERANCE) and np.isclose(np.linalg.det(u), 1, atol=FLOAT32_TOLERANCE)
-        assert np.allclose(u @ np.diag(s**2) @ u.T, m @ m.T, atol=FLOAT32_TOLERANCE * max(1, np.abs(m @ m.T).max()))
+    cases = np.stack(
+        [
+            np.zeros((3, 3)),
+            np.eye(3),
+            np.outer([1, 2, 3], [1, 0, 1]),
+            np.diag([1, 1e-20, 0]),
+            -np.eye(3),
+        ]
+    )
+    for m, u, s in zip(
+        cases,
+        *map(np.asarray, jax.jit(left_singular_vectors)(jnp.asarray(cases, jnp.float32))),
+        strict=True,
+    ):
+        assert np.allclose(u.T @ u, np.eye(3), atol=FLOAT32_TOLERANCE) and np.isclose(
+            np.linalg.det(u), 1, atol=FLOAT32_TOLERANCE
+        )
+        assert np.allclose(
+            u @ np.diag(s**2) @ u.T, m @ m.T, atol=FLOAT32_TOLERANCE * max(1, np.abs(m @ m.T).max())
+        )

@@ -60,7 +60,10 @@ AVATARS = {
     "a corner of 2^30": put("faces", 1 << 30),
     "a corner of -1": put("faces", -1),
     "corners of half": cast("faces", np.float32),
-    **{f"complex {name}": cast(name, np.complex64) for name in ("means", "colors", "skinning_weights")},
+    **{
+        f"complex {name}": cast(name, np.complex64)
+        for name in ("means", "colors", "skinning_weights")
+    },
     "words": cast("means", str),
     "bytes": cast("colors", "S4"),
     "too large for float32": to(means=np.full((6, 3), 1e300)),
@@ -149,7 +152,13 @@ MOTION = {
 }
 for kind, change in MOTION.items():
     arrays_case(kind, "amass", AMASS.copy, change, 6)
-arrays_case("names that are no list", "joints npz", lambda: {"points": np.zeros((2, 3))}, to(names=np.asarray("x")), 6)
+arrays_case(
+    "names that are no list",
+    "joints npz",
+    lambda: {"points": np.zeros((2, 3))},
+    to(names=np.asarray("x")),
+    6,
+)
 FITS = {
     "another set": to(set=np.asarray("mine")),
     "NaN": put("points", np.nan),
@@ -158,8 +167,18 @@ FITS = {
     "one name": to(names=np.asarray("x")),
 }
 for kind, change in FITS.items():
-    for reader, arrays in (("fit record", honest.fit_arrays), ("keypoints npz", honest.keypoint_arrays)):
-        arrays_case(kind, reader, arrays, change, 6, "either" if kind in ("NaN", "names of numbers") else "refused")
+    for reader, arrays in (
+        ("fit record", honest.fit_arrays),
+        ("keypoints npz", honest.keypoint_arrays),
+    ):
+        arrays_case(
+            kind,
+            reader,
+            arrays,
+            change,
+            6,
+            "either" if kind in ("NaN", "names of numbers") else "refused",
+        )
 BANKS = {
     "a seed of another split": put("seeds", 10**9),
     "seeds below 0": put("seeds", -5),
@@ -222,7 +241,9 @@ TURNS = {
     "one place": {"root_positions": np.zeros(3)},
 }
 for kind, change in TURNS.items():
-    arrays_case(kind, "kimodo", lambda change=change: honest.KIMODO | change, lambda arrays: None, 6)
+    arrays_case(
+        kind, "kimodo", lambda change=change: honest.KIMODO | change, lambda arrays: None, 6
+    )
 
 
 def body_of(key, value):
@@ -240,8 +261,21 @@ for kind, rate in RATES.items():
     for reader in ("filmed", "motion npz"):
         arrays_case(f"a rate of {kind}", reader, honest.motion_arrays, to(fps=np.asarray(rate)), 5)
 MANY = {
-    "300,000 frames": {"rotations": np.zeros((300_000, 55, 3), np.float32), "translations": np.zeros((300_000, 3), np.float32)},
-    "9,000 frames of 100 seconds each": {"rotations": np.zeros((9000, 55, 3)), "translations": np.zeros((9000, 3)), "fps": 0.01},
+    "300,000 frames": {
+        "rotations": np.zeros((300_000, 55, 3), np.float32),
+        "translations": np.zeros((300_000, 3), np.float32),
+    },
+    "9,000 frames of 100 seconds each": {
+        "rotations": np.zeros((9000, 55, 3)),
+        "translations": np.zeros((9000, 3)),
+        "fps": 0.01,
+    },
 }
 for kind, changes in MANY.items():
-    arrays_case(kind, "filmed", lambda changes=changes: honest.motion_arrays(**changes), lambda arrays: None, 5)
+    arrays_case(
+        kind,
+        "filmed",
+        lambda changes=changes: honest.motion_arrays(**changes),
+        lambda arrays: None,
+        5,
+    )

@@ -24,10 +24,21 @@ def raw_zip(members):
     body, directory = bytearray(), bytearray()
     for name, method, data, size in members:
         common = struct.pack("<HHHHHIIIHH", 20, 0, method, 0, 0, 0, len(data), size, len(name), 0)
-        directory += b"PK\1\2" + struct.pack("<H", 20) + common + struct.pack("<HHHII", 0, 0, 0, 0, len(body)) + name
+        directory += (
+            b"PK\1\2"
+            + struct.pack("<H", 20)
+            + common
+            + struct.pack("<HHHII", 0, 0, 0, 0, len(body))
+            + name
+        )
         body += b"PK\3\4" + common + name + data
     count = min(len(members), 0xFFFF)
-    return bytes(body) + directory + b"PK\5\6" + struct.pack("<HHHHIIH", 0, 0, count, count, len(directory), len(body), 0)
+    return (
+        bytes(body)
+        + directory
+        + b"PK\5\6"
+        + struct.pack("<HHHHIIH", 0, 0, count, count, len(directory), len(body), 0)
+    )
 
 
 def deflated_zeros(size, start=b""):
@@ -41,7 +52,12 @@ def deflated_zeros(size, start=b""):
 
 def npy_header(descr="'<f8'", order=False, shape="(3,)", version=(1, 0), extra=""):
     text = f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, {extra}}}\n".encode()
-    return b"\x93NUMPY" + bytes(version) + struct.pack("<H" if version[0] == 1 else "<I", len(text)) + text
+    return (
+        b"\x93NUMPY"
+        + bytes(version)
+        + struct.pack("<H" if version[0] == 1 else "<I", len(text))
+        + text
+    )
 
 
 def npz_of(*members):
@@ -56,7 +72,9 @@ def npz_of(*members):
 def bomb(gigabytes):
     header = npy_header(shape=f"({(1 << 30) // 8},)")
     data = deflated_zeros(1 << 30, header)
-    return raw_zip([(f"x{i}.npy".encode(), 8, data, (1 << 30) + len(header)) for i in range(gigabytes)])
+    return raw_zip(
+        [(f"x{i}.npy".encode(), 8, data, (1 << 30) + len(header)) for i in range(gigabytes)]
+    )
 
 
 HEADERS = {
@@ -76,22 +94,45 @@ HEADERS = {
     "version 9": npy_header(version=(9, 0)),
     "characters that do not exist": npy_header("'<U1'", shape="(1,)") + b"\xff\xff\xff\x7f",
 }
-ARCHIVES = {f"with {kind}": npz_of(("x.npy", data + bytes(16 * (kind == "objects")))) for kind, data in HEADERS.items()} | {
-    "encrypted": raw_zip([(b"x.npy", 0, bytes(20), 20)]).replace(b"PK\3\4\x14\0\0\0", b"PK\3\4\x14\0\1\0"),
+ARCHIVES = {
+    f"with {kind}": npz_of(("x.npy", data + bytes(16 * (kind == "objects"))))
+    for kind, data in HEADERS.items()
+} | {
+    "encrypted": raw_zip([(b"x.npy", 0, bytes(20), 20)]).replace(
+        b"PK\3\4\x14\0\0\0", b"PK\3\4\x14\0\1\0"
+    ),
     "compressed in another way": raw_zip([(b"x.npy", 14, bytes(20), 20)]),
     "with a method that does not exist": raw_zip([(b"x.npy", 99, bytes(20), 20)]),
-    "with a false checksum": raw_zip([(b"x.npy", 0, npy_header() + bytes(24), len(npy_header()) + 24)]),
+    "with a false checksum": raw_zip(
+        [(b"x.npy", 0, npy_header() + bytes(24), len(npy_header()) + 24)]
+    ),
     "with damaged deflate": raw_zip([(b"x.npy", 8, b"\xff" * 40, 400)]),
     "that says it is larger": raw_zip([(b"x.npy", 0, bytes(20), 1 << 31)]),
 }
 for kind, data in ARCHIVES.items():
     case(kind, "npz", written("a.npz", data), "read" if "object" in kind else "refused", item=6)
-    for reader in ("smplx npz", "avatar", "amass", "bank", "joints npz", "fit record", "body", "keypoints npz"):
+    for reader in (
+        "smplx npz",
+        "avatar",
+        "amass",
+        "bank",
+        "joints npz",
+        "fit record",
+        "body",
+        "keypoints npz",
+    ):
         case(kind, reader, written("a.npz", data), item=6)
 for gigabytes in (1, 8):
     for reader in ("npz", "avatar", "smplx npz", "amass", "keypoints npz"):
-        case(f"zeros of {gigabytes} GiB", reader, written("a.npz", lambda g=gigabytes: bomb(g)), item=5)
-many = lambda suffix: lambda: raw_zip([(f"{i}{suffix}".encode(), 0, b"", 0) for i in range(100_000)])
+        case(
+            f"zeros of {gigabytes} GiB",
+            reader,
+            written("a.npz", lambda g=gigabytes: bomb(g)),
+            item=5,
+        )
+many = lambda suffix: (
+    lambda: raw_zip([(f"{i}{suffix}".encode(), 0, b"", 0) for i in range(100_000)])
+)
 case("100,000 members", "npz", written("a.npz", many(".npy")), item=5)
 case("100,000 members", "torch zip", written("a.pt", many("")), item=5)
 
@@ -120,7 +161,12 @@ SAFETENSORS = {
 for kind, (header, item) in SAFETENSORS.items():
     for reader in ("safetensors", "weights", "vgg", "released checkpoint"):
         case(kind, reader, written("a.safetensors", safetensors(header)), item=item)
-case("a header of 2^60", "safetensors", written("a.safetensors", struct.pack("<Q", 1 << 60) + b"{" + bytes(64)), item=5)
+case(
+    "a header of 2^60",
+    "safetensors",
+    written("a.safetensors", struct.pack("<Q", 1 << 60) + b"{" + bytes(64)),
+    item=5,
+)
 
 
 # Photos ---------------------------------------------------------------------------------------------------------------
@@ -132,7 +178,13 @@ def chunk(name, data):
 
 def png(width, height, depth=8, color=2, data=b"", method=b"\0\0\0", extra=b""):
     header = struct.pack(">IIBB", width, height, depth, color) + method
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + extra + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + extra
+        + chunk(b"IDAT", data)
+        + chunk(b"IEND", b"")
+    )
 
 
 def zlib_zeros(size):
@@ -204,14 +256,23 @@ PHOTOS = {
     "a HEIC that is a video": (b"\0\0\0\x14ftypheic" + bytes(8) + b"\0\0\0\x08moov", 6),
 }  # fmt: skip
 for kind, (data, item) in PHOTOS.items():
-    expect = "either" if kind in ("8 bits and a bomb", "16 bits and a bomb", "text of a gigabyte") else "refused"
+    expect = (
+        "either"
+        if kind in ("8 bits and a bomb", "16 bits and a bomb", "text of a gigabyte")
+        else "refused"
+    )
     for reader, name in (("image", "a.png"), ("mask", "a.jpg")):
         case(kind, reader, written(name, data), expect, item)
 
 
 for kind in ("EPS", "13,000 x 13,000", "TIFF", "16 bits, cut"):
     for reader in ("capture", "photos", "boundary"):
-        case(f"a photo that is {kind}", reader, capture_with(photo=PHOTOS[kind][0]), item=PHOTOS[kind][1])
+        case(
+            f"a photo that is {kind}",
+            reader,
+            capture_with(photo=PHOTOS[kind][0]),
+            item=PHOTOS[kind][1],
+        )
 
 
 # Pillow decodes these -------------------------------------------------------------------------------------------------
@@ -231,7 +292,9 @@ DECODED = {
     "a false checksum of the pixels": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IDAT"),
     "a false checksum of the palette": damaged(BY_PALETTE, b"PLTE"),
     "a false checksum of the end": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IEND"),
-    "a false checksum of a text": damaged(png(4, 4, data=zlib.compress(bytes(52)), extra=chunk(b"tEXt", b"a\0b")), b"tEXt"),
+    "a false checksum of a text": damaged(
+        png(4, 4, data=zlib.compress(bytes(52)), extra=chunk(b"tEXt", b"a\0b")), b"tEXt"
+    ),
     "no end": png(4, 4, data=zlib.compress(bytes(52)))[:-12],
 }
 for kind, data in DECODED.items():
@@ -265,7 +328,9 @@ def instances(content):
 
 def chain_of_nodes(content):
     first = len(content["nodes"])
-    content["nodes"] += [{"children": [first + i + 1], "name": f"c{i}"} for i in range(5000)] + [{"mesh": 0, "name": "end"}]
+    content["nodes"] += [{"children": [first + i + 1], "name": f"c{i}"} for i in range(5000)] + [
+        {"mesh": 0, "name": "end"}
+    ]
     content["scenes"][0]["nodes"] = [first]
 
 
@@ -306,7 +371,13 @@ def filtered_ply(number):
     """One Gaussian in text, with Mip-Splatting's filter of that size."""
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "filter_3D"]
     names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
-    header = ["ply", "format ascii 1.0", "element vertex 1", *(f"property double {name}" for name in names), "end_header"]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 1",
+        *(f"property double {name}" for name in names),
+        "end_header",
+    ]
     row = ["1"] * len(names)
     row[7] = number
     return "\n".join([*header, " ".join(row), ""]).encode()
@@ -343,15 +414,29 @@ GAUSSIANS = {
     "a header cut off": ("spz 4", written("a.spz", b"NGSP\4\0\0\0\1"), 6),
     "1,500 properties that nobody knows": (
         "3dgs",
-        gaussians_ply("element vertex 1", *(f"property float \x1b[31m{i}" for i in range(1_500)), size=6_000),
+        gaussians_ply(
+            "element vertex 1", *(f"property float \x1b[31m{i}" for i in range(1_500)), size=6_000
+        ),
         6,
     ),
     "a filter of 10^30 m": ("3dgs", written("a.ply", lambda: filtered_ply("1e30")), 6),
     "all of it NaN": ("3dgs", written("a.ply", lambda: filtered_ply("nan")), 6),
-    "10^12 in the header": ("3dgs", gaussians_ply("element vertex 1000000000000", "property float x"), 5),
-    "20 million without a file": ("3dgs", gaussians_ply("element vertex 20000000", "property float x", size=99), 5),
+    "10^12 in the header": (
+        "3dgs",
+        gaussians_ply("element vertex 1000000000000", "property float x"),
+        5,
+    ),
+    "20 million without a file": (
+        "3dgs",
+        gaussians_ply("element vertex 20000000", "property float x", size=99),
+        5,
+    ),
     "10 million without properties": ("3dgs", gaussians_ply("element vertex 10000000"), 5),
-    "one property twice": ("3dgs", gaussians_ply("element vertex 1", *["property float x"] * 2, size=8), 6),
+    "one property twice": (
+        "3dgs",
+        gaussians_ply("element vertex 1", *["property float x"] * 2, size=8),
+        6,
+    ),
     "4 billion": ("spz", spz(2**32 - 1, 0), 5),
     "19 million of zeros, a bomb": ("spz", spz(19_000_000, 3, 64 << 20), 5),
     "ten times as long, a bomb": ("spz", spz(10, 0, 64 << 20), 5),
@@ -361,8 +446,18 @@ for kind, (reader, make, item) in GAUSSIANS.items():
 case("a chain of 5,000 nodes", "glb", glb(chain_of_nodes), "either", 5)
 case("a texture that is EPS", "glb", glb(images=EPS), item=4)
 case("a texture of 13,000 x 13,000", "glb", glb(images=PHOTOS["13,000 x 13,000"][0]), item=5)
-case("lists in lists", "glb", written("a.glb", lambda: glb_of(b'{"a":' + b"[" * 90_000 + b"]" * 90_000 + b"}")), item=6)
-case("2 MB of JSON", "glb", written("a.glb", lambda: glb_of(b'{"a": "' + b"x" * (2 << 20) + b'"}')), item=5)
+case(
+    "lists in lists",
+    "glb",
+    written("a.glb", lambda: glb_of(b'{"a":' + b"[" * 90_000 + b"]" * 90_000 + b"}")),
+    item=6,
+)
+case(
+    "2 MB of JSON",
+    "glb",
+    written("a.glb", lambda: glb_of(b'{"a": "' + b"x" * (2 << 20) + b'"}')),
+    item=5,
+)
 case("a texture that has moved", "glb", glb({"images.0": {"uri": "moved.png"}}), "read", 6)
 
 
@@ -389,14 +484,27 @@ def of_bytes(data):
 case("a texture that has moved", "obj", obj_with(), "read", 6)
 case("a material that has moved", "obj", obj_with(material="moved.mtl"), "read", 6)
 case("a texture that is EPS", "obj", obj_with(of_bytes(EPS)), "read", 4)
-case("a texture of 13,000 x 13,000", "obj", obj_with(of_bytes(PHOTOS["13,000 x 13,000"][0])), "read", 5)
+case(
+    "a texture of 13,000 x 13,000",
+    "obj",
+    obj_with(of_bytes(PHOTOS["13,000 x 13,000"][0])),
+    "read",
+    5,
+)
 case("a material outside", "obj", obj_with(material="../../../../etc/passwd"), "read", 2)
 short, short_uvs = (
-    lambda data, kind=kind: re.sub(rb"^(%s \S+) .*$" % kind, rb"\1", data, flags=re.MULTILINE) for kind in (b"v", b"vt")
+    lambda data, kind=kind: re.sub(rb"^(%s \S+) .*$" % kind, rb"\1", data, flags=re.MULTILINE)
+    for kind in (b"v", b"vt")
 )
 case("vertices of one number", "obj", changed("obj", short), item=6)
 case("vertices of one number", "thuman scan", changed("thuman scan", short), item=6)
-case("texture coordinates of one number", "thuman scan", changed("thuman scan", short_uvs), "either", 6)
+case(
+    "texture coordinates of one number",
+    "thuman scan",
+    changed("thuman scan", short_uvs),
+    "either",
+    6,
+)
 case("a texture outside", "obj", obj_with(texture="../../../../etc/passwd"), "read", 2)
 MESHES = {
     "a corner of 2^30": ("scan.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 1073741824\n" * 60),
@@ -424,9 +532,20 @@ MESHES = {
 }  # fmt: skip
 for kind, (name, data) in MESHES.items():
     expect = "either" if kind == "a corner of 0" else "refused"  # trimesh counts it from the end
-    case(kind, name.split(".")[1], written(name, data), expect, 5 if "10^" in kind or "2^" in kind else 6)
+    case(
+        kind,
+        name.split(".")[1],
+        written(name, data),
+        expect,
+        5 if "10^" in kind or "2^" in kind else 6,
+    )
 for suffix in ("dae", "3mf", "gltf", "zip", "xyz", "dxf", "svg", "step", "urdf", "json", "pkl", ""):
-    case(f"a file named .{suffix}", "obj", written(f"scan.{suffix}", "<?xml version='1.0'?><a/>"), item=4)
+    case(
+        f"a file named .{suffix}",
+        "obj",
+        written(f"scan.{suffix}", "<?xml version='1.0'?><a/>"),
+        item=4,
+    )
 
 
 # Parts and textures -------------------------------------------------------------------------------------------------------
@@ -434,7 +553,9 @@ for suffix in ("dae", "3mf", "gltf", "zip", "xyz", "dxf", "svg", "step", "urdf",
 
 def many_changes(word, count):
     vertices = "".join(f"v {i} {i % 7} {i % 3}\n" for i in range(3 * count))
-    return vertices + "".join(f"{word} a{i}\nf {3 * i + 1} {3 * i + 2} {3 * i + 3}\n" for i in range(count))
+    return vertices + "".join(
+        f"{word} a{i}\nf {3 * i + 1} {3 * i + 2} {3 * i + 3}\n" for i in range(count)
+    )
 
 
 for word in ("o", "g", "s"):
@@ -449,12 +570,20 @@ for kind, line in {
     def disguised(line=line):
         vertices = "".join(f"v {i} {i % 7} {i % 3}\n" for i in range(90_000))
         return vertices + "".join(
-            line.format(i, f"{3 * i + 1} {3 * i + 2} {3 * i + 3}") for i in range(30_000 // line.count("u"))
+            line.format(i, f"{3 * i + 1} {3 * i + 2} {3 * i + 3}")
+            for i in range(30_000 // line.count("u"))
         )
 
     case(f"usemtl {kind}, 30,000", "obj", written("scan.obj", disguised), "either", 5)
-case("usemtl for each of 30,000 faces", "obj", written("scan.obj", lambda: many_changes("usemtl", 30_000)), item=5)
-two = written("scan.obj", lambda: re.sub(r"usemtl a\d*(\d)", r"usemtl \1", many_changes("usemtl", 30_000)))
+case(
+    "usemtl for each of 30,000 faces",
+    "obj",
+    written("scan.obj", lambda: many_changes("usemtl", 30_000)),
+    item=5,
+)
+two = written(
+    "scan.obj", lambda: re.sub(r"usemtl a\d*(\d)", r"usemtl \1", many_changes("usemtl", 30_000))
+)
 case("two materials, 30,000 changes", "obj", two, "read", 5)
 SOLID = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 {}\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
 solids = lambda: "".join(SOLID.format(i) for i in range(30_000))
@@ -463,15 +592,24 @@ case("30,000 SOLIDS", "stl", written("scan.stl", lambda: solids().upper()), item
 
 
 def repeated(count):
-    return lambda content: content["meshes"][0].update(primitives=content["meshes"][0]["primitives"] * count)
+    return lambda content: content["meshes"][0].update(
+        primitives=content["meshes"][0]["primitives"] * count
+    )
 
 
 WHITE = Image.new("RGB", (3000, 3000), "white")
 case("3,000 parts of a mesh", "glb", glb(repeated(3000)), item=5)
-case("1,000 parts with a texture of 9 million pixels", "glb", glb(repeated(1000), image=WHITE), item=5)
+case(
+    "1,000 parts with a texture of 9 million pixels",
+    "glb",
+    glb(repeated(1000), image=WHITE),
+    item=5,
+)
 
 
-for kind, place in (PLACES | {"empty": of_bytes(b""), "cut off": of_bytes(honest.photo_bytes()[:200])}).items():
+for kind, place in (
+    PLACES | {"empty": of_bytes(b""), "cut off": of_bytes(honest.photo_bytes()[:200])}
+).items():
     case(f"a texture: {kind}", "obj", obj_with(place), "read", 6)
 case("a texture without a name", "obj", obj_with(texture=""), "read", 6)
 case("a texture that is cut off", "glb", glb(images=honest.photo_bytes()[:200]), item=6)
@@ -479,7 +617,9 @@ case("a texture that is cut off", "glb", glb(images=honest.photo_bytes()[:200]),
 
 def nine_thousand_textures(folder):
     path = honest.write_obj(folder)
-    (folder / "scan.mtl").write_text("".join(f"newmtl m{i}\nmap_Kd texture.png\n" for i in range(9000)))
+    (folder / "scan.mtl").write_text(
+        "".join(f"newmtl m{i}\nmap_Kd texture.png\n" for i in range(9000))
+    )
     return path
 
 

@@ -42,7 +42,9 @@ for way, named in WAYS_OUT.items():
     for key, name in OUTSIDE.items():
         for reader in CAPTURES:
             unread = key == "body" and reader == "photos" and "characters" in way
-            make = capture_with(lambda folder, key=key, named=named, name=name: {key: named(folder, name)}, prepare)
+            make = capture_with(
+                lambda folder, key=key, named=named, name=name: {key: named(folder, name)}, prepare
+            )
             case(f"{key}: {way}", reader, make, "either" if unread else "refused", 2)
 for name in ("images/000.png", "capture.json", "", ".", "images"):
     case(f"body: {name!r}", "capture", capture_with({"body": name}), item=2)
@@ -68,9 +70,20 @@ def one_frame(name):
     return honest.transforms(frames=[{"file_path": name, "transform_matrix": honest.POSE}])
 
 
-for name in ("../outside.png", "../../outside.png", "/outside.png", "photos/../../outside.png", "..\\outside.png"):
+for name in (
+    "../outside.png",
+    "../../outside.png",
+    "/outside.png",
+    "photos/../../outside.png",
+    "..\\outside.png",
+):
     case(f"a photo {name}", "import", import_of("transforms.json", one_frame(name)), item=2)
-case("a photo that is a link outwards", "import", import_of("transforms.json", one_frame("l.png"), link=True), item=2)
+case(
+    "a photo that is a link outwards",
+    "import",
+    import_of("transforms.json", one_frame("l.png"), link=True),
+    item=2,
+)
 for name in ("..", "../..", "/", "/tmp", "x\0y"):
     camera = {"K": honest.K, "R": np.eye(3).tolist(), "T": [0, 0, 3], "imgSize": [10, 12]}
     case(f"a camera {name!r}", "import", import_of("cameras.json", {name: camera}), item=2)
@@ -81,7 +94,11 @@ for name in ("..", "../..", "/", "/tmp", "x\0y"):
 
 def capture_of(count, prepare=lambda folder: None, image="images/000.png", **changes):
     """Views that name a photo each: `image` with the number of the view, if it has a place for it."""
-    view = {key: value for key, value in honest.capture_description()["views"][0].items() if key != "mask"}
+    view = {
+        key: value
+        for key, value in honest.capture_description()["views"][0].items()
+        if key != "mask"
+    }
     views = [view | {"frame": 0, "image": image.format(i)} | changes for i in range(count)]
     return capture_with({"views": views}, prepare)
 
@@ -104,10 +121,18 @@ def copies(count, link=lambda old, new: new.write_bytes(old.read_bytes()), size=
 for reader in CAPTURES:
     case("one photo 4,000 times", reader, capture_of(4000, large_photo), item=5)
     case("one photo 100 times", reader, capture_of(100, large_photo), item=5)
-    for kind, link in {"links": lambda old, new: new.symlink_to(old), "hard links": os.link}.items():
+    for kind, link in {
+        "links": lambda old, new: new.symlink_to(old),
+        "hard links": os.link,
+    }.items():
         case(f"400 {kind} to a photo", reader, capture_of(400, copies(400, link), "{}.png"), item=5)
     if reader != "boundary":  # which reads one after the other
-        case("21 white photos of 49 million pixels", reader, capture_of(21, copies(21, size=7000), "{}.png"), item=5)
+        case(
+            "21 white photos of 49 million pixels",
+            reader,
+            capture_of(21, copies(21, size=7000), "{}.png"),
+            item=5,
+        )
 case("5,000 photos", "photos", capture_of(5000, copies(5000, size=12), "{}.png"), item=5)
 for frame in (2_000_000_000, 10**30, 100_000, 1000):
     case(f"frame {frame}", "photos", capture_of(4, frame=frame), item=5)

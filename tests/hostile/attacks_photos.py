@@ -26,7 +26,9 @@ def photo(kind="JPEG", **options):
 # Color profiles ---------------------------------------------------------------------------------------------------------
 
 HONEST = profiles.of_colors(profiles.P3_TO_XYZ, profiles.SRGB_CURVE)
-TABLES = profiles.of_tables(b"RGB ", 3, lambda r, g, b: (30 * r + 50 * g + 20 * b, 60 * r - 60 * g, 40 * r - 80 * b))
+TABLES = profiles.of_tables(
+    b"RGB ", 3, lambda r, g, b: (30 * r + 50 * g + 20 * b, 60 * r - 60 * g, 40 * r - 80 * b)
+)
 RNG = np.random.default_rng(0)
 
 
@@ -58,11 +60,17 @@ PROFILES = {
     "an unknown space": at(HONEST, 16, b"ZZZZ"),
     "CMYK": profiles.of_tables(b"CMYK", 4, lambda c, m, y, k: (100 - 90 * k, 50 * c, 50 * m)),
     "greys": profiles.of_grey(profiles.gamma(2.2)),
-    "a table of 4 billion": profiles.of_colors(profiles.P3_TO_XYZ, b"curv" + bytes(4) + b"\xff" * 40),
+    "a table of 4 billion": profiles.of_colors(
+        profiles.P3_TO_XYZ, b"curv" + bytes(4) + b"\xff" * 40
+    ),
     "an exponent of 255": profiles.of_colors(profiles.P3_TO_XYZ, profiles.gamma(255)),
     "a negative exponent": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(0, -30000)),
-    "a formula over nothing": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(1, 2.2, 0, 1)),
-    "huge numbers": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(4, 30000, 30000, 30000, 3, -3, 9, 9)),
+    "a formula over nothing": profiles.of_colors(
+        profiles.P3_TO_XYZ, profiles.formula(1, 2.2, 0, 1)
+    ),
+    "huge numbers": profiles.of_colors(
+        profiles.P3_TO_XYZ, profiles.formula(4, 30000, 30000, 30000, 3, -3, 9, 9)
+    ),
     "primaries of nothing": profiles.of_colors(0 * profiles.P3_TO_XYZ, profiles.SRGB_CURVE),
     "huge primaries": profiles.of_colors(30000 * profiles.P3_TO_XYZ, profiles.SRGB_CURVE),
     "a cube of 255 sides": with_table(b"mft1" + bytes(4) + bytes([3, 3, 255, 0]) + bytes(600)),
@@ -79,7 +87,9 @@ PROFILES = {
 for kind, data in PROFILES.items():
     case(f"a profile: {kind}", "image", written("a.jpg", photo(icc_profile=data)), "read", 6)
     case(f"a profile: {kind}", "mask", written("a.jpg", photo(icc_profile=data)), "either", 6)
-    deep = png(1, 1, 16, data=zlib.compress(bytes(7)), extra=chunk(b"iCCP", b"a\0\0" + zlib.compress(data)))
+    deep = png(
+        1, 1, 16, data=zlib.compress(bytes(7)), extra=chunk(b"iCCP", b"a\0\0" + zlib.compress(data))
+    )
     case(f"a profile of 16 bits: {kind}", "image", written("a.png", deep), "either", 6)
 for kind in ("a size of 4 GB", "CMYK", "16 channels"):
     in_capture = capture_with(photo=photo("PNG", icc_profile=PROFILES[kind]))
@@ -100,7 +110,13 @@ CHUNKS = {
     "primaries that are cut": chunk(b"cHRM", b"\1" * 5),
 }
 for kind, extra in CHUNKS.items():
-    case(f"a PNG with {kind}", "image", written("a.png", png(4, 4, data=ROW, extra=extra)), "either", 6)
+    case(
+        f"a PNG with {kind}",
+        "image",
+        written("a.png", png(4, 4, data=ROW, extra=extra)),
+        "either",
+        6,
+    )
 
 
 # Behind the picture, and in its segments --------------------------------------------------------------------------------
@@ -116,12 +132,21 @@ def segment(code, content):
 BEHIND = {
     "a video": JPEG + b"\0\0\0\x18ftypmp42" + SCANS + RNG.bytes(100_000),
     "a thousand pictures": JPEG * 1000,
-    "marks of scans": JPEG[:2] + segment(0xE1, b"Exif\0\0" + SCANS) + segment(0xFE, SCANS) + JPEG[2:],
+    "marks of scans": JPEG[:2]
+    + segment(0xE1, b"Exif\0\0" + SCANS)
+    + segment(0xFE, SCANS)
+    + JPEG[2:],
     "a million bytes FF": JPEG[:2] + b"\xff" * 1_000_000 + JPEG[2:],
 }
 for kind, data in BEHIND.items():
     case(f"a JPEG with {kind}", "image", written("a.jpg", data), "read", 6)
-case("a JPEG whose million bytes FF end in 0", "image", written("a.jpg", JPEG[:-2] + b"\xff" * 1_000_000 + bytes(9)), "either", 5)
+case(
+    "a JPEG whose million bytes FF end in 0",
+    "image",
+    written("a.jpg", JPEG[:-2] + b"\xff" * 1_000_000 + bytes(9)),
+    "either",
+    5,
+)
 MANY = as_format("JPEG", progressive=True)()
 LAST = MANY[MANY.rindex(b"\xff\xda") : -2]
 HIDDEN = {
@@ -158,7 +183,8 @@ EXIF = {
     "an orientation of 60,000": exif(orientation=60_000),
     "folders within themselves": b"Exif\0\0MM\0*\0\0\0\x08\0\1\x87\x69\0\4\0\0\0\1\0\0\0\x08\0\0\0\x08",
     "a folder behind the end": b"Exif\0\0MM\0*\xff\xff\xff\xf0",
-    "60,000 tags": b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + b"\xa0\2\0\4\xff\xff\xff\xff\0\0\0\x08" * 5000,
+    "60,000 tags": b"Exif\0\0MM\0*\0\0\0\x08\xff\xff"
+    + b"\xa0\2\0\4\xff\xff\xff\xff\0\0\0\x08" * 5000,
 }
 for kind, data in EXIF.items():
     for form in ("JPEG", "WEBP"):
@@ -173,7 +199,10 @@ AVIF_SIZE = AVIF.index(b"ispe") + 8
 WEB = {
     "a WebP of 16,384 x 16,384": (at(LOSSLESS, 21, b"\xff\xff\xff\x0f"), 5),
     "a WebP of 16 million x 16 million": (at(EXTENDED, 24, b"\xff" * 6), 5),
-    "a WebP of 16,000 x 16,000 in its other way": (at(WEBP, 26, struct.pack("<HH", 16_000, 16_000)), 5),
+    "a WebP of 16,000 x 16,000 in its other way": (
+        at(WEBP, 26, struct.pack("<HH", 16_000, 16_000)),
+        5,
+    ),
     "a WebP without a picture": (b"RIFF\x04\0\0\0WEBP", 6),
     "a WebP of an unknown part": (at(WEBP, 12, b"ABCD"), 6),
     "a WebP that is cut": (WEBP[: len(WEBP) // 2], 6),

@@ -58,7 +58,12 @@ def a_call(module, name, argument=b"touch OWNED"):
 
 def numpy_array(dtype, shape, data):
     """Instructions of an array as numpy writes it, from those of a dtype, a shape and the data."""
-    start = name_of("numpy.core.multiarray", "_reconstruct") + name_of("numpy", "ndarray") + number(0) + TUPLE1
+    start = (
+        name_of("numpy.core.multiarray", "_reconstruct")
+        + name_of("numpy", "ndarray")
+        + number(0)
+        + TUPLE1
+    )
     start += b"C\x01b" + TUPLE3 + REDUCE
     return start + MARK + number(1) + shape + dtype + b"\x89" + data + TUPLE + BUILD
 
@@ -103,7 +108,18 @@ def doubled_list(times):
     """x = [x, x], again and again."""
     out = EMPTY_LIST + b"K\x01a"
     for i in range(times):
-        out += b"q" + bytes([i]) + b"0" + EMPTY_LIST + MARK + b"h" + bytes([i]) + b"h" + bytes([i]) + b"e"
+        out += (
+            b"q"
+            + bytes([i])
+            + b"0"
+            + EMPTY_LIST
+            + MARK
+            + b"h"
+            + bytes([i])
+            + b"h"
+            + bytes([i])
+            + b"e"
+        )
     return out
 
 
@@ -122,7 +138,9 @@ def repeated_encode():
 
 def sparse(kind="csc", shape=(3, 3), indptr=(0, 1, 1, 1), indices=(0,), data=(1.0,)):
     """A sparse matrix with the state that scipy writes."""
-    array = lambda values, code: numpy_array(numpy_dtype(code), shape_of(len(values)), raw(np.asarray(values, code).tobytes()))
+    array = lambda values, code: numpy_array(
+        numpy_dtype(code), shape_of(len(values)), raw(np.asarray(values, code).tobytes())
+    )
     state = EMPTY_DICT + MARK + word("_shape") + (number(shape[0]) + number(shape[1]) + TUPLE2)
     state += word("data") + array(data, "f8") + word("indices") + array(indices, "i4")
     state += word("indptr") + array(indptr, "i8") + b"u"
@@ -142,17 +160,38 @@ PICKLES = {
     "exec of Python 2": a_call("__builtin__", "exec", b"import os"),
     "a dotted name": a_call("os", "path.os.system"),
     "numpy.load": a_call("numpy", "load"),
-    "getattr": name_of("builtins", "getattr") + name_of("os", "system") + word("x") + TUPLE2 + REDUCE,
+    "getattr": name_of("builtins", "getattr")
+    + name_of("os", "system")
+    + word("x")
+    + TUPLE2
+    + REDUCE,
     "an extension": b"\x82\x01",
     "an instance of the old kind": MARK + word("x") + b"ios\nsystem\n",
     "an object of the old kind": MARK + name_of("os", "system") + word("x") + b"o",
     "a persistent id": b"Pos.system\n",
-    "a state for the reconstructor": name_of("copyreg", "_reconstructor") + EMPTY_DICT + word("x") + number(1) + SETITEM + BUILD,
+    "a state for the reconstructor": name_of("copyreg", "_reconstructor")
+    + EMPTY_DICT
+    + word("x")
+    + number(1)
+    + SETITEM
+    + BUILD,
     "a state for _frombuffer": name_of("numpy._core.numeric", "_frombuffer")
     + (EMPTY_DICT + word("__code__") + number(1) + SETITEM)
     + BUILD,
-    "a state for ndarray": name_of("numpy", "ndarray") + EMPTY_DICT + word("x") + number(1) + SETITEM + BUILD,
-    "slots of ndarray": name_of("numpy", "ndarray") + b"N" + EMPTY_DICT + word("x") + number(1) + SETITEM + TUPLE2 + BUILD,
+    "a state for ndarray": name_of("numpy", "ndarray")
+    + EMPTY_DICT
+    + word("x")
+    + number(1)
+    + SETITEM
+    + BUILD,
+    "slots of ndarray": name_of("numpy", "ndarray")
+    + b"N"
+    + EMPTY_DICT
+    + word("x")
+    + number(1)
+    + SETITEM
+    + TUPLE2
+    + BUILD,
     "a reconstructed type": name_of("copyreg", "_reconstructor")
     + name_of("builtins", "object")
     + name_of("builtins", "object")
@@ -163,13 +202,21 @@ PICKLES = {
     "an array of objects": numpy_array(numpy_dtype("O8"), shape_of(1), EMPTY_LIST),
     "a record": numpy_array(numpy_dtype("f8,O"), shape_of(1), raw(bytes(16))),
     "a dtype of a million": numpy_array(numpy_dtype("V1000000"), shape_of(0), raw(b"")),
-    "a dtype that is an array": numpy_array(numpy_array(numpy_dtype("f8"), shape_of(1), EIGHT), shape_of(1), EIGHT),
+    "a dtype that is an array": numpy_array(
+        numpy_array(numpy_dtype("f8"), shape_of(1), EIGHT), shape_of(1), EIGHT
+    ),
     "a shape too large": numpy_array(numpy_dtype("f8"), shape_of(1 << 30, 1 << 30), EIGHT),
     "a negative shape": numpy_array(numpy_dtype("f8"), shape_of(-1), EIGHT),
     "no bytes": numpy_array(numpy_dtype("f8"), shape_of(1), b"N"),
     "too few bytes": numpy_array(numpy_dtype("f8"), shape_of(2), EIGHT),
-    "an array without a state": name_of("numpy.core.multiarray", "_reconstruct") + EMPTY_TUPLE + REDUCE,
-    "scalar of an object": name_of("numpy.core.multiarray", "scalar") + numpy_dtype("O8") + EIGHT + TUPLE2 + REDUCE,
+    "an array without a state": name_of("numpy.core.multiarray", "_reconstruct")
+    + EMPTY_TUPLE
+    + REDUCE,
+    "scalar of an object": name_of("numpy.core.multiarray", "scalar")
+    + numpy_dtype("O8")
+    + EIGHT
+    + TUPLE2
+    + REDUCE,
     "memo index of 2^31": LONG_BINPUT + struct.pack("<I", (1 << 31) - 1) + number(1),
     "memo index of 2^32": number(1) + LONG_BINPUT + struct.pack("<I", (1 << 32) - 1),
     "hex of hex": hex_chain(40),
@@ -203,14 +250,33 @@ PICKLES = {
     "chumpy of nothing": name_of("chumpy.ch", "Ch") + EMPTY_TUPLE + NEWOBJ,
     "chumpy's own functions": a_call("chumpy.ch", "depends_on"),
 }
-MEMORY_OF_PICKLES = ("memo", "hex", "encode", "2^", "sparse", "lists in", "tuples", "key", "keys", "10^12", "such")
+MEMORY_OF_PICKLES = (
+    "memo",
+    "hex",
+    "encode",
+    "2^",
+    "sparse",
+    "lists in",
+    "tuples",
+    "key",
+    "keys",
+    "10^12",
+    "such",
+)
 for kind, instructions in PICKLES.items():
     item = 5 if any(part in kind for part in MEMORY_OF_PICKLES) else 1
     data = body_pickle(instructions)
     case(kind, "smplx pkl", written("model.pkl", data), item=item)
-    case(kind, "pickle", written("a.pkl", data), "either" if "memo" in kind else "refused", item)  # memos are dicts
+    case(
+        kind, "pickle", written("a.pkl", data), "either" if "memo" in kind else "refused", item
+    )  # memos are dicts
     case(kind, "torch stream", written("a.pt", data), item=item)
-    case(kind, "aist", written("a.pkl", data.replace(word("v_template"), word("smpl_poses"))), item=item)
+    case(
+        kind,
+        "aist",
+        written("a.pkl", data.replace(word("v_template"), word("smpl_poses"))),
+        item=item,
+    )
 
 
 def many_instructions():
@@ -231,7 +297,9 @@ def twenty_thousand_names(folder):
     data, storages = pickled({"model": {"w": FakeTensor(np.ones(1 << 18, np.float32))}})
     at = data.index(b"R", data.index(b"_rebuild_tensor_v2")) + 1
     rest = data[at:]
-    copies = b"".join(b"X" + struct.pack("<I", 6) + f"{i:06d}".encode() + b"h\xfa" + b"s" for i in range(20_000))
+    copies = b"".join(
+        b"X" + struct.pack("<I", 6) + f"{i:06d}".encode() + b"h\xfa" + b"s" for i in range(20_000)
+    )
     end = rest.index(b"s")  # the tensor goes into its dict
     data = data[:at] + b"q\xfa" + rest[:end] + b"s" + copies + rest[end + 1 :]
     with zipfile.ZipFile(folder / "a.pt", "w") as archive:
@@ -246,9 +314,13 @@ def torch_of(content, write=write_checkpoint):
 
 case("20,000 tensors of one storage", "torch zip", twenty_thousand_names, item=5)
 for kind, content in {
-    "a shape of 2^60": {"model": {"w": FakeTensor(NUMBERS, shape=(1 << 30, 1 << 30), strides=(0, 0))}},
+    "a shape of 2^60": {
+        "model": {"w": FakeTensor(NUMBERS, shape=(1 << 30, 1 << 30), strides=(0, 0))}
+    },
     "a shape of 70 axes": {"model": {"w": FakeTensor(NUMBERS, shape=(1,) * 70, strides=(1,) * 70)}},
-    "strides of 2^60": {"model": {"w": FakeTensor(NUMBERS, shape=(2, 2), strides=(1 << 60, 1 << 60))}},
+    "strides of 2^60": {
+        "model": {"w": FakeTensor(NUMBERS, shape=(2, 2), strides=(1 << 60, 1 << 60))}
+    },
     "an offset of 2^62": {"model": {"w": FakeTensor(NUMBERS, offset=1 << 62)}},
     "no axis of 2^62": {"model": {"w": FakeTensor(NUMBERS, shape=(0, 1 << 62), strides=(1, 1))}},
     "a call of eval": {"model": {"w": Call(eval, "1")}},

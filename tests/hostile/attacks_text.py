@@ -38,9 +38,17 @@ DEEP = {
 FINE = ("null", "a number", "a word", "a list of nothing", "no keys", "half a surrogate")
 for reader in JSON_READERS:
     for kind, data in DEEP.items():
-        fine = (reader == "json" and kind in FINE) or (reader == "configuration" and kind == "no keys")
+        fine = (reader == "json" and kind in FINE) or (
+            reader == "configuration" and kind == "no keys"
+        )
         data = data if isinstance(data, bytes) else data.encode()
-        case(kind, reader, changed(reader, lambda _, data=data: data), "read" if fine else "refused", 6)
+        case(
+            kind,
+            reader,
+            changed(reader, lambda _, data=data: data),
+            "read" if fine else "refused",
+            6,
+        )
 for reader in ("json", "openpose", "transforms"):
     case("100 MB", reader, changed(reader, lambda _: b"[" + b"1," * (50 << 20) + b"1]"), item=5)
 
@@ -64,15 +72,32 @@ YAML = {
     "names of nobody": honest.opencv_yaml() + "names: [x, y]\n",
 }
 for kind, data in YAML.items():
-    case(kind, "opencv yaml", written("cameras.yml", "%YAML:1.0\n---\n" + data), item=5 if "digits" not in kind else 6)
+    case(
+        kind,
+        "opencv yaml",
+        written("cameras.yml", "%YAML:1.0\n---\n" + data),
+        item=5 if "digits" not in kind else 6,
+    )
 
 
 # Numbers that are none ------------------------------------------------------------------------------------------------
 
-BAD_NUMBERS = {"10^400": 10**400, "inf": float("inf"), "NaN": float("nan"), "words": "x", "objects": {}, "ragged": [[1], 2]}
+BAD_NUMBERS = {
+    "10^400": 10**400,
+    "inf": float("inf"),
+    "NaN": float("nan"),
+    "words": "x",
+    "objects": {},
+    "ragged": [[1], 2],
+}
 NUMBERS = {
     "transforms": {"frames.0.transform_matrix.0.0": 0, "fl_x": 0, "w": 0},
-    "capture": {"views.0.K": 0, "views.0.cam_from_world": 0, "views.0.frame": 0, "views.0.image": 0},
+    "capture": {
+        "views.0.K": 0,
+        "views.0.cam_from_world": 0,
+        "views.0.frame": 0,
+        "views.0.image": 0,
+    },
     "openpose": {"people.0.pose_keypoints_2d": 75},
     "coco": {"0.keypoints": 51},
     "mmpose": {"instance_info.0.instances.0.keypoint_scores": 17},
@@ -84,10 +109,18 @@ NUMBERS = {
 for reader, paths in NUMBERS.items():
     for path, count in paths.items():
         for kind, bad in BAD_NUMBERS.items():
-            fine = kind in ("inf", "NaN") and reader in ("coco", "mmpose")  # a point that is not seen
-            fine |= (reader, kind) == ("coco annotations", "objects")  # an image without a width, whose keypoints tell the size
+            fine = kind in ("inf", "NaN") and reader in (
+                "coco",
+                "mmpose",
+            )  # a point that is not seen
+            fine |= (reader, kind) == (
+                "coco annotations",
+                "objects",
+            )  # an image without a width, whose keypoints tell the size
             expect = "read" if fine else "refused"
-            json_case(f"{path} of {kind}", reader, {path: [bad] * count if count else bad}, expect=expect)
+            json_case(
+                f"{path} of {kind}", reader, {path: [bad] * count if count else bad}, expect=expect
+            )
 for kind, bad in {"numbers in words": "0.5", "truth": True}.items():
     for reader, path in (("openpose", "people.0.pose_keypoints_2d"), ("coco", "0.keypoints")):
         json_case(kind, reader, {f"{path}.0": bad, f"{path}.1": None})
@@ -108,7 +141,13 @@ COLMAP = {
     "another lens": ("cameras.txt", "PINHOLE", "FISHEYE"),
 }
 for kind, (name, old, new) in COLMAP.items():
-    case(kind, "colmap", edited("colmap", old, new, name), "either" if "place" in kind else "refused", 6)
+    case(
+        kind,
+        "colmap",
+        edited("colmap", old, new, name),
+        "either" if "place" in kind else "refused",
+        6,
+    )
 
 
 # Configurations and weights -------------------------------------------------------------------------------------------
@@ -125,7 +164,10 @@ CONFIGURATIONS = {
     "the command line": ({f"{ENCODER}.kind": "humangs_jax.cli.__main__.Encoder"}, 1),
     "another function": ({f"{ENCODER}.kind": "os.system"}, 1),
     "a field that does not exist": ({f"{ENCODER}.evil": 1}, 6),
-    "a reader of 10^9 features": ({"model.architecture.reader": {"kind": "PixelAlignedReader", "output_width": 10**9}}, 6),
+    "a reader of 10^9 features": (
+        {"model.architecture.reader": {"kind": "PixelAlignedReader", "output_width": 10**9}},
+        6,
+    ),
     "a list for a part": ({"model.architecture.encoder": []}, 6),
     "a rate of 10^400": ({"optimizer.learning_rate": 10**400}, 6),
     "a thousand counts": ({"views.input_counts": [4] * 1000}, 5),
@@ -144,7 +186,10 @@ def weights_with(changes):
 
         file = FORMATS["weights"].make(folder)
         with safe_open(file, "numpy") as content:
-            tensors, metadata = {key: content.get_tensor(key) for key in content.keys()}, content.metadata()  # noqa: SIM118
+            tensors, metadata = (
+                {key: content.get_tensor(key) for key in content.keys()},  # noqa: SIM118
+                content.metadata(),
+            )
         architecture = setting(changes)(json.loads(metadata["architecture"]))
         save_file(tensors, file, metadata | {"architecture": json.dumps(architecture)})
         return file
@@ -153,7 +198,11 @@ def weights_with(changes):
 
 
 for kind, (changes, item) in CONFIGURATIONS.items():
-    own = {path.removeprefix("model.architecture."): value for path, value in changes.items() if path.startswith(ENCODER + ".")}
+    own = {
+        path.removeprefix("model.architecture."): value
+        for path, value in changes.items()
+        if path.startswith(ENCODER + ".")
+    }
     if own:
         case(kind, "weights", weights_with(own), item=item)
 case(
@@ -162,8 +211,17 @@ case(
     changed("weights", lambda data: data[:-7] + bytes([data[-7] ^ 1]) + data[-6:]),
     item=3,
 )
-for kind, line in {"a slash": b"/", "a frame of 5,000 digits": b"cam00/" + b"9" * 5000, "no camera": b"00000001.jpg"}.items():
-    case(f"a line of {kind}", "missing photos", changed("missing photos", lambda _, line=line: line), item=6)
+for kind, line in {
+    "a slash": b"/",
+    "a frame of 5,000 digits": b"cam00/" + b"9" * 5000,
+    "no camera": b"00000001.jpg",
+}.items():
+    case(
+        f"a line of {kind}",
+        "missing photos",
+        changed("missing photos", lambda _, line=line: line),
+        item=6,
+    )
 
 
 # Words that a terminal would act on -----------------------------------------------------------------------------------
@@ -183,12 +241,21 @@ for kind, word in WORDS.items():
     for reader in ("capture", "photos"):
         for key in ("image", "mask"):
             json_case(f"{kind} in {key}", reader, {f"views.0.{key}": f"images/{word}.png"}, 0)
-    json_case(f"{kind} in a path", "transforms", {"frames.0.file_path": word, "frames.0.transform_matrix": [1]}, 0)
+    json_case(
+        f"{kind} in a path",
+        "transforms",
+        {"frames.0.file_path": word, "frames.0.transform_matrix": [1]},
+        0,
+    )
     json_case(f"{kind} in a name", "coco", {"0.file_name": word, "0.keypoints": [1]}, 0)
     json_case(f"{kind} in a key", "joints json", {word: [0, 0]}, 0)
     json_case(f"{kind} in a field", "configuration", {word: 1}, 0)
     json_case(f"{kind} in a preset", "settings", {"settings.splat": word}, 0)
-    case(f"{kind} in a name", "colmap", edited("colmap", "0.9 2.6 1 photos/000", f"x 2.6 1 photos/{word}", "images.txt"))
+    case(
+        f"{kind} in a name",
+        "colmap",
+        edited("colmap", "0.9 2.6 1 photos/000", f"x 2.6 1 photos/{word}", "images.txt"),
+    )
     case(f"{kind} in a word", "bvh", edited("bvh", "CHANNELS", word))
 
 
@@ -215,15 +282,34 @@ for key, values in {
     "format": ([], {}, None),
 }.items():
     for value in values:
-        json_case(f"{key} {'10^400' if isinstance(value, int) and value > 9 else repr(value)}", "manifest", {key: value})
+        json_case(
+            f"{key} {'10^400' if isinstance(value, int) and value > 9 else repr(value)}",
+            "manifest",
+            {key: value},
+        )
 
 NOBODY = '{"pose_keypoints_2d":[]}'
 FEW_BYTES = {
-    "a million people without points": ("openpose", lambda: '{"people":[' + ",".join([NOBODY] * 1_000_000) + "]}"),
-    "110,000 people without points": ("openpose", lambda: '{"people":[' + ",".join([NOBODY] * 110_000) + "]}"),
-    "a million images": ("coco annotations", lambda: '{"annotations":[],"images":[' + ",".join(["0"] * 1_000_000) + "]}"),
-    "a million frames": ("mmpose", lambda: "[" + ",".join(['{"frame_id":0,"instances":[]}'] * 1_000_000) + "]"),
-    "200,000 instances": ("mmpose", lambda: '[{"frame_id":0,"instances":[' + ",".join(["0"] * 200_000) + "]}]"),
+    "a million people without points": (
+        "openpose",
+        lambda: '{"people":[' + ",".join([NOBODY] * 1_000_000) + "]}",
+    ),
+    "110,000 people without points": (
+        "openpose",
+        lambda: '{"people":[' + ",".join([NOBODY] * 110_000) + "]}",
+    ),
+    "a million images": (
+        "coco annotations",
+        lambda: '{"annotations":[],"images":[' + ",".join(["0"] * 1_000_000) + "]}",
+    ),
+    "a million frames": (
+        "mmpose",
+        lambda: "[" + ",".join(['{"frame_id":0,"instances":[]}'] * 1_000_000) + "]",
+    ),
+    "200,000 instances": (
+        "mmpose",
+        lambda: '[{"frame_id":0,"instances":[' + ",".join(["0"] * 200_000) + "]}]",
+    ),
     "200,000 results": ("coco", lambda: "[" + ",".join(['{"image_id":0}'] * 200_000) + "]"),
 }
 for kind, (reader, data) in FEW_BYTES.items():

@@ -35,7 +35,10 @@ class Disk:
         self.folder = folder
         folder.mkdir()
         command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "humangs", str(folder)]
-        self.mounted = os.geteuid() == 0 and subprocess.run(command, capture_output=True, check=False).returncode == 0
+        self.mounted = (
+            os.geteuid() == 0
+            and subprocess.run(command, capture_output=True, check=False).returncode == 0
+        )
 
     def __enter__(self):
         return self
@@ -88,8 +91,14 @@ def begun(command: Command, folder: Path, inputs: Path):
 
 def changed(place: Path, before: dict) -> list[str]:
     final, other = writers.snapshot(place)
-    names = {name for name in before | final if before.get(name) != final.get(name) and name.split("/")[0] not in GROWS}
-    return [f"{name}: changed" for name in sorted(names)] + [f"{name}: left over" for name in other if "orbax" not in name]
+    names = {
+        name
+        for name in before | final
+        if before.get(name) != final.get(name) and name.split("/")[0] not in GROWS
+    }
+    return [f"{name}: changed" for name in sorted(names)] + [
+        f"{name}: left over" for name in other if "orbax" not in name
+    ]
 
 
 def full(command: Command, disk: Disk, inputs: Path) -> list[str]:
@@ -103,8 +112,16 @@ def full(command: Command, disk: Disk, inputs: Path) -> list[str]:
         shutil.copytree(saved, place)
         if disk.mounted:
             disk.leave(int(share * size))
-        ending = writers.run(command, place, inputs, 2, most=None if disk.mounted else max(LEAST, int(share * size / 4)))
-        found = [] if ending.code == 0 else refused(ending, targets(expected)) + changed(place, before)
+        ending = writers.run(
+            command,
+            place,
+            inputs,
+            2,
+            most=None if disk.mounted else max(LEAST, int(share * size / 4)),
+        )
+        found = (
+            [] if ending.code == 0 else refused(ending, targets(expected)) + changed(place, before)
+        )
         if disk.mounted:
             disk.leave(None)
         found += writers.next_run(command, place, inputs, expected)

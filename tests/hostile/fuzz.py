@@ -44,7 +44,26 @@ LARGEST = 1 << 26
 MOST_MAPPINGS = 20_000
 """Every compiled program maps memory, of which Linux allows 65,530 pieces: with more than this the fuzzer starts itself again."""
 
-NUMBERS = [0, 1, -1, 2, 7, 255, 2**15, 2**31 - 1, 2**31, 2**32, 2**63, -(2**63), 10**30, 0.5, 1e30, 1e400, -1e400, np.nan]
+NUMBERS = [
+    0,
+    1,
+    -1,
+    2,
+    7,
+    255,
+    2**15,
+    2**31 - 1,
+    2**31,
+    2**32,
+    2**63,
+    -(2**63),
+    10**30,
+    0.5,
+    1e30,
+    1e400,
+    -1e400,
+    np.nan,
+]
 VALUES = [*NUMBERS, None, True, "", "x", "..", "../x", "/", "a\0b", "1", "nan"]
 VALUES += [[], {}, [1, [2]], {"a": 1}, [[]] * 9, [0.0] * 51]
 DTYPES = ("<f4", "<f8", ">f8", "<f2", "<i4", "<i8", "<u1", "<u4", "|b1", "<c8", "<U3", "|S3")
@@ -63,11 +82,28 @@ defaultdict, torch._utils _rebuild_tensor_v2, torch._utils _rebuild_parameter, o
 INSTRUCTIONS = [each.code.encode("latin1") for each in pickletools.opcodes]
 INSTRUCTIONS += [b"c" + "\n".join((*each.split(), "")).encode() for each in NAMES.split(",")]
 INSTRUCTIONS += [b"J" + struct.pack("<i", n) for n in (-1, 0, 7, 2**31 - 1)] + [b"X\1\0\0\0<"]
-HEADERS = itertools.product((0, 9, 10, 70_000), (0, 12, 2**31), (1, 8, 16), range(8), (0, 1), (0, 1), (0, 1, 2))
-CHUNKS = [(b"IHDR", struct.pack(">IIBBBBB", *header)) for header in itertools.islice(HEADERS, 0, None, 7)]
+HEADERS = itertools.product(
+    (0, 9, 10, 70_000), (0, 12, 2**31), (1, 8, 16), range(8), (0, 1), (0, 1), (0, 1, 2)
+)
+CHUNKS = [
+    (b"IHDR", struct.pack(">IIBBBBB", *header)) for header in itertools.islice(HEADERS, 0, None, 7)
+]
 CHUNKS += [
     (name, body)
-    for name in (b"tRNS", b"PLTE", b"iCCP", b"zTXt", b"gAMA", b"cHRM", b"cICP", b"eXIf", b"acTL", b"fcTL", b"IDAT", b"IEND")
+    for name in (
+        b"tRNS",
+        b"PLTE",
+        b"iCCP",
+        b"zTXt",
+        b"gAMA",
+        b"cHRM",
+        b"cICP",
+        b"eXIf",
+        b"acTL",
+        b"fcTL",
+        b"IDAT",
+        b"IEND",
+    )
     for body in (b"", b"\0", bytes(40), b"x\0\0" + zlib.compress(bytes(99)))
 ]
 
@@ -93,7 +129,11 @@ class Draw:
     def exchanged(self, pieces, hostile):
         """Pieces in a list, or a bytearray, of which a few are left out, doubled, or exchanged for hostile ones."""
         for _ in range(1 + self.below(4)):
-            at, way, count = self.below(len(pieces) + 1), self.below(4), 1 + self.below(self.of((1, 8, 64)))
+            at, way, count = (
+                self.below(len(pieces) + 1),
+                self.below(4),
+                1 + self.below(self.of((1, 8, 64))),
+            )
             if way == 0:
                 del pieces[at : at + count]
             elif way == 1:
@@ -110,7 +150,9 @@ def mutated_bytes(data, draw):
 
 
 def mutated_text(data, draw):
-    return b"".join(draw.exchanged(re.split(rb"([ \n])", data), [[b" ", word, b" "] for word in WORDS]))
+    return b"".join(
+        draw.exchanged(re.split(rb"([ \n])", data), [[b" ", word, b" "] for word in WORDS])
+    )
 
 
 def mutated_pickle(data, draw):
@@ -128,16 +170,28 @@ def mutated_png(data, draw):
     at = draw.below(len(chunks))
     name, body = chunks[at]
     chunks[at] = draw.of(
-        [(name, mutated_bytes(body, draw)), (name, zlib.compress(mutated_bytes(bytes(400), draw))), (name, body)]
+        [
+            (name, mutated_bytes(body, draw)),
+            (name, zlib.compress(mutated_bytes(bytes(400), draw))),
+            (name, body),
+        ]
     )
     chunks = draw.exchanged(chunks, [[each] for each in CHUNKS])
-    packed = (struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks)
+    packed = (
+        struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks
+    )
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
 def places(value, path=()):
     yield path
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, item in items:
         yield from places(item, (*path, key))
 
@@ -174,7 +228,11 @@ def mutated_array(array, draw):
         array.reshape(-1)[draw.below(array.size)] = draw.of(bad)
         return array
     if way == 2:
-        return array.astype(draw.of(DTYPES[:9])) if array.dtype.kind in "fiub" else np.asarray(draw.of(("", "x", "\0")))
+        return (
+            array.astype(draw.of(DTYPES[:9]))
+            if array.dtype.kind in "fiub"
+            else np.asarray(draw.of(("", "x", "\0")))
+        )
     if way == 3:
         return array[None]
     return array[: draw.below(len(array) + 1)] if array.ndim else np.zeros(3)
@@ -188,7 +246,9 @@ def mutated_npz(data, draw):
         if draw.below(6) == 0:
             arrays.pop(key, None)
         elif key == "header" and "header" in arrays:
-            arrays[key] = np.asarray(mutated_json(str(arrays[key]).encode(), draw).decode("utf-8", "replace"))
+            arrays[key] = np.asarray(
+                mutated_json(str(arrays[key]).encode(), draw).decode("utf-8", "replace")
+            )
         else:
             arrays[key] = mutated_array(arrays.get(key, np.zeros(3)), draw)
     stream = io.BytesIO()
@@ -201,7 +261,11 @@ def mutated_zip(data, draw):
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     name = draw.of([*(["archive/data.pkl"] * 3 if "archive/data.pkl" in members else ()), *members])
-    members[name] = mutated_pickle(members[name], draw) if name.endswith(".pkl") else mutated_bytes(members[name], draw)
+    members[name] = (
+        mutated_pickle(members[name], draw)
+        if name.endswith(".pkl")
+        else mutated_bytes(members[name], draw)
+    )
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, content in members.items():
@@ -218,7 +282,9 @@ def mutated_glb(data, draw):
 
 
 def mutated_spz(data, draw):
-    if data.startswith(b"NGSP"):  # the header and the table, else hardly any change comes as far as the numbers
+    if data.startswith(
+        b"NGSP"
+    ):  # the header and the table, else hardly any change comes as far as the numbers
         return mutated_bytes(data[:128], draw) + data[128:]
     return gzip.compress(mutated_bytes(gzip.decompress(data), draw))
 
@@ -304,7 +370,11 @@ def fuzz(name, folder, inputs, number, watch):
         run()
     except AssertionError as error:
         return {"found": str(error)[-900:]}
-    return counts | {"inputs": sum(counts.values()), "chunks": 1, "seconds": time.perf_counter() - start}
+    return counts | {
+        "inputs": sum(counts.values()),
+        "chunks": 1,
+        "seconds": time.perf_counter() - start,
+    }
 
 
 def main():
@@ -312,10 +382,20 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("inputs", type=int)
     parser.add_argument("readers", nargs="*")
-    parser.add_argument("--page", type=Path, help="page whose table fuzz is written, with its docs/results/fuzz.json")
+    parser.add_argument(
+        "--page",
+        type=Path,
+        help="page whose table fuzz is written, with its docs/results/fuzz.json",
+    )
     arguments = parser.parse_args()
-    folder, names = arguments.folder, arguments.readers or [name for name, each in readers.FORMATS.items() if each.make]
-    record, fresh = folder / "record.json", {"inputs": 0, "read": 0, "refused": 0, "chunks": 0, "seconds": 0.0}
+    folder, names = (
+        arguments.folder,
+        arguments.readers or [name for name, each in readers.FORMATS.items() if each.make],
+    )
+    record, fresh = (
+        folder / "record.json",
+        {"inputs": 0, "read": 0, "refused": 0, "chunks": 0, "seconds": 0.0},
+    )
     figures = json.loads(record.read_text()) if record.exists() else {}
     figures |= {name: fresh | figures.get(name, {}) | {"found": ""} for name in names}
     shutil.rmtree(folder / "honest", ignore_errors=True)
@@ -323,7 +403,11 @@ def main():
     worker.warm_up(readers, folder)
     watch = worker.Watch()
     worker.limit_memory()
-    while waiting := [name for name in names if figures[name]["inputs"] < arguments.inputs and not figures[name]["found"]]:
+    while waiting := [
+        name
+        for name in names
+        if figures[name]["inputs"] < arguments.inputs and not figures[name]["found"]
+    ]:
         name = min(waiting, key=lambda each: figures[each]["inputs"])
         own = figures[name]
         chunk = min(CHUNK, arguments.inputs - own["inputs"])
@@ -346,10 +430,26 @@ def write_page(page, figures):
     from experiments.results import markdown_table, publish
 
     total = lambda key: sum(each[key] for each in figures.values())
-    header = ["readers", "mutated files", "fewest of a reader", "read", "refused in one line", "anything else"]
+    header = [
+        "readers",
+        "mutated files",
+        "fewest of a reader",
+        "read",
+        "refused in one line",
+        "anything else",
+    ]
     fewest = min(each["inputs"] for each in figures.values())
     found = sum(bool(each["found"]) for each in figures.values())
-    rows = [[len(figures), f"{total('inputs'):,}", f"{fewest:,}", f"{total('read'):,}", f"{total('refused'):,}", found]]
+    rows = [
+        [
+            len(figures),
+            f"{total('inputs'):,}",
+            f"{fewest:,}",
+            f"{total('read'):,}",
+            f"{total('refused'):,}",
+            found,
+        ]
+    ]
     publish(page, "fuzz", markdown_table(header, rows, "r" * len(header)), figures)
 
 

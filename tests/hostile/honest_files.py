@@ -72,7 +72,12 @@ def avatar_arrays(g=6, n=4, j=3):
 
 
 AVATAR_HEADER = {
-    **{"format": "humangs-avatar", "version": 1, "parents": [-1, 0, 1], "joint_names": ["a", "b", "c"]},
+    **{
+        "format": "humangs-avatar",
+        "version": 1,
+        "parents": [-1, 0, 1],
+        "joint_names": ["a", "b", "c"],
+    },
     **{"skinning": "affine", "rendering": "exact"},
 }
 
@@ -84,12 +89,20 @@ def avatar_file():
 def write_weights(path):
     config = tiny().model
     shapes = expected_variables(config)
-    save_weights(path, jax.tree.map(lambda x: np.zeros(x.shape, np.float32), shapes), config, "float16")
+    save_weights(
+        path, jax.tree.map(lambda x: np.zeros(x.shape, np.float32), shapes), config, "float16"
+    )
 
 
 def capture_description(**changes):
     views = [
-        {"image": f"images/{name}.png", "mask": f"masks/{name}.png", "frame": i, "K": K, "cam_from_world": POSE}
+        {
+            "image": f"images/{name}.png",
+            "mask": f"masks/{name}.png",
+            "frame": i,
+            "K": K,
+            "cam_from_world": POSE,
+        }
         for i, name in enumerate(VIEWS)
     ]
     return {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": views} | changes
@@ -140,9 +153,14 @@ def write_easymocap(folder):
 
 def write_colmap(folder):
     (folder / "cameras.txt").write_text("# cameras\n1 PINHOLE 10 12 60 60 5 6\n")
-    images = [f"{i} 0 1 0 0 0 0.9 2.6 1 photos/{name}.png\n5.0 6.0 {i}\n" for i, name in enumerate(VIEWS, 1)]
+    images = [
+        f"{i} 0 1 0 0 0 0.9 2.6 1 photos/{name}.png\n5.0 6.0 {i}\n"
+        for i, name in enumerate(VIEWS, 1)
+    ]
     (folder / "images.txt").write_text("# images\n" + "".join(images))
-    (folder / "points3D.txt").write_text("# points\n1 0 0.9 0 9 9 9 0.1 1 0\n2 0.1 0.9 0 9 9 9 0.1 2 0\n")
+    (folder / "points3D.txt").write_text(
+        "# points\n1 0 0.9 0 9 9 9 0.1 1 0\n2 0.1 0.9 0 9 9 9 0.1 2 0\n"
+    )
     return folder
 
 
@@ -167,10 +185,18 @@ def write_import_folder(folder):
 
 
 def motion_arrays(**changes):
-    return {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0} | changes
+    return {
+        "rotations": np.zeros((3, 55, 3)),
+        "translations": np.zeros((3, 3)),
+        "fps": 30.0,
+    } | changes
 
 
-MDM = {"thetas": np.tile(np.eye(3)[:2].reshape(1, 6, 1), (24, 1, 3)), "root_translation": np.zeros((3, 3)), "text": "walk"}
+MDM = {
+    "thetas": np.tile(np.eye(3)[:2].reshape(1, 6, 1), (24, 1, 3)),
+    "root_translation": np.zeros((3, 3)),
+    "text": "walk",
+}
 KIMODO = {"local_rot_mats": np.tile(np.eye(3), (3, 22, 1, 1)), "root_positions": np.zeros((3, 3))}
 
 
@@ -187,27 +213,39 @@ def openpose():
 def annots():
     values = person(25)
     values[:, 2] = 0.9
-    return json.dumps({"filename": "000.jpg", "annots": [{"personID": 0, "keypoints": values.tolist()}]})
+    return json.dumps(
+        {"filename": "000.jpg", "annots": [{"personID": 0, "keypoints": values.tolist()}]}
+    )
 
 
 def coco():
     values = person(17)
     values[:, 2] = 0.9
-    entries = [{"file_name": f"{n}.png", "category_id": 1, "keypoints": values.ravel().tolist()} for n in VIEWS]
+    entries = [
+        {"file_name": f"{n}.png", "category_id": 1, "keypoints": values.ravel().tolist()}
+        for n in VIEWS
+    ]
     return json.dumps(entries)
 
 
 def coco_annotations():
     values = person(17)
     values[:, 2] = 2
-    images = [{"id": i, "file_name": f"{n}.png", "width": 640, "height": 480} for i, n in enumerate(VIEWS)]
-    annotations = [{"id": i, "image_id": i, "keypoints": values.ravel().tolist()} for i in range(len(VIEWS))]
+    images = [
+        {"id": i, "file_name": f"{n}.png", "width": 640, "height": 480} for i, n in enumerate(VIEWS)
+    ]
+    annotations = [
+        {"id": i, "image_id": i, "keypoints": values.ravel().tolist()} for i in range(len(VIEWS))
+    ]
     return json.dumps({"images": images, "annotations": annotations})
 
 
 def mmpose():
     frames = [
-        {"frame_id": i, "instances": [{"keypoints": person(17, 2).tolist(), "keypoint_scores": [0.9] * 17}]}
+        {
+            "frame_id": i,
+            "instances": [{"keypoints": person(17, 2).tolist(), "keypoint_scores": [0.9] * 17}],
+        }
         for i in range(len(VIEWS))
     ]
     return json.dumps({"meta_info": {}, "instance_info": frames})
@@ -224,7 +262,10 @@ def keypoint_arrays():
 def fit_arrays():
     return keypoint_arrays() | {
         **{"noise": np.ones(2, np.float32), "joint_std": np.ones((2, 5), np.float32)},
-        **{"determined": np.ones((2, 5), np.float32), "shape_covariance": np.eye(3, dtype=np.float32)},
+        **{
+            "determined": np.ones((2, 5), np.float32),
+            "shape_covariance": np.eye(3, dtype=np.float32),
+        },
         **{"places": np.zeros((17, 3), np.float32), "certainty": np.ones(17, np.float32)},
     }
 
@@ -239,16 +280,30 @@ def phalp():
     return {f"{i}.jpg": {"tid": [1], "smpl": [pose], "camera": [np.zeros(3)]} for i in range(3)}
 
 
-TRAM = {"pred_rotmat": np.tile(np.eye(3), (3, 24, 1, 1)), "pred_trans": np.zeros((3, 1, 3)), "frame": np.arange(3)}
+TRAM = {
+    "pred_rotmat": np.tile(np.eye(3), (3, 24, 1, 1)),
+    "pred_trans": np.zeros((3, 1, 3)),
+    "frame": np.arange(3),
+}
 
 
 def mhr():
     points = np.random.default_rng(3).normal(size=(2, 127, 3))
-    return {"pred_joint_coords": points, "pred_cam_t": np.zeros((2, 3)), "pred_global_rots": np.tile(np.eye(3), (2, 127, 1, 1))}
+    return {
+        "pred_joint_coords": points,
+        "pred_cam_t": np.zeros((2, 3)),
+        "pred_global_rots": np.tile(np.eye(3), (2, 127, 1, 1)),
+    }
 
 
 def write_easymocap_motion(folder):
-    person = {"id": 0, "Rh": [[0.0, 0, 0]], "Th": [[0.0, 0, 1]], "poses": [[0.0] * 72], "shapes": [[0.0] * 10]}
+    person = {
+        "id": 0,
+        "Rh": [[0.0, 0, 0]],
+        "Th": [[0.0, 0, 1]],
+        "poses": [[0.0] * 72],
+        "shapes": [[0.0] * 10],
+    }
     for i in range(3):
         (folder / f"{i:06d}.json").write_text(json.dumps([person]))
     return folder
@@ -258,17 +313,42 @@ def text_ply():
     """Of Gaussians, in text."""
     names = [*"xyz", *(f"{kind}_{i}" for kind in ("f_dc", "scale") for i in range(3)), "opacity"]
     names += [f"rot_{i}" for i in range(4)]
-    header = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {name}" for name in names), "end_header"]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 4",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
     return "\n".join([*header, *[" ".join(["0.5"] * len(names))] * 4, ""])
 
 
 def compressed_ply():
     """Of PlayCanvas, with harmonics."""
-    bounds = [f"{end}_{name}" for end in ("min", "max") for name in (*"xyz", "scale_x", "scale_y", "scale_z")]
+    bounds = [
+        f"{end}_{name}"
+        for end in ("min", "max")
+        for name in (*"xyz", "scale_x", "scale_y", "scale_z")
+    ]
     words = [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
-    header = ["ply", "format binary_little_endian 1.0", "element chunk 1", *(f"property float {name}" for name in bounds)]
-    header += ["element vertex 4", *words, "element sh 4", *(f"property uchar f_rest_{i}" for i in range(9)), "end_header\n"]
-    body = np.repeat(np.float32([-1, 1]), 6).tobytes() + np.arange(16, dtype="<u4").tobytes() + bytes(36)
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element chunk 1",
+        *(f"property float {name}" for name in bounds),
+    ]
+    header += [
+        "element vertex 4",
+        *words,
+        "element sh 4",
+        *(f"property uchar f_rest_{i}" for i in range(9)),
+        "end_header\n",
+    ]
+    body = (
+        np.repeat(np.float32([-1, 1]), 6).tobytes()
+        + np.arange(16, dtype="<u4").tobytes()
+        + bytes(36)
+    )
     return "\n".join(header).encode() + body
 
 
@@ -278,14 +358,23 @@ def write_glb_motion(path):
     joints = [name for name in JOINT_NAMES if name in names]
     above = {name: JOINT_NAMES[PARENTS[JOINT_NAMES.index(name)]] for name in joints[1:]}
     place = lambda name: rest[JOINT_NAMES.index(name)]
-    nodes = [{"name": names[n], "translation": (place(n) - (place(above[n]) if n in above else 0)).tolist()} for n in joints]
+    nodes = [
+        {
+            "name": names[n],
+            "translation": (place(n) - (place(above[n]) if n in above else 0)).tolist(),
+        }
+        for n in joints
+    ]
     for name, node in zip(joints, nodes, strict=True):
         if children := [joints.index(other) for other in joints if above.get(other) == name]:
             node["children"] = children
     matrices = np.tile(np.eye(4), (len(joints), 1, 1))
     matrices[:, 3, :3] = [-place(name) for name in joints]  # column by column, as glTF has them
     inverse = writer.array("MAT4", matrices.reshape(-1, 16))
-    times, turns = writer.array("SCALAR", np.arange(2.0)), writer.array("VEC4", np.tile([0.0, 0, 0, 1], (2, 1)))
+    times, turns = (
+        writer.array("SCALAR", np.arange(2.0)),
+        writer.array("VEC4", np.tile([0.0, 0, 0, 1], (2, 1))),
+    )
     channel = {"sampler": 0, "target": {"node": 0, "path": "rotation"}}
     animation = {"channels": [channel], "samplers": [{"input": times, "output": turns}]}
     skin = {"joints": list(range(len(joints))), "inverseBindMatrices": inverse}
@@ -329,7 +418,11 @@ def textured_glb(image=None, images=None, change=lambda content: None):
     header += b" " * (-len(header) % 4)
     total = 28 + len(header) + len(binary)
     chunk = lambda kind, body: struct.pack("<II", len(body), kind) + body
-    return struct.pack("<III", 0x46546C67, 2, total) + chunk(0x4E4F534A, header) + chunk(0x004E4942, binary)
+    return (
+        struct.pack("<III", 0x46546C67, 2, total)
+        + chunk(0x4E4F534A, header)
+        + chunk(0x004E4942, binary)
+    )
 
 
 def textured_obj(folder, texture="texture.png", material="scan.mtl"):
@@ -350,16 +443,30 @@ def write_obj(folder):
 def bank_arrays():
     p, n, f, q, j, k = 2, 8, 4, 2, 5, 4
     return {
-        **{"format": np.asarray("humangs-people"), "version": np.asarray(2), "split": np.asarray("train")},
-        **{"generator": np.asarray(1), "parents": np.asarray([-1, 0, 1, 2, 3]), "mirrored_joints": np.arange(j)},
+        **{
+            "format": np.asarray("humangs-people"),
+            "version": np.asarray(2),
+            "split": np.asarray("train"),
+        },
+        **{
+            "generator": np.asarray(1),
+            "parents": np.asarray([-1, 0, 1, 2, 3]),
+            "mirrored_joints": np.arange(j),
+        },
         **{"seeds": np.asarray([0, 1], np.int32), "betas": np.zeros((p, 3), np.float32)},
         **{"joints": np.zeros((p, j, 3), np.float32), "vertex_counts": np.full(p, n, np.int32)},
         **{"vertices": np.zeros((p, n, 3), np.float32), "normals": np.zeros((p, n, 3), np.float16)},
-        **{"joint_ids": np.zeros((p, n, k), np.uint8), "joint_weights": np.full((p, n, k), 0.25, np.float16)},
+        **{
+            "joint_ids": np.zeros((p, n, k), np.uint8),
+            "joint_weights": np.full((p, n, k), 0.25, np.float16),
+        },
         **{"faces": np.zeros((p, f, 3), np.uint16), "uvs": np.zeros((p, f, 3, 2), np.uint16)},
         **{"face_pieces": np.zeros((p, f), np.uint8), "sheen": np.zeros((p, 32), np.float32)},
         **{"groups": np.zeros((p, 32), np.uint8), "dyeable": np.zeros((p, 32), np.float32)},
-        **{"texture": np.zeros((p, 8, 8, 6), np.uint8), "rotations": np.zeros((p, q, j, 3), np.float32)},
+        **{
+            "texture": np.zeros((p, 8, 8, 6), np.uint8),
+            "rotations": np.zeros((p, q, j, 3), np.float32),
+        },
         **{"nearest": np.zeros((p, q), np.int32), "displacements": np.zeros((p, 0, 3), np.float16)},
     }
 
@@ -374,7 +481,10 @@ def data_set(write, *arguments, **options):
     return seed
 
 
-STATE = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
+STATE = {
+    "a.weight": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "b": np.asarray([1, 2], np.int64),
+}
 MODEL = dataset_files.model_arrays()
 MANIFEST = {"generator_version": GENERATOR_VERSION} | {
     "format": "humangs-synthetic",

@@ -54,7 +54,13 @@ def setting(changes):
 def json_case(kind, reader, changes, item=6, expect="refused"):
     """The honest JSON of a reader with some values changed, by path."""
     change = setting(changes)
-    case(kind, reader, changed(reader, lambda data: json.dumps(change(json.loads(data))).encode()), expect, item)
+    case(
+        kind,
+        reader,
+        changed(reader, lambda data: json.dumps(change(json.loads(data))).encode()),
+        expect,
+        item,
+    )
 
 
 def capture_with(changes=None, prepare=lambda folder: None, photo=None):
@@ -71,7 +77,9 @@ def capture_with(changes=None, prepare=lambda folder: None, photo=None):
         if photo is not None:
             (folder / "images" / "000.png").write_bytes(photo)
         change = setting(changes(folder) if callable(changes) else changes or {})
-        edit_bytes(folder / "capture.json", lambda data: json.dumps(change(json.loads(data))).encode())
+        edit_bytes(
+            folder / "capture.json", lambda data: json.dumps(change(json.loads(data))).encode()
+        )
         return folder
 
     return make
@@ -146,11 +154,22 @@ PLACES = {
     "a link to itself": lambda file: file.symlink_to(file),
     "of a terabyte": huge,
 }
-NOT_NOTICED = {"log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start", "splat"}
+NOT_NOTICED = {
+    "log",
+    "missing photos",
+    "scene arrays",
+    "preprocessed scene",
+    "skipped subject",
+    "start",
+    "splat",
+}
 """Files that need not be there: a missing log is that of a run without trouble; what preprocessing lacks is made again. Zeros are
 Gaussians of a `.splat`, which has no header."""
 READ = {
-    *(("manifest", kind) for kind in ("missing", "a pipe", "a link to an endless device", "a link to itself")),
+    *(
+        ("manifest", kind)
+        for kind in ("missing", "a pipe", "a link to an endless device", "a link to itself")
+    ),
     ("easymocap motion", "missing"),
 }
 """A set is begun where its manifest is no file, and writing it replaces a link or a pipe; a motion may begin later."""
@@ -166,7 +185,12 @@ for seed in (name for name, each in FORMATS.items() if each.make is not None):
     for kind, place in PLACES.items():
         case(kind, seed, replaced(seed, place), expected(seed, kind))
     for share in (0.02, 0.3, 0.6, 0.9):
-        case(f"cut at {share:.0%}", seed, changed(seed, lambda data, s=share: data[: int(s * len(data))]), "either")
+        case(
+            f"cut at {share:.0%}",
+            seed,
+            changed(seed, lambda data, s=share: data[: int(s * len(data))]),
+            "either",
+        )
     case("without its last byte", seed, changed(seed, lambda data: data[:-1]), "either")
     case("with more behind it", seed, changed(seed, lambda data: data + b"\0 more" * 20), "either")
     for i in range(4):

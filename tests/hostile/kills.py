@@ -30,16 +30,26 @@ INTERRUPTED = 130
 
 def some_moment(changes: list, generator: random.Random, interrupt: bool) -> Moment:
     times = [when for when, *_ in changes]
-    at, kind, seconds = generator.randrange(len(times)), generator.random(), generator.uniform(0, times[-1])
+    at, kind, seconds = (
+        generator.randrange(len(times)),
+        generator.random(),
+        generator.uniform(0, times[-1]),
+    )
     if interrupt:
         return Moment(seconds=seconds, by=signal.SIGINT)
     if kind < 0.45:
         return Moment(event=at)
     gap = min(1.0, ([*times, times[-1] + 0.1][at + 1]) - times[at])
-    return Moment(event=at, seconds=generator.uniform(1e-6, gap)) if kind < 0.85 else Moment(seconds=seconds)
+    return (
+        Moment(event=at, seconds=generator.uniform(1e-6, gap))
+        if kind < 0.85
+        else Moment(seconds=seconds)
+    )
 
 
-def run_undisturbed(command: Command, place: Path, kept: Path, inputs: Path) -> tuple[dict, writers.Run, dict]:
+def run_undisturbed(
+    command: Command, place: Path, kept: Path, inputs: Path
+) -> tuple[dict, writers.Run, dict]:
     """The files before a run, the run, and the files after it. `kept` becomes a copy of the place before."""
     if command.first is not None:
         assert writers.run(command, place, inputs, 1).code == 0, command.name
@@ -66,7 +76,9 @@ def disturb(command: Command, folder: Path, inputs: Path, count: int, interrupt:
         temporary = writers.snapshot(place)[1]
         found = writers.half_written(command, place, before, expected)
         said = writers.error_lines(ending.errors)[-1:]
-        if ending.code not in (0, INTERRUPTED if interrupt else None) or (ending.code and said != ["humangs: interrupted"]):
+        if ending.code not in (0, INTERRUPTED if interrupt else None) or (
+            ending.code and said != ["humangs: interrupted"]
+        ):
             found.append(f"exit status {ending.code}: {ending.errors[-500:]}")
         found += [f"{name}: left behind" for name in temporary if interrupt]
         found += [] if interrupt else writers.next_run(command, place, inputs, expected)
@@ -84,20 +96,28 @@ def disturb(command: Command, folder: Path, inputs: Path, count: int, interrupt:
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("commands", nargs="*", help="default: all")
     parser.add_argument("--count", type=int, default=10, help="of moments, for each command")
     parser.add_argument("--interrupts", action="store_true", help="instead of kills")
-    parser.add_argument("--json", type=Path, help="record of the figures by command; an earlier one is continued")
-    parser.add_argument("--page", type=Path, help="page whose table is written, with its docs/results")
+    parser.add_argument(
+        "--json", type=Path, help="record of the figures by command; an earlier one is continued"
+    )
+    parser.add_argument(
+        "--page", type=Path, help="page whose table is written, with its docs/results"
+    )
     arguments = parser.parse_args()
     folder, record = arguments.folder, arguments.json
     figures = json.loads(record.read_text()) if record is not None and record.exists() else {}
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     writers.prepare(folder / "inputs")
-    for command in (command for command in COMMANDS if command.name in (arguments.commands or [command.name])):
+    for command in (
+        command for command in COMMANDS if command.name in (arguments.commands or [command.name])
+    ):
         found = disturb(command, folder, folder / "inputs", arguments.count, arguments.interrupts)
         figures[command.name] = found
         print(command.name, found, flush=True)

@@ -44,7 +44,15 @@ from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.fitting.files import read_fit_record
 from humangs_jax.fitting.scan_files import read_joints, read_mesh, read_placement
 from humangs_jax.io.arrays import read_npz
-from humangs_jax.io.images import check_image, cropped_from, focal_length, image_size, orientation, read_grey, read_image
+from humangs_jax.io.images import (
+    check_image,
+    cropped_from,
+    focal_length,
+    image_size,
+    orientation,
+    read_grey,
+    read_image,
+)
 from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors
@@ -128,7 +136,11 @@ def continue_preprocessing(folder):
 
 def continue_synthetic_set(path):
     """What `synth` does before it makes anybody."""
-    begin_set(path.parent, SYNTHETIC, {key: honest.MANIFEST[key] for key in ("generator_version", "split", "settings")})
+    begin_set(
+        path.parent,
+        SYNTHETIC,
+        {key: honest.MANIFEST[key] for key in ("generator_version", "split", "settings")},
+    )
 
 
 def film(path):
@@ -174,19 +186,40 @@ AMASS = zeros(poses=(3, 156), trans=(3, 3)) | {"mocap_framerate": 120.0}
 PARTS = zeros(global_orient=(3, 3), body_pose=(3, 63), transl=(3, 3))
 WHAM = zeros(pose_world=(3, 72), trans_world=(3, 3), frame_ids=(3,)) | {"frame_ids": np.arange(3)}
 JOINTS = {"left_hip": [0, 1, 0], "right_hip": [0.2, 1, 0], "neck": [0.1, 1.5, 0]}
-RIG = {n: {"K": honest.K, "R": np.diag([1, -1, -1]).tolist(), "T": [0, 1, 3], "imgSize": [9, 9]} for n in "ab"}
+RIG = {
+    n: {"K": honest.K, "R": np.diag([1, -1, -1]).tolist(), "T": [0, 1, 3], "imgSize": [9, 9]}
+    for n in "ab"
+}
 WORLD_FROM_SCAN = np.diag([2.0, 2, 2, 1]).tolist()
-STATE, BVH = honest.STATE, functools.partial(bvh_files.write_bvh, shipped_joints(), np.zeros((2, 55, 3)), bvh_files.CMU)
+STATE, BVH = (
+    honest.STATE,
+    functools.partial(bvh_files.write_bvh, shipped_joints(), np.zeros((2, 55, 3)), bvh_files.CMU),
+)
 ROWS = {
-    "npz": (read_npz, npz("a.npz", lambda: {"x": np.arange(40.0).reshape(5, 8), "s": np.asarray("word")})),
+    "npz": (
+        read_npz,
+        npz("a.npz", lambda: {"x": np.arange(40.0).reshape(5, 8), "s": np.asarray("word")}),
+    ),
     "json": (read_json, written("a.json", as_json({"a": [1, 2.5, None, "x"], "b": {"c": True}}))),
-    "image": (read_image_in_every_way, saved("a.png", Image.fromarray(honest.pixels(12, 10, 3)).save)),
+    "image": (
+        read_image_in_every_way,
+        saved("a.png", Image.fromarray(honest.pixels(12, 10, 3)).save),
+    ),
     "mask": (read_grey, saved("a.jpg", Image.fromarray(honest.pixels(12, 10)).save)),
     "pickle": (read_whole_pickle, written("a.pkl", pickled(lambda: {"x": np.eye(3), "n": 2}))),
-    "torch zip": (read_tensors, saved("a.pt", lambda path: write_checkpoint(path, {"model": tensors(STATE)}))),
-    "torch stream": (read_tensors, saved("a.pth", lambda path: write_stream(path, {"model": tensors(STATE)}))),
+    "torch zip": (
+        read_tensors,
+        saved("a.pt", lambda path: write_checkpoint(path, {"model": tensors(STATE)})),
+    ),
+    "torch stream": (
+        read_tensors,
+        saved("a.pth", lambda path: write_stream(path, {"model": tensors(STATE)})),
+    ),
     "released checkpoint": (load_checkpoint, None),
-    "safetensors": (read_tensors, saved("a.safetensors", lambda path: save_file(STATE, path, {"note": "x"}))),
+    "safetensors": (
+        read_tensors,
+        saved("a.safetensors", lambda path: save_file(STATE, path, {"note": "x"})),
+    ),
     "vgg": (load_vgg19, None),
     "smplx npz": (load_smplx, npz("SMPLX.npz", dataset_files.model_arrays)),
     "smplx pkl": (load_smplx, written("SMPLX.pkl", pickled(dataset_files.model_arrays))),
@@ -194,8 +227,14 @@ ROWS = {
     "body": (load_body, saved("body.npz", lambda path: save_body(path, honest.tiny_body()))),
     "avatar": (Avatar.load, npz("me.npz", honest.avatar_file)),
     "weights": (load_weights, saved("w.safetensors", honest.write_weights)),
-    "configuration": (read_config, written("config.json", lambda: config_to_json(tiny(), indent=1))),
-    "settings": (load_settings, saved("settings.json", lambda path: save_settings(path, PRESETS["best"]))),
+    "configuration": (
+        read_config,
+        written("config.json", lambda: config_to_json(tiny(), indent=1)),
+    ),
+    "settings": (
+        load_settings,
+        saved("settings.json", lambda path: save_settings(path, PRESETS["best"])),
+    ),
     "capture": (read_capture, honest.write_capture),
     "photos": (load_photos, honest.write_capture),
     "boundary": (lambda path: read_summary(path, honest.tiny_body()), honest.write_capture),
@@ -223,51 +262,103 @@ ROWS = {
     "lhm": (load_motion, written("m.json", honest.lhm)),
     "wham": (load_motion, written("m.pkl", lambda: joblib({0: WHAM}))),
     "phalp": (load_motion, written("m.pkl", pickled(honest.phalp))),
-    "gvhmr": (load_motion, saved("m.pt", lambda path: write_checkpoint(path, {"smpl_params_global": tensors(PARTS)}))),
-    "gvhmr stream": (load_motion, saved("m.pt", lambda path: write_stream(path, {"smpl_params_global": tensors(PARTS)}))),
-    "tram": (load_motion, saved("m.npy", lambda path: np.save(path, honest.TRAM, allow_pickle=True))),
+    "gvhmr": (
+        load_motion,
+        saved("m.pt", lambda path: write_checkpoint(path, {"smpl_params_global": tensors(PARTS)})),
+    ),
+    "gvhmr stream": (
+        load_motion,
+        saved("m.pt", lambda path: write_stream(path, {"smpl_params_global": tensors(PARTS)})),
+    ),
+    "tram": (
+        load_motion,
+        saved("m.npy", lambda path: np.save(path, honest.TRAM, allow_pickle=True)),
+    ),
     "human3r": (
         load_motion,
-        npz("m.npz", lambda: zeros(rotvec=(1, 53, 3), transl=(1, 3), smpl_id=(1,)) | {"cam2world": np.eye(4)}),
+        npz(
+            "m.npz",
+            lambda: (
+                zeros(rotvec=(1, 53, 3), transl=(1, 3), smpl_id=(1,)) | {"cam2world": np.eye(4)}
+            ),
+        ),
     ),
     "mdm": (load_motion, saved("m.npy", lambda path: np.save(path, honest.MDM, allow_pickle=True))),
     "motion x": (load_motion, saved("m.npy", lambda path: np.save(path, np.zeros((3, 322))))),
     "kimodo": (load_motion, npz("m.npz", lambda: honest.KIMODO)),
-    "smplcodec": (load_motion, saved("m.npz", lambda path: np.savez(path, bodyPose=np.zeros((3, 22, 3)), frameRate=24.0))),
+    "smplcodec": (
+        load_motion,
+        saved("m.npz", lambda path: np.savez(path, bodyPose=np.zeros((3, 22, 3)), frameRate=24.0)),
+    ),
     "sam 3d": (load_motion, npz("m.npz", honest.mhr)),
     "easymocap motion": (load_motion, honest.write_easymocap_motion, "000000.json"),
     "bvh": (load_motion, written("m.bvh", BVH)),
     "glb motion": (load_motion, saved("m.glb", honest.write_glb_motion)),
-    "3dgs": (load_gaussians, saved("a.ply", lambda path: save_gaussians(path, random_gaussians(harmonics=3)))),
+    "3dgs": (
+        load_gaussians,
+        saved("a.ply", lambda path: save_gaussians(path, random_gaussians(harmonics=3))),
+    ),
     "3dgs text": (load_gaussians, written("a.ply", honest.text_ply)),
     "3dgs compressed": (load_gaussians, written("a.ply", honest.compressed_ply)),
-    "splat": (load_gaussians, saved("a.splat", lambda path: save_gaussians(path, random_gaussians()))),
-    "spz": (load_gaussians, saved("a.spz", lambda path: save_gaussians(path, random_gaussians(harmonics=15)))),
-    "spz 4": (load_gaussians, saved("a.spz", lambda path: save_gaussians(path, random_gaussians(harmonics=3), version=4))),
-    "glb splats": (load_gaussians, saved("a.glb", lambda path: save_gaussians(path, random_gaussians(harmonics=8)))),
+    "splat": (
+        load_gaussians,
+        saved("a.splat", lambda path: save_gaussians(path, random_gaussians())),
+    ),
+    "spz": (
+        load_gaussians,
+        saved("a.spz", lambda path: save_gaussians(path, random_gaussians(harmonics=15))),
+    ),
+    "spz 4": (
+        load_gaussians,
+        saved("a.spz", lambda path: save_gaussians(path, random_gaussians(harmonics=3), version=4)),
+    ),
+    "glb splats": (
+        load_gaussians,
+        saved("a.glb", lambda path: save_gaussians(path, random_gaussians(harmonics=8))),
+    ),
     "obj": (colored_mesh, honest.write_obj),
     "ply": (colored_mesh, honest.mesh("ply")),
     "glb": (colored_mesh, written("scan.glb", honest.textured_glb)),
     "stl": (read_mesh, honest.mesh("stl")),
     "off": (read_mesh, honest.mesh("off")),
     "joints json": (read_joints, written("j.json", as_json(JOINTS))),
-    "joints npz": (read_joints, npz("j.npz", lambda: {"names": np.asarray(["left_hip", "neck"])} | zeros(points=(2, 3)))),
+    "joints npz": (
+        read_joints,
+        npz("j.npz", lambda: {"names": np.asarray(["left_hip", "neck"])} | zeros(points=(2, 3))),
+    ),
     "fit record": (read_fit_record, npz("fit.npz", honest.fit_arrays)),
     "bank": (load_bank, npz("bank.npz", honest.bank_arrays)),
     "manifest": (continue_synthetic_set, written("manifest.json", as_json(honest.MANIFEST))),
-    "log": (first_failed_step, written("log.jsonl", '{"step": 1, "loss": 2.0}\n{"step": 2, "event": "skipped"}\n')),
+    "log": (
+        first_failed_step,
+        written("log.jsonl", '{"step": 1, "loss": 2.0}\n{"step": 2, "event": "skipped"}\n'),
+    ),
     "filmed": (film, npz("m.npz", honest.motion_arrays)),
-    "scan views": (read_placement, written("scan.json", as_json({"world_from_scan": WORLD_FROM_SCAN}))),
+    "scan views": (
+        read_placement,
+        written("scan.json", as_json({"world_from_scan": WORLD_FROM_SCAN})),
+    ),
     "start": (look, honest.write_import_folder, "photos/000.png"),
     "avatarrex": (read_data_set, avatarrex, "calibration_full.json"),
     "video poses": (read_data_set, avatarrex, "smpl_params.npz"),
-    "missing photos": (read_data_set, data_set(dataset_files.write_thuman4, frames=2), "missing_img_files.txt"),
-    "actorshq": (read_data_set, data_set(dataset_files.write_actorshq, frames=1), "4x/calibration.csv"),
+    "missing photos": (
+        read_data_set,
+        data_set(dataset_files.write_thuman4, frames=2),
+        "missing_img_files.txt",
+    ),
+    "actorshq": (
+        read_data_set,
+        data_set(dataset_files.write_actorshq, frames=1),
+        "4x/calibration.csv",
+    ),
     "dna photos": (read_data_set, dna, "main/0001_01.smc"),
     "dna notes": (read_data_set, dna, "annotations/0001_01_annots.smc"),
     "scene list": (read_data_set, scenes, "train.json"),
     "scene arrays": (read_data_set, scenes, "smpl/0.npz"),
-    "evaluation": (read_evaluation, written("evaluation_2.json", as_json({"s0": {"context": [0, 3], "target": [1]}}))),
+    "evaluation": (
+        read_evaluation,
+        written("evaluation_2.json", as_json({"s0": {"context": [0, 3], "target": [1]}})),
+    ),
     "thuman fit": (read_scans, scans, "smplx/0000/smplx_param.pkl"),
     "thuman mesh": (read_scans, scans, "smplx/0000/mesh_smplx.obj"),
     "thuman scan": (read_scans, scans, "model/0000/0000.obj"),

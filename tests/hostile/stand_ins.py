@@ -14,7 +14,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data", "data/datasets", ""))]
+sys.path[:0] = [
+    str(HERE),
+    *(str(HERE.parent / name) for name in ("network", "data", "data/datasets", "")),
+]
 os.environ |= {"JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "2"}
 
 import jax
@@ -49,14 +52,36 @@ from humangs_jax.training.forward import METRICS
 
 HEAVY = (
     *("apps.check", "apps.demo", "avatar.frames", "avatar.layers", "avatar.video"),
-    *("data.calibration.importing", "people.writer", "refinement.refine", "training.diagnose", "viewer.page"),
+    *(
+        "data.calibration.importing",
+        "people.writer",
+        "refinement.refine",
+        "training.diagnose",
+        "viewer.page",
+    ),
     *("fitting.fit_capture", "fitting.refine", "fitting.scan_files", "network.conversion"),
 )
-LATE = ("orbax.checkpoint", "tensorboardX", "OpenEXR", "safetensors.numpy", "plyfile", "imageio_ffmpeg", "tqdm")
+LATE = (
+    "orbax.checkpoint",
+    "tensorboardX",
+    "OpenEXR",
+    "safetensors.numpy",
+    "plyfile",
+    "imageio_ffmpeg",
+    "tqdm",
+)
 for name in (*LATE, *(f"humangs_jax.{name}" for name in ("cli", *HEAVY))):
     importlib.import_module(name)
 WORK = {
-    *("reconstruct", "refine_with_report", "motion_frames", "images", "draw", "fit_photos", "refine_capture"),
+    *(
+        "reconstruct",
+        "refine_with_report",
+        "motion_frames",
+        "images",
+        "draw",
+        "fit_photos",
+        "refine_capture",
+    ),
     *("fit_scan", "load_checkpoint", "make_subject", "train_step"),
 }
 """Stand-ins for what takes long: nothing that is wrong with the place may be found only after these."""
@@ -79,7 +104,9 @@ def some_avatar(variant, count=60):
         colors=number(random.random((count, 3))),
     )
     weights = body.skinning_weights[chosen]
-    return Avatar(gaussians, weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names)
+    return Avatar(
+        gaussians, weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names
+    )
 
 
 def some_renderings(variant, count, size=16):
@@ -98,7 +125,9 @@ def some_capture(variant, views=6, size=32):
     body, random, cameras = load_body(), random_of(variant, 1), some_cameras(views, size)
     masks = np.zeros((views, size, size), np.float32)
     masks[:, 4:-4, 8:-8] = 1
-    images = np.where(masks[..., None] > 0, random.random((views, size, size, 3)), 1.0).astype(np.float32)
+    images = np.where(masks[..., None] > 0, random.random((views, size, size, 3)), 1.0).astype(
+        np.float32
+    )
     rotations = 0.01 * random.normal(size=(1, len(body.parents), 3))
     return Capture(
         images=np.rint(255 * images) / np.float32(255),
@@ -114,8 +143,12 @@ def some_capture(variant, views=6, size=32):
 
 def some_record(variant, names):
     random = random_of(variant, 2)
-    keypoints = Keypoints(32 * random.random((len(names), 17, 2)), np.full((len(names), 17), 0.9), COCO_17)
-    return FitRecord(keypoints, tuple(names), np.ones(1), np.ones((1, 55)), np.ones((1, 55)), np.eye(3))
+    keypoints = Keypoints(
+        32 * random.random((len(names), 17, 2)), np.full((len(names), 17), 0.9), COCO_17
+    )
+    return FitRecord(
+        keypoints, tuple(names), np.ones(1), np.ones((1, 55)), np.ones((1, 55)), np.eye(3)
+    )
 
 
 def some_variables():
@@ -125,13 +158,18 @@ def some_variables():
 
 def stand_ins(variant):
     """What is patched: (module, name, replacement)."""
-    drawn = lambda count, size=16: (some_cameras(count, size), some_renderings(variant, count, size))
+    drawn = lambda count, size=16: (
+        some_cameras(count, size),
+        some_renderings(variant, count, size),
+    )
     moved = lambda capture: replace(capture, betas=np.full_like(capture.betas, variant / 8))
     frames = lambda *_, **__: iter([np.asarray(r.rgb) for r in some_renderings(variant, 3)])
 
     def refined(capture, **_):
         found = some_cameras(capture.view_count, 32).K  # whatever the start was
-        cameras = replace(capture.cameras, K=found + jnp.asarray([[0, 0, variant / 8], [0, 0, 0], [0, 0, 0]]))
+        cameras = replace(
+            capture.cameras, K=found + jnp.asarray([[0, 0, variant / 8], [0, 0, 0], [0, 0, 0]])
+        )
         return RefinedCapture(replace(moved(capture), cameras=cameras), FitReport("refinement"))
 
     def person(seed, _body):
@@ -158,10 +196,14 @@ def stand_ins(variant):
         return replace(state, step=state.step + 1, params=params), metrics
 
     def state(config, variables=None):
-        return importlib.import_module("humangs_jax.training.state").init_state(config, some_variables())
+        return importlib.import_module("humangs_jax.training.state").init_state(
+            config, some_variables()
+        )
 
     def validated(_variables, _body, examples, *_):
-        return dict.fromkeys(METRICS, 20.0), [np.asarray(example.targets.images) for example in examples]
+        return dict.fromkeys(METRICS, 20.0), [
+            np.asarray(example.targets.images) for example in examples
+        ]
 
     def shown(vertices, faces, tints, camera):
         image = random_of(variant, 3).random((camera.height, camera.width))
@@ -180,7 +222,9 @@ def stand_ins(variant):
         count = 1 + int(np.max(photos.frames))
         poses = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), capture.poses)
         capture = replace(capture, frames=np.asarray(photos.frames, np.int32), poses=poses)
-        return SimpleNamespace(capture=capture, record=record, report=FitReport("keypoints"), camera_errors=())
+        return SimpleNamespace(
+            capture=capture, record=record, report=FitReport("keypoints"), camera_errors=()
+        )
 
     def converted(*_):
         return SimpleNamespace(variables=some_variables(), config=tiny(), skipped=1)
@@ -198,17 +242,26 @@ def stand_ins(variant):
         ),
         "avatar.frames.images": frames,
         "avatar.frames.motion_views": lambda *_: (None, None),
-        "avatar.frames.turntable_views": lambda _avatar, _pose, views, _shot: ([None] * views, some_cameras(views)),
+        "avatar.frames.turntable_views": lambda _avatar, _pose, views, _shot: (
+            [None] * views,
+            some_cameras(views),
+        ),
         "avatar.layers.draw": lambda _, poses, *__: iter(some_renderings(variant, len(poses))),
         "detection.people.available": lambda: False,
         "apps.check._body_image": shown,
-        "apps.check.faults": lambda capture: Faults((), (None,) * capture.view_count, (1.0,) * capture.view_count, set()),
-        "apps.check._posed_frames": lambda capture, *_: dict.fromkeys(map(int, capture.frames), np.zeros((4, 3))),
+        "apps.check.faults": lambda capture: Faults(
+            (), (None,) * capture.view_count, (1.0,) * capture.view_count, set()
+        ),
+        "apps.check._posed_frames": lambda capture, *_: dict.fromkeys(
+            map(int, capture.frames), np.zeros((4, 3))
+        ),
         "apps.start.better_body": lambda _weights, _config, loose, *_: (loose, None),
         "apps.demo.load_weights": lambda *_: (None, tiny()),
         "apps.demo.reconstruct": avatar,
         "apps.demo.animate": lambda avatar, _: avatar.gaussians,
-        "apps.demo.capture_renderings": lambda _, truth, *__: drawn(truth.view_count, truth.cameras.width),
+        "apps.demo.capture_renderings": lambda _, truth, *__: drawn(
+            truth.view_count, truth.cameras.width
+        ),
         "apps.demo.score": lambda *_: Scores(20.0, 0.9, 20.0, 0.2),
         "apps.demo.painted_body": lambda _: None,
         "apps.demo.draw_painted_body": lambda *_: None,
@@ -224,7 +277,9 @@ def stand_ins(variant):
         "people.writer.make_subject": person,
         "people.writer.sample_pose": posed,
         "people.writer.capture_views": views_of,
-        "people.writer.cameras_around": lambda rng, vertices, azimuths, size: some_cameras(len(azimuths), size),
+        "people.writer.cameras_around": lambda rng, vertices, azimuths, size: some_cameras(
+            len(azimuths), size
+        ),
         "training.loop.train_step": step,
         "training.loop.init_state": state,
         "training.loop.gaussian_body": lambda body, _: body,
@@ -234,7 +289,9 @@ def stand_ins(variant):
 
 def make_inputs(inputs: Path) -> None:
     inputs.mkdir()
-    zeros = jax.tree.map(lambda x: np.zeros(x.shape, np.float32), expected_variables(config.tiny().model))
+    zeros = jax.tree.map(
+        lambda x: np.zeros(x.shape, np.float32), expected_variables(config.tiny().model)
+    )
     (inputs / "variables.pkl").write_bytes(pickle.dumps(zeros))
     write_import(inputs)
     write_avatarrex(inputs / "videos" / "a", frames=1)
@@ -245,8 +302,14 @@ def make_inputs(inputs: Path) -> None:
     for variant in (1, 2):
         some_avatar(variant).save(inputs / f"avatar{variant}.npz")
     record = some_record(0, [f"{i:03d}" for i in range(6)])
-    arrays = {"set": record.keypoints.set.name, "names": record.names, "points": record.keypoints.points}
+    arrays = {
+        "set": record.keypoints.set.name,
+        "names": record.names,
+        "points": record.keypoints.points,
+    }
     write_npz(inputs / "keypoints.npz", arrays | {"confidences": record.keypoints.confidences})
     (inputs / "scan.obj").write_text(sphere().export(file_type="obj"))
     (inputs / "any.pt").write_bytes(b"")
-    (inputs / "train.json").write_text(config_to_json(dataclasses.replace(config.tiny(), steps=6, checkpoint_every=2), indent=1))
+    (inputs / "train.json").write_text(
+        config_to_json(dataclasses.replace(config.tiny(), steps=6, checkpoint_every=2), indent=1)
+    )

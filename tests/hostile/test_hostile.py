@@ -17,7 +17,10 @@ import pytest
 from humangs_jax.core.progress import printable
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data", "data/datasets", ""))]
+sys.path[:0] = [
+    str(HERE),
+    *(str(HERE.parent / name) for name in ("network", "data", "data/datasets", "")),
+]
 
 from hostile_cases import all_cases  # noqa: E402
 from readers import FORMATS  # noqa: E402
@@ -36,20 +39,39 @@ ITEMS = {
 }
 """Of the list that these tests began with; 8 is tests/io/test_atomic.py, 9 the checks of arrays in tests/avatar."""
 CASES = all_cases()
-FUZZED, MOMENTS = (int(os.environ.get(*each)) for each in (("HUMANGS_FUZZ_INPUTS", "10000"), ("HUMANGS_KILLS", "2")))
+FUZZED, MOMENTS = (
+    int(os.environ.get(*each))
+    for each in (("HUMANGS_FUZZ_INPUTS", "10000"), ("HUMANGS_KILLS", "2"))
+)
 """Files for each reader, and kills and interrupts of each command; docs/results has the figures of more."""
 EVERY = 12
 HEAVY = (
-    *("GiB", "million", "bomb", "100,000", "100 MB", "digits", "8,000", "13,000", "30,000", "60,000,000", "300,000"),
+    *(
+        "GiB",
+        "million",
+        "bomb",
+        "100,000",
+        "100 MB",
+        "digits",
+        "8,000",
+        "13,000",
+        "30,000",
+        "60,000,000",
+        "300,000",
+    ),
     *("5,000 photos", "white photos", "scans", "nodes", "MB"),
 )
 """Files that a reader which has become careless would take minutes or gigabytes for."""
 
 
-def program(script: str, *arguments: object, seconds: float | None = None) -> subprocess.CompletedProcess:
+def program(
+    script: str, *arguments: object, seconds: float | None = None
+) -> subprocess.CompletedProcess:
     environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, str(HERE / script), *map(str, arguments)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=seconds, check=False)
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=seconds, check=False
+    )
 
 
 def run_cases(folder: Path, names: list[str]) -> dict[str, dict]:
@@ -73,7 +95,12 @@ def run_cases(folder: Path, names: list[str]) -> dict[str, dict]:
         if begun is None and len(waiting) == len([name for name in waiting if name not in results]):
             raise RuntimeError(f"the worker read nothing: {ending}\n{errors}")
         if begun is not None:
-            died = {"outcome": "died", "message": f"{ending} {errors[-300:]}", "path": "", "seconds": 0}
+            died = {
+                "outcome": "died",
+                "message": f"{ending} {errors[-300:]}",
+                "path": "",
+                "seconds": 0,
+            }
             results[begun] = {"name": begun} | died
         waiting, attempt = [name for name in waiting if name not in results], attempt + 1
     return results
@@ -96,7 +123,9 @@ def fault(case, result: dict) -> str:
 
 @pytest.mark.parametrize("item", ITEMS)
 def test_some_files_of_each_item(item, tmp_path):
-    light = [case for case in CASES if case.item == item and not any(word in case.name for word in HEAVY)]
+    light = [
+        case for case in CASES if case.item == item and not any(word in case.name for word in HEAVY)
+    ]
     faults = []
     for number, case in enumerate(light[::EVERY] if len(light) > 60 else light):
         folder = tmp_path / str(number)
@@ -148,7 +177,9 @@ def disturbed(folder, *options):
 @pytest.mark.slow
 def test_killed_at_any_moment_nothing_is_half_written_or_lost_and_the_next_run_works(tmp_path):
     commands = disturbed(tmp_path)
-    assert sum(each["killed"] for each in commands.values()) > MOMENTS * len(commands) / 2  # some come to their end before
+    assert (
+        sum(each["killed"] for each in commands.values()) > MOMENTS * len(commands) / 2
+    )  # some come to their end before
 
 
 @pytest.mark.slow
@@ -171,9 +202,16 @@ def main():
     print("\n".join(faults))
     for key, unit in (("seconds", 1), ("bytes", 1 << 20)):
         most = sorted(results.values(), key=lambda result, key=key: -result.get(key, 0))[:8]
-        print("\n".join(f"{each.get(key, 0) / unit:.2f} {key if unit == 1 else 'MiB'}  {each['name']}" for each in most))
+        print(
+            "\n".join(
+                f"{each.get(key, 0) / unit:.2f} {key if unit == 1 else 'MiB'}  {each['name']}"
+                for each in most
+            )
+        )
     print(Counter(result["outcome"] for result in results.values()))
-    print(f"{len(CASES)} files, {len({case.reader for case in CASES})} readers, {len(faults)} faults")
+    print(
+        f"{len(CASES)} files, {len({case.reader for case in CASES})} readers, {len(faults)} faults"
+    )
 
 
 if __name__ == "__main__":

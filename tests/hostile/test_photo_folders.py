@@ -186,7 +186,14 @@ FOLDERS = {
     "nothing": (lambda folder: folder.mkdir(), None, "no photo: expected"),
     "a folder that is not there": (lambda folder: None, None, "no such folder"),
 }  # fmt: skip
-FAST = ("black", "one name with two suffixes", "a HEIC without the extra", "a photo cut short", "feet cut off", "nothing")
+FAST = (
+    "black",
+    "one name with two suffixes",
+    "a HEIC without the extra",
+    "a photo cut short",
+    "feet cut off",
+    "nothing",
+)
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +218,9 @@ def run(kind, command, remembered, monkeypatch, capsys):
     code = cli.execute(command)
     err = capsys.readouterr().err
     assert "Traceback" not in err
-    return code, *([line for line in err.splitlines() if f"{word}:" in line] for word in ("error", "warning"))
+    return code, *(
+        [line for line in err.splitlines() if f"{word}:" in line] for word in ("error", "warning")
+    )
 
 
 def kinds(names, fast):
@@ -219,10 +228,14 @@ def kinds(names, fast):
 
 
 @pytest.mark.parametrize("kind", kinds(FOLDERS, FAST))
-def test_the_person_is_found_or_one_line_says_why_not(kind, remembered, tmp_path, monkeypatch, capsys):
+def test_the_person_is_found_or_one_line_says_why_not(
+    kind, remembered, tmp_path, monkeypatch, capsys
+):
     _, count, said = FOLDERS[kind]
     monkeypatch.chdir(tmp_path)
-    code, errors, warnings = run(kind, ["detect", "photos", "--out", "found"], remembered, monkeypatch, capsys)
+    code, errors, warnings = run(
+        kind, ["detect", "photos", "--out", "found"], remembered, monkeypatch, capsys
+    )
     if count is None:
         assert code == cli.BAD_DATA and len(errors) == 1 and not warnings
         assert re.search(said, errors[0])
@@ -237,11 +250,17 @@ def test_the_person_is_found_or_one_line_says_why_not(kind, remembered, tmp_path
         assert mask.shape == each.size[::-1] and bool(mask.any()) == (each.people[0] is not None)
 
 
-HOPELESS = [kind for kind, (_, count, _) in FOLDERS.items() if count is None and kind != "one name with two suffixes"]
+HOPELESS = [
+    kind
+    for kind, (_, count, _) in FOLDERS.items()
+    if count is None and kind != "one name with two suffixes"
+]
 
 
 @pytest.mark.parametrize("kind", kinds(HOPELESS, ("a photo cut short", "nothing")))
-def test_start_says_in_one_line_what_is_wrong_with_the_photos(kind, remembered, tmp_path, monkeypatch, capsys):
+def test_start_says_in_one_line_what_is_wrong_with_the_photos(
+    kind, remembered, tmp_path, monkeypatch, capsys
+):
     """Or that cameras are missing; there is no capture then."""
     monkeypatch.chdir(tmp_path)
     command = ["start", "photos", "--out", "me", "--no-browser"]

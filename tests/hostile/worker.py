@@ -17,13 +17,32 @@ ROOT = Path(__file__).resolve().parents[2]
 MEMORY, RESIDENT, SECONDS, WAITING = 3 << 30, 1 << 30, 10.0, 120.0
 """Bytes of address space, bytes that a file may make resident, seconds of the processor and of the clock that it may take."""
 FORBIDDEN = (
-    *("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "pty.spawn"),
+    *(
+        "subprocess.Popen",
+        "os.system",
+        "os.exec",
+        "os.posix_spawn",
+        "os.spawn",
+        "os.fork",
+        "os.forkpty",
+        "pty.spawn",
+    ),
     *("socket.connect", "socket.bind", "socket.getaddrinfo", "urllib.Request", "webbrowser.open"),
 )
 MODULES = ("antigravity", "this", "webbrowser", "humangs_jax.cli.__main__")
 """A file may name modules: none of these is imported."""
 CHANGES = (
-    *("os.remove", "os.rmdir", "os.rename", "os.mkdir", "os.link", "os.symlink", "os.chmod", "os.truncate", "os.utime"),
+    *(
+        "os.remove",
+        "os.rmdir",
+        "os.rename",
+        "os.mkdir",
+        "os.link",
+        "os.symlink",
+        "os.chmod",
+        "os.truncate",
+        "os.utime",
+    ),
     *("shutil.rmtree", "shutil.copyfile", "shutil.move"),
 )
 
@@ -53,18 +72,24 @@ class Watch:
             self.stop(event, arguments)
         if event == "open" and isinstance(arguments[0], str | bytes | os.PathLike):
             path, mode, flags = arguments
-            writes = any(c in (mode or "") for c in "wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+            writes = any(c in (mode or "") for c in "wax+") or (flags or 0) & (
+                os.O_WRONLY | os.O_RDWR | os.O_CREAT
+            )
             if writes:
                 self.check(event, path)
         elif event in CHANGES:
             for path in arguments[:2]:
                 if isinstance(path, str | bytes | os.PathLike):
-                    self.check(event, path, arguments[DESCRIPTORS[event]] if event in DESCRIPTORS else -1)
+                    self.check(
+                        event, path, arguments[DESCRIPTORS[event]] if event in DESCRIPTORS else -1
+                    )
 
     def check(self, event, path, folder=-1):
         """folder: descriptor of the folder that the path is relative to, -1 for the working folder."""
         base = os.getcwd() if folder == -1 else os.readlink(f"/proc/self/fd/{folder}")
-        if not Path(os.path.abspath(os.path.join(base, os.fsdecode(path)))).is_relative_to(self.folder):
+        if not Path(os.path.abspath(os.path.join(base, os.fsdecode(path)))).is_relative_to(
+            self.folder
+        ):
             self.stop(event, path)
 
     def stop(self, event, arguments):
@@ -98,7 +123,10 @@ def run(case, read, folder, watch, measured=True):
     except (Forbidden, TooLong) as error:
         result |= {"outcome": type(error).__name__, "message": str(error)}
     except BaseException as error:
-        result |= {"outcome": "traceback", "message": "".join(traceback.format_exception(error))[-1500:]}
+        result |= {
+            "outcome": "traceback",
+            "message": "".join(traceback.format_exception(error))[-1500:],
+        }
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
@@ -113,7 +141,11 @@ def run(case, read, folder, watch, measured=True):
 
 def resident():
     """The most that was resident, bytes."""
-    (line,) = (each for each in Path("/proc/self/status").read_text().splitlines() if each.startswith("VmHWM"))
+    (line,) = (
+        each
+        for each in Path("/proc/self/status").read_text().splitlines()
+        if each.startswith("VmHWM")
+    )
     return int(line.split()[1]) * 1024
 
 
@@ -128,7 +160,9 @@ def too_long(*_):
 
 def prepare():
     """Paths of the test helpers, JAX on one CPU, and everything imported that readers import late."""
-    sys.path[:0] = [str(ROOT / "tests" / name) for name in ("hostile", "network", "data", "data/datasets", "")]
+    sys.path[:0] = [
+        str(ROOT / "tests" / name) for name in ("hostile", "network", "data", "data/datasets", "")
+    ]
     os.environ |= {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
     import jax
 
@@ -156,11 +190,15 @@ def main():
     watch = Watch()
     limit_memory()
     with open(folder / "results.jsonl", "a", buffering=1) as results:
-        for number, case in enumerate(each for each in hostile_cases.all_cases() if each.name in names):
+        for number, case in enumerate(
+            each for each in hostile_cases.all_cases() if each.name in names
+        ):
             results.write(json.dumps({"begun": case.name}) + "\n")
             place = folder / f"case{number}"
             place.mkdir()
-            results.write(json.dumps(run(case, readers.FORMATS[case.reader].read, place, watch)) + "\n")
+            results.write(
+                json.dumps(run(case, readers.FORMATS[case.reader].read, place, watch)) + "\n"
+            )
 
 
 if __name__ == "__main__":

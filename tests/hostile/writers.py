@@ -29,7 +29,14 @@ from stand_ins import WORK, make_inputs, stand_ins
 
 SECONDS = 300
 """Longest that a run may take on a busy machine."""
-CHANGES = {"open": (), "os.rename": (2, 3), "os.remove": (1,), "os.mkdir": (2,), "os.rmdir": (1,), "subprocess.Popen": ()}
+CHANGES = {
+    "open": (),
+    "os.rename": (2, 3),
+    "os.remove": (1,),
+    "os.mkdir": (2,),
+    "os.rmdir": (1,),
+    "subprocess.Popen": (),
+}
 """Events of Python that change files, and which of their arguments are descriptors of folders."""
 
 
@@ -58,17 +65,30 @@ class Command:
 
 CAPTURE = "--keypoints {inputs}/keypoints.npz --overwrite"
 RUN = ("run/checkpoints/*", "run/tensorboard/*")
-SYNTH = "synth --out people --subjects {} --size 128 --views 2 --close-views 0 --workers 1 --held-out 1"
+SYNTH = (
+    "synth --out people --subjects {} --size 128 --views 2 --close-views 0 --workers 1 --held-out 1"
+)
 COMMANDS = (
-    Command("import", "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite"),
+    Command(
+        "import",
+        "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite",
+    ),
     Command("fit in place", f"fit capture {CAPTURE}", copies=("capture",)),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
     Command("fit --scan", "fit --scan {inputs}/scan.obj --out body --overwrite"),
-    Command("fit --scan --scan-views", "fit --scan {inputs}/scan.obj --scan-views views", first=None, once=True),
+    Command(
+        "fit --scan --scan-views",
+        "fit --scan {inputs}/scan.obj --scan-views views",
+        first=None,
+        once=True,
+    ),
     Command("check", "check {inputs}/capture --out check.png"),
     Command("demo", "demo --out demo --refine 0 --size 16", varies=("demo/report.json",)),
     Command("reconstruct", "reconstruct {inputs}/capture --out me.npz --no-check"),
-    Command("refine", "refine {inputs}/avatar1.npz {inputs}/capture --limit 1steps --out me.npz --no-check"),
+    Command(
+        "refine",
+        "refine {inputs}/avatar1.npz {inputs}/capture --limit 1steps --out me.npz --no-check",
+    ),
     Command("animate mp4", "animate {inputs}/avatar1.npz --out me.mp4 --size 16"),
     Command("render", "render {inputs}/avatar1.npz --out views --views 3 --size 16 --exr"),
     Command("export ply", "export {inputs}/avatar{v}.npz --out me.ply"),
@@ -92,7 +112,10 @@ COMMANDS = (
         often=("begun/capture.json",),
         once=True,
     ),
-    Command("preprocess", "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16 --every 1"),
+    Command(
+        "preprocess",
+        "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16 --every 1",
+    ),
     Command(
         "evaluate",
         "evaluate {inputs}/capture --predictions {inputs}/capture/images --json a.json --html a.html --csv a.csv "
@@ -141,7 +164,9 @@ class Changes:
             return
         if event == "open":
             path, mode, flags = arguments
-            if not (any(c in (mode or "") for c in "wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR)):
+            if not (
+                any(c in (mode or "") for c in "wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR)
+            ):
                 return
         path = arguments[0]
         if event == "subprocess.Popen":
@@ -160,7 +185,14 @@ class Changes:
             threading.Timer(self.moment.seconds, os.killpg, (0, signal.SIGKILL)).start()
 
 
-def start(command: Command, place: Path, inputs: Path, variant: int, moment: Moment | None = None, most: int | None = None):
+def start(
+    command: Command,
+    place: Path,
+    inputs: Path,
+    variant: int,
+    moment: Moment | None = None,
+    most: int | None = None,
+):
     """Begins a run; most: bytes that a file may have, as on a disk that is full then. Returns what `end` wants."""
     log = inputs.with_name("logs") / f"{place.name}.{variant}"  # not on a disk that is full
     shutil.rmtree(log, ignore_errors=True)
@@ -193,7 +225,10 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
     called = []
     for place, replacement in stand_ins(variant).items():
         module, _, name = place.rpartition(".")
-        noted = lambda *given, _name=name, _work=replacement, **named: (called.append(_name), _work(*given, **named))[1]
+        noted = lambda *given, _name=name, _work=replacement, **named: (
+            called.append(_name),
+            _work(*given, **named),
+        )[1]
         mock.patch.object(importlib.import_module(f"humangs_jax.{module}"), name, noted).start()
     sys.argv = ["humangs", *command.words(inputs, variant)]
     if moment is not None and moment.by == signal.SIGINT:
@@ -228,8 +263,12 @@ def hear_from_the_start(cli, tell):
     from humangs_jax.cli import screen
 
     importing, hook = screen._importing, Changes.audit.__code__
-    mock.patch.object(screen, "_importing", lambda frame: frame.f_code is hook or importing(frame)).start()
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start what runs in the background without it
+    mock.patch.object(
+        screen, "_importing", lambda frame: frame.f_code is hook or importing(frame)
+    ).start()
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # shells start what runs in the background without it
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     prepare = cli._prepare
 
@@ -259,8 +298,14 @@ def end(begun) -> Run:
     assert ended, f"{log}: did not end"
     changes = log / "changes.json"
     code = None if os.WIFSIGNALED(status) else os.waitstatus_to_exitcode(status)
-    texts = [(log / name).read_text() if (log / name).exists() else "" for name in ("out", "errors")]
-    return Run(code, *texts, *(json.loads(changes.read_text()) if changes.exists() and code is not None else ([], [])))
+    texts = [
+        (log / name).read_text() if (log / name).exists() else "" for name in ("out", "errors")
+    ]
+    return Run(
+        code,
+        *texts,
+        *(json.loads(changes.read_text()) if changes.exists() and code is not None else ([], [])),
+    )
 
 
 def run(*arguments, **options) -> Run:
@@ -319,7 +364,9 @@ def weights_are_whole(data: bytes) -> bool:
     try:
         size = 8 + int.from_bytes(data[:8], "little")
         header = json.loads(data[8:size])
-        return size + max(each["data_offsets"][1] for name, each in header.items() if name != "__metadata__") == len(data)
+        return size + max(
+            each["data_offsets"][1] for name, each in header.items() if name != "__metadata__"
+        ) == len(data)
     except (ValueError, LookupError):
         return False
 
@@ -370,7 +417,9 @@ def unlike(command: Command, place: Path, expected: dict) -> list[str]:
     found += [f"{name}: missing" for name in compared(expected.keys() - final.keys())]
     found += [f"{name}: too much" for name in compared(final.keys() - expected.keys())]
     for name in compared(final.keys() & expected.keys()):
-        same = whole(place / name) if matches(name, command.varies) else final[name] == expected[name]
+        same = (
+            whole(place / name) if matches(name, command.varies) else final[name] == expected[name]
+        )
         found += [] if same else [f"{name}: not what the command writes"]
     if (place / "run").is_dir():
         found += unlike_a_run(place / "run")
@@ -381,17 +430,27 @@ def next_run(command: Command, place: Path, inputs: Path, expected: dict) -> lis
     """What is wrong with the run after one that was killed or failed, and with what is there then."""
     finished = command.once and not unlike(command, place, expected)
     ending = run(command, place, inputs, 2)
-    found = [] if ending.code == (2 if finished else 0) else [f"exit status {ending.code}: {ending.errors[-500:]}"]
+    found = (
+        []
+        if ending.code == (2 if finished else 0)
+        else [f"exit status {ending.code}: {ending.errors[-500:]}"]
+    )
     return [f"the next run: {fault}" for fault in found + unlike(command, place, expected)]
 
 
 def unlike_a_run(out: Path) -> list[str]:
     steps = sorted(path.name for path in (out / "checkpoints").iterdir())
-    losses = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines() if '"loss"' in line]
+    losses = [
+        json.loads(line)["step"]
+        for line in (out / "log.jsonl").read_text().splitlines()
+        if '"loss"' in line
+    ]
     # one that was interrupted at 5 has saved that step, and two are kept
     good = {"4", "6"} <= set(steps) or {"5", "6"} <= set(steps)
     found = [] if good and all(step.isdecimal() for step in steps) else [f"checkpoints {steps}"]
-    return found + ([] if losses == sorted(set(losses)) and losses[-1] == 6 else [f"steps in the log: {losses}"])
+    return found + (
+        [] if losses == sorted(set(losses)) and losses[-1] == 6 else [f"steps in the log: {losses}"]
+    )
 
 
 def place_of(command: Command, folder: Path, inputs: Path, name: str) -> Path:
@@ -406,4 +465,8 @@ def place_of(command: Command, folder: Path, inputs: Path, name: str) -> Path:
 
 def error_lines(text: str) -> list[str]:
     """Lines of stderr that are no progress bar."""
-    return [line for line in re.split(r"[\r\n]+", text) if line.strip() and not re.search(r"\d+%\||\d+it \[|it/s", line)]
+    return [
+        line
+        for line in re.split(r"[\r\n]+", text)
+        if line.strip() and not re.search(r"\d+%\||\d+it \[|it/s", line)
+    ]

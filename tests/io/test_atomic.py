@@ -73,27 +73,40 @@ def test_a_failed_write_changes_nothing(tmp_path, error):
     with pytest.raises(error):
         atomic.add_files(tmp_path / "folder", lambda temporary: fail_file(temporary / "a.txt"))
     assert names(tmp_path) == ["file.txt", "folder"]
-    assert (tmp_path / "file.txt").read_text() == (tmp_path / "folder" / "a.txt").read_text() == "old"
+    assert (
+        (tmp_path / "file.txt").read_text() == (tmp_path / "folder" / "a.txt").read_text() == "old"
+    )
 
 
 def test_writes_replace_and_leave_nothing_temporary(tmp_path):
     for text in ("one", "two"):
         atomic.write_text(tmp_path / "file.txt", text)
         atomic.replace_folder(tmp_path / "deep" / "folder", writes(text), mark=MARK)
-        assert (tmp_path / "file.txt").read_text() == (tmp_path / "deep" / "folder" / "a.txt").read_text() == text
+        assert (
+            (tmp_path / "file.txt").read_text()
+            == (tmp_path / "deep" / "folder" / "a.txt").read_text()
+            == text
+        )
     (tmp_path / "deep" / "folder" / "mine.txt").write_text("kept")
-    atomic.add_files(tmp_path / "deep" / "folder", lambda temporary: atomic.write_text(temporary / "a.txt", "three"))
+    atomic.add_files(
+        tmp_path / "deep" / "folder",
+        lambda temporary: atomic.write_text(temporary / "a.txt", "three"),
+    )
     assert (tmp_path / "deep" / "folder" / "a.txt").read_text() == "three"
     assert names(tmp_path) == ["deep", "file.txt"] and names(tmp_path / "deep") == ["folder"]
     assert names(tmp_path / "deep" / "folder") == ["a.txt", "mine.txt"]
     deeper = lambda temporary: folder_with(temporary / "b" / "c", "four")
     atomic.add_files(tmp_path / "deep" / "folder", deeper, without=("mine.txt", "none.txt"))
-    assert names(tmp_path / "deep" / "folder") == ["a.txt", "b"] and names(tmp_path / "deep") == ["folder"]
+    assert names(tmp_path / "deep" / "folder") == ["a.txt", "b"] and names(tmp_path / "deep") == [
+        "folder"
+    ]
     assert (tmp_path / "deep" / "folder" / "b" / "c" / "a.txt").read_text() == "four"
     atomic.add_files(tmp_path / "deep" / "new", writes_into("five"))
     assert (tmp_path / "deep" / "new" / "a.txt").read_text() == "five"
     atomic.write_text(tmp_path / "none" / "yet" / "file.txt", "text")
-    assert (tmp_path / "none" / "yet" / "file.txt").read_text() == "text" and names(tmp_path / "none" / "yet") == ["file.txt"]
+    assert (tmp_path / "none" / "yet" / "file.txt").read_text() == "text" and names(
+        tmp_path / "none" / "yet"
+    ) == ["file.txt"]
     with pytest.raises(NotADirectoryError, match=r"file\.txt: is no folder, or lies in a file"):
         atomic.write_text(tmp_path / "file.txt" / "b.txt", "text")
 
@@ -102,7 +115,9 @@ def test_a_folder_that_was_made_for_a_file_that_failed_goes_again(tmp_path):
     (tmp_path / "there").mkdir()
     for place in ("new/and/deep/a.txt", "there/new/a.txt", "there/a.txt"):
         with pytest.raises(ZeroDivisionError):
-            atomic.replace_file(tmp_path / place, lambda temporary: temporary.write_text(str(1 / 0)))
+            atomic.replace_file(
+                tmp_path / place, lambda temporary: temporary.write_text(str(1 / 0))
+            )
     assert names(tmp_path) == ["there"] and not names(tmp_path / "there")
 
 
@@ -157,7 +172,9 @@ def test_an_interrupt_while_the_old_folder_is_deleted_leaves_nothing_of_it(tmp_p
         remove(path, **options)
 
     monkeypatch.setattr(atomic.shutil, "rmtree", interrupted)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start what runs in the background without it
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # shells start what runs in the background without it
     try:
         with pytest.raises(KeyboardInterrupt):
             atomic.replace_folder(folder, writes("new"), mark=MARK)
@@ -170,7 +187,9 @@ def test_a_full_disk_names_what_was_to_be_written(tmp_path):
     def fill(temporary):
         temporary = temporary if temporary.suffix else temporary / "deep" / "a.txt"
         temporary.parent.mkdir(parents=True, exist_ok=True)
-        atomic.replace_file(temporary, lambda inner: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left")))
+        atomic.replace_file(
+            temporary, lambda inner: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left"))
+        )
 
     def say(temporary):
         raise OSError(f"{temporary}: ffmpeg failed")
@@ -187,7 +206,9 @@ def test_a_full_disk_names_what_was_to_be_written(tmp_path):
     assert names(tmp_path) == []
     source = tmp_path / "source"
     with pytest.raises(FileNotFoundError, match="source"):  # that of an input is not ours
-        atomic.replace_file(tmp_path / "file", lambda temporary: temporary.write_bytes(source.read_bytes()))
+        atomic.replace_file(
+            tmp_path / "file", lambda temporary: temporary.write_bytes(source.read_bytes())
+        )
 
 
 def test_if_one_of_several_files_fails_none_appears(tmp_path):
@@ -197,7 +218,9 @@ def test_if_one_of_several_files_fails_none_appears(tmp_path):
         raise OSError(errno.ENOSPC, "No space left", str(temporary))
 
     with pytest.raises(OSError, match=r"No space left: '.*b\.html'"):
-        atomic.replace_files({tmp_path / "a.csv": lambda path: path.write_text("new"), tmp_path / "b.html": full})
+        atomic.replace_files(
+            {tmp_path / "a.csv": lambda path: path.write_text("new"), tmp_path / "b.html": full}
+        )
     assert names(tmp_path) == ["a.csv"] and (tmp_path / "a.csv").read_text() == "old"
     atomic.write_texts({tmp_path / "a.csv": "new", tmp_path / "b.html": "whole"})
     assert names(tmp_path) == ["a.csv", "b.html"] and (tmp_path / "a.csv").read_text() == "new"
@@ -210,7 +233,9 @@ def test_a_folder_has_one_writer_at_a_time(tmp_path, replaced):
         place.mkdir()
     code = "import sys; from humangs_jax.io import atomic\n"
     code += f"with atomic.only_writer(sys.argv[1], replaced={replaced}): print('held', flush=True); input()"
-    with subprocess.Popen([sys.executable, "-c", code, place], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+    with subprocess.Popen(
+        [sys.executable, "-c", code, place], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
         other.stdout.readline()
         with pytest.raises(BlockingIOError, match=f"{place}: another process is writing here"):
             atomic.only_writer(place, replaced=replaced).__enter__()
@@ -224,7 +249,11 @@ def test_places_are_checked_before_the_work(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path, tmp_path / "file", tmp_path / "new" / "deep"):
         atomic.check_writable(path)
-    for path in (tmp_path / "file" / "deep" / "a.npz", Path("/proc/new/deep"), Path("/proc/version")):
+    for path in (
+        tmp_path / "file" / "deep" / "a.npz",
+        Path("/proc/new/deep"),
+        Path("/proc/version"),
+    ):
         with pytest.raises(OSError, match=f"{path}: cannot write to "):
             atomic.check_writable(path)
     assert names(tmp_path) == ["file"]
@@ -236,11 +265,16 @@ def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     leftover(tmp_path / "file", "new", dead_process, suffix=".npz").write_text("half")
     folder_with(leftover(target, "new", os.getpid()), "of this process")
     folder_with(leftover(target, "new", dead_process, machine="00000000"), "of another machine")
-    old = folder_with(leftover(target, "new", dead_process, machine="00000001"), "of another machine, long ago")
+    old = folder_with(
+        leftover(target, "new", dead_process, machine="00000001"), "of another machine, long ago"
+    )
     os.utime(old, (0, 0))
     (tmp_path / ".hidden").write_text("not ours")
     atomic.add_files(tmp_path / "other", writes_into("new"))
-    folder_with(leftover(tmp_path / "other", "new", dead_process), "of one that was killed after it had made the folder")
+    folder_with(
+        leftover(tmp_path / "other", "new", dead_process),
+        "of one that was killed after it had made the folder",
+    )
     atomic._sweep.cache_clear()  # a new process sweeps
     atomic.add_files(tmp_path / "other", writes_into("newer"))
     assert not leftover(tmp_path / "other", "new", dead_process).exists()
@@ -287,7 +321,10 @@ def test_only_folders_of_the_kind_are_replaced_and_none_that_holds_an_input(tmp_
     thesis.write_text("dear")
     (tmp_path / "docs" / "deep").mkdir()
     (tmp_path / "docs" / "deep" / "b.txt").write_text("b")
-    assert atomic.contents(folder) == "a.txt, deep (1 file), thesis.tex" and atomic.contents(tmp_path / "none") == ""
+    assert (
+        atomic.contents(folder) == "a.txt, deep (1 file), thesis.tex"
+        and atomic.contents(tmp_path / "none") == ""
+    )
     never = lambda temporary: pytest.fail("the work has begun")
     with pytest.raises(ValueError, match=r"holds no capture\.json: refusing"):
         atomic.replace_folder(folder, never, mark="capture.json")
@@ -300,7 +337,9 @@ def test_only_folders_of_the_kind_are_replaced_and_none_that_holds_an_input(tmp_
         with pytest.raises(ValueError, match="lies in it and would be deleted"):
             atomic.check_replaceable(folder, mark=MARK, inputs=(None, given))
     (tmp_path / "loop").symlink_to("loop")
-    atomic.check_replaceable(folder, mark=MARK, inputs=(tmp_path / "loop",))  # whoever reads it says what is wrong
+    atomic.check_replaceable(
+        folder, mark=MARK, inputs=(tmp_path / "loop",)
+    )  # whoever reads it says what is wrong
     assert thesis.read_text() == "dear"
 
 
@@ -330,7 +369,9 @@ def test_several_writers_of_one_folder_end_with_one_of_theirs(tmp_path):
         thread.start()
     for thread in threads:
         thread.join()
-    assert failed == [] and names(tmp_path) == ["folder"] and (target / "a.txt").read_text() in "0123"
+    assert (
+        failed == [] and names(tmp_path) == ["folder"] and (target / "a.txt").read_text() in "0123"
+    )
 
 
 WRITE_FOR_EVER = """
@@ -357,7 +398,9 @@ def test_killed_at_any_moment_the_folder_is_whole_and_the_next_write_cleans_up(t
             process.kill()
         atomic._sweep.cache_clear()  # a new process sweeps
         with pytest.raises(OSError, match="disk full"):
-            atomic.replace_folder(target, lambda temporary: (_ for _ in ()).throw(OSError("disk full")), mark=MARK)
+            atomic.replace_folder(
+                target, lambda temporary: (_ for _ in ()).throw(OSError("disk full")), mark=MARK
+            )
         assert names(tmp_path) == ["folder"] and names(target) == ["a.txt", "b.txt"]
 
 
@@ -380,7 +423,10 @@ def test_the_file_that_is_to_be_last_is_moved_last(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "replace", noted)
     names = ("a.json", "body.npz", "c.json")
-    write = lambda folder: (folder.mkdir(exist_ok=True), [(folder / name).touch() for name in names])
+    write = lambda folder: (
+        folder.mkdir(exist_ok=True),
+        [(folder / name).touch() for name in names],
+    )
     atomic.add_files(tmp_path / "me", write, last="body.npz")
     assert moved == ["a.json", "c.json", "body.npz"]
 

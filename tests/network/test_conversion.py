@@ -14,7 +14,14 @@ from torch_writer import FakeTensor, tensors, write_checkpoint
 
 from humangs_jax.losses.loss_networks import expected_tensors, load_lpips
 from humangs_jax.network.config import paper_parts
-from humangs_jax.network.conversion import describe, expected_shapes, infer_config, load_checkpoint, read_state_dict, to_release
+from humangs_jax.network.conversion import (
+    describe,
+    expected_shapes,
+    infer_config,
+    load_checkpoint,
+    read_state_dict,
+    to_release,
+)
 from humangs_jax.network.presets import published
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.weights import load_weights
@@ -40,9 +47,16 @@ def test_the_configuration_is_read_off_the_shapes(options, tmp_path):
     config = converted.config
     encoder, reader, decoder = paper_parts(config.architecture)
     transformer = encoder.transformer
-    assert (transformer.width, transformer.layers, transformer.mlp_ratio) == (options.width, options.layers, 4)
+    assert (transformer.width, transformer.layers, transformer.mlp_ratio) == (
+        options.width,
+        options.layers,
+        4,
+    )
     assert transformer.head_width == options.head and transformer.qk_norm
-    assert transformer.class_token == options.class_token and (encoder.upsampler is not None) == options.upsampler
+    assert (
+        transformer.class_token == options.class_token
+        and (encoder.upsampler is not None) == options.upsampler
+    )
     assert encoder.patch_size == options.patch
     assert (encoder.texture.resolution, encoder.texture.channels) == options.texture
     assert (decoder.hidden, decoder.tight, decoder.free) == (8, 1, options.gaussians - 1)
@@ -50,7 +64,10 @@ def test_the_configuration_is_read_off_the_shapes(options, tmp_path):
     if options.upsampler:
         assert (encoder.upsampler.hidden, reader.output_width) == (8, options.width)
     size = config.conventions.image_size
-    assert config.conventions == published().with_conventions(image_size=size).conventions and size % options.patch == 0
+    assert (
+        config.conventions == published().with_conventions(image_size=size).conventions
+        and size % options.patch == 0
+    )
     back = to_release(converted.variables) | {"tpose_lbs_weights": converted.skinning_weights}
     assert {key: x.shape for key, x in back.items()} == {key: x.shape for key, x in state.items()}
     for key, value in state.items():
@@ -69,9 +86,18 @@ def test_the_golden_checkpoint():
 
 def test_shapes_of_the_published_network():
     shapes = expected_shapes(published())
-    assert shapes["image_tokenizer.1.weight"] == (768, 64 * 57) and shapes["neural_texture"] == (3, 128, 128, 16)
-    assert shapes["transformer_blocks.11.mlp.mlp.2.weight"] == (768, 3072) and shapes["cls_token"] == (1, 1, 768)
-    assert shapes["upsampler.up1.0.weight"] == (512, 256, 4, 4) and shapes["upsampler.up2.3.weight"] == (768, 128, 3, 3)
+    assert shapes["image_tokenizer.1.weight"] == (768, 64 * 57) and shapes["neural_texture"] == (
+        3,
+        128,
+        128,
+        16,
+    )
+    assert shapes["transformer_blocks.11.mlp.mlp.2.weight"] == (768, 3072) and shapes[
+        "cls_token"
+    ] == (1, 1, 768)
+    assert shapes["upsampler.up1.0.weight"] == (512, 256, 4, 4) and shapes[
+        "upsampler.up2.3.weight"
+    ] == (768, 128, 3, 3)
     assert shapes["vertex_decoder.trunk.0.weight"] == (256, 768 + 768 + 39)
     state = {key: np.broadcast_to(np.float32(0), shape) for key, shape in shapes.items()}
     assert infer_config(state) == published()
@@ -82,17 +108,24 @@ def test_shapes_of_the_published_network():
 def test_a_made_up_network_goes_there_and_back(tmp_path):
     config = infer_config(oracle.random_state(Options()))
     sizes = TransformerConfig(width=128, layers=4)
-    config = config.with_parts(encoder=dataclasses.replace(config.architecture.encoder, transformer=sizes))
+    config = config.with_parts(
+        encoder=dataclasses.replace(config.architecture.encoder, transformer=sizes)
+    )
     variables = random_variables(config)
     state = to_release(variables) | {"tpose_lbs_weights": np.ones((2, 55), np.float32)}
     back = load_checkpoint(write(tmp_path, state))
     assert back.config == config
-    assert all(np.array_equal(*pair) for pair in zip(*map(jax.tree.leaves, (variables, back.variables)), strict=True))
+    assert all(
+        np.array_equal(*pair)
+        for pair in zip(*map(jax.tree.leaves, (variables, back.variables)), strict=True)
+    )
 
 
 def test_heads_without_norms_need_their_width(tmp_path):
     path = write(tmp_path, oracle.random_state(Options(qk_norm=False)))
-    with pytest.raises(ValueError, match=r"a\.pt: no tensor .*q_norm.weight' tells the width of a head"):
+    with pytest.raises(
+        ValueError, match=r"a\.pt: no tensor .*q_norm.weight' tells the width of a head"
+    ):
         load_checkpoint(path)
     transformer = load_checkpoint(path, head_width=4).config.architecture.encoder.transformer
     assert transformer.head_width == 4 and not transformer.qk_norm
@@ -106,7 +139,10 @@ def test_heads_without_norms_need_their_width(tmp_path):
 def test_safetensors_state_dicts(tmp_path):
     state = oracle.random_state(Options())
     save_file(state | {"loss_computer.x": np.zeros(2, np.float32)}, tmp_path / "a.safetensors")
-    ours, other = load_checkpoint(tmp_path / "a.safetensors"), load_checkpoint(write(tmp_path, state))
+    ours, other = (
+        load_checkpoint(tmp_path / "a.safetensors"),
+        load_checkpoint(write(tmp_path, state)),
+    )
     assert ours.config == other.config and ours.skipped == 1 and other.skipped == 0
     leaves = zip(*(jax.tree.leaves(x.variables) for x in (ours, other)), strict=True)
     assert all(np.array_equal(*pair) for pair in leaves)
@@ -118,7 +154,10 @@ def test_safetensors_state_dicts(tmp_path):
 
 
 def test_half_precision_checkpoints(tmp_path):
-    state = {key: x if x.ndim == 0 else x.astype(np.float16) for key, x in oracle.random_state(Options()).items()}
+    state = {
+        key: x if x.ndim == 0 else x.astype(np.float16)
+        for key, x in oracle.random_state(Options()).items()
+    }
     variables = load_checkpoint(write(tmp_path, state)).variables
     assert all(x.dtype == np.float32 for x in jax.tree.leaves(variables))
 
@@ -148,7 +187,9 @@ def test_every_wrong_shape_is_noticed(monkeypatch):
             continue  # the number of vertices, and of texels, is free
         for wrong in (np.concatenate([value, value]) if value.ndim else np.zeros(1), value[None]):
             spoilt = state | {key: wrong}
-            monkeypatch.setattr(conversion, "read_state_dict", lambda path, spoilt=spoilt: (spoilt, 0))
+            monkeypatch.setattr(
+                conversion, "read_state_dict", lambda path, spoilt=spoilt: (spoilt, 0)
+            )
             with pytest.raises(ValueError, match=r"x: .*(shape|inputs|multiple)") as error:
                 load_checkpoint("x")
             named += f"'{key}'" in str(error.value)
@@ -160,14 +201,26 @@ def change(key, value):
 
 
 REFUSED = {
-    "unknown": (change("decoder.weight", np.zeros(3, np.float32)), "tensor 'decoder.weight' is not part"),
-    "a block of no number": (change("transformer_blocks.x.norm1.weight", np.zeros(3, np.float32)), "transformer_blocks"),
+    "unknown": (
+        change("decoder.weight", np.zeros(3, np.float32)),
+        "tensor 'decoder.weight' is not part",
+    ),
+    "a block of no number": (
+        change("transformer_blocks.x.norm1.weight", np.zeros(3, np.float32)),
+        "transformer_blocks",
+    ),
     "a block too far": (
         change("transformer_blocks.99.norm1.weight", np.zeros(16, np.float32)),
         "'transformer_blocks.4.norm1.weight' is missing",
     ),
-    "canonical target maps": (change("target_pose_tokenizer.1.weight", np.zeros(3, np.float32)), "target_pose_tokenizer"),
-    "not finite": (change("norm.bias", np.full(16, np.nan, np.float32)), "'norm.bias' holds numbers that are not finite"),
+    "canonical target maps": (
+        change("target_pose_tokenizer.1.weight", np.zeros(3, np.float32)),
+        "target_pose_tokenizer",
+    ),
+    "not finite": (
+        change("norm.bias", np.full(16, np.nan, np.float32)),
+        "'norm.bias' holds numbers that are not finite",
+    ),
     "class token removed": (
         lambda state: {key: x for key, x in state.items() if key != "cls_token"},
         "'vertex_decoder.trunk.0.weight' has shape",
@@ -183,8 +236,12 @@ REFUSED = {
 def test_the_command_refuses_by_name_and_writes_nothing(case, tmp_path, monkeypatch, capsys):
     spoil, message = REFUSED[case]
     path = write(tmp_path, spoil(oracle.random_state(Options())))
-    code, out, error = run(monkeypatch, capsys, "convert", path, "--out", tmp_path / "w.safetensors")
-    assert code == 1 and out == "" and error.count("\n") == 1 and message in error and "a.pt" in error
+    code, out, error = run(
+        monkeypatch, capsys, "convert", path, "--out", tmp_path / "w.safetensors"
+    )
+    assert (
+        code == 1 and out == "" and error.count("\n") == 1 and message in error and "a.pt" in error
+    )
     assert os.listdir(tmp_path) == ["a.pt"]
 
 
@@ -201,10 +258,24 @@ def test_the_command_refuses_code(tmp_path, monkeypatch, capsys):
 
 def test_the_command_converts(tmp_path, monkeypatch, capsys):
     state = oracle.random_state(Options(qk_norm=False))
-    losses = {"loss_computer.a": FakeTensor(np.ones(2, np.float32)), "loss_computer.b": FakeTensor(np.ones(2, np.float32))}
+    losses = {
+        "loss_computer.a": FakeTensor(np.ones(2, np.float32)),
+        "loss_computer.b": FakeTensor(np.ones(2, np.float32)),
+    }
     path = write_checkpoint(tmp_path / "a.pt", {"model": tensors(state) | losses, "optimizer": {}})
     weights = tmp_path / "w.safetensors"
-    code, out, error = run(monkeypatch, capsys, "convert", path, "--out", weights, "--head-width", "4", "--pool", "visible")
+    code, out, error = run(
+        monkeypatch,
+        capsys,
+        "convert",
+        path,
+        "--out",
+        weights,
+        "--head-width",
+        "4",
+        "--pool",
+        "visible",
+    )
     assert code == 0, error
     assert "skipped 2 tensors" in out and "loss_computer" in out and "4 layers of 4 heads" in out
     variables, config = load_weights(weights)
@@ -213,7 +284,9 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     assert config.with_conventions(pool="all") == converted.config.trained
     leaves = zip(*map(jax.tree.leaves, (variables, converted.variables)), strict=True)
     assert all(np.array_equal(*pair) for pair in leaves)
-    code, _, error = run(monkeypatch, capsys, "convert", weights, "--out", tmp_path / "again.safetensors")
+    code, _, error = run(
+        monkeypatch, capsys, "convert", weights, "--out", tmp_path / "again.safetensors"
+    )
     assert code == 1 and "a weights file already" in error
     code, _, error = run(monkeypatch, capsys, "convert", weights, "--out", weights)
     assert code == 2 and "is read by this command" in error
@@ -224,16 +297,26 @@ def loss_networks():
     """LPIPS squeeze as the released checkpoint would carry it, its heads twice."""
     draw = np.random.default_rng(0)
     layers = expected_tensors("SqueezeNet 1.1").items()
-    state = {f"net.slice1.{key}": draw.normal(size=shape).astype(np.float32) for key, shape in layers}
+    state = {
+        f"net.slice1.{key}": draw.normal(size=shape).astype(np.float32) for key, shape in layers
+    }
     for i, count in enumerate((64, 128, 256, 384, 384, 512, 512)):
-        state[f"lin{i}.model.1.weight"] = state[f"lins.{i}.model.1.weight"] = np.ones((1, count, 1, 1), np.float32)
+        state[f"lin{i}.model.1.weight"] = state[f"lins.{i}.model.1.weight"] = np.ones(
+            (1, count, 1, 1), np.float32
+        )
     return {f"loss_computer.lpips_loss_module.{key}": x for key, x in state.items()}
 
 
 def test_the_command_keeps_the_loss_networks(tmp_path, monkeypatch, capsys):
-    losses, weights, networks = tmp_path / "losses.safetensors", tmp_path / "w.safetensors", loss_networks()
+    losses, weights, networks = (
+        tmp_path / "losses.safetensors",
+        tmp_path / "w.safetensors",
+        loss_networks(),
+    )
     path = write(tmp_path, oracle.random_state(Options()) | networks)
-    code, out, error = run(monkeypatch, capsys, "convert", path, "--out", weights, "--losses", losses)
+    code, out, error = run(
+        monkeypatch, capsys, "convert", path, "--out", weights, "--losses", losses
+    )
     assert code == 0 and f"{losses}: LPIPS squeeze" in out and "skipped" not in out, error
     assert sorted(os.listdir(tmp_path)) == ["a.pt", "losses.safetensors", "w.safetensors"]
     kernel = load_lpips("squeeze", losses).backbone["3.squeeze"].kernel

@@ -27,7 +27,9 @@ def test_every_stage_agrees(name, dtype):
     checkpoint, subject = golden.carried(name)
     with jax.enable_x64(dtype == "float64"):
         converted, arrays = load_checkpoint(checkpoint), golden.load_subject(name)
-        config = converted.config.with_conventions(pool=golden.POOLS[name]).with_runtime(dtype="float32")
+        config = converted.config.with_conventions(pool=golden.POOLS[name]).with_runtime(
+            dtype="float32"
+        )
         variables = jax.tree.map(lambda x: jnp.asarray(x, dtype), converted.variables)
         inputs, weights, transforms = check_parity.subject_inputs(arrays, 0, dtype)
         compute = jax.jit(check_parity.compute_stages, static_argnames="config")
@@ -35,4 +37,6 @@ def test_every_stage_agrees(name, dtype):
         assert all(x.dtype == dtype for x in found.values())
     errors = golden.thinned_errors(jax.tree.map(np.asarray, found), dict(np.load(subject)))
     assert len(errors) == 17
-    assert max(errors.values()) < (bound(TOLERANCES[dtype]) if dtype == "float32" else TOLERANCES[dtype]), errors
+    assert max(errors.values()) < (
+        bound(TOLERANCES[dtype]) if dtype == "float32" else TOLERANCES[dtype]
+    ), errors

@@ -10,7 +10,12 @@ from network_cases import ALL_TOKENS, TINY, random_inputs, random_variables
 from humangs_jax.core.pytree import replace
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, paper_parts
-from humangs_jax.network.encoder import PatchTransformer, needed_tokens, pack_patches, touched_patches
+from humangs_jax.network.encoder import (
+    PatchTransformer,
+    needed_tokens,
+    pack_patches,
+    touched_patches,
+)
 from humangs_jax.network.humangs import apply_humangs, encode, read
 from humangs_jax.network.parts import Encoding, subject_unit
 from humangs_jax.network.runtime import Runtime
@@ -55,17 +60,24 @@ def test_presets_have_the_shapes_they_promise(name):
     """Traced at full size, nothing is computed."""
     config = presets.PRESETS[name]()
     views, vertices, size = 4, 37, config.conventions.image_size
-    inputs = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, random_inputs(0, views, vertices, size)))
+    inputs = jax.eval_shape(
+        lambda: jax.tree.map(jnp.asarray, random_inputs(0, views, vertices, size))
+    )
     variables = expected_variables(config)
     encoding, outputs = jax.eval_shape(lambda v, x: run(v, x, config), variables, inputs)
     encoder, _, decoder = paper_parts(config.architecture)
     side = size // encoder.patch_size * (4 if encoder.upsampler else 1)
     width = encoder.upsampler.hidden // 2 if encoder.upsampler else encoder.transformer.width
     assert encoding.maps.shape == (views, side, side, width)
-    assert encoding.maps.dtype == (jnp.bfloat16 if config.runtime.dtype == "bfloat16" else jnp.float32) or side == size // 8
+    assert (
+        encoding.maps.dtype == (jnp.bfloat16 if config.runtime.dtype == "bfloat16" else jnp.float32)
+        or side == size // 8
+    )
     assert outputs.gaussians.means.shape == (vertices * decoder.gaussians_per_vertex, 3)
     assert outputs.tight_offsets.shape == (vertices, 1, 3)
-    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((outputs.gaussians, variables)))
+    assert all(
+        leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((outputs.gaussians, variables))
+    )
 
 
 def test_the_published_network_has_99_million_parameters():
@@ -83,7 +95,9 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
             transformer=dataclasses.replace(ENCODER.transformer, class_token=class_token),
             upsampler=ENCODER.upsampler if class_token else None,
         ),
-        reader=dataclasses.replace(READER, output_width=8 if class_token else None, sample_rgb=sample_rgb),
+        reader=dataclasses.replace(
+            READER, output_width=8 if class_token else None, sample_rgb=sample_rgb
+        ),
         decoder=dataclasses.replace(DECODER, residual_color=sample_rgb),
     )
     variables = expected_variables(config)
@@ -103,7 +117,8 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_color_of_the_photos():
     inputs = random_inputs()
     inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
     plain = TINY.with_parts(
-        reader=dataclasses.replace(READER, shells=()), decoder=dataclasses.replace(DECODER, frame="canonical")
+        reader=dataclasses.replace(READER, shells=()),
+        decoder=dataclasses.replace(DECODER, frame="canonical"),
     )
     variables = variables_of(plain)
     features = read(variables, encode(variables, inputs, plain), inputs, plain)
@@ -113,13 +128,17 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_color_of_the_photos():
     unit, k = subject_unit(inputs.canonical_vertices), DECODER.gaussians_per_vertex
     assert np.abs(fresh.means - jnp.repeat(inputs.canonical_vertices, k, axis=0)).max() < 0.02
     assert np.allclose(fresh.scales, 0.0082 * unit, rtol=0.1)  # softplus(-4.8) = 8.2 mm
-    assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(fresh.colors, 0.7, atol=0.01)
+    assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(
+        fresh.colors, 0.7, atol=0.01
+    )
     assert np.allclose(jnp.abs(fresh.quats[:, 0]), 1, atol=0.01)
 
 
 def test_deeper_blocks_begin_smaller():
     config = TransformerConfig(width=64, layers=4, head_width=32)
-    kernel = jax.jit(Block(config, Runtime(), 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"]["kernel"]
+    kernel = jax.jit(Block(config, Runtime(), 3).init)(jax.random.key(0), jnp.zeros((2, 64)))[
+        "params"
+    ]["mlp_in"]["kernel"]
     assert np.isclose(kernel.std(), 0.02 / np.sqrt(2 * 4), rtol=0.05)
 
 
@@ -129,12 +148,20 @@ def test_the_order_of_the_views_does_not_matter():
     inputs, order = random_inputs(), jnp.asarray([1, 0])
     per_view = {name: getattr(inputs, name) for name in PER_VIEW}
     permuted = replace(
-        inputs, cameras=jax.tree.map(lambda x: x[order], inputs.cameras), **{name: x[order] for name, x in per_view.items()}
+        inputs,
+        cameras=jax.tree.map(lambda x: x[order], inputs.cameras),
+        **{name: x[order] for name, x in per_view.items()},
     )
     variables = variables_of(ALL_TOKENS)
-    (encoding, outputs), (other_encoding, other_outputs) = (run(variables, x, ALL_TOKENS) for x in (inputs, permuted))
-    assert close(encoding.maps[order], other_encoding.maps) and not close(encoding.maps, other_encoding.maps)
-    assert close(encoding.global_token, other_encoding.global_token) and close(outputs, other_outputs)
+    (encoding, outputs), (other_encoding, other_outputs) = (
+        run(variables, x, ALL_TOKENS) for x in (inputs, permuted)
+    )
+    assert close(encoding.maps[order], other_encoding.maps) and not close(
+        encoding.maps, other_encoding.maps
+    )
+    assert close(encoding.global_token, other_encoding.global_token) and close(
+        outputs, other_outputs
+    )
 
 
 @pytest.mark.slow
@@ -143,7 +170,9 @@ def test_foreground_tokens_are_all_tokens_when_everything_is_foreground():
     patches = 2 * (32 // 8) ** 2
     config = TINY.with_runtime(token_capacity=patches + 50)
     variables = variables_of(ALL_TOKENS)
-    (encoding, outputs), (all_encoding, all_outputs) = (run(variables, inputs, c) for c in (config, ALL_TOKENS))
+    (encoding, outputs), (all_encoding, all_outputs) = (
+        run(variables, inputs, c) for c in (config, ALL_TOKENS)
+    )
     assert close((encoding.maps, outputs), (all_encoding.maps, all_outputs))
 
 
@@ -157,25 +186,37 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     roomy, exact, tight = TINY, *(TINY.with_runtime(token_capacity=n) for n in (5, 3))
     encoding, outputs = run(variables, inputs, roomy)
     exactly, same = run(variables, inputs, exact)
-    assert outputs.dropped_tokens == 0 and close((encoding.maps, outputs), (exactly.maps, same))  # padding is nothing
+    assert outputs.dropped_tokens == 0 and close(
+        (encoding.maps, outputs), (exactly.maps, same)
+    )  # padding is nothing
     touched = np.kron(foreground.reshape(2, 4, 8, 4, 8).any((2, 4)), np.ones((8, 8), bool))
     noise = jnp.where(touched[..., None], inputs.images, 0.123)
     assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
-    assert not close(encoding, run(variables, replace(inputs, images=inputs.images.at[1, 0, 8].add(0.5)), roomy)[0])
-    assert run(variables, inputs, tight)[1].dropped_tokens == 2 and needed_tokens(inputs.foreground, None, 8) == 5
+    assert not close(
+        encoding,
+        run(variables, replace(inputs, images=inputs.images.at[1, 0, 8].add(0.5)), roomy)[0],
+    )
+    assert (
+        run(variables, inputs, tight)[1].dropped_tokens == 2
+        and needed_tokens(inputs.foreground, None, 8) == 5
+    )
     packing = pack_patches(touched_patches(inputs.foreground, None, 8), 3)
     assert packing.count == 3 and np.array_equal(packing.indices, [6, 7, 10])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "tolerance"), [("bfloat16", BFLOAT16_TOLERANCE), ("float16", BFLOAT16_TOLERANCE / 4)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [("bfloat16", BFLOAT16_TOLERANCE), ("float16", BFLOAT16_TOLERANCE / 4)]
+)
 def test_short_number_types_are_close(dtype, tolerance):
     variables, inputs = variables_of(ALL_TOKENS), random_inputs()
     encoding, outputs = run(variables, inputs, ALL_TOKENS.with_runtime(dtype=dtype))
     exact_encoding, exact = run(variables, inputs, ALL_TOKENS)
     assert encoding.maps.dtype == dtype
     scale = jnp.abs(exact_encoding.maps).max()
-    assert jnp.abs(encoding.maps.astype(jnp.float32) - exact_encoding.maps).max() < tolerance * scale
+    assert (
+        jnp.abs(encoding.maps.astype(jnp.float32) - exact_encoding.maps).max() < tolerance * scale
+    )
     assert close(outputs.gaussians.means, exact.gaussians.means, tolerance)
     assert close(outputs.gaussians.colors, exact.gaussians.colors, 2 * tolerance)
 
@@ -186,7 +227,9 @@ def test_unseen_vertices_are_grey_and_pool_nothing():
     encoding = Encoding(jnp.ones((2, 16, 16, 4)), jnp.ones(16), jnp.int32(0))
     variables = variables_of(TINY)
     features = read(variables, encoding, inputs, TINY)
-    assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(features.photo_colors, np.full((20, 3), 0.5))
+    assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(
+        features.photo_colors, np.full((20, 3), 0.5)
+    )
     assert np.array_equal(features.visible_fraction, np.zeros(20))
     every = TINY.with_conventions(pool="all")
     assert np.abs(read(variables, encoding, inputs, every).local).min(axis=1).max() > 0
@@ -198,7 +241,9 @@ def test_unseen_vertices_are_grey_and_pool_nothing():
 def padded(inputs, views):
     """Garbage behind the views that there are."""
     missing = views - len(inputs.images)
-    extend = lambda x, junk: jnp.concatenate([x, jnp.broadcast_to(jnp.asarray(junk, x.dtype), (missing, *x.shape[1:]))])
+    extend = lambda x, junk: jnp.concatenate(
+        [x, jnp.broadcast_to(jnp.asarray(junk, x.dtype), (missing, *x.shape[1:]))]
+    )
     return replace(
         inputs,
         images=extend(inputs.images, 0.9),
@@ -237,7 +282,9 @@ def loss(variables, inputs, config):
 
 @functools.partial(jax.jit, static_argnames="config")
 def gradients(variables, continuous, inputs, config):
-    of = lambda params, continuous: loss({**variables, "params": params}, replace(inputs, **continuous), config)
+    of = lambda params, continuous: loss(
+        {**variables, "params": params}, replace(inputs, **continuous), config
+    )
     return jax.grad(of, (0, 1))(variables["params"], continuous)
 
 
@@ -245,13 +292,25 @@ def gradients(variables, continuous, inputs, config):
 def test_gradients_are_finite_and_reach_every_parameter():
     inputs = random_inputs()
     cameras = inputs.cameras
-    posed = inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)  # in and behind the camera
-    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))  # some vertices are seen by none
-    continuous = {"posed_vertices": posed, "images": inputs.images, "canonical_vertices": inputs.canonical_vertices}
+    posed = (
+        inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)
+    )  # in and behind the camera
+    inputs = replace(
+        inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0)
+    )  # some vertices are seen by none
+    continuous = {
+        "posed_vertices": posed,
+        "images": inputs.images,
+        "canonical_vertices": inputs.canonical_vertices,
+    }
     config = TINY.with_runtime(remat="full")
     of_params, of_inputs = gradients(variables_of(TINY), continuous, inputs, config)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_params, of_inputs)))
-    silent = [path for path, leaf in jax.tree_util.tree_leaves_with_path(of_params) if not np.abs(leaf).max() > 0]
+    silent = [
+        path
+        for path, leaf in jax.tree_util.tree_leaves_with_path(of_params)
+        if not np.abs(leaf).max() > 0
+    ]
     assert not silent
 
 
@@ -274,7 +333,10 @@ def test_a_vmap_over_subjects_is_a_loop():
     [
         (lambda: TINY.with_conventions(image_size=100), "not a multiple of patch_size"),
         (lambda: TransformerConfig(width=100), "head_width"),
-        (lambda: Architecture(reader=dataclasses.replace(READER, shells=(0.0, 0.1))), "along the normals"),
+        (
+            lambda: Architecture(reader=dataclasses.replace(READER, shells=(0.0, 0.1))),
+            "along the normals",
+        ),
         (lambda: dataclasses.replace(READER, shells=(0.1, 0.0)), "ascending"),
         (lambda: PatchTransformer(transformer=TransformerConfig(layers=3)), "layers"),
         (lambda: Architecture(decoder=VertexDecoder(residual_color=True)), "sample_rgb"),
@@ -287,7 +349,9 @@ def test_configurations_that_do_not_fit_are_refused(make, message):
 
 
 def test_images_must_be_those_of_the_cameras():
-    apply = lambda inputs: jax.eval_shape(lambda x: apply_humangs(variables_of(TINY), x, TINY), inputs)
+    apply = lambda inputs: jax.eval_shape(
+        lambda x: apply_humangs(variables_of(TINY), x, TINY), inputs
+    )
     inputs = random_inputs()
     with pytest.raises(ValueError, match="32 x 32 but their cameras say 64 x 32"):
         apply(replace(inputs, cameras=replace(inputs.cameras, width=64)))

@@ -47,7 +47,9 @@ def test_agrees_with_a_sum_over_all_texels(height, width):
         ours = jax.jit(sample_bilinear)(jnp.asarray(grid), jnp.asarray(indices))
         assert ours.dtype == jnp.float64
         np.testing.assert_allclose(ours, oracle(grid, indices), rtol=FLOAT64, atol=FLOAT64)
-    ours = jax.jit(sample_bilinear)(jnp.asarray(grid, jnp.float32), jnp.asarray(indices, jnp.float32))
+    ours = jax.jit(sample_bilinear)(
+        jnp.asarray(grid, jnp.float32), jnp.asarray(indices, jnp.float32)
+    )
     np.testing.assert_allclose(ours, oracle(grid, indices), rtol=RTOL32, atol=RTOL32)
 
 
@@ -63,13 +65,20 @@ def test_far_and_broken_positions_read_zero_with_zero_gradient():
 def test_gradients_agree_with_differences():
     rng = np.random.default_rng(1)
     with jax.enable_x64(True):
-        grid, indices = jnp.asarray(rng.normal(size=(4, 5, 2))), jnp.asarray(rng.uniform(0.1, 2.9, (6, 2)))
-        check_grads(jax.jit(sample_bilinear), (grid, indices), order=1, modes=("rev",), atol=1e-6, rtol=1e-6)
+        grid, indices = (
+            jnp.asarray(rng.normal(size=(4, 5, 2))),
+            jnp.asarray(rng.uniform(0.1, 2.9, (6, 2))),
+        )
+        check_grads(
+            jax.jit(sample_bilinear), (grid, indices), order=1, modes=("rev",), atol=1e-6, rtol=1e-6
+        )
 
 
 def test_nearest_rounds_halves_to_even():
     grid = jnp.arange(1.0, 7.0)[None]
-    indices = jnp.asarray([[0.5, 0], [1.5, 0], [2.5, 0], [3.5, 0], [-0.5, 0], [5.5, 0], [2.0, 0.5], [2.0, 0.6]])
+    indices = jnp.asarray(
+        [[0.5, 0], [1.5, 0], [2.5, 0], [3.5, 0], [-0.5, 0], [5.5, 0], [2.0, 0.5], [2.0, 0.6]]
+    )
     assert np.array_equal(sample_nearest(grid, indices), [1, 3, 3, 5, 1, 0, 3, 0])
 
 
@@ -82,15 +91,21 @@ def test_conventions():
     mixed = texel_indices(pixels, (16, 8), (4, 2), "mixed")
     ndc = pixels / jnp.asarray([16, 8]) * 2 - 1
     assert np.allclose(mixed, (ndc + 1) / 2 * jnp.asarray([3, 1]))
-    assert np.allclose(mixed[1], texel_indices(pixels, (16, 8), (4, 2), "half_pixel")[1])  # equal in the middle only
+    assert np.allclose(
+        mixed[1], texel_indices(pixels, (16, 8), (4, 2), "half_pixel")[1]
+    )  # equal in the middle only
 
 
 def test_half_pixel_sampling_reproduces_a_ramp_at_any_resolution():
-    ramp = lambda n, size: (jnp.arange(n) + 0.5) * size / n  # each texel holds its centre's pixel position
+    ramp = lambda n, size: (
+        (jnp.arange(n) + 0.5) * size / n
+    )  # each texel holds its centre's pixel position
     pixels = jnp.asarray([[3.0, 5.0], [7.25, 2.0]])
     for n in (4, 16):
         grid = jnp.broadcast_to(ramp(n, 16.0)[None, :, None], (n, n, 1))
-        sampled = jax.jit(sample_bilinear)(grid, texel_indices(pixels, (16, 16), (n, n), "half_pixel"))
+        sampled = jax.jit(sample_bilinear)(
+            grid, texel_indices(pixels, (16, 16), (n, n), "half_pixel")
+        )
         assert np.allclose(sampled[:, 0], pixels[:, 0], atol=1e-5)
 
 
@@ -111,7 +126,9 @@ def test_background_reads_the_last_texel_and_outside_is_zero():
     texture = jnp.arange(3 * 4 * 4 * 2, dtype=jnp.float32).reshape(3, 4, 4, 2)
     read = jax.jit(sample_triplane)(texture, jnp.asarray([[[1.0, 1, 1], [2, 2, 2]]]))
     assert read.shape == (1, 2, 6)
-    assert np.allclose(read[0, 0], texture[:, -1, -1].ravel()) and np.array_equal(read[0, 1], np.zeros(6))
+    assert np.allclose(read[0, 0], texture[:, -1, -1].ravel()) and np.array_equal(
+        read[0, 1], np.zeros(6)
+    )
 
 
 SHAPE, FEATURES = (2, 5, 7, 3), 4
@@ -131,11 +148,23 @@ def reference(x, kernel):
 @pytest.mark.slow
 def test_it_is_the_sum_over_a_neighbourhood_with_its_gradients():
     with jax.enable_x64(True):
-        x, kernel, weights = random(*SHAPE), random(3, 3, SHAPE[-1], FEATURES), random(*SHAPE[:3], FEATURES)
+        x, kernel, weights = (
+            random(*SHAPE),
+            random(3, 3, SHAPE[-1], FEATURES),
+            random(*SHAPE[:3], FEATURES),
+        )
         for function in (convolve, jax.jit(convolve)):
-            np.testing.assert_allclose(function(x, kernel), reference(x, kernel), rtol=FLOAT64, atol=FLOAT64)
-            gradients = [jax.grad(lambda *a, f=f: jnp.sum(weights * f(*a)), (0, 1))(x, kernel) for f in (function, reference)]
-            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=FLOAT64, atol=FLOAT64), *gradients)
+            np.testing.assert_allclose(
+                function(x, kernel), reference(x, kernel), rtol=FLOAT64, atol=FLOAT64
+            )
+            gradients = [
+                jax.grad(lambda *a, f=f: jnp.sum(weights * f(*a)), (0, 1))(x, kernel)
+                for f in (function, reference)
+            ]
+            jax.tree.map(
+                lambda a, b: np.testing.assert_allclose(a, b, rtol=FLOAT64, atol=FLOAT64),
+                *gradients,
+            )
 
 
 def test_a_batch_of_maps():
@@ -152,7 +181,9 @@ def test_the_module_has_the_parameters_of_flax():
     ours, theirs = Convolution(FEATURES, nn.initializers.ones), nn.Conv(FEATURES, (3, 3))
     variables = theirs.init(jax.random.key(0), x)
     assert jax.tree.structure(ours.init(jax.random.key(0), x)) == jax.tree.structure(variables)
-    np.testing.assert_allclose(ours.apply(variables, x), theirs.apply(variables, x), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        ours.apply(variables, x), theirs.apply(variables, x), rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("batch", [1, 2], ids=["unrolled", "looped"])
@@ -160,11 +191,18 @@ def test_in_a_loop_all_of_its_convolutions_are_those_that_the_library_knows(batc
     """XLA leaves others to nested loops over single numbers."""
 
     def total_gradient(xs, kernel):
-        add = lambda total, x: (total + jax.grad(lambda k: jnp.sum(jnp.sin(convolve(x, k))))(kernel), None)
+        add = lambda total, x: (
+            total + jax.grad(lambda k: jnp.sum(jnp.sin(convolve(x, k))))(kernel),
+            None,
+        )
         return jax.lax.scan(add, jnp.zeros_like(kernel), xs)[0]
 
-    shapes = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((batch, 2, 8, 8, 16), (3, 3, 16, 16))]
-    labels = re.findall(r"dim_labels=(\S+)", jax.jit(total_gradient).lower(*shapes).compile().as_text())
+    shapes = [
+        jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((batch, 2, 8, 8, 16), (3, 3, 16, 16))
+    ]
+    labels = re.findall(
+        r"dim_labels=(\S+)", jax.jit(total_gradient).lower(*shapes).compile().as_text()
+    )
     assert labels and {label.rstrip(",") for label in labels} == {"b01f_01io->b01f"}
 
 
@@ -180,22 +218,34 @@ def test_reading_before_the_convolution_is_reading_after_it(where):
     positions = {
         "inside": rng.uniform([1, 1], [WIDTH - 2, HEIGHT - 2], (40, 2)),
         "border": rng.uniform([-1.5, -1.5], [WIDTH + 0.5, HEIGHT + 0.5], (200, 2)),
-        "corners": np.asarray([[x, y] for x in (-1, -0.5, 0, WIDTH - 1, WIDTH - 0.5) for y in (-0.99, 0, HEIGHT - 1)]),
-        "outside": np.asarray([[-1.0, 2], [3, HEIGHT], [1e9, 0], [-1e30, 3], [np.inf, 1], [2, np.nan]]),
+        "corners": np.asarray(
+            [[x, y] for x in (-1, -0.5, 0, WIDTH - 1, WIDTH - 0.5) for y in (-0.99, 0, HEIGHT - 1)]
+        ),
+        "outside": np.asarray(
+            [[-1.0, 2], [3, HEIGHT], [1e9, 0], [-1e30, 3], [np.inf, 1], [2, np.nan]]
+        ),
     }[where]
     with jax.enable_x64(True):
         neighborhoods, coverages = sample_neighborhoods(jnp.asarray(grid), jnp.asarray(positions))
-        ours = convolve_neighborhoods(neighborhoods, coverages, jnp.asarray(kernel), jnp.asarray(bias))
-        expected = sample_bilinear(reference(jnp.asarray(grid)[None], kernel)[0] + bias, jnp.asarray(positions))
+        ours = convolve_neighborhoods(
+            neighborhoods, coverages, jnp.asarray(kernel), jnp.asarray(bias)
+        )
+        expected = sample_bilinear(
+            reference(jnp.asarray(grid)[None], kernel)[0] + bias, jnp.asarray(positions)
+        )
     assert np.abs(ours - expected).max() < FLOAT64
     assert (np.abs(ours).max() > 0) == (where != "outside")
 
 
 @pytest.mark.slow
 def test_gradients_are_finite_wherever_one_reads():
-    positions = jnp.asarray([[2.0, 2.0], [-1.0, 0.0], [-0.5, 4.5], [1e30, 0], [np.nan, 1], [WIDTH - 1, HEIGHT - 1]])
+    positions = jnp.asarray(
+        [[2.0, 2.0], [-1.0, 0.0], [-0.5, 4.5], [1e30, 0], [np.nan, 1], [WIDTH - 1, HEIGHT - 1]]
+    )
     grid = jnp.asarray(np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, CHANNELS)), jnp.float32)
-    total = lambda grid, positions: sum(jnp.sum(jnp.sin(x)) for x in sample_neighborhoods(grid, positions))
+    total = lambda grid, positions: sum(
+        jnp.sum(jnp.sin(x)) for x in sample_neighborhoods(grid, positions)
+    )
     of_grid, of_positions = jax.grad(total, (0, 1))(grid, positions)
     assert np.isfinite(of_grid).all() and np.isfinite(of_positions).all()
     assert np.array_equal(of_positions[3:5], np.zeros((2, 2))) and np.abs(of_grid).max() > 0
@@ -206,17 +256,25 @@ CONFIG = UpsamplerConfig(hidden=4)
 
 def random_maps(depths=4, views=2, side=3, width=6):
     rng = np.random.default_rng(0)
-    return [jnp.asarray(rng.normal(size=(views, side, side, width)), jnp.float32) for _ in range(depths)]
+    return [
+        jnp.asarray(rng.normal(size=(views, side, side, width)), jnp.float32) for _ in range(depths)
+    ]
 
 
 def test_up_convolution_is_the_transposed_convolution():
     """Every input pixel adds its kernel, stride 2, minus a border of one."""
     rng = np.random.default_rng(1)
-    x, kernel, bias = rng.normal(size=(2, 3, 4, 5)), rng.normal(size=(4, 4, 5, 6)), rng.normal(size=6)
+    x, kernel, bias = (
+        rng.normal(size=(2, 3, 4, 5)),
+        rng.normal(size=(4, 4, 5, 6)),
+        rng.normal(size=6),
+    )
     expected = np.zeros((2, 2 * 3 + 2, 2 * 4 + 2, 6))
     for i in range(3):
         for j in range(4):
-            expected[:, 2 * i : 2 * i + 4, 2 * j : 2 * j + 4] += np.einsum("vc,abco->vabo", x[:, i, j], kernel)
+            expected[:, 2 * i : 2 * i + 4, 2 * j : 2 * j + 4] += np.einsum(
+                "vc,abco->vabo", x[:, i, j], kernel
+            )
     expected = expected[:, 1:-1, 1:-1] + bias
     with jax.enable_x64(True):
         params = {"kernel": jnp.asarray(kernel), "bias": jnp.asarray(bias)}
@@ -229,9 +287,13 @@ def test_statistics_follow_the_batch_only_in_training():
     module = Upsampler(CONFIG)
     variables = random_like(jax.eval_shape(module.init, jax.random.key(0), maps))
     evaluate = jax.jit(module.apply)
-    trained, updated = jax.jit(lambda v, m: module.apply(v, m, True, mutable=["batch_stats"]))(variables, maps)
+    trained, updated = jax.jit(lambda v, m: module.apply(v, m, True, mutable=["batch_stats"]))(
+        variables, maps
+    )
     still = evaluate(variables, maps)
-    assert still.shape == trained.shape == (2, 12, 12, CONFIG.hidden // 2) and not np.allclose(still, trained, atol=1e-3)
+    assert still.shape == trained.shape == (2, 12, 12, CONFIG.hidden // 2) and not np.allclose(
+        still, trained, atol=1e-3
+    )
     of_the_batch = lambda new, old: (new - MOMENTUM * old) / (1 - MOMENTUM)
     statistics = jax.tree.map(of_the_batch, updated["batch_stats"], variables["batch_stats"])
     assert all((norm["var"] > 0).all() for norm in statistics.values())
@@ -256,7 +318,9 @@ def test_padding_does_not_count_in_the_statistics():
     maps = random_maps()
     module = Upsampler(CONFIG)
     variables = random_like(jax.eval_shape(module.init, jax.random.key(0), maps))
-    run = jax.jit(lambda m, present: module.apply(variables, m, True, present, mutable=["batch_stats"]))
+    run = jax.jit(
+        lambda m, present: module.apply(variables, m, True, present, mutable=["batch_stats"])
+    )
     padded = [jnp.concatenate([x, 100 * jnp.ones_like(x)]) for x in maps]
     ours, statistics = run(padded, jnp.asarray([True, True, False, False]))
     expected, expected_statistics = run(maps, None)

@@ -9,10 +9,32 @@ import numpy as np
 import pytest
 from network_cases import TINY, random_inputs
 
-from humangs_jax.core.configuration import Width, config_from_json, config_to_json, field_names, part, vary
+from humangs_jax.core.configuration import (
+    Width,
+    config_from_json,
+    config_to_json,
+    field_names,
+    part,
+    vary,
+)
 from humangs_jax.network.config import Architecture, paper_parts
-from humangs_jax.network.humangs import apply_humangs, decode, encode, init_humangs, intermediates, read
-from humangs_jax.network.parts import Decoder, Encoder, Encoding, HumanGSInputs, Pass, Reader, VertexFeatures
+from humangs_jax.network.humangs import (
+    apply_humangs,
+    decode,
+    encode,
+    init_humangs,
+    intermediates,
+    read,
+)
+from humangs_jax.network.parts import (
+    Decoder,
+    Encoder,
+    Encoding,
+    HumanGSInputs,
+    Pass,
+    Reader,
+    VertexFeatures,
+)
 from humangs_jax.network.vertex_decoder import positional_encoding
 from humangs_jax.network.weights import load_weights, save_weights
 
@@ -29,7 +51,9 @@ class LookingReader(Reader):
         dense = lambda name: nn.Dense(self.width, use_bias=False, name=name)
         queries = dense("query")(positional_encoding(inputs.canonical_vertices))
         attention = jax.nn.softmax(queries @ dense("key")(tokens).T * self.width**-0.5)
-        return VertexFeatures(attention @ tokens, encoding.global_token, normals=inputs.canonical_normals)
+        return VertexFeatures(
+            attention @ tokens, encoding.global_token, normals=inputs.canonical_normals
+        )
 
 
 DECODER = dataclasses.replace(paper_parts(TINY.architecture)[2], residual_color=False)
@@ -38,7 +62,9 @@ CONFIG = TINY.with_parts(reader=LookingReader(), decoder=DECODER)
 
 def test_the_papers_parts_are_parts():
     encoder, reader, decoder = paper_parts(TINY.architecture)
-    assert isinstance(encoder, Encoder) and isinstance(reader, Reader) and isinstance(decoder, Decoder)
+    assert (
+        isinstance(encoder, Encoder) and isinstance(reader, Reader) and isinstance(decoder, Decoder)
+    )
     with pytest.raises(ValueError, match="LookingReader"):
         paper_parts(CONFIG.architecture)
 
@@ -71,7 +97,9 @@ def test_a_part_is_named_in_json_and_found_again():
 
 
 def test_a_part_of_this_name_exists_once_and_only_a_registered_one_is_written():
-    with pytest.raises(ValueError, match=r"part LookingReader of elsewhere: .*test_parts has one of this name"):
+    with pytest.raises(
+        ValueError, match=r"part LookingReader of elsewhere: .*test_parts has one of this name"
+    ):
         part(type("LookingReader", (Reader,), {"__module__": "elsewhere", "__annotations__": {}}))
 
     class Plain(LookingReader):
@@ -98,8 +126,13 @@ def test_fields_of_parts_are_checked(make, message):
 
 
 def test_parts_are_compared_by_their_configuration():
-    assert LookingReader(width=4) == vary(CONFIG, {"architecture.reader.width": 4}).architecture.reader
-    assert LookingReader(width=4) != LookingReader() and len({LookingReader(), LookingReader(width=8)}) == 1
+    assert (
+        LookingReader(width=4) == vary(CONFIG, {"architecture.reader.width": 4}).architecture.reader
+    )
+    assert (
+        LookingReader(width=4) != LookingReader()
+        and len({LookingReader(), LookingReader(width=8)}) == 1
+    )
     for made in (LookingReader(), TINY.architecture.decoder):
         with pytest.raises(dataclasses.FrozenInstanceError, match="cannot assign to field"):
             setattr(made, next(iter(field_names(type(made)))), 4)
@@ -111,8 +144,19 @@ def test_the_pass_is_its_three_parts_and_can_be_looked_into():
     outputs, _ = jax.jit(lambda v: apply_humangs(v, inputs, TINY))(variables)
     encoding = encode(variables, inputs, TINY)
     parts = decode(variables, read(variables, encoding, inputs, TINY), inputs, TINY)
-    for a, b in zip(jax.tree.leaves(outputs.gaussians), jax.tree.leaves(parts.gaussians), strict=True):
+    for a, b in zip(
+        jax.tree.leaves(outputs.gaussians), jax.tree.leaves(parts.gaussians), strict=True
+    ):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)  # fused in other ways
     found = jax.eval_shape(lambda v: intermediates(v, inputs, TINY), variables)
-    assert {"encoder", "encoder.tokenizer", "encoder.transformer.block_3", "reader", "decoder.geometry_out"} <= set(found)
-    assert found["encoder"].maps.shape == encoding.maps.shape and found[""].gaussians.means.shape == outputs.gaussians.means.shape
+    assert {
+        "encoder",
+        "encoder.tokenizer",
+        "encoder.transformer.block_3",
+        "reader",
+        "decoder.geometry_out",
+    } <= set(found)
+    assert (
+        found["encoder"].maps.shape == encoding.maps.shape
+        and found[""].gaussians.means.shape == outputs.gaussians.means.shape
+    )

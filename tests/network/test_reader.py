@@ -29,10 +29,14 @@ CONVENTIONS = ["half_pixel", "mixed"]
 
 
 def test_projection_is_the_cameras():
-    points = jnp.asarray(np.random.default_rng(0).uniform([-1, -1, 1], [1, 1, 3], (20, 3)), jnp.float32)
+    points = jnp.asarray(
+        np.random.default_rng(0).uniform([-1, -1, 1], [1, 1, 3], (20, 3)), jnp.float32
+    )
     pixels, depths = project_vertices(AXIS_CAMERA, points)
     expected, z = project(AXIS_CAMERA, points)
-    assert np.allclose(pixels, expected, atol=1e-3) and np.allclose(depths, z)  # 1e-6 in z moves a pixel by 1e-5
+    assert np.allclose(pixels, expected, atol=1e-3) and np.allclose(
+        depths, z
+    )  # 1e-6 in z moves a pixel by 1e-5
 
 
 @pytest.mark.parametrize("z", [0.0, -1e-6, 1e-6, -2e-6, 1e-30, -1.0, -1e-3])
@@ -46,15 +50,30 @@ def test_projection_is_finite_in_and_behind_the_camera_plane(z):
 def test_visibility(convention):
     depth_map = jnp.full(SIZE[::-1], -1.0).at[4:12, 8:24].set(2.0)
     pixels = jnp.asarray([[16.0, 8], [16, 8], [16, 8], [2, 2], [40, 8], [16, -1], [16, 8]])
-    depths = jnp.asarray([2.0, 2.045, 2.055, 2, 2, 2, -1])  # units: 5 cm behind the surface is hidden
-    expected = [True, True, False, False, False, False, False]  # seen, just so, hidden, background, outside x 2, behind
+    depths = jnp.asarray(
+        [2.0, 2.045, 2.055, 2, 2, 2, -1]
+    )  # units: 5 cm behind the surface is hidden
+    expected = [
+        True,
+        True,
+        False,
+        False,
+        False,
+        False,
+        False,
+    ]  # seen, just so, hidden, background, outside x 2, behind
     assert np.array_equal(visible_vertices(pixels, depths, depth_map, SIZE, convention), expected)
 
 
 def test_visibility_reads_the_pixel_that_holds_the_vertex():
     depth_map = jnp.full(SIZE[::-1], -1.0).at[7, 30].set(2.0)
-    pixels, depths = jnp.asarray([[30.1, 7.9], [29.9, 7.5], [31.1, 7.5], [30.5, 8.1]]), jnp.full(4, 2.0)
-    assert np.array_equal(visible_vertices(pixels, depths, depth_map, SIZE, "half_pixel"), [True, False, False, False])
+    pixels, depths = (
+        jnp.asarray([[30.1, 7.9], [29.9, 7.5], [31.1, 7.5], [30.5, 8.1]]),
+        jnp.full(4, 2.0),
+    )
+    assert np.array_equal(
+        visible_vertices(pixels, depths, depth_map, SIZE, "half_pixel"), [True, False, False, False]
+    )
     nearest = np.round(np.asarray(pixels) / SIZE * (np.asarray(SIZE) - 1))  # published
     expected = (nearest == [30, 7]).all(-1)
     assert np.array_equal(visible_vertices(pixels, depths, depth_map, SIZE, "mixed"), expected)
@@ -83,7 +102,13 @@ def test_reads_are_summed_over_the_views_that_count():
 
 @pytest.mark.slow
 def test_photo_colors_are_grey_where_nothing_is_seen():
-    images = jnp.zeros((2, 4, 4, 3)).at[0].set(jnp.asarray([1.0, 0, 0])).at[1].set(jnp.asarray([0, 0, 1.0]))
+    images = (
+        jnp.zeros((2, 4, 4, 3))
+        .at[0]
+        .set(jnp.asarray([1.0, 0, 0]))
+        .at[1]
+        .set(jnp.asarray([0, 0, 1.0]))
+    )
     pixels = jnp.full((2, 3, 2), 2.0)
     visible = jnp.asarray([[True, False, False], [True, True, False]])
     colors = photo_colors(images, pixels, visible, "half_pixel")
@@ -94,13 +119,22 @@ def test_photo_colors_are_grey_where_nothing_is_seen():
 def test_views_that_do_not_see_a_vertex_do_not_dilute_its_feature(pool):
     """Each photo's map is constant: the mean over the views that count is known. View 1 sees nothing, view 2 is padding."""
     inputs = random_inputs(views=3)
-    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[1].set(-1.0), view_count=jnp.asarray(2))
+    inputs = replace(
+        inputs, depth_maps=inputs.depth_maps.at[1].set(-1.0), view_count=jnp.asarray(2)
+    )
     maps = jnp.asarray([2.0, 6.0, 50.0])[:, None, None, None] * jnp.ones((3, 32, 32, 1))
-    reader, how = PixelAlignedReader(output_width=None, sample_rgb=True), TINY.with_conventions(pool=pool).run()
-    features = jax.jit(lambda maps, inputs: reader.apply({}, Encoding(maps, None, jnp.int32(0)), inputs, how))(maps, inputs)
+    reader, how = (
+        PixelAlignedReader(output_width=None, sample_rgb=True),
+        TINY.with_conventions(pool=pool).run(),
+    )
+    features = jax.jit(
+        lambda maps, inputs: reader.apply({}, Encoding(maps, None, jnp.int32(0)), inputs, how)
+    )(maps, inputs)
     unit = subject_unit(inputs.canonical_vertices)
     cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
-    pixels, visible = project_and_test(cameras, vertices, inputs.depth_maps, inputs.present, "half_pixel")
+    pixels, visible = project_and_test(
+        cameras, vertices, inputs.depth_maps, inputs.present, "half_pixel"
+    )
     inner = visible[0] & jnp.all((pixels[:2] > 1) & (pixels[:2] < 31), axis=(0, 2))
     assert inner.sum() > 5 and not visible[1:].any()
     np.testing.assert_allclose(features.local[inner], 2.0 if pool == "visible" else 4.0, rtol=1e-5)
@@ -112,10 +146,18 @@ def test_at_the_edge_of_a_mask_a_shell_has_the_color_of_the_person_alone():
     camera = jax.tree.map(lambda x: x[None], AXIS_CAMERA)
     images = jnp.asarray([0.9, 0.6, 0.3]) * jnp.ones((1, *SIZE[::-1], 3))
     mask = jnp.arange(SIZE[0]) < 16
-    images, foreground = jnp.where(mask[:, None], images, 1.0), jnp.broadcast_to(mask, (1, *SIZE[::-1]))
-    vertex, normal = (jnp.asarray([[[0.0, 0.0, 2.0]]]), jnp.asarray([[[0.0, 0.0, -1.0]]]))  # at the middle: the mask's edge
+    images, foreground = (
+        jnp.where(mask[:, None], images, 1.0),
+        jnp.broadcast_to(mask, (1, *SIZE[::-1])),
+    )
+    vertex, normal = (
+        jnp.asarray([[[0.0, 0.0, 2.0]]]),
+        jnp.asarray([[[0.0, 0.0, -1.0]]]),
+    )  # at the middle: the mask's edge
     nothing = jnp.full((1, *SIZE[::-1]), -1.0)
-    read_one = jax.jit(lambda *arrays: sample_shells(*arrays, (0.0,), jnp.ones(1, bool), "half_pixel"))
+    read_one = jax.jit(
+        lambda *arrays: sample_shells(*arrays, (0.0,), jnp.ones(1, bool), "half_pixel")
+    )
     shells = read_one(images, foreground, nothing, camera, vertex, normal)
     np.testing.assert_allclose(shells.colors[0, 0], [0.9, 0.6, 0.3], rtol=1e-5)
     np.testing.assert_allclose(shells.inside[0, 0], 0.5, rtol=1e-5)
@@ -133,23 +175,41 @@ LATERAL = 0.02
 def scene(views=VIEWS):
     """Photos of the coat: red as the first view sees it, green as the others do."""
     cameras = orbit(
-        jnp.zeros(3), 4.0, jnp.arange(views) * 2 * np.pi / views, 0.0, intrinsics_from_fov(0.6, SIDE, SIDE), SIDE, SIDE
+        jnp.zeros(3),
+        4.0,
+        jnp.arange(views) * 2 * np.pi / views,
+        0.0,
+        intrinsics_from_fov(0.6, SIDE, SIDE),
+        SIDE,
+        SIDE,
     )
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(200, 3))
     normals = jnp.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True), jnp.float32)
-    centre = (np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), -1) + 0.5 - SIDE / 2) / float(cameras.K[0, 0, 0])
-    sine = np.linalg.norm(centre, axis=-1) / np.sqrt(1 + np.sum(centre**2, -1))  # of the angle off the axis
-    ray = lambda radius: 4 * sine < radius
-    depth = 4 / (1 + np.sum(centre**2, -1)) - np.sqrt(np.maximum(BODY**2 - (4 * sine) ** 2, 0)) / np.sqrt(
-        1 + np.sum(centre**2, -1)
+    centre = (np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), -1) + 0.5 - SIDE / 2) / float(
+        cameras.K[0, 0, 0]
     )
+    sine = np.linalg.norm(centre, axis=-1) / np.sqrt(
+        1 + np.sum(centre**2, -1)
+    )  # of the angle off the axis
+    ray = lambda radius: 4 * sine < radius
+    depth = 4 / (1 + np.sum(centre**2, -1)) - np.sqrt(
+        np.maximum(BODY**2 - (4 * sine) ** 2, 0)
+    ) / np.sqrt(1 + np.sum(centre**2, -1))
     depths = np.where(ray(BODY), depth, -1).astype(np.float32)
     colors = np.asarray([[1.0, 0, 0], [0, 1, 0]])[(np.arange(views) > 0).astype(int)]
     mask = ray(COAT)
     images = np.where(mask[None, ..., None], colors[:, None, None], 1).astype(np.float32)
     same = lambda x: jnp.broadcast_to(jnp.asarray(x), (views, *np.shape(x)))
-    return (jnp.asarray(images), same(mask), same(depths), cameras, same(BODY * normals), same(normals), normals)
+    return (
+        jnp.asarray(images),
+        same(mask),
+        same(depths),
+        cameras,
+        same(BODY * normals),
+        same(normals),
+        normals,
+    )
 
 
 @jax.jit
@@ -158,7 +218,9 @@ def read_views(arguments, present):
 
 
 def read(arguments, present=None):
-    return read_views(arguments[:6], jnp.ones(len(arguments[0]), bool) if present is None else present)
+    return read_views(
+        arguments[:6], jnp.ones(len(arguments[0]), bool) if present is None else present
+    )
 
 
 def lateral(points, cameras):
@@ -178,7 +240,9 @@ def test_hull_and_share_tell_how_far_the_coat_reaches():
     away = lateral(points, arguments[3])
     certain = np.all(np.abs(away - COAT) > 2 * LATERAL, axis=0)
     inside = away < COAT
-    assert np.sum(certain) > 20 and np.sum(~inside.all(0) & certain) > 20  # the test tests something
+    assert (
+        np.sum(certain) > 20 and np.sum(~inside.all(0) & certain) > 20
+    )  # the test tests something
     assert np.allclose(shells.inside[certain, 3], inside.mean(0)[certain], atol=1e-5)
     assert np.allclose(shells.hull[certain, 3], inside.all(0)[certain], atol=1e-5)
 
@@ -189,7 +253,9 @@ def test_colors_are_of_the_views_that_face_the_point():
     shells = read(arguments)
     first = np.asarray(arguments[3].center[0]) / 4
     front = np.asarray(arguments[-1]) @ first > 0.95
-    assert np.sum(front) > 2 and np.all(shells.colors[front, :3, 0] > 0.8)  # neighbouring views see it at a slant
+    assert np.sum(front) > 2 and np.all(
+        shells.colors[front, :3, 0] > 0.8
+    )  # neighbouring views see it at a slant
     back = np.asarray(arguments[-1]) @ first < -0.3
     assert np.allclose(shells.colors[back, :3], [0, 1, 0], atol=1e-5)
     level = np.abs(np.asarray(arguments[-1])[:, 1]) < 0.9
@@ -210,7 +276,9 @@ def test_absent_views_and_points_out_of_the_image_say_nothing():
     fewer = jax.tree.map(lambda x: x[:2], arguments[:-1])
     padded = read(arguments, jnp.arange(VIEWS) < 2)
     for name in ("colors", "seen", "inside", "hull"):
-        assert np.allclose(getattr(padded, name), getattr(read((*fewer, arguments[-1])), name), atol=1e-6), name
+        assert np.allclose(
+            getattr(padded, name), getattr(read((*fewer, arguments[-1])), name), atol=1e-6
+        ), name
     camera = arguments[3]
     aside = replace(camera, K=camera.K.at[:, 0, 2].add(10 * SIDE))
     nothing = read((*arguments[:3], aside, *arguments[4:]))
@@ -225,7 +293,9 @@ def test_batches_by_vmap_and_gradients_are_finite():
     batched = jax.vmap(read)(two)
     # near the rim of a silhouette, where few views weigh little, rounding in float32 moves a mean by 1e-5
     assert np.allclose(batched.colors[1], read(arguments).colors, atol=1e-4)
-    total = lambda images, vertices: jnp.sum(read((images, *arguments[1:4], vertices, *arguments[5:])).colors)
+    total = lambda images, vertices: jnp.sum(
+        read((images, *arguments[1:4], vertices, *arguments[5:])).colors
+    )
     for gradient in jax.grad(total, (0, 1))(arguments[0], arguments[4]):
         assert np.isfinite(gradient).all() and np.any(gradient)
 
@@ -238,8 +308,12 @@ def test_the_background_lends_no_color():
     certain = np.all(np.abs(away - COAT) > 2 * LATERAL, axis=0)
     outside = certain & np.all(away > COAT, axis=0)
     known = certain & ~outside & (np.asarray(shells.seen[:, 3]) > 0)
-    assert np.allclose(shells.colors[outside, 3], UNSEEN_COLOR) and not np.any(shells.seen[outside, 3])
-    assert np.sum(known) > 20 and np.allclose(shells.colors[known, 3, 2], 0, atol=1e-5)  # red and green, never white
+    assert np.allclose(shells.colors[outside, 3], UNSEEN_COLOR) and not np.any(
+        shells.seen[outside, 3]
+    )
+    assert np.sum(known) > 20 and np.allclose(
+        shells.colors[known, 3, 2], 0, atol=1e-5
+    )  # red and green, never white
 
 
 def test_a_vertex_is_on_the_person_if_any_photo_shows_the_person_at_any_distance():

@@ -5,7 +5,10 @@ from torch_writer import tensors, write_checkpoint, write_stream
 
 from humangs_jax.io.tensors import is_safetensors, read_tensors
 
-STATE = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
+STATE = {
+    "a.weight": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "b": np.asarray([1, 2], np.int64),
+}
 WRITERS = {
     "safetensors": lambda path: save_file(STATE, path),
     "zip": lambda path: write_checkpoint(path, tensors(STATE)),
@@ -20,7 +23,9 @@ def test_the_name_of_a_file_does_not_matter(kind, name, tmp_path):
     assert is_safetensors(tmp_path / name) == (kind == "safetensors")
     found, skipped = read_tensors(tmp_path / name)
     assert skipped == 0 and found.keys() == STATE.keys()
-    assert all(np.array_equal(found[key], x) and found[key].dtype == x.dtype for key, x in STATE.items())
+    assert all(
+        np.array_equal(found[key], x) and found[key].dtype == x.dtype for key, x in STATE.items()
+    )
     some, skipped = read_tensors(tmp_path / name, lambda key: key == "b")
     assert list(some) == ["b"] and skipped == 1
 
@@ -29,7 +34,10 @@ def test_headers_of_any_length(tmp_path):
     """A header's length must not pass for another format's first bytes (640 is 80 02, the start of a pickle)."""
     for length in range(600, 680, 8):
         save_file(STATE, tmp_path / "a", {"padding": "x" * (length - 200)})
-        assert is_safetensors(tmp_path / "a") and read_tensors(tmp_path / "a")[0].keys() == STATE.keys()
+        assert (
+            is_safetensors(tmp_path / "a")
+            and read_tensors(tmp_path / "a")[0].keys() == STATE.keys()
+        )
 
 
 @pytest.mark.parametrize("kind", WRITERS)

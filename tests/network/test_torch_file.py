@@ -49,21 +49,32 @@ def test_tensors_are_views_of_their_storages(write, tmp_path):
         "half": FakeTensor(halves, "BFloat16Storage"),
         "loss_computer.vgg": FakeTensor(numbers),
     }
-    content = {"model": collections.OrderedDict(model), "optimizer": {"state": FakeTensor(numbers)}, "step": 3}
+    content = {
+        "model": collections.OrderedDict(model),
+        "optimizer": {"state": FakeTensor(numbers)},
+        "step": 3,
+    }
     path = write(tmp_path / "a.pt", content)
     state, skipped = read_torch_file(path, lambda key: not key.startswith("loss_computer."))
     assert skipped == 1 and set(state) == set(model) - {"loss_computer.vgg"}
     assert np.array_equal(state["turned"], [[2, 6, 10], [3, 7, 11]])
     assert state["scalar"].shape == () and state["scalar"] == 7 and state["empty"].shape == (0, 3)
-    assert state["half"].dtype == np.float32 and np.allclose(state["half"], [1, -2.5, 0.1], rtol=2**-7)
+    assert state["half"].dtype == np.float32 and np.allclose(
+        state["half"], [1, -2.5, 0.1], rtol=2**-7
+    )
     assert read_torch_file(path)[1] == 0 and set(read_torch_file(path)[0]) == set(model)
 
 
 def test_only_storages_of_the_state_dict_are_read(tmp_path):
-    content = {"model": {"w": FakeTensor(np.ones(3, np.float32))}, "optimizer": FakeTensor(np.ones(9, np.float32))}
+    content = {
+        "model": {"w": FakeTensor(np.ones(3, np.float32))},
+        "optimizer": FakeTensor(np.ones(9, np.float32)),
+    }
     path = write_checkpoint(tmp_path / "a.pt", content)
     with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist() if name != "archive/data/1"}
+        members = {
+            name: archive.read(name) for name in archive.namelist() if name != "archive/data/1"
+        }
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in members.items():
             archive.writestr(name, data)
@@ -100,12 +111,16 @@ def test_no_code_of_a_file_runs(write, name, place, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     content = {"model": {"w": FakeTensor(np.ones(3, np.float32))}, "optimizer": {}}
     content[place]["evil"] = CALLS[name]
-    with pytest.raises(ValueError, match=rf"a\.pt: refused to load [\w.]*{name}: no part of a state dict"):
+    with pytest.raises(
+        ValueError, match=rf"a\.pt: refused to load [\w.]*{name}: no part of a state dict"
+    ):
         read_torch_file(write(tmp_path / "a.pt", content))
     assert os.listdir(tmp_path) == ["a.pt"]
 
 
-@pytest.mark.parametrize("name", ["torch.load", "torch.jit._script", "torch._utils._rebuild_qtensor", "torch.nn.Module"])
+@pytest.mark.parametrize(
+    "name", ["torch.load", "torch.jit._script", "torch._utils._rebuild_qtensor", "torch.nn.Module"]
+)
 def test_nor_does_any_other_call_of_torch(name, tmp_path):
     module, _, function = name.rpartition(".")
     data = b"\x80\x02}q\x00X\x05\x00\x00\x00modelc" + f"{module}\n{function}\n".encode() + b")Rs."
@@ -115,7 +130,11 @@ def test_nor_does_any_other_call_of_torch(name, tmp_path):
 
 def test_what_is_allowed_cannot_be_changed(tmp_path):
     """BUILD with a pair of dicts sets attributes of whatever stands on the stack."""
-    for target in (b"ctorch._utils\n_rebuild_tensor_v2\n", b"ctorch\nFloatStorage\n", b"ccollections\nOrderedDict\n"):
+    for target in (
+        b"ctorch._utils\n_rebuild_tensor_v2\n",
+        b"ctorch\nFloatStorage\n",
+        b"ccollections\nOrderedDict\n",
+    ):
         data = b"\x80\x02" + target + b"}}X\x04\x00\x00\x00namei" + b"X\x01\x00\x00\x00xs\x86b."
         data = data.replace(b"namei", b"name")
         with pytest.raises(ValueError, match=r"a\.pt"):
@@ -131,16 +150,41 @@ BOMB = (1 << 40, 2)
         ({"weights": {}}, "under 'model'"),
         ({"model": [3]}, "under 'model'"),
         ({}, "expected a state dict"),
-        ({"w": FakeTensor(np.zeros(4, np.float32)), "epoch": 3}, r"state_dict\['epoch'\] is no tensor but int"),
+        (
+            {"w": FakeTensor(np.zeros(4, np.float32)), "epoch": 3},
+            r"state_dict\['epoch'\] is no tensor but int",
+        ),
         ({"model": {"w": 3}}, r"model\['w'\] is no tensor but int"),
         ({"model": {3: 3}}, "no string"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(5,))}}, "w: shape .* does not fit"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(2,), strides=(-1,), offset=3)}}, "no counts"),
+        (
+            {"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(5,))}},
+            "w: shape .* does not fit",
+        ),
+        (
+            {
+                "model": {
+                    "w": FakeTensor(np.zeros(4, np.float32), shape=(2,), strides=(-1,), offset=3)
+                }
+            },
+            "no counts",
+        ),
         ({"model": {"w": FakeTensor(np.zeros(4, np.float32), offset=-1)}}, "no counts"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(2,), strides=(1, 1))}}, "1 axes and 2 strides"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=BOMB, strides=(0, 1))}}, "does not fit"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=("a",), strides=(1,))}}, "no counts"),
-        ({"model": dict.fromkeys("abcdefghi", FakeTensor(np.zeros(9999, np.float32)))}, "take more than 4 times the size"),
+        (
+            {"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(2,), strides=(1, 1))}},
+            "1 axes and 2 strides",
+        ),
+        (
+            {"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=BOMB, strides=(0, 1))}},
+            "does not fit",
+        ),
+        (
+            {"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=("a",), strides=(1,))}},
+            "no counts",
+        ),
+        (
+            {"model": dict.fromkeys("abcdefghi", FakeTensor(np.zeros(9999, np.float32)))},
+            "take more than 4 times the size",
+        ),
     ],
 )
 @FORMATS
@@ -176,13 +220,17 @@ def test_every_damaged_byte_is_noticed_or_harmless(tmp_path):
     numbers = np.arange(40, dtype=np.float32)
     path = write_checkpoint(tmp_path / "a.pt", {"model": {"w": FakeTensor(numbers)}})
     states, noticed, size = damaged(path)
-    assert all(np.array_equal(state["w"], numbers) for state in states)  # a time stamp, an unused field
+    assert all(
+        np.array_equal(state["w"], numbers) for state in states
+    )  # a time stamp, an unused field
     assert noticed > size / 6
 
 
 def test_damage_to_the_older_format_raises_nothing_else(tmp_path):
     """It has no checksums: numbers, names and shapes may change, but a damaged structure is a ValueError."""
-    path = write_stream(tmp_path / "a.pt", {"model": {"w": FakeTensor(np.arange(40, dtype=np.float32))}})
+    path = write_stream(
+        tmp_path / "a.pt", {"model": {"w": FakeTensor(np.arange(40, dtype=np.float32))}}
+    )
     assert damaged(path)[1] > 0
 
 
@@ -242,7 +290,10 @@ def test_parts_of_storages_in_old_streams(tmp_path):
 
 def test_state_dicts_that_python_2_wrote(tmp_path):
     numbers = np.arange(12, dtype=np.float32)
-    truth = {"lin0.model.1.weight": numbers.reshape(1, 12, 1, 1), "lin1.model.1.weight": numbers[:3].reshape(1, 3, 1, 1)}
+    truth = {
+        "lin0.model.1.weight": numbers.reshape(1, 12, 1, 1),
+        "lin1.model.1.weight": numbers[:3].reshape(1, 3, 1, 1),
+    }
     state, skipped = read_torch_file(write_python2_stream(tmp_path / "a.pth", truth))
     assert skipped == 0 and list(state) == list(truth)
     for key, expected in truth.items():
@@ -280,7 +331,9 @@ def test_a_list_of_pairs_makes_one_dict(tmp_path):
 
 
 def test_a_storage_of_two_types_is_refused(tmp_path):
-    data, _ = pickled({"a": FakeTensor(np.ones(2, np.float32)), "b": FakeTensor(np.ones(2), "DoubleStorage")})
+    data, _ = pickled(
+        {"a": FakeTensor(np.ones(2, np.float32)), "b": FakeTensor(np.ones(2), "DoubleStorage")}
+    )
     data = data.replace(b"X\x01\x00\x00\x001", b"X\x01\x00\x00\x000")
     with pytest.raises(ValueError, match="storage 0 is of two types"):
         read_torch_file(write_pickle(tmp_path / "a.pt", data))

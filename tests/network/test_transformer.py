@@ -43,7 +43,9 @@ def oracle(q, k, v, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [None, 5, LENGTH])
-@pytest.mark.parametrize(("implementation", "chunk"), [("xla", 1), ("chunked", 4), ("chunked", 13), ("chunked", 100)])
+@pytest.mark.parametrize(
+    ("implementation", "chunk"), [("xla", 1), ("chunked", 4), ("chunked", 13), ("chunked", 100)]
+)
 def test_agrees_with_the_definition(implementation, chunk, count):
     q, k, v = random_qkv()
     length = None if count is None else jnp.asarray(count)
@@ -57,7 +59,9 @@ def test_agrees_with_the_definition(implementation, chunk, count):
 
 def test_extreme_logits_stay_finite():
     q, k, v = (jnp.asarray(x, jnp.float32) for x in random_qkv())
-    value, gradient = jax.value_and_grad(lambda q: jnp.sum(chunked_attention(1e4 * q, k, v, jnp.asarray(5), 4)))(q)
+    value, gradient = jax.value_and_grad(
+        lambda q: jnp.sum(chunked_attention(1e4 * q, k, v, jnp.asarray(5), 4))
+    )(q)
     assert np.isfinite(value) and np.isfinite(gradient).all()
 
 
@@ -71,7 +75,9 @@ def test_gradients_agree_with_differences():
 def test_padding_changes_nothing():
     q, k, v = (jnp.asarray(x, jnp.float32) for x in random_qkv())
     short = chunked_attention(q[:6], k[:6], v[:6], None, 4)
-    padded = chunked_attention(q.at[6:].set(1e3), k.at[6:].set(1e3), v.at[6:].set(1e3), jnp.asarray(6), 4)
+    padded = chunked_attention(
+        q.at[6:].set(1e3), k.at[6:].set(1e3), v.at[6:].set(1e3), jnp.asarray(6), 4
+    )
     assert np.allclose(padded[:6], short, atol=FLOAT32_TOLERANCE)
 
 
@@ -110,7 +116,9 @@ def test_query_key_norm_makes_attention_blind_to_their_lengths():
         kernel = variables["params"]["qkv"]["kernel"]
         longer = kernel.at[:, :16].multiply(3.0)  # queries and keys
         params = {**variables["params"], "qkv": {"kernel": longer}}
-        same = np.allclose(module.apply(variables, tokens), module.apply({"params": params}, tokens), atol=1e-4)
+        same = np.allclose(
+            module.apply(variables, tokens), module.apply({"params": params}, tokens), atol=1e-4
+        )
         assert same == normed
 
 
@@ -131,14 +139,18 @@ value_and_grad = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [{"scan": True}, {"remat": "dots"}, {"scan": True, "remat": "full"}], ids=str)
+@pytest.mark.parametrize(
+    "how", [{"scan": True}, {"remat": "dots"}, {"scan": True, "remat": "full"}], ids=str
+)
 def test_blocks_may_be_looped_over_and_recomputed(how):
     runtime = Runtime(**how)
     shapes = jax.eval_shape(Transformer(CONFIG, runtime).init, jax.random.key(0), TOKENS)
     assert jax.tree.structure(shapes) == jax.tree.structure(VARIABLES)
     ours, reference = (jax.tree.leaves(value_and_grad(VARIABLES, x)) for x in (runtime, Runtime()))
     for a, b in zip(ours, reference, strict=True):
-        assert np.allclose(a, b, rtol=BLOCKS_TOLERANCE, atol=BLOCKS_TOLERANCE * max(1, np.abs(b).max()))
+        assert np.allclose(
+            a, b, rtol=BLOCKS_TOLERANCE, atol=BLOCKS_TOLERANCE * max(1, np.abs(b).max())
+        )
 
 
 @pytest.mark.slow
@@ -146,13 +158,19 @@ def test_outputs_are_those_of_the_quarters():
     """A network that is cut off after a quarter gives the raw output of that quarter."""
     outputs = network(CONFIG).apply(VARIABLES, TOKENS)
     assert len(outputs) == 4
-    blocks = lambda n: {k: v for k, v in VARIABLES["params"].items() if k in {f"block_{i}" for i in range(n)}}
+    blocks = lambda n: {
+        k: v for k, v in VARIABLES["params"].items() if k in {f"block_{i}" for i in range(n)}
+    }
     rest = {k: VARIABLES["params"][k] for k in ("input_norm", "norm")}
     short = network(dataclasses.replace(CONFIG, layers=4))
-    quarters = short.apply({"params": {**blocks(4), **rest}}, TOKENS)  # 1, 2, 3, 4 of 6: here 1, 3, 4, 6
+    quarters = short.apply(
+        {"params": {**blocks(4), **rest}}, TOKENS
+    )  # 1, 2, 3, 4 of 6: here 1, 3, 4, 6
     assert np.allclose(outputs[0], quarters[0], atol=BLOCKS_TOLERANCE) and np.allclose(
         outputs[1], quarters[2], atol=BLOCKS_TOLERANCE
     )
-    normed = (outputs[2] - outputs[2].mean(-1, keepdims=True)) / jnp.sqrt(outputs[2].var(-1, keepdims=True) + 1e-5)
+    normed = (outputs[2] - outputs[2].mean(-1, keepdims=True)) / jnp.sqrt(
+        outputs[2].var(-1, keepdims=True) + 1e-5
+    )
     expected = normed * rest["norm"]["scale"] + rest["norm"]["bias"]
     assert np.allclose(quarters[3], expected, atol=10 * BLOCKS_TOLERANCE)

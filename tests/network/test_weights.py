@@ -40,7 +40,10 @@ def rewrite(file, change, **metadata):
 def test_round_trip(file):
     variables, config = load_weights(file)
     assert config == TINY.trained and jax.tree.structure(variables) == jax.tree.structure(VARIABLES)
-    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (variables, VARIABLES)), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(*map(jax.tree.leaves, (variables, VARIABLES)), strict=True)
+    )
     assert os.listdir(file.parent) == [file.name]
 
 
@@ -62,8 +65,14 @@ def test_half_precision_halves_the_file_and_loads_as_float32(file, tmp_path):
     [
         (lambda t: t.pop(TEXTURE), f"'{TEXTURE}' is missing"),
         (lambda t: t.update(extra=np.zeros(2, np.float32)), "'extra' is unknown"),
-        (lambda t: t.update({TEXTURE: t[TEXTURE][:, :4].copy()}), rf"'{TEXTURE}' has shape \(3, 4, 8, 2\)"),
-        (lambda t: t[TEXTURE].__setitem__((0, 0, 0, 0), np.nan), f"'{TEXTURE}' holds numbers that are not finite"),
+        (
+            lambda t: t.update({TEXTURE: t[TEXTURE][:, :4].copy()}),
+            rf"'{TEXTURE}' has shape \(3, 4, 8, 2\)",
+        ),
+        (
+            lambda t: t[TEXTURE].__setitem__((0, 0, 0, 0), np.nan),
+            f"'{TEXTURE}' holds numbers that are not finite",
+        ),
     ],
 )
 def test_tensors_that_do_not_fit_are_named(file, change, message):
@@ -82,9 +91,18 @@ def test_tensors_that_do_not_fit_are_named(file, change, message):
         ({"conventions": json.dumps({"pool": "some"})}, "config.pool: .*got 'some'"),
         ({"conventions": json.dumps({"image_size": 100})}, "not a multiple of patch_size"),
         ({"architecture": json.dumps({"encoder": {"kind": "os.system"}})}, "config.encoder.kind"),
-        ({"architecture": json.dumps({"encoder": {"kind": "antigravity.Encoder"}})}, "import their module first"),
-        ({"architecture": json.dumps({"encoder": {"kind": "VertexDecoder"}})}, "a registered Encoder, one of "),
-        ({"architecture": json.dumps({"encoder": {"kind": "PatchTransformer", "a": 1}})}, "encoder.a"),
+        (
+            {"architecture": json.dumps({"encoder": {"kind": "antigravity.Encoder"}})},
+            "import their module first",
+        ),
+        (
+            {"architecture": json.dumps({"encoder": {"kind": "VertexDecoder"}})},
+            "a registered Encoder, one of ",
+        ),
+        (
+            {"architecture": json.dumps({"encoder": {"kind": "PatchTransformer", "a": 1}})},
+            "encoder.a",
+        ),
     ],
 )
 def test_bad_headers_are_clear_errors(file, metadata, message):
@@ -106,7 +124,9 @@ def test_no_file_and_no_weights(tmp_path, monkeypatch):
 
 
 def test_nothing_is_written_that_could_not_be_read(tmp_path):
-    wrong = TINY.with_parts(encoder=dataclasses.replace(ENCODER, texture=presets.TriplaneConfig(4, 2)))
+    wrong = TINY.with_parts(
+        encoder=dataclasses.replace(ENCODER, texture=presets.TriplaneConfig(4, 2))
+    )
     with pytest.raises(ValueError, match=TEXTURE):
         save_weights(tmp_path / "w.safetensors", VARIABLES, wrong)
     assert os.listdir(tmp_path) == []

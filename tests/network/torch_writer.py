@@ -44,7 +44,10 @@ def pickled(content, extra=lambda tensor: ()):
     """The pickle of `content` and the storages of the tensors in it, named by their number."""
     torch, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
     rebuild = lambda *_: None
-    rebuild.__module__, rebuild.__qualname__, rebuild.__name__ = "torch._utils", *["_rebuild_tensor_v2"] * 2
+    rebuild.__module__, rebuild.__qualname__, rebuild.__name__ = (
+        "torch._utils",
+        *["_rebuild_tensor_v2"] * 2,
+    )
     utils._rebuild_tensor_v2, torch._utils = rebuild, utils
     for name in STORAGE_DTYPES:
         setattr(torch, name, type(name, (), {"__module__": "torch"}))
@@ -68,7 +71,14 @@ def pickled(content, extra=lambda tensor: ()):
                 return NotImplemented
             shape = value.storage.shape if value.shape is None else value.shape
             strides = contiguous(shape) if value.strides is None else value.strides
-            return rebuild, (Reference(value), value.offset, shape, strides, False, collections.OrderedDict())
+            return rebuild, (
+                Reference(value),
+                value.offset,
+                shape,
+                strides,
+                False,
+                collections.OrderedDict(),
+            )
 
     file = io.BytesIO()
     with mock.patch.dict(sys.modules, {"torch": torch, "torch._utils": utils}):
@@ -87,10 +97,16 @@ def write_checkpoint(path, content, byteorder="little", compression=zipfile.ZIP_
     return path
 
 
-def write_stream(path, content, magic=MAGIC_NUMBER, version=STREAM_VERSION, little=True, count=lambda size: size):
+def write_stream(
+    path, content, magic=MAGIC_NUMBER, version=STREAM_VERSION, little=True, count=lambda size: size
+):
     """The same in the older format."""
     data, storages = pickled(content, lambda tensor: (tensor.part,))
-    machine = {"protocol_version": version, "little_endian": little, "type_sizes": {"short": 2, "int": 4, "long": 4}}
+    machine = {
+        "protocol_version": version,
+        "little_endian": little,
+        "type_sizes": {"short": 2, "int": 4, "long": 4},
+    }
     with open(path, "wb") as file:
         file.write(b"".join(pickle.dumps(x, 2) for x in (magic, version, machine)) + data)
         file.write(pickle.dumps([str(i) for i in range(len(storages))], 2))
@@ -107,17 +123,36 @@ def write_python2_stream(path, state, device="cuda:0"):
     text = lambda value: b"U" + bytes([len(value)]) + value.encode()
     count = lambda value: b"J" + struct.pack("<i", value)
     counts = lambda values: b"(" + b"".join(map(count, values)) + b"t"
-    metadata = text("_metadata") + b"ccollections\nOrderedDict\n(](](" + text("") + b"}" + text("version") + b"K\x01seetR"
+    metadata = (
+        text("_metadata")
+        + b"ccollections\nOrderedDict\n(](]("
+        + text("")
+        + b"}"
+        + text("version")
+        + b"K\x01seetR"
+    )
 
     def tensor(i, x):
         kind = f"ctorch\n{KINDS[x.dtype]}\n".encode()
-        reference = b"(" + text("storage") + kind + text(str(i)) + text(device) + b"\x8a\x03" + x.size.to_bytes(3, "little")
+        reference = (
+            b"("
+            + text("storage")
+            + kind
+            + text(str(i))
+            + text(device)
+            + b"\x8a\x03"
+            + x.size.to_bytes(3, "little")
+        )
         view = count(0) + counts(x.shape) + counts(contiguous(x.shape))
         return b"ctorch._utils\n_rebuild_tensor_v2\n(" + reference + b"NtQ" + view + b"\x89NtR"
 
     pairs = (b"](" + text(key) + tensor(i, x) + b"e" for i, (key, x) in enumerate(state.items()))
-    data = b"\x80\x02ccollections\nOrderedDict\n](" + b"".join(pairs) + b"e\x85R}" + metadata + b"sb."
-    machine = b"\x80\x02}(" + text("protocol_version") + b"M\xe9\x03" + text("little_endian") + b"\x88u."
+    data = (
+        b"\x80\x02ccollections\nOrderedDict\n](" + b"".join(pairs) + b"e\x85R}" + metadata + b"sb."
+    )
+    machine = (
+        b"\x80\x02}(" + text("protocol_version") + b"M\xe9\x03" + text("little_endian") + b"\x88u."
+    )
     with open(path, "wb") as file:
         file.write(pickle.dumps(MAGIC_NUMBER, 2) + pickle.dumps(STREAM_VERSION, 2) + machine + data)
         file.write(b"\x80\x02](" + b"".join(text(str(i)) for i in range(len(state))) + b"e.")

@@ -60,14 +60,21 @@ def test_charts_stay_apart_and_belong_to_one_piece(person, baked, shown):
     charts = of_face[shown[0]]
     for axis in (0, 1):
         near, far = (np.take(charts, range(i, SIZE - 1 + i), axis) for i in (0, 1))
-        assert not np.any((near != far) & (near >= 0) & (far >= 0))  # a texel at least between two of them
-    pieces = [np.unique(baked.atlas.charts[person.face_materials == k]) for k in range(len(person.materials))]
+        assert not np.any(
+            (near != far) & (near >= 0) & (far >= 0)
+        )  # a texel at least between two of them
+    pieces = [
+        np.unique(baked.atlas.charts[person.face_materials == k])
+        for k in range(len(person.materials))
+    ]
     assert len(np.concatenate(pieces)) == baked.atlas.charts.max() + 1
 
 
 def test_texels_are_spread_evenly(person, baked):
     corners = person.surface.vertices[person.surface.faces].astype(np.float64)
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     flat = flat_areas(baked.atlas.uvs, baked.atlas.faces) * (SIZE * baked.atlas.texel) ** 2
     order = np.argsort(flat / np.maximum(areas, 1e-12))
     share = np.cumsum(areas[order]) / areas.sum()
@@ -85,7 +92,9 @@ def test_the_texture_says_what_the_materials_say(person, baked):
     weights = rng.dirichlet(np.ones(3), size=4000).astype(np.float32)
     albedo, slopes = subject.paint(person, faces, subject.spots_at(person, faces, weights))
     uv = sum(weights[:, i : i + 1] * baked.atlas.uvs[baked.atlas.faces[faces, i]] for i in range(3))
-    look = lambda texture: np.asarray(sample_texture(jnp.asarray(texture, jnp.float32), jnp.asarray(uv[None])))[0]
+    look = lambda texture: np.asarray(
+        sample_texture(jnp.asarray(texture, jnp.float32), jnp.asarray(uv[None]))
+    )[0]
     error = np.abs(look(baked.albedo) / 255 - np.clip(albedo, 0, 1))
     assert np.median(error) < 0.01 and error.mean() < 0.04  # edges of patterns are a texel wide
     bent = (look(baked.slopes) - bank.SLOPE_ZERO) * bank.SLOPE_STEP
@@ -111,7 +120,9 @@ def test_a_few_joints_move_the_mesh_as_all_of_them(person):
         few = np.zeros_like(surface.weights)
         np.put_along_axis(few, ids.astype(int), weights, axis=1)
         other = dataclasses.replace(person, surface=dataclasses.replace(surface, weights=few))
-        return np.abs(other.posed_vertices(posed.rotations, posed.translation) - posed.vertices).max()
+        return np.abs(
+            other.posed_vertices(posed.rotations, posed.translation) - posed.vertices
+        ).max()
 
     assert moved(bank.JOINTS_PER_VERTEX) < SKINNING
     assert moved(2) > moved(bank.JOINTS_PER_VERTEX)
@@ -133,13 +144,22 @@ def test_scans_are_read_back_as_they_were(person, tmp_path):
         np.testing.assert_allclose(mesh.vertices, posed.vertices[baked.atlas.vertices], atol=1e-6)
         np.testing.assert_allclose(mesh.visual.uv, baked.atlas.uvs, atol=1e-6)
         material = mesh.visual.material
-        texture = np.asarray(material.image if name.endswith("obj") else material.baseColorTexture)[..., :3]
+        texture = np.asarray(material.image if name.endswith("obj") else material.baseColorTexture)[
+            ..., :3
+        ]
         np.testing.assert_array_equal(texture, expected)
-    camera = surroundings.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128)[0]
+    camera = surroundings.cameras_around(
+        np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128
+    )[0]
     direct, mask = subject.render_view(posed, camera)
     faces, uvs = jnp.asarray(baked.atlas.faces), jnp.asarray(baked.atlas.uvs)
-    vertices, texture = jnp.asarray(posed.vertices[baked.atlas.vertices]), jnp.asarray(expected / 255, jnp.float32)
-    seen = rasterizer.rasterize_mesh(vertices, faces, camera.resized(2 * camera.width, 2 * camera.height))
+    vertices, texture = (
+        jnp.asarray(posed.vertices[baked.atlas.vertices]),
+        jnp.asarray(expected / 255, jnp.float32),
+    )
+    seen = rasterizer.rasterize_mesh(
+        vertices, faces, camera.resized(2 * camera.width, 2 * camera.height)
+    )
     covered = (seen.face_ids >= 0)[..., None]
     uv = rasterizer.interpolate_attributes(seen, faces, uvs, jnp.zeros(2))
     mean = lambda x: x.reshape(camera.height, 2, camera.width, 2, -1).mean(axis=(1, 3))
@@ -159,6 +179,8 @@ def test_a_scan_is_written_whole_or_not_at_all(person, baked, tmp_path, monkeypa
     monkeypatch.setattr(bank, "lit_texture", lambda *_: baked.albedo)
     with pytest.raises(OSError, match="disk full"):
         bank.export_scan(
-            subject.pose_subject(person, np.zeros((55, 3), np.float32), np.zeros(3, np.float32)), tmp_path / "scan", 128
+            subject.pose_subject(person, np.zeros((55, 3), np.float32), np.zeros(3, np.float32)),
+            tmp_path / "scan",
+            128,
         )
     assert [path.name for path in tmp_path.rglob("*")] == ["scan", "scan.json"]

@@ -32,7 +32,9 @@ def faults(body, posed):
 
 
 @pytest.mark.slow
-def test_a_dressed_person_has_hardly_any_fault_and_skin_that_is_pushed_through_cloth_is_counted(posed, faults):
+def test_a_dressed_person_has_hardly_any_fault_and_skin_that_is_pushed_through_cloth_is_counted(
+    posed, faults
+):
     before = faults(posed)
     assert before["poking"] < 0.01 and before["hollow"] < 0.01 and before["gaps"] < 0.01
     pushed = posed.vertices + 0.04 * posed.normals * (posed.subject.cover > 0)[:, None]
@@ -44,9 +46,13 @@ def test_a_dressed_person_has_hardly_any_fault_and_skin_that_is_pushed_through_c
 def test_holes_in_cloth_are_counted(posed, faults):
     subject = posed.subject
     middle = posed.vertices[subject.surface.faces].mean(1)
-    chest = (subject.face_materials >= 2) & (np.abs(middle[:, 1] - 0.65 * posed.vertices[:, 1].max()) < 0.08)
+    chest = (subject.face_materials >= 2) & (
+        np.abs(middle[:, 1] - 0.65 * posed.vertices[:, 1].max()) < 0.08
+    )
     front = chest & (middle[:, 2] > middle[chest, 2].mean())
     surface = dataclasses.replace(subject.surface, faces=subject.surface.faces[~front])
-    torn = dataclasses.replace(subject, surface=surface, face_materials=subject.face_materials[~front])
+    torn = dataclasses.replace(
+        subject, surface=surface, face_materials=subject.face_materials[~front]
+    )
     shares = faults(dataclasses.replace(posed, subject=torn))
     assert shares["hollow"] + shares["gaps"] > 0.02

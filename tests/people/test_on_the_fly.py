@@ -67,7 +67,12 @@ def example(bank):
 
 @pytest.mark.slow
 def test_banks_hold_people_of_one_split_only(bank, body, tmp_path):
-    for seeds, split in (([TEST[0]], "train"), ([5, TEST[0]], "train"), ([DEMO[0]], "train"), ([5], "test")):
+    for seeds, split in (
+        ([TEST[0]], "train"),
+        ([5, TEST[0]], "train"),
+        ([DEMO[0]], "train"),
+        ([5], "test"),
+    ):
         with pytest.raises(ValueError, match="belongs to the range"):
             build_bank(seeds, body, split)
     with pytest.raises(ValueError, match="no seeds"):
@@ -112,14 +117,19 @@ def test_a_key_is_an_example_bit_for_bit_and_of_a_batch(bank, example):
     assert batch.inputs.images.shape == (2, 2, 48, 48, 3)
     # another program: roundings may move single samples across an edge
     assert np.abs(np.asarray(batch.inputs.images[1] - example.inputs.images)).mean() < 1e-4
-    np.testing.assert_allclose(batch.inputs.cameras.cam_from_world[1], example.inputs.cameras.cam_from_world, atol=1e-5)
+    np.testing.assert_allclose(
+        batch.inputs.cameras.cam_from_world[1], example.inputs.cameras.cam_from_world, atol=1e-5
+    )
 
 
 @pytest.mark.slow
 def test_examples_look_like_those_of_the_loader(bank, example, body):
     for views, count in ((example.inputs, 2), (example.targets, 1)):
         assert views.images.shape == (count, 48, 48, 3) and views.masks.shape == (count, 48, 48)
-        assert views.cameras.K.shape == (count, 3, 3) and (views.cameras.width, views.cameras.height) == (48, 48)
+        assert views.cameras.K.shape == (count, 3, 3) and (
+            views.cameras.width,
+            views.cameras.height,
+        ) == (48, 48)
         assert views.rotations.shape == (count, 55, 3) and views.translations.shape == (count, 3)
         assert views.betas.shape == (body.shape_directions.shape[-1],)
         assert {leaf.dtype for leaf in jax.tree.leaves(views)} == {np.dtype(np.float32)}
@@ -134,7 +144,9 @@ def test_examples_look_like_those_of_the_loader(bank, example, body):
 @pytest.mark.slow
 @pytest.mark.parametrize("platform", ["cuda", "tpu"])
 def test_it_lowers_for_accelerators(bank, platform):
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (bank, jax.random.key(0)))
+    shapes = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (bank, jax.random.key(0))
+    )
     config = dataclasses.replace(CONFIG, views_at_once=3, pixels_per_step=1 << 30)
     traced = jax.jit(on_the_fly.on_the_fly_example, static_argnames="config")
     exported = jax.export.export(traced, platforms=[platform])(*shapes, config=config)
@@ -153,7 +165,9 @@ def test_masks_are_the_share_of_covered_samples_and_depths_their_mean(bank, scen
     by_pixel = lambda x: x.reshape(SIZE, 2, SIZE, 2).mean((1, 3))
     np.testing.assert_array_equal(mask, by_pixel(covered))
     share = np.where(mask > 0, mask, 1)
-    np.testing.assert_allclose(depth, by_pixel(np.where(covered, z, 0)) / share, rtol=1e-6)  # float32
+    np.testing.assert_allclose(
+        depth, by_pixel(np.where(covered, z, 0)) / share, rtol=1e-6
+    )  # float32
 
 
 def draw(scene, bank, seed, close_share, size):
@@ -167,8 +181,12 @@ def test_it_looks_like_the_rendering_on_the_host(bank, scene, body):
     person = make_subject(SEEDS[int(scene.person)], body)
     person = dataclasses.replace(person, lights=scene.lights)
     scene = replace(scene, dyes=jnp.tile(jnp.eye(3), (bank.sheen.shape[1], 1, 1)))
-    posed = subject.pose_subject(person, np.asarray(scene.rotations[0]), np.asarray(scene.translations[0]))
-    np.testing.assert_allclose(scene.vertices[0][: len(posed.vertices)], posed.vertices, atol=SKIN_DEPTH)
+    posed = subject.pose_subject(
+        person, np.asarray(scene.rotations[0]), np.asarray(scene.translations[0])
+    )
+    np.testing.assert_allclose(
+        scene.vertices[0][: len(posed.vertices)], posed.vertices, atol=SKIN_DEPTH
+    )
     camera = draw(scene, bank, 0, 0.0, SIZE)
     image, mask, _ = draw_view(bank, scene, jnp.int32(0), camera)
     expected, coverage = subject.render_view(posed, camera)
@@ -184,7 +202,10 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
     ids = np.asarray(fragments.face_ids)
     skin = (ids >= 0) & (np.asarray(bank.face_pieces[scene.person])[ids] == 0)
     assert skin.sum() > 50
-    batched, blank = jax.tree.map(lambda x: jnp.asarray(x)[None], camera), jnp.ones((1, SIZE, SIZE, 3))
+    batched, blank = (
+        jax.tree.map(lambda x: jnp.asarray(x)[None], camera),
+        jnp.ones((1, SIZE, SIZE, 3)),
+    )
     poses = scene.rotations[:1], scene.translations[:1]
     views = SubjectViews(blank, blank[..., 0], batched, *poses, bank.betas[scene.person])
     prepare = jax.jit(prepare_inputs, static_argnames="config")
@@ -196,7 +217,9 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
     # a point of the position map, moved by the pose, is where that pixel sees the body: project the nearest vertex
     rest = shape_body(body, views.betas)
     positions = np.asarray(inputs.position_maps[0])[skin][alike] * unit
-    nearest = np.linalg.norm(positions[:, None] - np.asarray(rest.vertices)[None], axis=-1).argmin(1)
+    nearest = np.linalg.norm(positions[:, None] - np.asarray(rest.vertices)[None], axis=-1).argmin(
+        1
+    )
     seen, _ = project(camera, jnp.asarray(inputs.posed_vertices[0])[nearest])
     rows, columns = np.nonzero(skin)
     pixels = np.stack([columns, rows], -1)[alike] + 0.5
@@ -206,7 +229,9 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
 @pytest.mark.slow
 def test_examples_are_of_the_body_mirrored_or_not(bank, body):
     keys = jax.random.split(jax.random.key(0), 8)
-    numbers = jax.jit(jax.vmap(lambda key: on_the_fly._draw_numbers(bank, key, CONFIG)["mirrored"]))(keys)
+    numbers = jax.jit(
+        jax.vmap(lambda key: on_the_fly._draw_numbers(bank, key, CONFIG)["mirrored"])
+    )(keys)
     flipped = (np.asarray(numbers) < CONFIG.mirrored_share).tolist()
     for key in (keys[flipped.index(True)], keys[flipped.index(False)]):
         views = jitted_example(bank, key, config=CONFIG).inputs
@@ -243,9 +268,13 @@ def test_poses_stand_on_the_ground_between_two_of_the_prior(bank, scene):
     np.testing.assert_allclose(between(a, b, 1.0), b, atol=2e-6)
     turn = jnp.zeros((1, 3)).at[0, 2].set(1.0)
     np.testing.assert_allclose(between(0 * turn, turn, 0.25), 0.25 * turn, atol=1e-6)
-    np.testing.assert_allclose(between(-3 * turn, 3 * turn, 0.5)[0, 2] % (2 * np.pi), np.pi, atol=1e-5)
+    np.testing.assert_allclose(
+        between(-3 * turn, 3 * turn, 0.5)[0, 2] % (2 * np.pi), np.pi, atol=1e-5
+    )
     build = make_subject(SEEDS[0], load_body()).build
-    places = np.stack([joint_positions(build, np.asarray(r, np.float64))[1] for r in bank.rotations[0]])
+    places = np.stack(
+        [joint_positions(build, np.asarray(r, np.float64))[1] for r in bank.rotations[0]]
+    )
     away = np.linalg.norm(places[:, None] - places, axis=-1).mean(-1)
     nearest = np.asarray(bank.nearest[0])
     assert all(np.all(away[i, nearest[i]] <= np.delete(away[i], i)) for i in range(len(away)))
@@ -259,7 +288,11 @@ def test_cameras_see_all_of_the_person_or_keep_clear_of_it(bank, scene):
     for seed in range(8):
         camera = draw(scene, bank, seed, 0.0, SIZE)
         seen, depth = project(camera, jnp.asarray(vertices))
-        assert np.all(np.asarray(depth) > 0) and np.asarray(seen).min() > 0 and np.asarray(seen).max() < SIZE
+        assert (
+            np.all(np.asarray(depth) > 0)
+            and np.asarray(seen).min() > 0
+            and np.asarray(seen).max() < SIZE
+        )
         distance = np.linalg.norm(np.asarray(camera.center) - center)
         assert distance > surroundings.DISTANCE_FACTOR[0] * radius * 0.999
         near = draw(scene, bank, seed, 1.0, SIZE)
@@ -271,13 +304,17 @@ def test_cameras_see_all_of_the_person_or_keep_clear_of_it(bank, scene):
 
 def test_dyes_leave_skin_alone_and_pieces_of_one_cloth_alike():
     groups, dyeable = jnp.asarray([0, 1, 2, 2, 4]), jnp.asarray([0.0, 0.0, 1.0, 1.0, 1.0])
-    matrices = np.asarray(dyes(np.random.default_rng(0).random((4, 5), np.float32), groups, dyeable))
+    matrices = np.asarray(
+        dyes(np.random.default_rng(0).random((4, 5), np.float32), groups, dyeable)
+    )
     np.testing.assert_array_equal(matrices[:2], np.broadcast_to(np.eye(3), (2, 3, 3)))
     np.testing.assert_array_equal(matrices[2], matrices[3])
     assert np.abs(matrices[4] - matrices[2]).max() > 0.05
     grey = matrices @ np.ones(3)
     np.testing.assert_allclose(grey - grey[:, :1], 0, atol=1e-6)  # grey stays grey
-    lights = jax.jit(surroundings.lights_from)(np.random.default_rng(0).random(surroundings.LIGHT_NUMBERS, np.float32))
+    lights = jax.jit(surroundings.lights_from)(
+        np.random.default_rng(0).random(surroundings.LIGHT_NUMBERS, np.float32)
+    )
     np.testing.assert_allclose(np.linalg.norm(lights.directions, axis=1), 1, atol=1e-6)
 
 
@@ -290,21 +327,32 @@ def test_openness_is_how_empty_a_blurred_grid_is(bank, scene):
     normals = np.zeros_like(vertices)
     normals[np.asarray(faces).reshape(-1)] = corners[:, :3]
     shaded = jax.jit(surroundings.shaded_vertices)
-    openness, exact = (np.asarray(x) for x in shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0])))
+    openness, exact = (
+        np.asarray(x) for x in shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0]))
+    )
     low = vertices.min(0) - np.float32(surroundings.MARGIN * surroundings.CELL)
     grid = np.zeros(surroundings.GRID)
     grid[tuple(((vertices - low) / np.float32(surroundings.CELL)).astype(int).T)] = 1
     grid = uniform_filter(uniform_filter(grid, 3, mode="constant"), 3, mode="constant")
-    at = [(vertices + reach * normals - low) / surroundings.CELL - 0.5 for reach in surroundings.REACH]
+    at = [
+        (vertices + reach * normals - low) / surroundings.CELL - 0.5 for reach in surroundings.REACH
+    ]
     dark = np.mean([map_coordinates(grid, points.T, order=1) for points in at], axis=0)
     expected = np.clip(1.08 - 2.6 * dark, 0.35, 1.0)
-    assert np.mean(np.abs(openness - expected) > 1e-4) < 0.01  # a vertex on the edge of a voxel may mark the next one
+    assert (
+        np.mean(np.abs(openness - expected) > 1e-4) < 0.01
+    )  # a vertex on the edge of a voxel may mark the next one
     used = np.unique(np.asarray(faces))
-    for arriving in (exact, np.asarray(shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0]), faces)[1])):
+    for arriving in (
+        exact,
+        np.asarray(shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0]), faces)[1]),
+    ):
         lit = arriving[used]
         assert lit.min() >= surroundings.DARKEST and lit.max() <= 1
         high, low_down = vertices[used, 1] > vertices[:, 1].max() - 0.03, vertices[used, 1] < 0.05
-        assert lit[high].mean() > lit[low_down].mean() + 0.15  # from above: the head is lit, the feet are not
+        assert (
+            lit[high].mean() > lit[low_down].mean() + 0.15
+        )  # from above: the head is lit, the feet are not
 
 
 def test_a_bank_is_a_source_of_its_split(bank, example):
@@ -347,19 +395,31 @@ def test_a_person_who_is_asked_for_is_the_one_who_is_picked(people):
 def test_displaced_bodies_and_fewer_photos(bank, example, monkeypatch):
     moved = np.random.default_rng(0).normal(0, 0.01, (bank.people, 5, 3)).astype(np.float16)
     bank = replace(bank, displacements=jnp.asarray(moved))
-    config = dataclasses.replace(CONFIG, input_views=3, view_counts=(2,), displaced_share=1.0, mirrored_share=1.0)
-    monkeypatch.setattr(on_the_fly, "mirrored", lambda views, joints: jax.tree.map(jnp.zeros_like, views))
+    config = dataclasses.replace(
+        CONFIG, input_views=3, view_counts=(2,), displaced_share=1.0, mirrored_share=1.0
+    )
+    monkeypatch.setattr(
+        on_the_fly, "mirrored", lambda views, joints: jax.tree.map(jnp.zeros_like, views)
+    )
     make = lambda bank, key: on_the_fly.on_the_fly_example(bank, key, config)
-    given = jax.jit(make, compiler_options={"xla_backend_optimization_level": 0})(bank, jax.random.key(1))
+    given = jax.jit(make, compiler_options={"xla_backend_optimization_level": 0})(
+        bank, jax.random.key(1)
+    )
     assert example.inputs.displacement is example.inputs.view_count is None
-    who = [i for i in range(bank.people) if (np.asarray(bank.betas[i]) == np.asarray(given.inputs.betas)).all()]
+    who = [
+        i
+        for i in range(bank.people)
+        if (np.asarray(bank.betas[i]) == np.asarray(given.inputs.betas)).all()
+    ]
     np.testing.assert_array_equal(given.inputs.displacement, moved[who[0]])
     assert given.inputs.view_count == 2
     np.testing.assert_array_equal(given.inputs.images[2], given.inputs.images[1])
     assert (given.inputs.images[1] != given.inputs.images[0]).any()
     assert given.targets.masks.any(), "the displaced are not mirrored"
     with pytest.raises(ValueError, match="displaced_share: the bank has no displacements"):
-        jitted_example(replace(bank, displacements=bank.displacements[:, :0]), jax.random.key(1), config=config)
+        jitted_example(
+            replace(bank, displacements=bank.displacements[:, :0]), jax.random.key(1), config=config
+        )
     with pytest.raises(ValueError, match="expected at most input_views, 2"):
         dataclasses.replace(CONFIG, view_counts=(1, 3))
 
@@ -369,7 +429,8 @@ def test_fewer_azimuths_go_around_once():
     around = surroundings.azimuths_from(numbers, 0.7, 0.2, jnp.asarray(4))
     np.testing.assert_allclose(np.diff(around), np.pi / 2, rtol=1e-5)
     np.testing.assert_allclose(
-        surroundings.azimuths_from(numbers, 0.7, 0.2, jnp.asarray(6)), surroundings.azimuths_from(numbers, 0.7, 0.2)
+        surroundings.azimuths_from(numbers, 0.7, 0.2, jnp.asarray(6)),
+        surroundings.azimuths_from(numbers, 0.7, 0.2),
     )
 
 
@@ -381,6 +442,10 @@ def test_a_displaced_body_fills_the_silhouettes_of_the_clothes(body):
         moved = to_silhouettes(person, carrier, np.zeros((len(person.build.joints), 3), np.float32))
         assert moved.shape == carrier.template.shape and np.abs(moved).max() <= 0.15
         rest = shape_body(carrier, jnp.asarray(person.betas)).vertices
-        cloth, rest, far = cKDTree(person.surface.vertices), np.asarray(rest), np.linalg.norm(moved, axis=-1) > 0.005
+        cloth, rest, far = (
+            cKDTree(person.surface.vertices),
+            np.asarray(rest),
+            np.linalg.norm(moved, axis=-1) > 0.005,
+        )
         before, after = (cloth.query(points[far])[0] for points in (rest, rest + moved))
         assert far.sum() > 100 and after.mean() < NEARER * before.mean()

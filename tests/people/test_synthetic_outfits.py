@@ -18,7 +18,9 @@ MILLIMETRES = 4e-3
 
 @pytest.fixture(scope="module")
 def people(body):
-    return [describe(DEMO[i], body) for i in range(150)]  # the first 148 wear everything that there is
+    return [
+        describe(DEMO[i], body) for i in range(150)
+    ]  # the first 148 wear everything that there is
 
 
 def test_people_are_as_tall_as_they_are_described(body, people):
@@ -45,16 +47,24 @@ def test_people_differ(people):
 
 def test_clothes_go_together(people):
     for person in people:
-        count = lambda kinds, person=person: sum(garment.kind in kinds for garment in person.garments)
+        count = lambda kinds, person=person: sum(
+            garment.kind in kinds for garment in person.garments
+        )
         assert count(outfits.DRESSES + outfits.TOPS) >= 1
-        assert count(outfits.DRESSES + outfits.BOTTOMS + outfits.SKIRTS) == count(outfits.SHOES) == 1
+        assert (
+            count(outfits.DRESSES + outfits.BOTTOMS + outfits.SKIRTS) == count(outfits.SHOES) == 1
+        )
         assert count(outfits.HEADWEAR) <= 1 and count(outfits.OUTER) <= 1
         assert not (person.male and count(outfits.DRESSES + outfits.SKIRTS))
 
 
 @pytest.mark.slow
 def test_every_kind_of_garment_and_hair_can_be_built(body, people):
-    missing = set(outfits.KINDS) | set(CUTS) | {"full", "goatee", "moustache", "hood_up", "hood", "lapels", "open"}
+    missing = (
+        set(outfits.KINDS)
+        | set(CUTS)
+        | {"full", "goatee", "moustache", "hood_up", "hood", "lapels", "open"}
+    )
     for person in people:
         own = {g.kind for g in person.garments} | {d for g in person.garments for d in g.details}
         own |= {person.haircut.cut, person.haircut.beard}
@@ -71,7 +81,9 @@ def test_every_kind_of_garment_and_hair_can_be_built(body, people):
         for k, material in enumerate(built.materials):
             chosen = np.unique(s.faces[built.face_materials == k])[::7]
             if len(chosen):
-                colors = material.albedo(Spots(s.attributes["cloth"][chosen], s.attributes["template"][chosen]))
+                colors = material.albedo(
+                    Spots(s.attributes["cloth"][chosen], s.attributes["template"][chosen])
+                )
                 assert colors.shape == (len(chosen), 3) and np.isfinite(colors).all()
                 assert colors.min() > -0.1 and colors.max() < 1.6
     assert not missing
@@ -82,7 +94,9 @@ def test_the_person_of_a_subject_is_its_description(body, people):
     assert [g.kind for g in built.person.garments] == [g.kind for g in people[3].garments]
     np.testing.assert_array_equal(built.betas, people[3].betas)
     skin = built.face_materials == 0
-    assert (built.cover[np.unique(built.surface.faces[~skin])] == -1).all()  # only skin lies under hems
+    assert (
+        built.cover[np.unique(built.surface.faces[~skin])] == -1
+    ).all()  # only skin lies under hems
     assert built.cover.max() > 0.003  # metres
 
 
@@ -114,15 +128,24 @@ def test_a_chest_print_faces_the_viewer_and_a_sleeve_has_its_own_coordinates():
 
 @pytest.mark.slow
 def test_shadows_fall_away_from_the_light():
-    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 33), np.linspace(-0.4, 0.4, 33)), -1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.linspace(-0.4, 0.4, 33), np.linspace(-0.4, 0.4, 33)), -1
+    ).reshape(-1, 2)
     floor = np.stack([grid[:, 0], np.zeros(len(grid)), grid[:, 1]], -1)
     roof = np.stack([0.5 * grid[:, 0], np.full(len(grid), 0.3), 0.5 * grid[:, 1]], -1)
     vertices = np.concatenate([floor, roof]).astype(np.float32)
     normals = np.tile(np.asarray([0, 1, 0], np.float32), (len(vertices), 1))
     up = jnp.asarray([0.0, 1.0, 0.0])
-    lit = np.asarray(surroundings.shaded_vertices(jnp.asarray(vertices), jnp.asarray(normals), up)[1])
+    lit = np.asarray(
+        surroundings.shaded_vertices(jnp.asarray(vertices), jnp.asarray(normals), up)[1]
+    )
     below = np.linalg.norm(floor, axis=1) < 0.1
-    assert lit[: len(floor)][below].max() < 0.75 < 0.95 < lit[: len(floor)][np.abs(floor[:, 0]) > 0.37].min()
+    assert (
+        lit[: len(floor)][below].max()
+        < 0.75
+        < 0.95
+        < lit[: len(floor)][np.abs(floor[:, 0]) > 0.37].min()
+    )
     assert lit[len(floor) :].min() > 0.95  # nothing above the roof
     assert lit.min() >= surroundings.DARKEST
 
@@ -131,7 +154,13 @@ def test_exposure_and_white_balance_scale_the_picture():
     lights = surroundings.sample_lights(np.random.default_rng(0))
     plain = replace(lights, gain=jnp.ones(3))
     warm = replace(lights, gain=jnp.asarray([1.2, 1.0, 0.8]))
-    point = jnp.full((1, 3), 0.2), jnp.asarray([[0.0, 0.0, 1.0]]), jnp.ones(1), jnp.ones(1), jnp.zeros(1)
+    point = (
+        jnp.full((1, 3), 0.2),
+        jnp.asarray([[0.0, 0.0, 1.0]]),
+        jnp.ones(1),
+        jnp.ones(1),
+        jnp.zeros(1),
+    )
     ratio = surroundings.shade(warm, *point) / surroundings.shade(plain, *point)
     np.testing.assert_allclose(ratio, [[1.2, 1.0, 0.8]], rtol=1e-5)
 
@@ -139,5 +168,7 @@ def test_exposure_and_white_balance_scale_the_picture():
 def test_highlights_are_bent_not_cut():
     bright = np.linspace(0, 3, 200, dtype=np.float32)[:, None] * np.ones(3, np.float32)
     bent = np.asarray(surroundings.rolled_off(jnp.asarray(bright)))
-    np.testing.assert_allclose(bent[bright < surroundings.SHOULDER], bright[bright < surroundings.SHOULDER])
+    np.testing.assert_allclose(
+        bent[bright < surroundings.SHOULDER], bright[bright < surroundings.SHOULDER]
+    )
     assert (np.diff(bent, axis=0) > 0).all() and bent.max() < surroundings.WHITEST

@@ -36,7 +36,9 @@ def views(posed):
     result = []
     for i, p in enumerate(posed):
         rng = np.random.default_rng(i)
-        batch = surroundings.cameras_around(rng, p.vertices, surroundings.spread_azimuths(rng, 3), SIZE)
+        batch = surroundings.cameras_around(
+            rng, p.vertices, surroundings.spread_azimuths(rng, 3), SIZE
+        )
         images, masks = zip(*(subject.render_view(p, batch[k]) for k in range(3)), strict=True)
         result.append((batch, np.stack(images), np.stack(masks)))
     return result
@@ -57,7 +59,12 @@ def test_a_seed_is_a_person_bit_for_bit(body, people, posed, views):
 
 def test_different_seeds_are_different_people(people):
     shapes = np.stack([person.betas for person in people])
-    assert np.linalg.norm(shapes[:, None] - shapes[None], axis=-1)[np.triu_indices(len(SEEDS), 1)].min() > 0.5
+    assert (
+        np.linalg.norm(shapes[:, None] - shapes[None], axis=-1)[
+            np.triu_indices(len(SEEDS), 1)
+        ].min()
+        > 0.5
+    )
     assert len({len(person.surface.vertices) for person in people}) > 2
 
 
@@ -69,7 +76,9 @@ def test_other_bodies_are_refused(body):
 def test_meshes_are_sound(people):
     for person in people:
         s = person.surface
-        assert np.isfinite(s.vertices).all() and s.faces.min() == 0 and s.faces.max() < len(s.vertices)
+        assert (
+            np.isfinite(s.vertices).all() and s.faces.min() == 0 and s.faces.max() < len(s.vertices)
+        )
         np.testing.assert_allclose(s.weights.sum(1), 1, atol=1e-4)
         assert (s.weights >= 0).all()
         assert len(person.face_materials) == len(s.faces) < 45_000
@@ -135,14 +144,18 @@ def test_garments_move_with_the_pose(people):
     near_knee = np.linalg.norm(rest - (knee + np.asarray([0, 0.1, 0])), axis=1) < 0.15
     assert np.median(moved[near_knee]) > 0.05
     assert moved[(template[:, 1] > 0.25) & ~is_cloth].max() < 1e-5
-    shifted = person.posed_vertices(rotations, np.asarray([1.0, 2.0, 3.0])) - person.posed_vertices(rotations, np.zeros(3))
+    shifted = person.posed_vertices(rotations, np.asarray([1.0, 2.0, 3.0])) - person.posed_vertices(
+        rotations, np.zeros(3)
+    )
     np.testing.assert_allclose(shifted, np.broadcast_to([1.0, 2.0, 3.0], shifted.shape), atol=1e-5)
 
 
 def test_skin_is_posed_as_the_body_model_poses_it(body, people, posed):
     person, p = people[1], posed[1]
     pose = BodyPose(jax.numpy.asarray(p.rotations), jax.numpy.asarray(p.translation))
-    naked = np.asarray(pose_body(body, shape_body(body, jax.numpy.asarray(person.betas)), pose).vertices)
+    naked = np.asarray(
+        pose_body(body, shape_body(body, jax.numpy.asarray(person.betas)), pose).vertices
+    )
     head = np.unique(person.surface.faces[person.face_materials == 0])
     chosen = head[:: max(1, len(head) // 50)]
     distance = np.linalg.norm(p.vertices[chosen][:, None] - naked[None], axis=-1).min(1)
@@ -151,7 +164,13 @@ def test_skin_is_posed_as_the_body_model_poses_it(body, people, posed):
 
 def test_cameras_follow_the_protocol_and_see_the_whole_person(posed, views):
     for p, (batch, _, masks) in zip(posed, views, strict=True):
-        assert masks[:, 0].max() == masks[:, -1].max() == masks[:, :, 0].max() == masks[:, :, -1].max() == 0
+        assert (
+            masks[:, 0].max()
+            == masks[:, -1].max()
+            == masks[:, :, 0].max()
+            == masks[:, :, -1].max()
+            == 0
+        )
         share = masks.mean((1, 2))
         assert (share > 0.05).all() and (share < 0.5).all()
         center, radius = surroundings.bounding_sphere(p.vertices)
@@ -160,14 +179,18 @@ def test_cameras_follow_the_protocol_and_see_the_whole_person(posed, views):
         assert (distance >= 1.8 * radius - 1e-4).all() and (distance < 2.7 * radius).all()
         elevation = np.rad2deg(np.arcsin(offset[:, 1] / distance))
         assert (elevation > -5.01).all() and (elevation < 15.01).all()
-        np.testing.assert_allclose(2 * np.arctan(SIZE / 2 / np.asarray(batch.K[:, 1, 1])), np.deg2rad(60), rtol=1e-5)
+        np.testing.assert_allclose(
+            2 * np.arctan(SIZE / 2 / np.asarray(batch.K[:, 1, 1])), np.deg2rad(60), rtol=1e-5
+        )
 
 
 def test_masks_are_the_coverage_of_the_pictures(posed, views):
     for p, (batch, images, masks) in zip(posed[:2], views[:2], strict=True):
         black, mask = subject.render_view(p, batch[0], background=0.0)
         np.testing.assert_array_equal(mask, masks[0])
-        np.testing.assert_allclose(images[0] - black, np.broadcast_to(1 - mask[..., None], black.shape), atol=1e-6)
+        np.testing.assert_allclose(
+            images[0] - black, np.broadcast_to(1 - mask[..., None], black.shape), atol=1e-6
+        )
         assert (images[0][mask == 0] == 1).all() and images.min() >= 0 and images.max() <= 1
         assert set(np.unique(mask * 4)) == {0, 1, 2, 3, 4}  # 2 x 2 samples
 

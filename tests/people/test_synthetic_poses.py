@@ -13,7 +13,13 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.people import anatomy as kin
-from humangs_jax.people.poses import STANCES, arm_clearance, pose_hand, sample_rotations, take_stance
+from humangs_jax.people.poses import (
+    STANCES,
+    arm_clearance,
+    pose_hand,
+    sample_rotations,
+    take_stance,
+)
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 CLOSE = 1e-4
@@ -44,7 +50,9 @@ def drawn(build):
 def posed(body):
     """Vertices (n, 3) of the mean body, without translation, for rotations (j, 3)."""
     rest = shape_body(body, jnp.zeros(0))
-    pose = jax.jit(lambda rotations: pose_body(body, rest, BodyPose(rotations, jnp.zeros(3))).vertices)
+    pose = jax.jit(
+        lambda rotations: pose_body(body, rest, BodyPose(rotations, jnp.zeros(3))).vertices
+    )
     return lambda rotations: np.asarray(pose(jnp.asarray(rotations, jnp.float32)))
 
 
@@ -53,8 +61,12 @@ def posed(body):
 def test_halfway_rotations_are_on_the_way(numbers, t):
     a, b = np.asarray(numbers[:3]), np.asarray(numbers[3:])
     middle = kin.between(a, b, t)
-    angle = lambda x, y: np.linalg.norm(kin.rotation_vector(kin.rotation_matrix(x).T @ kin.rotation_matrix(y)))
-    np.testing.assert_allclose([angle(a, middle), angle(middle, b)], [t * angle(a, b), (1 - t) * angle(a, b)], atol=1e-6)
+    angle = lambda x, y: np.linalg.norm(
+        kin.rotation_vector(kin.rotation_matrix(x).T @ kin.rotation_matrix(y))
+    )
+    np.testing.assert_allclose(
+        [angle(a, middle), angle(middle, b)], [t * angle(a, b), (1 - t) * angle(a, b)], atol=1e-6
+    )
 
 
 def test_all_joints_stay_within_their_limits(drawn):
@@ -68,7 +80,9 @@ def test_all_joints_stay_within_their_limits(drawn):
 
 
 def test_knees_elbows_and_fingers_bend_one_way(drawn):
-    assert (drawn[:, [kin.LEFT_KNEE, kin.RIGHT_KNEE], 0] >= -0.03).all()  # rest knees are not quite straight
+    assert (
+        drawn[:, [kin.LEFT_KNEE, kin.RIGHT_KNEE], 0] >= -0.03
+    ).all()  # rest knees are not quite straight
     assert (drawn[:, kin.LEFT_ELBOW, 1] < 0).all() and (drawn[:, kin.RIGHT_ELBOW, 1] > 0).all()
     for first, sign in ((kin.LEFT_HAND, -1), (kin.RIGHT_HAND, 1)):
         bends = sign * drawn[:, first : first + 12, 2]  # towards the palm
@@ -79,7 +93,9 @@ def test_kinematics_are_those_of_the_body_model(body, build, drawn):
     rotations = drawn[3].astype(np.float32)
     _, positions = kin.joint_positions(build, rotations)
     rest = shape_body(body, np.zeros(1, np.float32) + rest_pose(body).translation[:1])
-    pose = jax.jit(pose_body)(body, rest, BodyPose(rotations + rest_pose(body).rotations, rest_pose(body).translation))
+    pose = jax.jit(pose_body)(
+        body, rest, BodyPose(rotations + rest_pose(body).rotations, rest_pose(body).translation)
+    )
     np.testing.assert_allclose(positions, pose.joints, atol=CLOSE)
 
 
@@ -105,7 +121,9 @@ def test_legs_put_the_feet_where_they_are_to_be(x, z, yaw, pitch, lift, sink):
         if foot.pitch >= 0:  # the ball is above its place, the toes are flat
             ball = positions[kin.LEFT_FOOT + side]
             np.testing.assert_allclose(ball[[0, 2]], [foot.x, foot.z], atol=1e-9)
-            np.testing.assert_allclose(ball[1], foot.lift + joints[kin.LEFT_FOOT + side, 1] - build.sole, atol=1e-9)
+            np.testing.assert_allclose(
+                ball[1], foot.lift + joints[kin.LEFT_FOOT + side, 1] - build.sole, atol=1e-9
+            )
             np.testing.assert_allclose(world[kin.LEFT_FOOT + side][1], [0, 1, 0], atol=1e-9)
 
 
@@ -123,7 +141,9 @@ def test_both_soles_are_on_the_ground(body, build, posed):
                 low = [posed(rotations)[sole, 1].min() for sole in soles]
                 gaps.setdefault(name, []).append(abs(low[0] - low[1]))
     assert set(gaps) == set(STANCES) - {"one leg"}
-    assert max(max(values) for values in gaps.values()) < 0.012  # a sole is round where the model of a foot has corners
+    assert (
+        max(max(values) for values in gaps.values()) < 0.012
+    )  # a sole is round where the model of a foot has corners
     assert np.mean(gaps["stand"]) < 1e-3
 
 
@@ -149,8 +169,15 @@ def winding_numbers(points, vertices, faces):
 @jax.jit
 def inside_itself(body, rotations):
     """Which vertices lie inside of another part: 2 mm off along their normal. Meshes are not quite closed (mouth, eyes)."""
-    vertices = pose_body(body, shape_body(body, jnp.zeros(0)), BodyPose(jnp.asarray(rotations), jnp.zeros(3))).vertices
-    return winding_numbers(vertices + 2e-3 * vertex_normals(vertices, body.faces), vertices, body.faces) > 0.6
+    vertices = pose_body(
+        body, shape_body(body, jnp.zeros(0)), BodyPose(jnp.asarray(rotations), jnp.zeros(3))
+    ).vertices
+    return (
+        winding_numbers(
+            vertices + 2e-3 * vertex_normals(vertices, body.faces), vertices, body.faces
+        )
+        > 0.6
+    )
 
 
 @pytest.mark.slow
@@ -158,7 +185,9 @@ def test_hardly_any_of_the_body_is_inside_itself(body, drawn):
     body = decimate(body, 1000)
     at_rest = inside_itself(body, np.zeros((kin.JOINTS, 3), np.float32))
     assert at_rest.mean() < 0.02  # mouth and eyes
-    inside_of = lambda rotations: np.asarray(inside_itself(body, np.float32(rotations)) & ~at_rest).mean()
+    inside_of = lambda rotations: np.asarray(
+        inside_itself(body, np.float32(rotations)) & ~at_rest
+    ).mean()
     inside = [inside_of(rotations) for rotations in drawn[:10]]
     assert np.mean(inside) < INSIDE and np.max(inside) < 0.04
     folded = np.zeros((kin.JOINTS, 3))
@@ -179,7 +208,9 @@ def test_gestures_are_drawn_and_mirrored():
             pose_hand(np.random.default_rng(seed), rotations, side)
             drawn.append(rotations)
             assert not rotations[: kin.LEFT_HAND].any()
-        curls = -sign * np.asarray(drawn)[:, (kin.LEFT_HAND, kin.RIGHT_HAND)[side] + np.arange(12), 2]
+        curls = (
+            -sign * np.asarray(drawn)[:, (kin.LEFT_HAND, kin.RIGHT_HAND)[side] + np.arange(12), 2]
+        )
         index, others = curls[:, :3].mean(1), curls[:, 3:].mean(1)
         assert ((index < 0.3) & (others > 0.8)).any()  # pointing
         assert ((index > 0.9) & (others > 0.9)).any()  # fists

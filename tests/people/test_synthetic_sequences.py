@@ -20,12 +20,22 @@ SUNK = 5e-3
 
 @pytest.fixture(scope="module")
 def build(body):
-    return kin.Build(np.asarray(body.joint_regressor @ body.template, float), body.parents, 0.13, 0.1, 0.08, 0.035)
+    return kin.Build(
+        np.asarray(body.joint_regressor @ body.template, float),
+        body.parents,
+        0.13,
+        0.1,
+        0.08,
+        0.035,
+    )
 
 
 @pytest.fixture(scope="module")
 def drawn(build):
-    return {case: sample_sequence(np.random.default_rng(case[1]), build, FRAMES, case[0]) for case in CASES}
+    return {
+        case: sample_sequence(np.random.default_rng(case[1]), build, FRAMES, case[0])
+        for case in CASES
+    }
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +49,9 @@ def feet(body, drawn):
     pose = jax.jit(lambda r, t: pose_body(body, rest, BodyPose(r, t)).vertices[chosen])
     f32 = lambda x: jnp.asarray(x, jnp.float32)
     return {
-        case: np.stack([pose(f32(r), f32(t)) for r, t in zip(s.rotations, s.translations, strict=True)])
+        case: np.stack(
+            [pose(f32(r), f32(t)) for r, t in zip(s.rotations, s.translations, strict=True)]
+        )
         for case, s in drawn.items()
     }
 
@@ -57,7 +69,9 @@ def test_planted_soles_are_on_the_ground_and_do_not_slide(drawn, feet, case):
         for side in (0, 1):
             if sequence.planted[f : f + 2, side].all():
                 now, then = vertices[f, side], vertices[f + 1, side]
-                touching = (now[:, 1] < lowest[f, side] + 4e-3) & (then[:, 1] < lowest[f + 1, side] + 4e-3)
+                touching = (now[:, 1] < lowest[f, side] + 4e-3) & (
+                    then[:, 1] < lowest[f + 1, side] + 4e-3
+                )
                 slides += np.linalg.norm((then - now)[touching][:, [0, 2]], axis=1).tolist()
     assert len(slides) > 100 and np.mean(slides) < SLIDE / 3 and np.quantile(slides, 0.99) < SLIDE
 
@@ -66,10 +80,14 @@ def test_planted_soles_are_on_the_ground_and_do_not_slide(drawn, feet, case):
 def test_motions_are_smooth(drawn, case):
     sequence = drawn[case]
     matrices = kin.rotation_matrix(sequence.rotations)
-    steps = np.linalg.norm(kin.rotation_vector(np.swapaxes(matrices[:-1], -1, -2) @ matrices[1:]), axis=-1)
+    steps = np.linalg.norm(
+        kin.rotation_vector(np.swapaxes(matrices[:-1], -1, -2) @ matrices[1:]), axis=-1
+    )
     assert steps.max() < np.deg2rad(22)  # a swinging shin makes 500 degrees a second
     assert steps.max() > np.deg2rad(3)  # it moves
-    assert np.linalg.norm(np.diff(sequence.translations, 2, axis=0), axis=1).max() * 30**2 < 12  # m/s^2
+    assert (
+        np.linalg.norm(np.diff(sequence.translations, 2, axis=0), axis=1).max() * 30**2 < 12
+    )  # m/s^2
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -83,7 +101,9 @@ def test_legs_and_arms_keep_to_their_limits(build, drawn, case):
 
 def test_walks_get_on_and_turns_turn(drawn):
     way = lambda s: np.linalg.norm(s.translations[-1] - s.translations[0])
-    heading = lambda s: np.unwrap(np.arctan2(*np.moveaxis(kin.rotation_matrix(s.rotations[:, 0])[:, [0, 2], 2], -1, 0)))
+    heading = lambda s: np.unwrap(
+        np.arctan2(*np.moveaxis(kin.rotation_matrix(s.rotations[:, 0])[:, [0, 2], 2], -1, 0))
+    )
     for case, sequence in drawn.items():
         if case[0] == "walk":
             assert way(sequence) > 0.6
@@ -100,4 +120,6 @@ def test_walks_get_on_and_turns_turn(drawn):
 def test_a_seed_is_a_motion_and_kinds_are_drawn(build, drawn):
     again = sample_sequence(np.random.default_rng(0), build, FRAMES, "walk")
     np.testing.assert_array_equal(again.rotations, drawn["walk", 0].rotations)
-    assert {sample_sequence(np.random.default_rng(seed), build, 2).kind for seed in range(12)} == set(KINDS)
+    assert {
+        sample_sequence(np.random.default_rng(seed), build, 2).kind for seed in range(12)
+    } == set(KINDS)

@@ -27,7 +27,9 @@ def plane(rows=9, columns=12):
     y, x = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1).astype(np.float32)
     weights = np.stack([vertices[:, 0], 1 - vertices[:, 0]], -1)
-    return Surface(vertices, grid_faces(rows, columns, closed=False), weights, {"copy": vertices.copy()})
+    return Surface(
+        vertices, grid_faces(rows, columns, closed=False), weights, {"copy": vertices.copy()}
+    )
 
 
 def area(surface):
@@ -37,16 +39,23 @@ def area(surface):
 
 def test_grid_faces_look_towards_the_viewer():
     surface = plane()
-    np.testing.assert_allclose(vertex_normals(surface.vertices, surface.faces), [[0, 0, 1]] * len(surface.vertices))
+    np.testing.assert_allclose(
+        vertex_normals(surface.vertices, surface.faces), [[0, 0, 1]] * len(surface.vertices)
+    )
 
 
-@pytest.mark.parametrize("slope, level, expected", [(0.0, 0.37, 0.37), (1.0, 0.5, 0.5 * 0.5**2), (0.3, 0.61, 0.61 - 0.15)])
+@pytest.mark.parametrize(
+    "slope, level, expected",
+    [(0.0, 0.37, 0.37), (1.0, 0.5, 0.5 * 0.5**2), (0.3, 0.61, 0.61 - 0.15)],
+)
 def test_a_cut_is_exact(slope, level, expected):
     surface = plane()
     x, y, _ = surface.vertices.T
     kept = cut(surface, level - slope * x - y)
     assert area(kept) == pytest.approx(expected, abs=ROUNDING)
-    np.testing.assert_allclose(kept.attributes["copy"], kept.vertices, atol=ROUNDING)  # attributes move along
+    np.testing.assert_allclose(
+        kept.attributes["copy"], kept.vertices, atol=ROUNDING
+    )  # attributes move along
     np.testing.assert_allclose(kept.weights.sum(1), 1, atol=ROUNDING)
     a, b, c = (kept.vertices[kept.faces[:, i], :2] for i in range(3))
     assert (np.linalg.det(np.stack([b - a, c - a], -1)) > -ROUNDING).all()  # no face turned over
@@ -54,13 +63,17 @@ def test_a_cut_is_exact(slope, level, expected):
     corners = kept.vertices[np.unique(boundary_edges(kept.faces))]
     inner = (corners[:, 0] > 0.01) & (corners[:, 0] < 0.99) & (corners[:, 1] > 0.01)
     on_line = corners[inner, 1] + slope * corners[inner, 0]
-    np.testing.assert_allclose(on_line, level, atol=ROUNDING)  # no cracks: all inner borders are the cut
+    np.testing.assert_allclose(
+        on_line, level, atol=ROUNDING
+    )  # no cracks: all inner borders are the cut
 
 
 def test_both_halves_of_a_cut_make_the_whole_without_gaps():
     surface = plane()
     field = np.sin(5 * surface.vertices[:, 0]) - surface.vertices[:, 1]
-    assert area(join([cut(surface, field), cut(surface, -field)])) == pytest.approx(1.0, abs=ROUNDING)
+    assert area(join([cut(surface, field), cut(surface, -field)])) == pytest.approx(
+        1.0, abs=ROUNDING
+    )
 
 
 def test_smoothing_keeps_hems_in_place_and_flattens_bumps():
@@ -109,7 +122,9 @@ def test_boundaries_of_an_ellipse():
 def test_boundaries_bridge_hollows():
     along, across = ellipse_points()
     hollow = np.linalg.norm(across - [0.0, 0.1], axis=1) < 0.06  # a dent in front
-    found = boundaries(along[~hollow], across[~hollow], np.asarray([-0.1, 0.0, 0.1]), np.zeros((3, 2)), 0.03)
+    found = boundaries(
+        along[~hollow], across[~hollow], np.asarray([-0.1, 0.0, 0.1]), np.zeros((3, 2)), 0.03
+    )
     assert found.radius(np.zeros(1), np.zeros(1))[0] > 0.07
 
 

@@ -14,7 +14,15 @@ from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSa
 from humangs_jax.data.motion import load_motion
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.people import surroundings, writer
-from humangs_jax.people.subject import DEMO, GENERATOR_VERSION, SPLITS, make_subject, render_view, seeds_of, split_of
+from humangs_jax.people.subject import (
+    DEMO,
+    GENERATOR_VERSION,
+    SPLITS,
+    make_subject,
+    render_view,
+    seeds_of,
+    split_of,
+)
 from humangs_jax.people.writer import find_people
 
 SIZE, EIGHT_BITS = 32, 1.01 / 255
@@ -42,7 +50,11 @@ def fast(monkeypatch, made=None):
             made.append(seed)
         if seed % 10 == 7:
             raise ValueError("a hole at the hem")
-        replace_folder(folder, lambda f: (f.mkdir(), (f / "capture.json").write_text(str(seed))), mark="capture.json")
+        replace_folder(
+            folder,
+            lambda f: (f.mkdir(), (f / "capture.json").write_text(str(seed))),
+            mark="capture.json",
+        )
 
     monkeypatch.setattr(writer, "write_person", write_person)
 
@@ -54,12 +66,19 @@ def test_a_written_person_has_all_views_in_all_forms(folder, body):
     np.testing.assert_array_equal(capture.frames, [0, 0, 0, 1, 1, 1, 0, 1])
     np.testing.assert_array_equal(capture.betas, described.betas)
     image, mask = render_view(writer.sample_pose(described, 0), capture.cameras[1])
-    assert np.abs(image - capture.images[1]).max() < EIGHT_BITS and np.abs(mask - capture.masks[1]).max() < EIGHT_BITS
+    assert (
+        np.abs(image - capture.images[1]).max() < EIGHT_BITS
+        and np.abs(mask - capture.masks[1]).max() < EIGHT_BITS
+    )
     held_out = load_capture(person / "held_out", body=body)
     assert held_out.names == ("0_00", "1_00")
     np.testing.assert_array_equal(held_out.pose(0).rotations, capture.pose(0).rotations)
-    assert np.abs(held_out.pose(1).rotations - capture.pose(1).rotations).max() > 0.05  # a novel pose
-    gap = np.linalg.norm(np.asarray(capture.cameras.center)[:3] - np.asarray(held_out.cameras.center)[0], axis=-1)
+    assert (
+        np.abs(held_out.pose(1).rotations - capture.pose(1).rotations).max() > 0.05
+    )  # a novel pose
+    gap = np.linalg.norm(
+        np.asarray(capture.cameras.center)[:3] - np.asarray(held_out.cameras.center)[0], axis=-1
+    )
     assert gap.min() > 1e-3  # no held-out view is an input view
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["generator_version"] == GENERATOR_VERSION and manifest["split"] == "demo"
@@ -83,11 +102,15 @@ def test_close_cameras_are_close_and_outside(seed):
     along = np.einsum("vk,vk->v", center - eyes, forward)
     off_axis = np.linalg.norm(center - eyes - along[:, None] * forward, axis=1)
     assert (off_axis < radius * surroundings.CLOSE_SPREAD + 1e-3).all()  # they look at the person
-    assert (np.arcsin(-forward[:, 1]) > np.deg2rad(-5.1)).all() and (np.arcsin(-forward[:, 1]) < np.deg2rad(15.1)).all()
+    assert (np.arcsin(-forward[:, 1]) > np.deg2rad(-5.1)).all() and (
+        np.arcsin(-forward[:, 1]) < np.deg2rad(15.1)
+    ).all()
 
 
 def test_the_loader_shrinks_a_set_to_smaller_sizes(folder, body):
-    source = lambda size: CaptureSource(CaptureCache(find_people(folder, "demo"), body), ViewSampling(), size, size)
+    source = lambda size: CaptureSource(
+        CaptureCache(find_people(folder, "demo"), body), ViewSampling(), size, size
+    )
     small, large = (Loader(source(size), 1).batch_at(0).inputs for size in (SIZE // 2, SIZE))
     blocks = np.asarray(large.images).reshape(1, 4, SIZE // 2, 2, SIZE // 2, 2, 3)
     np.testing.assert_allclose(small.images, blocks.mean((3, 5)), atol=1e-6)
@@ -104,10 +127,14 @@ def test_sequences_are_written_with_their_motion_and_a_scan(tmp_path, body):
     np.testing.assert_array_equal(capture.frames, [0, 1, 2])
     for frame, of_motion in enumerate((0, 10, 19)):  # evenly spaced
         np.testing.assert_array_equal(capture.pose(frame).rotations, motion.rotations[of_motion])
-        np.testing.assert_array_equal(capture.pose(frame).translation, motion.translations[of_motion])
+        np.testing.assert_array_equal(
+            capture.pose(frame).translation, motion.translations[of_motion]
+        )
     scan = json.loads((person / "scan" / "scan.json").read_text())
     np.testing.assert_allclose(scan["rotations"], capture.pose(0).rotations, atol=1e-6)
-    assert {"scan.obj", "scan.glb", "material.mtl"} <= {path.name for path in (person / "scan").iterdir()}
+    assert {"scan.obj", "scan.glb", "material.mtl"} <= {
+        path.name for path in (person / "scan").iterdir()
+    }
 
 
 def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
@@ -115,7 +142,9 @@ def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
     fast(monkeypatch, made)
     layout = writer.Layout(SIZE, views=2)
     write = lambda count, **changes: writer.write_set(
-        tmp_path, count, **{"layout": layout, "split": "demo", "body": BODY, "progress": False} | changes
+        tmp_path,
+        count,
+        **{"layout": layout, "split": "demo", "body": BODY, "progress": False} | changes,
     )
     write(2)
     write(4)
@@ -127,13 +156,17 @@ def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="split 'demo' -> 'train'"):
         write(4, split="train")
     monkeypatch.setattr("humangs_jax.people.writer.GENERATOR_VERSION", GENERATOR_VERSION + 1)
-    with pytest.raises(ValueError, match=f"generator_version {GENERATOR_VERSION} -> {GENERATOR_VERSION + 1}"):
+    with pytest.raises(
+        ValueError, match=f"generator_version {GENERATOR_VERSION} -> {GENERATOR_VERSION + 1}"
+    ):
         write(4)
 
 
 def test_people_that_cannot_be_made_are_named_and_the_others_written(tmp_path, monkeypatch):
     fast(monkeypatch)
-    with pytest.raises(ValueError, match=f"1 of 9 people could not be made, the first of them {DEMO[7]}: a hole"):
+    with pytest.raises(
+        ValueError, match=f"1 of 9 people could not be made, the first of them {DEMO[7]}: a hole"
+    ):
         writer.write_set(tmp_path, 9, writer.Layout(SIZE), "demo", body=BODY, progress=False)
     assert len(json.loads((tmp_path / "manifest.json").read_text())["subjects"]) == 8
 
@@ -144,9 +177,16 @@ def test_processes_write_the_same_files(tmp_path):
     alone, together = tmp_path / "alone", tmp_path / "together"
     writer.write_set(alone, 3, layout, "demo", progress=False)
     writer.write_set(together, 3, layout, "demo", workers=2, progress=False)
-    read = lambda file: file.read_bytes() if file.suffix != ".npz" else {k: x.tolist() for k, x in np.load(file).items()}
+    read = lambda file: (
+        file.read_bytes()
+        if file.suffix != ".npz"
+        else {k: x.tolist() for k, x in np.load(file).items()}
+    )
     # an npz tells when it was written
-    contents = [{file.relative_to(root): read(file) for file in root.rglob("*.*")} for root in (alone, together)]
+    contents = [
+        {file.relative_to(root): read(file) for file in root.rglob("*.*")}
+        for root in (alone, together)
+    ]
     assert contents[0] == contents[1] and len(contents[0]) == 1 + 3 * (2 + 2 * 2)
 
 
@@ -193,7 +233,9 @@ def test_the_splits_share_no_seed():
     """Ranges are intervals: what is not in order after sorting overlaps."""
     ranges = sorted(SPLITS.values(), key=lambda r: r.start)
     assert all(a.stop <= b.start for a, b in itertools.pairwise(ranges))
-    assert all(r.step == 1 and 0 <= r.start < r.stop <= 2**32 for r in ranges)  # seeds are words of keys
+    assert all(
+        r.step == 1 and 0 <= r.start < r.stop <= 2**32 for r in ranges
+    )  # seeds are words of keys
     assert all(split_of(r[0]) == name == split_of(r[-1]) for name, r in SPLITS.items())
     with pytest.raises(ValueError, match="no range"):
         split_of(SPLITS["demo"].stop)
@@ -202,6 +244,10 @@ def test_the_splits_share_no_seed():
 def test_nobody_is_written_beyond_the_end_of_a_split(tmp_path, monkeypatch):
     fast(monkeypatch, made := [])
     with pytest.raises(ValueError, match="reach beyond the split"):
-        writer.write_set(tmp_path, 3, LAYOUT, "test", len(SPLITS["test"]) - 2, body=BODY, progress=False)
-    writer.write_set(tmp_path, 2, LAYOUT, "test", len(SPLITS["test"]) - 2, body=BODY, progress=False)
+        writer.write_set(
+            tmp_path, 3, LAYOUT, "test", len(SPLITS["test"]) - 2, body=BODY, progress=False
+        )
+    writer.write_set(
+        tmp_path, 2, LAYOUT, "test", len(SPLITS["test"]) - 2, body=BODY, progress=False
+    )
     assert [split_of(seed) for seed in made] == ["test", "test"]

@@ -23,9 +23,21 @@ def toy_avatar(body, shade):
     n = len(rest.vertices)
     colors = jnp.clip(0.5 + 0.4 * jnp.sin(9 * rest.vertices) + shade, 0.05, 0.95)
     gaussians = Gaussians(
-        rest.vertices, jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (n, 1)), jnp.full((n, 3), 0.03), jnp.full(n, 0.8), colors
+        rest.vertices,
+        jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (n, 1)),
+        jnp.full((n, 3), 0.03),
+        jnp.full(n, 0.8),
+        colors,
     )
-    return Avatar(gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names)
+    return Avatar(
+        gaussians,
+        body.skinning_weights,
+        rest.vertices,
+        rest.joints,
+        body.faces,
+        body.parents,
+        body.joint_names,
+    )
 
 
 def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
@@ -41,12 +53,18 @@ def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
     )
     rng = np.random.default_rng(0)
     rotations = 0.2 * rng.normal(size=(views, 55, 3)) * moving
-    arrays = dict(rotations=rotations, translations=np.zeros((views, 3)), frames=np.arange(views), body=body)
+    arrays = dict(
+        rotations=rotations, translations=np.zeros((views, 3)), frames=np.arange(views), body=body
+    )
     blank = np.ones((views, HEIGHT, WIDTH, 3))
-    capture = capture_from_arrays(blank, cameras.K, cameras.cam_from_world, masks=blank[..., 0], **arrays)
+    capture = capture_from_arrays(
+        blank, cameras.K, cameras.cam_from_world, masks=blank[..., 0], **arrays
+    )
     drawn = capture_renderings(avatar, capture)[1]
     images = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
-    return dataclasses.replace(capture, images=images, masks=np.stack([np.asarray(r.alpha) for r in drawn]))
+    return dataclasses.replace(
+        capture, images=images, masks=np.stack([np.asarray(r.alpha) for r in drawn])
+    )
 
 
 FEW = 0.03
@@ -57,4 +75,6 @@ def assert_nearly_all_close(got, expected, atol):
     """Two pytrees of one structure."""
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         differ = np.abs(np.asarray(a) - np.asarray(b)) > atol
-        assert differ.mean() < FEW, f"{differ.sum()} of {differ.size} numbers differ by more than {atol}"
+        assert differ.mean() < FEW, (
+            f"{differ.sum()} of {differ.size} numbers differ by more than {atol}"
+        )

@@ -34,7 +34,9 @@ def same_head_buffers(monkeypatch):
 
 
 def of_head(avatar, region=HEAD):
-    columns = [i for i, name in enumerate(avatar.joint_names) if any(part in name for part in region)]
+    columns = [
+        i for i, name in enumerate(avatar.joint_names) if any(part in name for part in region)
+    ]
     return np.asarray(avatar.skinning_weights)[:, columns].sum(axis=1) > 0.5
 
 
@@ -65,11 +67,17 @@ def test_crops_show_the_head(four):
     assert set(np.flatnonzero(crops.moved)) <= set(crops.drawn.tolist())
     assert len(crops.views.images) == 4 and crops.views.cameras.height < HEIGHT
     assert float(crops.views.masks.mean()) > 0.2
-    larger = head_crops(avatar, capture, RefineConfig(image_size=HEIGHT // 2))  # of the photos as they are
+    larger = head_crops(
+        avatar, capture, RefineConfig(image_size=HEIGHT // 2)
+    )  # of the photos as they are
     assert larger.finer and not crops.finer
-    np.testing.assert_allclose(larger.views.cameras.K[:, 0, 0], crops.views.cameras.K[:, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(
+        larger.views.cameras.K[:, 0, 0], crops.views.cameras.K[:, 0, 0], rtol=1e-6
+    )
     neck = ("neck", "collar")
-    np.testing.assert_array_equal(head_crops(avatar, capture, RefineConfig(region=neck)).moved, of_head(avatar, neck))
+    np.testing.assert_array_equal(
+        head_crops(avatar, capture, RefineConfig(region=neck)).moved, of_head(avatar, neck)
+    )
 
 
 def test_a_camera_that_has_the_head_behind_it_is_left_out(four):
@@ -85,9 +93,14 @@ def test_a_camera_that_has_the_head_behind_it_is_left_out(four):
 def test_where_no_photo_shows_a_head_there_are_no_crops(four, spoil):
     avatar, capture = four
     if spoil == "no head":
-        avatar = replace(avatar, joint_names=tuple(f"bone_{i}" for i in range(len(avatar.joint_names))))
+        avatar = replace(
+            avatar, joint_names=tuple(f"bone_{i}" for i in range(len(avatar.joint_names)))
+        )
     elif spoil == "nobody opaque":
-        avatar = replace(avatar, gaussians=replace(avatar.gaussians, opacities=jnp.zeros(len(avatar.gaussians.means))))
+        avatar = replace(
+            avatar,
+            gaussians=replace(avatar.gaussians, opacities=jnp.zeros(len(avatar.gaussians.means))),
+        )
     else:
         away = avatar.gaussians.means + 9.0 * of_head(avatar)[:, None]
         avatar = replace(avatar, gaussians=replace(avatar.gaussians, means=away))
@@ -95,10 +108,13 @@ def test_where_no_photo_shows_a_head_there_are_no_crops(four, spoil):
 
 
 @pytest.mark.parametrize(
-    ("longest", "image_size", "expected"), [(512, None, True), (2000, 512, True), (2000, 256, False), (256, None, False)]
+    ("longest", "image_size", "expected"),
+    [(512, None, True), (2000, 512, True), (2000, 256, False), (256, None, False)],
 )
 def test_photos_must_be_large_enough(four, longest, image_size, expected):
-    capture = dataclasses.replace(four[1], images=np.zeros((4, longest, 4, 3), np.float32), masks=None)
+    capture = dataclasses.replace(
+        four[1], images=np.zeros((4, longest, 4, 3), np.float32), masks=None
+    )
     assert shows_heads(capture, RefineConfig(image_size=image_size)) == expected
 
 
@@ -111,7 +127,10 @@ def test_colors_count_in_the_mask_and_excess_alpha_costs_more(four):
     assert loss(photo.image + 0.3 * outside, photo.mask) == pytest.approx(exact, abs=1e-6)
     assert loss(photo.image + 0.3 * inside, photo.mask) > 1e-3
     change = 0.1 * (photo.mask == 0), 0.1 * (photo.mask > 0.5)
-    grown, shrunk = loss(photo.image, photo.mask + change[0]), loss(photo.image, photo.mask - change[1])
+    grown, shrunk = (
+        loss(photo.image, photo.mask + change[0]),
+        loss(photo.image, photo.mask - change[1]),
+    )
     assert grown / change[0].mean() > 5 * shrunk / change[1].mean()
 
 

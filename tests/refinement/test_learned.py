@@ -44,7 +44,9 @@ def scene(body):
     avatar = toy_avatar(body, 0.0)
     views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
     photo = photos_of(views)[0]
-    splat = dataclasses.replace(plan_buffers(avatar.gaussians, views.cameras, margin=2.0), visibility=True)
+    splat = dataclasses.replace(
+        plan_buffers(avatar.gaussians, views.cameras, margin=2.0), visibility=True
+    )
     return avatar, photo, parameters_of(avatar.gaussians), splat
 
 
@@ -58,7 +60,9 @@ def drawn(scene, parameters):
 
 def signals_of(scene, photo=None):
     avatar, own, parameters, splat = scene
-    return jax.jit(photo_signals, static_argnames="splat")(parameters, avatar, photo or own, splat)[0]
+    return jax.jit(photo_signals, static_argnames="splat")(parameters, avatar, photo or own, splat)[
+        0
+    ]
 
 
 def test_neighbors_are_mutual_and_near():
@@ -76,7 +80,9 @@ def test_neighbors_are_mutual_and_near():
 def test_the_gradient_of_the_mean_is_its_transpose():
     rng = np.random.default_rng(2)
     graph = neighbors_of(rng.normal(size=(60, 3)), 6)
-    matrix = np.stack([np.asarray(neighbor_mean(column[:, None], graph))[:, 0] for column in jnp.eye(60)], axis=1)
+    matrix = np.stack(
+        [np.asarray(neighbor_mean(column[:, None], graph))[:, 0] for column in jnp.eye(60)], axis=1
+    )
     values, cotangent = (jnp.asarray(rng.normal(size=(60, 2)), jnp.float32) for _ in range(2))
     mean, pull_back = jax.vjp(lambda x: neighbor_mean(x, graph), values)
     np.testing.assert_allclose(mean, matrix @ values, atol=ROUNDING)
@@ -96,7 +102,10 @@ def test_clusters_are_of_equal_size_and_near():
 def test_every_gaussian_is_in_a_cluster_whatever_their_number(count):
     means = np.random.default_rng(5).normal(size=(count, 3))
     graph = jax.tree.map(np.asarray, graph_of(means))
-    assert set(graph.members.ravel()) == set(range(count)) and graph.members.shape == (512, -(-count // 512))
+    assert set(graph.members.ravel()) == set(range(count)) and graph.members.shape == (
+        512,
+        -(-count // 512),
+    )
     assert graph.nearest.shape == graph.weights.shape == (count, 4)
     np.testing.assert_allclose(graph.weights.sum(axis=1), 1, atol=ROUNDING)
     assert (np.diff(graph.weights, axis=1) <= 0).all()
@@ -108,7 +117,9 @@ def test_clusters_carry_what_one_end_knows_to_the_other(scene):
     values, graph = stacked(parameters), graph_of(np.asarray(avatar.gaussians.means))
     signals = jax.tree.map(lambda x: x[None], signals_of(scene))
     hidden = jnp.zeros((len(values), Refiner.width))
-    moves = lambda hidden: iterate(load_refiner(), values, values, hidden, signals, graph, avatar)[0] - values
+    moves = lambda hidden: (
+        iterate(load_refiner(), values, values, hidden, signals, graph, avatar)[0] - values
+    )
     lowest, highest = np.argsort(np.asarray(values[:, 1]))[[0, -1]]
     changed = moves(hidden.at[lowest].set(10.0)) - moves(hidden)
     assert np.abs(changed[highest]).max() > 0
@@ -124,7 +135,9 @@ def test_parameters_side_by_side_and_back(scene):
 def test_pixels_are_the_sums_of_the_weights(scene):
     signals, rendering = signals_of(scene), drawn(scene, scene[2])
     per_person = PERSON / float(scene[1].mask.sum())
-    assert float(signals.pixels.sum()) == pytest.approx(per_person * float(rendering.alpha.sum()), rel=1e-4)
+    assert float(signals.pixels.sum()) == pytest.approx(
+        per_person * float(rendering.alpha.sum()), rel=1e-4
+    )
     assert (np.asarray(signals.pixels) >= -ROUNDING).all()
     np.testing.assert_allclose(signals.visibility, rendering.visibility, atol=ROUNDING)
 
@@ -140,15 +153,21 @@ def test_gradients_are_those_of_the_squared_error(scene):
         return (np.asarray(photo.mask, np.float64)[..., None] * squared).sum()
 
     slope = (error(DIFFERENCE) - error(-DIFFERENCE)) / (2 * DIFFERENCE)
-    gradient = np.asarray(signals_of(scene).gradients)[most, 11:].sum() * float(photo.mask.sum()) / PERSON
+    gradient = (
+        np.asarray(signals_of(scene).gradients)[most, 11:].sum() * float(photo.mask.sum()) / PERSON
+    )
     assert gradient == pytest.approx(slope, rel=DIFFERENCES)
 
 
 def test_the_background_says_nothing_of_colors_but_something_of_the_rest(scene):
-    photo = replace(scene[1], mask=jnp.round(scene[1].mask))  # the rims of Gaussians stand before the background
+    photo = replace(
+        scene[1], mask=jnp.round(scene[1].mask)
+    )  # the rims of Gaussians stand before the background
     black = replace(photo, image=photo.mask[..., None] * photo.image)
     before, after = (np.asarray(signals_of(scene, x).gradients) for x in (photo, black))
-    np.testing.assert_allclose(after[:, 11:], before[:, 11:], atol=ROUNDING * np.abs(before[:, 11:]).max())
+    np.testing.assert_allclose(
+        after[:, 11:], before[:, 11:], atol=ROUNDING * np.abs(before[:, 11:]).max()
+    )
     assert np.abs(after - before)[:, :11].max() > 0.01 * np.abs(before[:, :11]).max()
 
 
@@ -163,7 +182,9 @@ def test_untrained_it_changes_nothing_and_trained_it_does(scene):
     values, graph = stacked(parameters), graph_of(np.asarray(avatar.gaussians.means))
     signals = jax.tree.map(lambda x: x[None], signals_of(scene))
     hidden = jnp.zeros((len(values), Refiner.width))
-    fresh = jax.jit(Refiner().init)(jax.random.key(0), values, values, hidden, signals, graph, jnp.zeros(3))
+    fresh = jax.jit(Refiner().init)(
+        jax.random.key(0), values, values, hidden, signals, graph, jnp.zeros(3)
+    )
     shipped = load_refiner()
     assert jax.tree.map(jnp.shape, fresh) == jax.tree.map(jnp.shape, shipped)
     same, carried = iterate(fresh, values, values, hidden, signals, graph, avatar)
@@ -177,9 +198,18 @@ def test_the_order_of_photos_does_not_matter(scene):
     avatar, _, parameters, _ = scene
     rng, values = np.random.default_rng(3), stacked(parameters)
     graph, g = graph_of(np.asarray(avatar.gaussians.means)), len(values)
-    signals = Signals(*(jnp.asarray(rng.random(shape), jnp.float32) for shape in ((3, g, COLUMNS), (3, g), (3, g))))
-    run = lambda s: iterate(load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar)[0]
-    np.testing.assert_allclose(run(signals), run(jax.tree.map(lambda x: x[::-1], signals)), atol=ROUNDING)
+    signals = Signals(
+        *(
+            jnp.asarray(rng.random(shape), jnp.float32)
+            for shape in ((3, g, COLUMNS), (3, g), (3, g))
+        )
+    )
+    run = lambda s: iterate(
+        load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar
+    )[0]
+    np.testing.assert_allclose(
+        run(signals), run(jax.tree.map(lambda x: x[::-1], signals)), atol=ROUNDING
+    )
 
 
 def test_weights_are_read_as_written(tmp_path, monkeypatch):
@@ -191,13 +221,20 @@ def test_weights_are_read_as_written(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_fit(scene, monkeypatch):
+def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_fit(
+    scene, monkeypatch
+):
     avatar, photo, parameters, splat = scene
     looked, signals = [], learned.photo_signals
-    watched = lambda parameters, avatar, photo, *how: looked.append(id(photo)) or signals(parameters, avatar, photo, *how)
+    watched = lambda parameters, avatar, photo, *how: (
+        looked.append(id(photo)) or signals(parameters, avatar, photo, *how)
+    )
     monkeypatch.setattr(learned, "photo_signals", watched)
     photos = [replace(photo) for _ in range(9)]
-    graph, small = graph_of(np.asarray(avatar.gaussians.means)), dataclasses.replace(splat, max_pairs=64)
+    graph, small = (
+        graph_of(np.asarray(avatar.gaussians.means)),
+        dataclasses.replace(splat, max_pairs=64),
+    )
     assert learned_update(parameters, avatar, photos, graph, 1, small)[1] > 0
     assert looked == [id(photos[i]) for i in (0, 1, 3, 4, 6, 7)]
 
@@ -206,7 +243,9 @@ def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_f
 def test_what_only_the_avatar_after_the_iterations_shows_moves_in_steps(scene, body, monkeypatch):
     """A Gaussian that is hidden at the start and seen after the iterations gets trust."""
     gaussians = scene[0].gaussians
-    hidden = replace(scene[0], gaussians=replace(gaussians, opacities=gaussians.opacities.at[0].set(0)))
+    hidden = replace(
+        scene[0], gaussians=replace(gaussians, opacities=gaussians.opacities.at[0].set(0))
+    )
     shown = lambda parameters, *_: (
         replace(parameters, opacity_logits=jnp.full_like(parameters.opacity_logits, 4.0)),
         jnp.zeros((), int),
@@ -230,14 +269,30 @@ def worse(parameters, *_):
 
 @pytest.mark.parametrize(
     ("update", "steps"),
-    [pytest.param(interrupted, 0, marks=pytest.mark.slow), (worse, 0), pytest.param(worse, 1, marks=pytest.mark.slow)],
+    [
+        pytest.param(interrupted, 0, marks=pytest.mark.slow),
+        (worse, 0),
+        pytest.param(worse, 1, marks=pytest.mark.slow),
+    ],
 )
-def test_without_useful_iterations_the_avatar_is_that_of_the_steps_alone(update, steps, scene, body, monkeypatch):
+def test_without_useful_iterations_the_avatar_is_that_of_the_steps_alone(
+    update, steps, scene, body, monkeypatch
+):
     monkeypatch.setattr(search, "learned_update", update)
     config = dataclasses.replace(STEPS, iterations=2, steps=steps, held_out=0.3)
-    report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
-    assert report.interrupted == (update is interrupted) and (report.iterations, report.steps) == (0, steps)
+    report = refinement.refine_with_report(
+        scene[0], toy_capture(body, toy_avatar(body, 0.15)), config
+    )
+    assert report.interrupted == (update is interrupted) and (report.iterations, report.steps) == (
+        0,
+        steps,
+    )
     if not steps:
         assert not report.kept
         jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])
-    assert np.abs(np.asarray(report.avatar.gaussians.means) - np.asarray(scene[0].gaussians.means)).max() < ONE_STEP
+    assert (
+        np.abs(
+            np.asarray(report.avatar.gaussians.means) - np.asarray(scene[0].gaussians.means)
+        ).max()
+        < ONE_STEP
+    )

@@ -32,10 +32,18 @@ def with_pose_off(capture, view, joints):
     rotations, axes = np.array(capture.poses.rotations)[frames], np.asarray([[0.0, 1.0, 0.0]])
     if joints > 1:
         axes = np.random.default_rng(view).normal(size=(joints, 3))
-    turns = Rotation.from_rotvec(np.radians(10) * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    turns = Rotation.from_rotvec(
+        np.radians(10) * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    )
     rotations[view, :joints] = (turns * Rotation.from_rotvec(rotations[view, :joints])).as_rotvec()
-    poses = replace(capture.poses, rotations=jnp.asarray(rotations), translation=jnp.asarray(capture.poses.translation)[frames])
-    return dataclasses.replace(capture, poses=poses, frames=np.arange(len(frames), dtype=frames.dtype))
+    poses = replace(
+        capture.poses,
+        rotations=jnp.asarray(rotations),
+        translation=jnp.asarray(capture.poses.translation)[frames],
+    )
+    return dataclasses.replace(
+        capture, poses=poses, frames=np.arange(len(frames), dtype=frames.dtype)
+    )
 
 
 WRONG = {

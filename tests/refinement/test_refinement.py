@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from refinement_cases import HEIGHT, STEPS, WIDTH, assert_nearly_all_close, toy_avatar, toy_capture
 
-from humangs_jax.avatar.animate import pixel_sizes, with_low_pass, with_low_pass_of, without_low_pass
+from humangs_jax.avatar.animate import (
+    pixel_sizes,
+    with_low_pass,
+    with_low_pass_of,
+    without_low_pass,
+)
 from humangs_jax.avatar.frames import capture_renderings, posed
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
@@ -36,7 +41,10 @@ def test_comes_closer_to_photos_of_a_moving_person(person):
     so_far = []
     report = refinement.refine_with_report(avatar, capture, STEPS, watch=so_far.append)
     assert report.kept and report.steps == 12
-    assert len(so_far) == STEPS.checks and (so_far[0].gaussians.colors != so_far[-1].gaussians.colors).any()
+    assert (
+        len(so_far) == STEPS.checks
+        and (so_far[0].gaussians.colors != so_far[-1].gaussians.colors).any()
+    )
     assert report.loss[1] < 0.8 * report.loss[0]
     assert report.psnr[1] > report.psnr[0] + 1
     assert "12 steps" in report.summary()
@@ -67,7 +75,10 @@ def test_refined_avatars_look_the_same_at_other_sizes(person):
     assert refined.gaussians.low_pass is not None and avatar.gaussians.low_pass is None
     assert jnp.abs(drawn(refined, camera) - drawn(raw, camera)).mean() < SAME_SIZE
     reduced = drawn(raw, camera).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
-    errors = [float(jnp.abs(drawn(a, camera.resized(WIDTH // 2, HEIGHT // 2)) - reduced).mean()) for a in (refined, raw)]
+    errors = [
+        float(jnp.abs(drawn(a, camera.resized(WIDTH // 2, HEIGHT // 2)) - reduced).mean())
+        for a in (refined, raw)
+    ]
     assert errors[0] < 0.7 * errors[1]
     again = refinement.refine(refined, capture, dataclasses.replace(STEPS, steps=2))
     np.testing.assert_allclose(again.gaussians.low_pass, refined.gaussians.low_pass, rtol=0.01)
@@ -87,15 +98,23 @@ def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     own = with_low_pass(avatar, times * pixel_sizes(avatar, views))
     start = with_low_pass_of(own, views)
     # those of smaller pixels are dimmed where a photo shows the person smaller than another does
-    np.testing.assert_allclose(squared_error(start, capture), squared_error(own, capture), rtol=0.01)
+    np.testing.assert_allclose(
+        squared_error(start, capture), squared_error(own, capture), rtol=0.01
+    )
     expected = own.gaussians.low_pass * min(1, 1 / times)
     np.testing.assert_allclose(start.gaussians.low_pass, expected, rtol=1e-5)
     report = refinement.refine_with_report(own, capture, STEPS)
     errors = [squared_error(own, capture), squared_error(report.avatar, capture)]
-    np.testing.assert_allclose(np.diff(report.psnr), -10 * np.diff(np.log10(errors)), atol=SAME_GAIN)
+    np.testing.assert_allclose(
+        np.diff(report.psnr), -10 * np.diff(np.log10(errors)), atol=SAME_GAIN
+    )
     assert report.kept and errors[1] < errors[0]
-    views_alone, _ = refine_views(own, views, STEPS, SplatConfig(max_pairs=1 << 14, max_rows=1 << 13), 0)
-    np.testing.assert_allclose(squared_error(views_alone, capture), errors[0], rtol=0.01)  # dimmed, as above
+    views_alone, _ = refine_views(
+        own, views, STEPS, SplatConfig(max_pairs=1 << 14, max_rows=1 << 13), 0
+    )
+    np.testing.assert_allclose(
+        squared_error(views_alone, capture), errors[0], rtol=0.01
+    )  # dimmed, as above
 
 
 @pytest.mark.slow
@@ -104,15 +123,21 @@ def test_photos_from_near_and_far_are_fitted_together(body, person):
     avatar, _ = person
     photos = toy_capture(body, toy_avatar(body, 0.1), distance=jnp.asarray([2.5, 5.0, 12.0]))
     report = refinement.refine_with_report(avatar, photos, STEPS)
-    assert report.kept and squared_error(report.avatar, photos) < 0.8 * squared_error(avatar, photos)
+    assert report.kept and squared_error(report.avatar, photos) < 0.8 * squared_error(
+        avatar, photos
+    )
     nearest = pixel_sizes(avatar, crop_to_person(photos))
     np.testing.assert_array_equal(report.avatar.gaussians.low_pass, nearest)
-    assert jnp.median(nearest) < 0.5 * 12.0 / float(photos.cameras.K[0, 0, 0])  # heads and feet are not in all frames
+    assert jnp.median(nearest) < 0.5 * 12.0 / float(
+        photos.cameras.K[0, 0, 0]
+    )  # heads and feet are not in all frames
 
 
 def test_what_no_photo_has_in_its_frame_has_the_pixels_of_the_rest(person):
     avatar, capture = person
-    away = replace(avatar, gaussians=replace(avatar.gaussians, means=avatar.gaussians.means.at[0].add(50.0)))
+    away = replace(
+        avatar, gaussians=replace(avatar.gaussians, means=avatar.gaussians.means.at[0].add(50.0))
+    )
     sizes = pixel_sizes(away, crop_to_person(capture))
     assert sizes[0] == sizes[1:].max()
 
@@ -128,7 +153,12 @@ def test_interruption_returns_the_best_state(person, monkeypatch):
 
     stepping(monkeypatch, interrupted)
     report = refinement.refine_with_report(*person, STEPS)
-    assert report.interrupted and report.steps == 8 and report.kept and "interrupted" in report.summary()
+    assert (
+        report.interrupted
+        and report.steps == 8
+        and report.kept
+        and "interrupted" in report.summary()
+    )
 
 
 @pytest.mark.slow
@@ -138,7 +168,10 @@ def test_pure_function_maps_over_people(person):
     other = replace(avatar, gaussians=replace(avatar.gaussians, colors=1 - avatar.gaussians.colors))
     splat = plan_buffers(avatar.gaussians, views.cameras, margin=3.0)
     run = lambda avatar, views: refine_views(avatar, views, STEPS, splat, 4)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), avatar, other), jax.tree.map(lambda x: jnp.stack([x, x]), views)
+    stacked = (
+        jax.tree.map(lambda *x: jnp.stack(x), avatar, other),
+        jax.tree.map(lambda x: jnp.stack([x, x]), views),
+    )
     batch, overflow = jax.jit(jax.vmap(run))(*stacked)
     assert not overflow.any()
     for i, one in enumerate((avatar, other)):
@@ -159,23 +192,32 @@ def test_crops_show_the_same_pixels(person):
     wide = np.pad(capture.images, ((0, 0), (40, 40), (30, 70), (0, 0)), constant_values=1.0)
     masks = np.pad(capture.masks, ((0, 0), (40, 40), (30, 70)))
     K = np.asarray(capture.cameras.K) + np.asarray([[0, 0, 30], [0, 0, 40], [0, 0, 0]])
-    cameras = replace(capture.cameras, K=jnp.asarray(K, jnp.float32), width=WIDTH + 100, height=HEIGHT + 80)
+    cameras = replace(
+        capture.cameras, K=jnp.asarray(K, jnp.float32), width=WIDTH + 100, height=HEIGHT + 80
+    )
     views = crop_to_person(dataclasses.replace(capture, images=wide, masks=masks, cameras=cameras))
     assert views.masks.shape[1] < HEIGHT + 80 and views.masks.shape[2] < WIDTH + 100
     assert views.masks.sum() == pytest.approx(masks.sum(), rel=1e-6)
     gaussians = posed(avatar, capture.pose(1))
     drawn = render(gaussians, views.cameras[1], background=jnp.ones(3))
     whole = render(gaussians, cameras[1])
-    rows, columns = (np.asarray(cameras.K[1] - views.cameras.K[1])[i, 2].astype(int) for i in (1, 0))
+    rows, columns = (
+        np.asarray(cameras.K[1] - views.cameras.K[1])[i, 2].astype(int) for i in (1, 0)
+    )
     height, width = drawn.alpha.shape
-    np.testing.assert_allclose(drawn.rgb, whole.rgb[rows : rows + height, columns : columns + width], atol=1e-5)
+    np.testing.assert_allclose(
+        drawn.rgb, whole.rgb[rows : rows + height, columns : columns + width], atol=1e-5
+    )
 
 
 def test_specks_of_a_mask_do_not_widen_the_crops():
     capture = load_capture("demo_capture")
     masks = capture.masks.copy()
     masks[2, :2, :3] = masks[3, -1, -1] = 1
-    crops, specked = crop_to_person(capture), crop_to_person(dataclasses.replace(capture, masks=masks))
+    crops, specked = (
+        crop_to_person(capture),
+        crop_to_person(dataclasses.replace(capture, masks=masks)),
+    )
     assert crops.images.shape[1:3] != capture.images.shape[1:3]
     np.testing.assert_array_equal(specked.images, crops.images)
     np.testing.assert_array_equal(specked.cameras.K, crops.cameras.K)
@@ -203,7 +245,9 @@ def test_wrong_captures_are_named(person):
         refinement.refine(avatar, capture.select([]))
     with pytest.raises(ValueError, match="no masks"):
         refinement.refine(avatar, dataclasses.replace(capture, masks=None))
-    few = dataclasses.replace(capture, poses=replace(capture.poses, rotations=capture.poses.rotations[:, :20]))
+    few = dataclasses.replace(
+        capture, poses=replace(capture.poses, rotations=capture.poses.rotations[:, :20])
+    )
     with pytest.raises(ValueError, match="20 joints, the avatar has 55"):
         refinement.refine(avatar, few)
 
@@ -223,8 +267,12 @@ def test_long_runs_after_iterations_take_smaller_steps(iterations, share, person
         return replace(state, done=state.done + 1)
 
     stepping(monkeypatch, recorded)
-    monkeypatch.setattr(search, "learned_update", lambda parameters, *_: (parameters, jnp.zeros((), int)))
-    monkeypatch.setattr(search, "iterated", lambda task, start, used: (start._replace(iterations=iterations), 0.0))
+    monkeypatch.setattr(
+        search, "learned_update", lambda parameters, *_: (parameters, jnp.zeros((), int))
+    )
+    monkeypatch.setattr(
+        search, "iterated", lambda task, start, used: (start._replace(iterations=iterations), 0.0)
+    )
     refinement.refine(*person, dataclasses.replace(STEPS, iterations=iterations, full_steps=6))
     assert taken[1:] == [(i, 12, share) for i in range(12)]  # the first one compiles
 
@@ -271,7 +319,9 @@ def test_a_machine_that_slows_down_cuts_a_run_short(person, clock, monkeypatch):
         return planned
 
     monkeypatch.setattr(Clock, "plan", then_slow)
-    report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, steps=None, seconds=2.0))
+    report = refinement.refine_with_report(
+        *person, dataclasses.replace(STEPS, steps=None, seconds=2.0)
+    )
     assert report.planned is None and report.seconds < 1.5 * 2.0 + 0.5 and 0 < report.steps < 10
 
 
@@ -291,47 +341,67 @@ def test_buffers_that_are_too_small_change_nothing(person, monkeypatch):
     config = dataclasses.replace(STEPS, iterations=1)
     expected = refinement.refine(*person, config)
     own = search.planned
-    monkeypatch.setattr(search, "planned", lambda *of: dataclasses.replace(own(*of), max_pairs=256, max_rows=256))
+    monkeypatch.setattr(
+        search, "planned", lambda *of: dataclasses.replace(own(*of), max_pairs=256, max_rows=256)
+    )
     jax.tree.map(np.testing.assert_array_equal, refinement.refine(*person, config), expected)
 
 
 def seen_by_steps(monkeypatch):
     """The views of every step of the runs to come."""
     seen, own = [], search.stepped
-    monkeypatch.setattr(search, "stepped", lambda task, state, view: seen.append(int(view)) or own(task, state, view))
+    monkeypatch.setattr(
+        search,
+        "stepped",
+        lambda task, state, view: seen.append(int(view)) or own(task, state, view),
+    )
     return seen
 
 
 def test_the_best_explained_photo_is_held_out_of_the_trial_and_then_fitted(four, monkeypatch):
     avatar, capture = four
     seen = seen_by_steps(monkeypatch)
-    report = refinement.refine_with_report(avatar, capture, dataclasses.replace(STEPS, held_out=0.05))
+    report = refinement.refine_with_report(
+        avatar, capture, dataclasses.replace(STEPS, held_out=0.05)
+    )
     assert report.kept and report.steps == report.planned == 12 and not report.left_out
     trial, fit = seen[1:5], seen[5:]  # the first one compiles
-    errors = np.square(np.stack([r.rgb for r in capture_renderings(avatar, capture)[1]]) - capture.images)
+    errors = np.square(
+        np.stack([r.rgb for r in capture_renderings(avatar, capture)[1]]) - capture.images
+    )
     (held,) = set(range(4)) - set(trial)
     assert errors[held].mean() < np.median(errors.mean(axis=(1, 2, 3)))
     assert set(fit) == {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize("misleads", [False, True])
-def test_iterations_alone_are_tried_only_where_a_photo_fits_much_less_than_others(four, misleads, monkeypatch):
+def test_iterations_alone_are_tried_only_where_a_photo_fits_much_less_than_others(
+    four, misleads, monkeypatch
+):
     avatar, capture = four
     images, asked = np.array(capture.images), []
     images[2] = 1 - images[2] if misleads else images[2]
-    monkeypatch.setattr(search, "learned_update", lambda parameters, *_: (parameters, jnp.zeros((), int)))
+    monkeypatch.setattr(
+        search, "learned_update", lambda parameters, *_: (parameters, jnp.zeros((), int))
+    )
     monkeypatch.setattr(search, "psnr_of", lambda *of: asked.append(of) or 20.0)
     settings = dataclasses.replace(STEPS, iterations=1, steps=0, held_out=0.05)
-    report = refinement.refine_with_report(avatar, dataclasses.replace(capture, images=images), settings)
+    report = refinement.refine_with_report(
+        avatar, dataclasses.replace(capture, images=images), settings
+    )
     assert bool(asked) == misleads and report.steps == 0 and not report.left_out
 
 
 def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
     """Steps and iterations that fit the photos they see and spoil the one that they do not."""
     avatar, capture = four
-    monkeypatch.setattr(search, "psnr_of", lambda *of, values=iter([20.0] + [10.0] * 99): next(values))
+    monkeypatch.setattr(
+        search, "psnr_of", lambda *of, values=iter([20.0] + [10.0] * 99): next(values)
+    )
     seen = seen_by_steps(monkeypatch)
-    report = refinement.refine_with_report(avatar, capture, dataclasses.replace(STEPS, iterations=1, held_out=0.05))
+    report = refinement.refine_with_report(
+        avatar, capture, dataclasses.replace(STEPS, iterations=1, held_out=0.05)
+    )
     assert (report.kept, report.iterations, report.left_out, len(seen)) == (False, 0, (), 1 + 4)
     jax.tree.map(np.testing.assert_array_equal, report.avatar, avatar)
 
@@ -350,8 +420,12 @@ def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeyp
 
     monkeypatch.setattr(search, "updated", spoilt)
     seen = seen_by_steps(monkeypatch)
-    misleading = dataclasses.replace(capture, images=images, masks=masks, names=("a", "b", "c", "d", "e"))
-    report = refinement.refine_with_report(avatar, misleading, dataclasses.replace(STEPS, iterations=1, held_out=0.05))
+    misleading = dataclasses.replace(
+        capture, images=images, masks=masks, names=("a", "b", "c", "d", "e")
+    )
+    report = refinement.refine_with_report(
+        avatar, misleading, dataclasses.replace(STEPS, iterations=1, held_out=0.05)
+    )
     assert report.left_out == ("d",) and "without d, which" in report.summary()
     assert report.iterations == 1 and 2 not in seen[1:]
 
@@ -359,14 +433,18 @@ def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeyp
 def test_the_state_with_the_highest_psnr_on_held_out_pixels_is_returned(person, monkeypatch):
     psnr, so_far = iter([20.0, 21.0, 25.0, 22.0, 21.0, 20.0]), []
     monkeypatch.setattr(search, "psnr_of", lambda *of: next(psnr))
-    report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, held_out=0.3), watch=so_far.append)
+    report = refinement.refine_with_report(
+        *person, dataclasses.replace(STEPS, held_out=0.3), watch=so_far.append
+    )
     assert report.kept and len(so_far) == STEPS.checks
     jax.tree.map(np.testing.assert_array_equal, report.avatar.gaussians, so_far[1].gaussians)
 
 
 def test_what_makes_the_photos_worse_is_not_returned(person, monkeypatch):
     """Also if nothing is held out, so that the search keeps its last state."""
-    worse = lambda own, state, *_: replace(state, parameters=replace(state.parameters, means=state.parameters.means + 0.2))
+    worse = lambda own, state, *_: replace(
+        state, parameters=replace(state.parameters, means=state.parameters.means + 0.2)
+    )
     stepping(monkeypatch, worse)
     report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, steps=2))
     assert not report.kept and report.loss[0] == report.loss[1]
@@ -391,8 +469,14 @@ def few(**changes):
     arrays = {name: jnp.ones((2,) if n is None else (2, n)) for name, n in names.items()}
     parameters = UnconstrainedGaussians(**arrays)
     config = RefineConfig(**{"optimizer": "sgd"} | changes)
-    found = Comparison(jnp.zeros(()), jnp.zeros(()), jnp.ones(()), jnp.asarray([0.0, 0.005]), jnp.zeros((), int))
-    return init_state(parameters, found, config, SplatConfig()), jax.tree.map(jnp.ones_like, parameters), config
+    found = Comparison(
+        jnp.zeros(()), jnp.zeros(()), jnp.ones(()), jnp.asarray([0.0, 0.005]), jnp.zeros((), int)
+    )
+    return (
+        init_state(parameters, found, config, SplatConfig()),
+        jax.tree.map(jnp.ones_like, parameters),
+        config,
+    )
 
 
 def test_gaussians_move_as_far_as_the_photos_show_them():
@@ -401,7 +485,9 @@ def test_gaussians_move_as_far_as_the_photos_show_them():
     for name in ("means", "quats", "log_scales", "opacity_logits", "color_logits"):
         steps = np.asarray(getattr(moved, name) - 1).reshape(2, -1)
         assert not steps[0].any()  # no photo shows it
-        np.testing.assert_allclose(steps[1], -0.5 * getattr(config.rates, name), atol=1e-6 + DECAY * 1e-2)
+        np.testing.assert_allclose(
+            steps[1], -0.5 * getattr(config.rates, name), atol=1e-6 + DECAY * 1e-2
+        )
 
 
 @pytest.mark.parametrize("done", [0, 5, 10])
@@ -419,4 +505,8 @@ def test_every_optimizer_goes_downhill(optimizer):
     for _ in range(2):
         state = update(state, gradient, config)
     colors = np.asarray(state.parameters.color_logits)
-    assert np.isfinite(colors).all() and (colors[1] < 1).all() and (int(state.done), colors[0, 0]) == (2, 1)
+    assert (
+        np.isfinite(colors).all()
+        and (colors[1] < 1).all()
+        and (int(state.done), colors[0, 0]) == (2, 1)
+    )

@@ -57,13 +57,23 @@ def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
         fading = np.log1p(-alpha)
         e_left = alpha * e_alpha / (1 - alpha) + 1
         rank = np.arange(1, n + 1)[:, None]
-        e_after = np.cumsum(e_left + 1 + LOG * -fading, axis=0) - (rank + n // CHUNK + 1) * np.cumsum(fading, axis=0) + EXP
+        e_after = (
+            np.cumsum(e_left + 1 + LOG * -fading, axis=0)
+            - (rank + n // CHUNK + 1) * np.cumsum(fading, axis=0)
+            + EXP
+        )
         after = np.exp(np.cumsum(fading, axis=0))
-        T, e_T = (np.concatenate([np.full((1, p), first), a[:-1]]) for first, a in ((1.0, after), (0.0, e_after)))
+        T, e_T = (
+            np.concatenate([np.full((1, p), first), a[:-1]])
+            for first, a in ((1.0, after), (0.0, e_after))
+        )
         live = after > config.transmittance_stop
         w, e_w = np.where(live, alpha * T, 0), e_alpha + e_T + 1
         reached = np.concatenate([np.ones((1, p), bool), live[:-1]])
-        margins = (abs(raw - config.alpha_min) / raw / e_raw, abs(raw - config.alpha_max) / raw / e_raw)
+        margins = (
+            abs(raw - config.alpha_min) / raw / e_raw,
+            abs(raw - config.alpha_max) / raw / e_raw,
+        )
         margins += (abs(after - config.transmittance_stop) / after / e_after,)
         decided &= all((margin[reached] > UNIT).all() for margin in margins)
 
@@ -79,24 +89,44 @@ def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
 
         # dL/dlog alpha = ((g . f) T - (Q - sum of w g . f so far) / (1 - alpha)) raw
         total = (cotangent * features[tile]).sum(0) + g_transmittance[tile] * transmittance[tile]
-        size = (abs(cotangent) * abs(features[tile])).sum(0) + abs(g_transmittance[tile]) * transmittance[tile]
-        b_total = (abs(cotangent) * b_features[tile]).sum(0) + abs(g_transmittance[tile]) * b_transmittance[tile] + 6 * size
+        size = (abs(cotangent) * abs(features[tile])).sum(0) + abs(
+            g_transmittance[tile]
+        ) * transmittance[tile]
+        b_total = (
+            (abs(cotangent) * b_features[tile]).sum(0)
+            + abs(g_transmittance[tile]) * b_transmittance[tile]
+            + 6 * size
+        )
         along, along_size = f @ cotangent, abs(f) @ abs(cotangent)
         seen = np.cumsum(w * along, axis=0)
         seen_size = np.cumsum(w * along_size, axis=0)
         behind = total - seen
-        b_behind = b_total + np.cumsum(w * along_size * (e_w + 5), axis=0) + n * seen_size + size + seen_size
+        b_behind = (
+            b_total
+            + np.cumsum(w * along_size * (e_w + 5), axis=0)
+            + n * seen_size
+            + size
+            + seen_size
+        )
         slope_size = raw * (along_size * T + abs(behind) / (1 - alpha))
         slope = np.where((w > 0) & ~clamped, (along * T - behind / (1 - alpha)) * raw, 0)
-        b_slope = raw * (along_size * T * (e_T + 5) + (b_behind + abs(behind) * (e_left + 2)) / (1 - alpha))
+        b_slope = raw * (
+            along_size * T * (e_T + 5) + (b_behind + abs(behind) * (e_left + 2)) / (1 - alpha)
+        )
         b_slope = np.where(slope != 0, b_slope + slope_size * (e_raw + 3), 0)
 
         # moments about the tile's centre, moved to the splat's: terms as large as |pixel| + |splat|
-        powers = lambda a, b: np.stack([np.ones_like(a * b), a + 0 * b, b + 0 * a, a * a + 0 * b, a * b, b * b + 0 * a])
+        powers = lambda a, b: np.stack(
+            [np.ones_like(a * b), a + 0 * b, b + 0 * a, a * a + 0 * b, a * b, b * b + 0 * a]
+        )
         moments = powers(px - x, py - y), powers(abs(px) + abs(x), abs(py) + abs(y))
         roundings = p + t + 10
         np.add.at(sums[:, :6], chosen, np.einsum("cnp,np->nc", moments[0], slope))
-        np.add.at(b_sums[:, :6], chosen, np.einsum("cnp,np->nc", moments[1], b_slope + roundings * abs(slope)))
+        np.add.at(
+            b_sums[:, :6],
+            chosen,
+            np.einsum("cnp,np->nc", moments[1], b_slope + roundings * abs(slope)),
+        )
         np.add.at(sums[:, 6:], chosen, w @ cotangent.T)
         np.add.at(b_sums[:, 6:], chosen, (w * (e_w + roundings)) @ abs(cotangent).T)
     bounds = tuple(SCALE * UNIT * b for b in (b_features, b_transmittance, b_sums, b_peaks))

@@ -21,7 +21,9 @@ def splat(means, quats, scales, opacities, colors, K, cam_from_world, background
     X, Y, Z = np.where(drawn[:, None], in_camera, [0.0, 0.0, 1.0]).T
     focal = np.array([K[0, 0], K[1, 1]])
     zero = np.zeros_like(Z)
-    jacobian = np.stack([np.stack([1 / Z, zero, -X / Z**2], -1), np.stack([zero, 1 / Z, -Y / Z**2], -1)], 1)
+    jacobian = np.stack(
+        [np.stack([1 / Z, zero, -X / Z**2], -1), np.stack([zero, 1 / Z, -Y / Z**2], -1)], 1
+    )
     M = focal[:, None] * jacobian @ cam_from_world[:3, :3] @ rotations(quats) * scales[:, None, :]
     drawn &= (np.abs(M) < LARGEST).all((1, 2))
     U, S, _ = np.linalg.svd(np.where(drawn[:, None, None], M, 0.0), full_matrices=False)
@@ -46,7 +48,9 @@ def splat(means, quats, scales, opacities, colors, K, cam_from_world, background
 def rotations(quats):
     """Rotation matrices (g, 3, 3): v + 2 w (q x v) + 2 q x (q x v) applied to the axes; a zero quaternion turns nothing."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    w, q = np.split(np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0]), [1], axis=1)
+    w, q = np.split(
+        np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0]), [1], axis=1
+    )
     axes = np.eye(3)[None]
     turned = np.cross(q[:, None], axes)
     return (axes + 2 * w[..., None] * turned + 2 * np.cross(q[:, None], turned)).swapaxes(1, 2)

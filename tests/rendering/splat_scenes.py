@@ -17,7 +17,9 @@ def random_gaussians(seed, dtype=np.float64, count=COUNT) -> Gaussians:
     """Gaussians 2 to 4 m before the camera at the origin: blobs, and a few of each kind that asks for care."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 4, count)
-    means = np.stack([rng.uniform(-1.2, 1.2, count) * z / 2, rng.uniform(-1.2, 1.2, count) * z / 3, z], axis=-1)
+    means = np.stack(
+        [rng.uniform(-1.2, 1.2, count) * z / 2, rng.uniform(-1.2, 1.2, count) * z / 3, z], axis=-1
+    )
     scales = np.exp(rng.uniform(np.log(0.01), np.log(0.5), (count, 3)))
     opacities = rng.uniform(0, 1, count)
     means[:6, :2] *= 0.1  # an opaque stack: reaches the stop and the clamp of alpha
@@ -28,7 +30,14 @@ def random_gaussians(seed, dtype=np.float64, count=COUNT) -> Gaussians:
     scales[12] = 5.0  # a semi-transparent foreground
     opacities[13:15] = [0, 1 / 255 - 1e-4]  # never drawn
     deformations = np.eye(3) + 0.3 * rng.normal(size=(count, 3, 3))
-    arrays = means, rng.normal(size=(count, 4)), scales, opacities, rng.uniform(0, 1, (count, 3)), deformations
+    arrays = (
+        means,
+        rng.normal(size=(count, 4)),
+        scales,
+        opacities,
+        rng.uniform(0, 1, (count, 3)),
+        deformations,
+    )
     return Gaussians(*(jnp.asarray(a, dtype) for a in arrays))
 
 

@@ -27,12 +27,20 @@ def make(seed):
     """Splats and lists: nine splats, the first few (in depth order) on each tile."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(7, 12, 9), rng.uniform(0, 4, 9)
-    shape = np.stack([rng.uniform(0.05, 0.2, 9), rng.uniform(-0.1, 0.1, 9), rng.uniform(0.05, 0.2, 9)])
+    shape = np.stack(
+        [rng.uniform(0.05, 0.2, 9), rng.uniform(-0.1, 0.1, 9), rng.uniform(0.05, 0.2, 9)]
+    )
     log_opacity = np.log(np.asarray([1.0, 0.99, 0.9, 1.0, 0.99, 0.9, 0.5, 0.4, 0.3]))
-    splats = np.concatenate([np.stack([x, y, *shape, log_opacity], axis=-1), rng.uniform(size=(9, 4))], axis=-1)
-    items = np.concatenate([np.sort(rng.choice(9, n, replace=False)) for n in LENGTHS] + [np.full(4, 7)])
+    splats = np.concatenate(
+        [np.stack([x, y, *shape, log_opacity], axis=-1), rng.uniform(size=(9, 4))], axis=-1
+    )
+    items = np.concatenate(
+        [np.sort(rng.choice(9, n, replace=False)) for n in LENGTHS] + [np.full(4, 7)]
+    )
     counts = np.asarray(LENGTHS)
-    lists = TileLists(*(jnp.asarray(a, jnp.int32) for a in (items, np.cumsum(counts) - counts, counts)))
+    lists = TileLists(
+        *(jnp.asarray(a, jnp.int32) for a in (items, np.cumsum(counts) - counts, counts))
+    )
     return jnp.asarray(splats), lists
 
 
@@ -40,9 +48,15 @@ def formula(splats, lists):
     """Tile by tile, splat by splat."""
     offsets, centers = GRID.offsets(np.float64), tile_centers(GRID)
     features, transmittances = [], []
-    for tile, (start, count) in enumerate(zip(np.asarray(lists.starts), np.asarray(lists.counts), strict=True)):
+    for tile, (start, count) in enumerate(
+        zip(np.asarray(lists.starts), np.asarray(lists.counts), strict=True)
+    ):
         pixels = centers[tile][:, None] + offsets
-        total, transmittance, ended = jnp.zeros((4, GRID.pixels)), jnp.ones(GRID.pixels), np.zeros(GRID.pixels, bool)
+        total, transmittance, ended = (
+            jnp.zeros((4, GRID.pixels)),
+            jnp.ones(GRID.pixels),
+            np.zeros(GRID.pixels, bool),
+        )
         for item in np.asarray(lists.items)[start : start + count]:
             x, y, r00, r01, r11, log_opacity, *f = splats[item]
             dx, dy = pixels[0] - x, pixels[1] - y
@@ -74,7 +88,11 @@ def value_and_gradient(draw, splats):
 
 def test_equals_the_formula_with_its_gradient():
     splats, lists = make(1)
-    tiled = jax.jit(lambda splats, lists: value_and_gradient(lambda s: composite(s, lists, GRID, CONFIG)[:2], splats))
+    tiled = jax.jit(
+        lambda splats, lists: value_and_gradient(
+            lambda s: composite(s, lists, GRID, CONFIG)[:2], splats
+        )
+    )
     exact = jax.jit(lambda splats: value_and_gradient(lambda s: formula(s, lists), splats))
     expected = exact(splats)
     for ours, exactly in zip(tiled(splats, lists), expected, strict=True):
@@ -94,7 +112,11 @@ def test_empty_lists_leave_their_tiles_blank():
 def test_a_batch_is_drawn_as_one():
     batch = [make(seed) for seed in (1, 2)]
     splats, lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
-    run = jax.jit(lambda splats, lists: value_and_gradient(lambda s: composite(s, lists, GRID, CONFIG)[:2], splats))
+    run = jax.jit(
+        lambda splats, lists: value_and_gradient(
+            lambda s: composite(s, lists, GRID, CONFIG)[:2], splats
+        )
+    )
     together = jax.jit(jax.vmap(run))(splats, lists)
     one_scene = jax.jit(jax.vmap(run, in_axes=(None, 0)))(splats[0], lists)
     for i in range(2):

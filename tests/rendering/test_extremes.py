@@ -32,7 +32,10 @@ SMALL = SplatConfig(block=4, chunk=4, max_pairs=256)
 """Quick to compile."""
 
 
-CASES = [pytest.param(case, id=name, marks=pytest.mark.slow if case.slow else ()) for name, case in cases.CASES.items()]
+CASES = [
+    pytest.param(case, id=name, marks=pytest.mark.slow if case.slow else ())
+    for name, case in cases.CASES.items()
+]
 
 
 @pytest.mark.slow
@@ -61,7 +64,13 @@ def test_case_against_plain_numpy(case):
     """The image of a splatter that shares no code with ours (numpy_splatter.py)."""
     scene = case.build()
     wide = lambda a: np.asarray(a, np.float64)
-    arguments = dict(zip(cases.NAMES, map(wide, (*scene.gaussians, scene.K, scene.pose, scene.background)), strict=True))
+    arguments = dict(
+        zip(
+            cases.NAMES,
+            map(wide, (*scene.gaussians, scene.K, scene.pose, scene.background)),
+            strict=True,
+        )
+    )
     image, _ = cases.tiled(scene)
     rgb, alpha = splat(**arguments, width=scene.width, height=scene.height)
     np.testing.assert_allclose(wide(image.rgb), rgb, rtol=0, atol=bound(case.image))
@@ -75,8 +84,12 @@ def check_sweep(scene):
     exact = cases.reference_in_float64(scene)
     outcome = cases.compare(scene, cases.tiled(scene), exact)
     assert outcome.finite
-    if outcome.image >= bound(DECISION):  # then it must be a decision: with more digits the same program is right
-        assert cases.compare(scene, cases.tiled_in_float64(scene), exact).image <= cases.FLOAT64, outcome
+    if outcome.image >= bound(
+        DECISION
+    ):  # then it must be a decision: with more digits the same program is right
+        assert cases.compare(scene, cases.tiled_in_float64(scene), exact).image <= cases.FLOAT64, (
+            outcome
+        )
         return
     assert outcome.gradient < bound(SWEEP_GRADIENT), outcome
 
@@ -106,10 +119,16 @@ def anything(seed, focal, nearest, farthest, smallest, largest):
 
 @pytest.mark.slow
 @settings(max_examples=100)
-@given(st.integers(0, 2**20), decade(0, 6), decade(-1.99, 6), decade(0, 3), decade(-7, 3), decade(0, 2))
+@given(
+    st.integers(0, 2**20), decade(0, 6), decade(-1.99, 6), decade(0, 3), decade(-7, 3), decade(0, 2)
+)
 def test_random_scenes_over_many_decades(seed, focal, nearest, depths, smallest, ratio):
     """Scales within two decades of each other, depths within three."""
-    check_sweep(anything(seed, focal, nearest, min(nearest * depths, 1e7), smallest, min(smallest * ratio, 1e3)))
+    check_sweep(
+        anything(
+            seed, focal, nearest, min(nearest * depths, 1e7), smallest, min(smallest * ratio, 1e3)
+        )
+    )
 
 
 def test_random_scenes_of_every_size_at_every_depth_at_once():
@@ -121,7 +140,10 @@ def test_random_scenes_of_every_size_at_every_depth_at_once():
 
 def test_gradients_have_no_signed_bias():
     scenes = [cases.ordinary(seed) for seed in range(8)]
-    pairs = [[cases.natural(s, draw(s)[1]) for draw in (cases.tiled, cases.reference_in_float64)] for s in scenes]
+    pairs = [
+        [cases.natural(s, draw(s)[1]) for draw in (cases.tiled, cases.reference_in_float64)]
+        for s in scenes
+    ]
     for name in cases.NAMES:
         found, exact = (np.concatenate([pair[i][name].ravel() for pair in pairs]) for i in (0, 1))
         n = np.count_nonzero(exact)  # K and the pose have zeros
@@ -152,6 +174,8 @@ def test_narrow_gaussians_give_a_float32_image_eagerly(dtype):
     images = []
     for wanted in (None, np.float32):
         gaussians, K, pose, background = scene.arguments(wanted)
-        images.append(render(gaussians, Camera(K, pose, scene.width, scene.height), SMALL, background).rgb)
+        images.append(
+            render(gaussians, Camera(K, pose, scene.width, scene.height), SMALL, background).rgb
+        )
     np.testing.assert_array_equal(*images)
     assert images[0].dtype == np.float32

@@ -42,7 +42,9 @@ def by_hand(seed, lengths, dtype, grid=GRID, opacities=(0.05, 1.0)):
     items = np.concatenate([np.sort(rng.choice(SPLATS, n, replace=False)) for n in lengths])
     items = np.pad(items, (0, CAPACITY - len(items)), constant_values=3)
     counts = np.asarray(lengths)
-    lists = TileLists(*(jnp.asarray(a, jnp.int32) for a in (items, np.cumsum(counts) - counts, counts)))
+    lists = TileLists(
+        *(jnp.asarray(a, jnp.int32) for a in (items, np.cumsum(counts) - counts, counts))
+    )
     return jnp.asarray(splats, dtype), lists
 
 
@@ -52,10 +54,16 @@ def from_scene(gaussians, grid, config):
     g, dtype = gaussians.means.shape[0], gaussians.means.dtype
     projected = project_gaussians(gaussians, camera(dtype, grid.width, grid.height), config)
     order = tiling.depth_order(jnp.where(projected.visible, projected.depths, jnp.inf))
-    ellipses = jax.tree.map(lambda plane: plane[order], tiling.footprints_by(projected, gaussians.opacities, config))
+    ellipses = jax.tree.map(
+        lambda plane: plane[order], tiling.footprints_by(projected, gaussians.opacities, config)
+    )
     pairs = tiling.emit_pairs(ellipses, grid, g * grid.tiles, g * grid.tiles)
-    features = jnp.concatenate([gaussians.colors, jnp.where(projected.visible, projected.depths, 0.0)[:, None]], axis=-1)
-    splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[order]
+    features = jnp.concatenate(
+        [gaussians.colors, jnp.where(projected.visible, projected.depths, 0.0)[:, None]], axis=-1
+    )
+    splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[
+        order
+    ]
     return splats, sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, g)
 
 
@@ -82,10 +90,14 @@ run = jax.jit(schedule, static_argnums=(0, 3, 4, 5))
 
 def assert_equal(ours, expected, counts, tolerance=EXACT):
     """Channel by channel, and column by column of the sums: their sizes differ."""
-    for name, a, b in zip(("features", "transmittance", "sums", "peaks"), ours, expected, strict=False):
+    for name, a, b in zip(
+        ("features", "transmittance", "sums", "peaks"), ours, expected, strict=False
+    ):
         assert a.dtype == b.dtype and a.shape == b.shape
         axes = (0, 2) if name == "features" else 0
-        error = np.abs(np.asarray(a) - b).max(axis=axes) / np.maximum(np.abs(b).max(axis=axes), 1e-30)
+        error = np.abs(np.asarray(a) - b).max(axis=axes) / np.maximum(
+            np.abs(b).max(axis=axes), 1e-30
+        )
         assert (error <= tolerance).all(), (name, error)
     assert_lengths(ours[-1], expected[-1], counts)
 
@@ -98,8 +110,12 @@ def assert_lengths(ours, expected, counts):
 
 def assert_rounded(found, exact):
     """Float32 results within the bounds of their float64 analysis."""
-    assert exact.decided  # no alpha at its threshold, no pixel at its stop: float32 decides as float64
-    for name, a, b, most in zip(("features", "transmittance", "sums", "peaks"), found, exact, exact.bounds, strict=False):
+    assert (
+        exact.decided
+    )  # no alpha at its threshold, no pixel at its stop: float32 decides as float64
+    for name, a, b, most in zip(
+        ("features", "transmittance", "sums", "peaks"), found, exact, exact.bounds, strict=False
+    ):
         assert a.dtype == np.float32 and a.shape == b.shape
         excess = np.abs(np.asarray(a, np.float64) - b) / np.maximum(most, 1e-30)
         assert (excess <= 1).all(), (name, excess.max())
@@ -111,21 +127,27 @@ def assert_equal_in_float32(splats, lists, grid, config, per_step=1024):
     Measured: errors reach 0.2 of the bounds of the images, 0.04 of those of the sums, whose first columns cancel. A mistake
     in a formula would show in float64, to 1e-10.
     """
-    ours, expected = run(FAT, splats, lists, grid, config, per_step), run(THIN, splats, lists, grid, config)
+    ours, expected = (
+        run(FAT, splats, lists, grid, config, per_step),
+        run(THIN, splats, lists, grid, config),
+    )
     g = [np.asarray(a, np.float64) for a in cotangents(grid, np.float32)]
     config = config or SplatConfig(visibility=True)
     exact = analyse(np.asarray(splats, np.float64), lists, grid, config, *g)
     for found in (ours, expected):
         assert_rounded(found, exact)
     assert_lengths(ours[-1], expected[-1], lists.counts)
-    for values, most in zip(exact[:2], exact.bounds, strict=False):  # so tight that a wrong decision, 4e-3, would show
+    for values, most in zip(
+        exact[:2], exact.bounds, strict=False
+    ):  # so tight that a wrong decision, 4e-3, would show
         assert np.median(most[values != 0] / values[values != 0]) < 1e-4
     return ours, expected
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("dtype", "tile_size", "per_step"), [(np.float64, 8, 1024), (np.float64, 16, PER_STEP), (np.float32, 16, 1024)]
+    ("dtype", "tile_size", "per_step"),
+    [(np.float64, 8, 1024), (np.float64, 16, PER_STEP), (np.float32, 16, 1024)],
 )
 def test_equals_the_other_schedule(dtype, tile_size, per_step):
     with jax.enable_x64(dtype == np.float64):
@@ -134,10 +156,15 @@ def test_equals_the_other_schedule(dtype, tile_size, per_step):
         if dtype == np.float32:
             ours, expected = assert_equal_in_float32(splats, lists, grid, None, per_step)
         else:
-            ours, expected = run(FAT, splats, lists, grid, None, per_step), run(THIN, splats, lists, grid)
+            ours, expected = (
+                run(FAT, splats, lists, grid, None, per_step),
+                run(THIN, splats, lists, grid),
+            )
             assert_equal(ours, expected, lists.counts)
         ended = np.asarray(expected[-1])
-        assert K < ended[1] < 3 * K and ended[1] % K != 0  # the whole tile ends inside a chunk that is not its first
+        assert (
+            K < ended[1] < 3 * K and ended[1] % K != 0
+        )  # the whole tile ends inside a chunk that is not its first
         assert not ours[0][0].any() and (ours[1][0] == 1).all()  # the empty list
 
 
@@ -158,12 +185,16 @@ def test_equals_the_other_schedule_on_scenes(dtype, seed):
 @pytest.mark.slow
 @given(
     seed=st.integers(0, 2**16),
-    lengths=st.lists(st.sampled_from([0, 1, K - 1, K, K + 1, 2 * K, 3 * K + 7, 4 * K]), min_size=6, max_size=6),
+    lengths=st.lists(
+        st.sampled_from([0, 1, K - 1, K, K + 1, 2 * K, 3 * K + 7, 4 * K]), min_size=6, max_size=6
+    ),
     faint=st.booleans(),
 )
 def test_equals_the_other_schedule_on_any_lists(seed, lengths, faint):
     with jax.enable_x64(True):
-        splats, lists = by_hand(seed, lengths, np.float64, opacities=(0.004, 0.02) if faint else (0.05, 1.0))
+        splats, lists = by_hand(
+            seed, lengths, np.float64, opacities=(0.004, 0.02) if faint else (0.05, 1.0)
+        )
         ours, expected = run(FAT, splats, lists, GRID, None, PER_STEP), run(THIN, splats, lists)
         assert_equal(ours, expected, lists.counts)
 
@@ -171,9 +202,14 @@ def test_equals_the_other_schedule_on_any_lists(seed, lengths, faint):
 @pytest.mark.slow
 def test_a_batch_is_one_call():
     with jax.enable_x64(True):
-        batch = [by_hand(seed, lengths, np.float64) for seed, lengths in ((1, LENGTHS), (2, LENGTHS[::-1]))]
+        batch = [
+            by_hand(seed, lengths, np.float64)
+            for seed, lengths in ((1, LENGTHS), (2, LENGTHS[::-1]))
+        ]
         splats, lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
-        together = jax.jit(jax.vmap(lambda s, l: schedule(FAT, s, l, per_step=PER_STEP)))(splats, lists)
+        together = jax.jit(jax.vmap(lambda s, l: schedule(FAT, s, l, per_step=PER_STEP)))(
+            splats, lists
+        )
         for i, (splats, lists) in enumerate(batch):
             expected = run(THIN, splats, lists)
             assert_equal([o[i] for o in together], expected, lists.counts)
@@ -219,11 +255,15 @@ def test_steps_are_bounded_in_memory():
         b = compositing._chunks_per_step(TileGrid(512, 512, tile_size), dtype, 1 << 20, 1024)
         assert 1 <= b <= compositing.STEP_CHUNKS
         assert b * K * tile_size**2 * np.dtype(dtype).itemsize <= compositing.STEP_BYTES
-    assert compositing._chunks_per_step(GRID, np.float32, 2 * K, 6) == 8  # no more than there can be
+    assert (
+        compositing._chunks_per_step(GRID, np.float32, 2 * K, 6) == 8
+    )  # no more than there can be
 
 
 @pytest.mark.parametrize("platform", ["cuda", "tpu"])
 def test_lowers_for(platform):
     splats, lists = by_hand(1, LENGTHS, np.float32)
-    exported = jax.export.export(jax.jit(lambda s, l: schedule(FAT, s, l)), platforms=[platform])(splats, lists)
+    exported = jax.export.export(jax.jit(lambda s, l: schedule(FAT, s, l)), platforms=[platform])(
+        splats, lists
+    )
     assert exported.platforms == (platform,)

@@ -8,7 +8,13 @@ import pytest
 import humangs_jax as hg
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.rendering.gaussians import COLOR_MARGIN, OPACITY_MARGIN, Gaussians, covariances, skin_gaussians
+from humangs_jax.rendering.gaussians import (
+    COLOR_MARGIN,
+    OPACITY_MARGIN,
+    Gaussians,
+    covariances,
+    skin_gaussians,
+)
 
 RTOL = 1e-10
 """float64 throughout."""
@@ -28,7 +34,10 @@ def test_affine_skinning_moves_means_and_covariances_by_the_whole_transform():
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
         gaussians = some_gaussians(rng)
-        first, second = (transform.make(jnp.asarray(rng.normal(size=(12, 3, 3))), jnp.ones((12, 3)) * 0.3) for _ in "ab")
+        first, second = (
+            transform.make(jnp.asarray(rng.normal(size=(12, 3, 3))), jnp.ones((12, 3)) * 0.3)
+            for _ in "ab"
+        )
         moved = skin_gaussians(skin_gaussians(gaussians, first), second)
         both = second @ first
         linear = both[:, :3, :3]
@@ -41,8 +50,13 @@ def test_affine_skinning_moves_means_and_covariances_by_the_whole_transform():
 def test_both_modes_agree_on_rigid_transforms():
     rng = np.random.default_rng(1)
     with jax.enable_x64(True):
-        gaussians, rigid = some_gaussians(rng), transform.make(rotations(rng), jnp.asarray(rng.normal(size=(12, 3))))
-        affine, rotation = (skin_gaussians(gaussians, rigid, mode) for mode in ("affine", "rotation"))
+        gaussians, rigid = (
+            some_gaussians(rng),
+            transform.make(rotations(rng), jnp.asarray(rng.normal(size=(12, 3)))),
+        )
+        affine, rotation = (
+            skin_gaussians(gaussians, rigid, mode) for mode in ("affine", "rotation")
+        )
         np.testing.assert_allclose(covariances(affine), covariances(rotation), rtol=1e-8, atol=RTOL)
         np.testing.assert_allclose(affine.means, rotation.means, rtol=RTOL)
         np.testing.assert_allclose(jnp.linalg.norm(rotation.quats, axis=-1), 1, rtol=RTOL)
@@ -57,11 +71,16 @@ def test_a_blend_of_rotations_leaves_a_short_quaternion():
     gaussians = replace(gaussians, quats=jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (12, 1)))
     quats = skin_gaussians(gaussians, jnp.broadcast_to(blend, (12, 4, 4)), "rotation").quats
     w = np.sqrt(1 + 0.5 + 0.5 + 1) / 2
-    assert np.allclose(quats[0], [w, 0, 0, 0.5 * 2 / (4 * w)], atol=1e-6) and np.linalg.norm(quats[0]) < 0.95
+    assert (
+        np.allclose(quats[0], [w, 0, 0, 0.5 * 2 / (4 * w)], atol=1e-6)
+        and np.linalg.norm(quats[0]) < 0.95
+    )
 
 
 def test_what_is_deformed_has_no_parameters_and_no_rotation():
-    gaussians = jax.tree.map(lambda x: x.astype(jnp.float32), some_gaussians(np.random.default_rng(3)))
+    gaussians = jax.tree.map(
+        lambda x: x.astype(jnp.float32), some_gaussians(np.random.default_rng(3))
+    )
     still = jnp.broadcast_to(jnp.eye(4), (12, 4, 4))
     deformed = skin_gaussians(gaussians, still)
     with pytest.raises(ValueError, match="deformed already"):
@@ -79,7 +98,10 @@ def within_bounds():
     rng = np.random.default_rng(0)
     array = lambda x: jnp.asarray(x, jnp.float32)
     means, quats = array(rng.normal(size=(COUNT, 3))), array(rng.normal(size=(COUNT, 4)))
-    scales, colors = array(rng.uniform(0.001, 0.3, (COUNT, 3))), array(rng.uniform(0.02, 0.98, (COUNT, 3)))
+    scales, colors = (
+        array(rng.uniform(0.001, 0.3, (COUNT, 3))),
+        array(rng.uniform(0.02, 0.98, (COUNT, 3))),
+    )
     return hg.Gaussians(means, quats, scales, array(rng.uniform(0.01, 0.99, COUNT)), colors)
 
 
@@ -91,7 +113,12 @@ def test_there_and_back():
 
 
 def test_bounds_are_met_within_the_margins():
-    edge = replace(within_bounds(), opacities=jnp.ones(COUNT), colors=jnp.zeros((COUNT, 3)), scales=jnp.zeros((COUNT, 3)))
+    edge = replace(
+        within_bounds(),
+        opacities=jnp.ones(COUNT),
+        colors=jnp.zeros((COUNT, 3)),
+        scales=jnp.zeros((COUNT, 3)),
+    )
     after = hg.constrain(hg.unconstrain(edge))
     np.testing.assert_allclose(after.opacities, 1 - OPACITY_MARGIN, atol=ROUNDING)
     np.testing.assert_allclose(after.colors, COLOR_MARGIN, atol=ROUNDING)
@@ -101,5 +128,13 @@ def test_bounds_are_met_within_the_margins():
 def test_parameters_of_constants_have_types_of_their_own():
     """Weakly typed ones would compile a step of an optimizer twice."""
     n = 4
-    flat = Gaussians(jnp.zeros((n, 3)), jnp.ones((n, 4)), jnp.full((n, 3), 0.03), jnp.full(n, 0.7), jnp.full((n, 3), 0.5))
-    assert jax.tree.leaves(flat)[3].weak_type and not any(leaf.weak_type for leaf in jax.tree.leaves(hg.unconstrain(flat)))
+    flat = Gaussians(
+        jnp.zeros((n, 3)),
+        jnp.ones((n, 4)),
+        jnp.full((n, 3), 0.03),
+        jnp.full(n, 0.7),
+        jnp.full((n, 3), 0.5),
+    )
+    assert jax.tree.leaves(flat)[3].weak_type and not any(
+        leaf.weak_type for leaf in jax.tree.leaves(hg.unconstrain(flat))
+    )

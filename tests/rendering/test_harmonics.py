@@ -36,7 +36,9 @@ def by_scipy(d, degree):
     for n in range(1, degree + 1):
         for m in range(-n, n + 1):
             value = sph_harm_y(n, abs(m), theta, phi)
-            found.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
+            found.append(
+                value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag)
+            )
     return np.stack(found, axis=-1)
 
 
@@ -45,16 +47,22 @@ def test_the_functions_are_scipys_in_both_renderers(degree):
     d, count = directions(), harmonics.COUNTS[degree]
     expected = by_scipy(d, degree)
     assert expected.shape[1] == count
-    np.testing.assert_allclose(np.stack(harmonics.basis(*d.T, count), axis=-1), expected, atol=FLOAT64)
+    np.testing.assert_allclose(
+        np.stack(harmonics.basis(*d.T, count), axis=-1), expected, atol=FLOAT64
+    )
     with jax.enable_x64(True):
-        np.testing.assert_allclose(reference._harmonics(jnp.asarray(d), degree), expected, atol=FLOAT64)
+        np.testing.assert_allclose(
+            reference._harmonics(jnp.asarray(d), degree), expected, atol=FLOAT64
+        )
 
 
 def test_signs_and_order_are_the_published_ones():
     """https://github.com/graphdeco-inria/diff-gaussian-rasterization: -y, z, -x; then -yz second, the zonal one in the middle."""
     x, y, z = np.asarray([0.6, 0.0, 0.8]).tolist()
     got = np.stack(harmonics.basis(x, y, z, 15))
-    np.testing.assert_allclose(got[:3], 0.4886025119029199 * np.asarray([0, 0.8, -0.6]), atol=FLOAT64)
+    np.testing.assert_allclose(
+        got[:3], 0.4886025119029199 * np.asarray([0, 0.8, -0.6]), atol=FLOAT64
+    )
     np.testing.assert_allclose(got[5], 0.31539156525252005 * (2 * z * z - x * x), atol=FLOAT64)
     np.testing.assert_allclose(got[6], -1.0925484305920792 * x * z, atol=FLOAT64)
     np.testing.assert_allclose(got[14], -0.5900435899266435 * x**3, atol=FLOAT64)
@@ -71,7 +79,9 @@ def test_the_direction_is_from_the_camera_to_the_mean_in_the_world():
         drawn = np.asarray(seen.visible)
         np.testing.assert_allclose(seen.added_colors[drawn], added[drawn], atol=FLOAT64)
         expected = np.maximum(gaussians.colors + added, 0)[drawn]
-        np.testing.assert_allclose(seen.seen_from_here(gaussians.colors)[drawn], expected, atol=FLOAT64)
+        np.testing.assert_allclose(
+            seen.seen_from_here(gaussians.colors)[drawn], expected, atol=FLOAT64
+        )
         assert (expected == 0).any() and project(random_gaussians(0), view).added_colors is None
 
 
@@ -85,22 +95,36 @@ def test_a_scene_turned_with_its_camera_looks_the_same():
         moved_view = replace(view, cam_from_world=view.cam_from_world @ jnp.linalg.inv(move))
         colors = project(gaussians, view).added_colors
         np.testing.assert_allclose(project(moved, moved_view).added_colors, colors, atol=1e-10)
-        assert np.abs(project(replace(moved, harmonics=gaussians.harmonics), moved_view).added_colors - colors).max() > 0.1
+        assert (
+            np.abs(
+                project(replace(moved, harmonics=gaussians.harmonics), moved_view).added_colors
+                - colors
+            ).max()
+            > 0.1
+        )
 
 
 def gradients(draw, gaussians, view):
-    weights = jnp.asarray(np.random.default_rng(7).normal(size=(view.height, view.width, 3)), gaussians.means.dtype)
-    loss = lambda gaussians, pose: jnp.sum(weights * draw(gaussians, replace(view, cam_from_world=pose)).rgb)
+    weights = jnp.asarray(
+        np.random.default_rng(7).normal(size=(view.height, view.width, 3)), gaussians.means.dtype
+    )
+    loss = lambda gaussians, pose: jnp.sum(
+        weights * draw(gaussians, replace(view, cam_from_world=pose)).rgb
+    )
     return jax.jit(jax.grad(loss, argnums=(0, 1)))(gaussians, view.cam_from_world)
 
 
 @pytest.mark.slow
 def test_gradients_in_float32_are_those_of_the_reference_in_float64():
     gaussians = with_harmonics(random_gaussians(5, np.float32), 15)
-    gaussians = replace(gaussians, means=gaussians.means.at[9:11, 2].set(3.0))  # none at the near plane
+    gaussians = replace(
+        gaussians, means=gaussians.means.at[9:11, 2].set(3.0)
+    )  # none at the near plane
     got = gradients(functools.partial(render, config=CONFIG), gaussians, camera(np.float32))
     with jax.enable_x64(True):
-        double = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), np.float64), (gaussians, camera(np.float32)))
+        double = jax.tree.map(
+            lambda x: jnp.asarray(np.asarray(x), np.float64), (gaussians, camera(np.float32))
+        )
         expected = gradients(render_reference, *double)
     for name in ("harmonics", "colors", "means"):
         a, b = (np.asarray(getattr(x[0], name), np.float64) for x in (got, expected))
@@ -113,7 +137,12 @@ def test_parameters_carry_them_and_other_counts_are_refused():
     gaussians = with_harmonics(random_gaussians(0, np.float32), 3)
     back = constrain(unconstrain(replace(gaussians, deformations=None)))
     np.testing.assert_array_equal(back.harmonics, gaussians.harmonics)
-    with pytest.raises(ValueError, match=r"^harmonics: expected \(g, 3, 3\), \(g, 8, 3\) or \(g, 15, 3\), got \(g, 4, 3\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"^harmonics: expected \(g, 3, 3\), \(g, 8, 3\) or \(g, 15, 3\), got \(g, 4, 3\)",
+    ):
         render(with_harmonics(gaussians, 4), camera(np.float32))
-    with pytest.raises(ValueError, match=r"gaussians\.harmonics: expected shape \(32, k, 3\), got \(31, 3, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"gaussians\.harmonics: expected shape \(32, k, 3\), got \(31, 3, 3\)"
+    ):
         render(replace(gaussians, harmonics=gaussians.harmonics[1:]), camera(np.float32))

@@ -22,9 +22,14 @@ INRIA = dataclasses.replace(SPLAT_PRESETS["inria"], block=4, chunk=4)
 
 
 def test_drawing_as_weights_were_trained_keeps_the_other_knobs():
-    inria, own = SPLAT_PRESETS["inria"], SplatConfig(near=0.05, radius_sigma=2.5, block=16, max_pairs=1000)
+    inria, own = (
+        SPLAT_PRESETS["inria"],
+        SplatConfig(near=0.05, radius_sigma=2.5, block=16, max_pairs=1000),
+    )
     assert drawn_as(own, "exact") is own
-    assert drawn_as(dataclasses.replace(inria, block=16), "inria") == dataclasses.replace(inria, block=16)
+    assert drawn_as(dataclasses.replace(inria, block=16), "inria") == dataclasses.replace(
+        inria, block=16
+    )
     assert drawn_as(own, "inria") == dataclasses.replace(inria, block=16, max_pairs=1000)
     assert drawn_as(dataclasses.replace(inria, chunk=4), "exact") == SplatConfig(chunk=4)
 
@@ -50,7 +55,9 @@ def project(gaussians, i, view):
     (fx, _, cx), (_, fy, cy) = K[0], K[1]
     # INRIA's frustum is symmetric; for a shifted one the limits lie 0.3 half fields of view beyond each border
     low = np.asarray([-cx / fx - 0.3 * 0.5 * WIDTH / fx, -cy / fy - 0.3 * 0.5 * HEIGHT / fy])
-    high = np.asarray([(WIDTH - cx) / fx + 0.3 * 0.5 * WIDTH / fx, (HEIGHT - cy) / fy + 0.3 * 0.5 * HEIGHT / fy])
+    high = np.asarray(
+        [(WIDTH - cx) / fx + 0.3 * 0.5 * WIDTH / fx, (HEIGHT - cy) / fy + 0.3 * 0.5 * HEIGHT / fy]
+    )
     tx, ty = np.clip(p[:2] / p[2], low, high) * p[2]
     J = np.asarray([[fx / p[2], 0, -fx * tx / p[2] ** 2], [0, fy / p[2], -fy * ty / p[2] ** 2]])
     factor = rotation(np.asarray(gaussians.quats)[i]) * np.asarray(gaussians.scales)[i]
@@ -94,7 +101,9 @@ def test_draws_what_the_release_draws(seed):
     with jax.enable_x64(True):
         gaussians = random_gaussians(seed, count=60)
         gaussians = dataclasses.replace(gaussians, deformations=None)
-        gaussians = dataclasses.replace(gaussians, quats=gaussians.quats * 0.4, scales=gaussians.scales * 0.3)
+        gaussians = dataclasses.replace(
+            gaussians, quats=gaussians.quats * 0.4, scales=gaussians.scales * 0.3
+        )
         view = camera(width=WIDTH, height=HEIGHT)
         view = dataclasses.replace(view, K=view.K.at[:2, :2].multiply(3.0))
         expected, alpha = draw(gaussians, view, np.ones(3))

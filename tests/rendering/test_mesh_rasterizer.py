@@ -11,7 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
-from humangs_jax.rendering.mesh.rasterizer import RasterConfig, interpolate_attributes, rasterize_mesh, sample_texture
+from humangs_jax.rendering.mesh.rasterizer import (
+    RasterConfig,
+    interpolate_attributes,
+    rasterize_mesh,
+    sample_texture,
+)
 
 PIXEL_ERROR = 1e-4
 """Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few operations each."""
@@ -39,7 +44,9 @@ def ray_reference(vertices, faces, camera, near=0.01):
     v = points[np.asarray(faces)]  # (f, corner, xyz)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     d = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
-    normals = np.stack([np.cross(v[:, 1], v[:, 2]), np.cross(v[:, 2], v[:, 0]), np.cross(v[:, 0], v[:, 1])], axis=1)
+    normals = np.stack(
+        [np.cross(v[:, 1], v[:, 2]), np.cross(v[:, 2], v[:, 0]), np.cross(v[:, 0], v[:, 1])], axis=1
+    )
     determinant = np.einsum("fi,fi->f", v[:, 0], normals[:, 0])
     drawn = (v[..., 2] > near).all(-1) & (np.abs(determinant) > 1e-14 * np.abs(v).max((1, 2)) ** 3)
     scaled = normals[drawn] / determinant[drawn, None, None]
@@ -47,13 +54,17 @@ def ray_reference(vertices, faces, camera, near=0.01):
     weights = np.einsum("hwi,fci->fhwc", d, scaled)  # b / z
     with np.errstate(divide="ignore"):
         z = 1 / weights.sum(-1)
-    distance = (weights / np.linalg.norm(scaled[..., :2] / [K[0, 0], K[1, 1]], axis=-1)[:, None, None]).min(-1)
+    distance = (
+        weights / np.linalg.norm(scaled[..., :2] / [K[0, 0], K[1, 1]], axis=-1)[:, None, None]
+    ).min(-1)
     hits = np.where(distance >= 0, z, np.inf)
     nearest = hits.argmin(0)  # of equal ones the first
     row, column = np.indices(nearest.shape)
     depth = hits[nearest, row, column]
     hit = np.isfinite(depth)
-    unsure = ((np.abs(distance) < PIXEL_ERROR) & (z < np.where(hit, depth * (1 + DEPTH_TIE), np.inf))).any(0)
+    unsure = (
+        (np.abs(distance) < PIXEL_ERROR) & (z < np.where(hit, depth * (1 + DEPTH_TIE), np.inf))
+    ).any(0)
     unsure |= ((hits > depth) & (hits < depth * (1 + DEPTH_TIE))).any(0)
     slope = np.linalg.norm(scaled.sum(1)[:, :2] / [K[0, 0], K[1, 1]], axis=-1)[nearest]
     finite = np.where(hit, depth, 0)
@@ -66,7 +77,9 @@ def ray_reference(vertices, faces, camera, near=0.01):
     )
 
 
-def check_against_rays(fragments, vertices, faces, camera, pixel_error=PIXEL_ERROR, most_unsure=0.1):
+def check_against_rays(
+    fragments, vertices, faces, camera, pixel_error=PIXEL_ERROR, most_unsure=0.1
+):
     expected = ray_reference(vertices, faces, camera)
     assert expected.unsure.mean() <= most_unsure  # or the test would be empty
     ids = np.asarray(fragments.face_ids)
@@ -74,14 +87,19 @@ def check_against_rays(fragments, vertices, faces, camera, pixel_error=PIXEL_ERR
     np.testing.assert_array_equal(np.asarray(fragments.depth)[ids < 0], -1)
     np.testing.assert_array_equal(np.asarray(fragments.barycentrics)[ids < 0], 0)
     same = (ids == expected.face_ids) & (ids >= 0)
-    depth, weights = np.asarray(fragments.depth, np.float64)[same], np.asarray(fragments.barycentrics, np.float64)[same]
+    depth, weights = (
+        np.asarray(fragments.depth, np.float64)[same],
+        np.asarray(fragments.barycentrics, np.float64)[same],
+    )
     assert weights.min(initial=0) >= 0
     np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-6)
     allowed = pixel_error * (expected.steepness[same] + expected.depth[same])
     assert (np.abs(depth - expected.depth[same]) <= allowed).all()
     # the weights say where on the face: the same point, seen from the camera, as the ray's
     corners = np.asarray(vertices, np.float64)[np.asarray(faces)[ids[same]]]
-    error = np.linalg.norm(np.einsum("pc,pci->pi", weights - expected.barycentrics[same], corners), axis=-1)
+    error = np.linalg.norm(
+        np.einsum("pc,pci->pi", weights - expected.barycentrics[same], corners), axis=-1
+    )
     assert (error <= allowed).all()
     return expected
 
@@ -93,7 +111,9 @@ def sphere(rows=12, columns=18, radius=1.0):
     ring = np.stack([np.cos(around), 0 * around, np.sin(around)], -1)
     body = np.sin(polar)[:, None, None] * ring + np.cos(polar)[:, None, None] * np.array([0, 1, 0])
     vertices = radius * np.concatenate([body.reshape(-1, 3), [[0, 1, 0], [0, -1, 0]]])
-    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(rows - 2), np.arange(columns), indexing="ij"))
+    i, j = (
+        a.reshape(-1) for a in np.meshgrid(np.arange(rows - 2), np.arange(columns), indexing="ij")
+    )
     a, b = i * columns + j, i * columns + (j + 1) % columns
     faces = [np.stack([a, b, a + columns], -1), np.stack([b, b + columns, a + columns], -1)]
     j = np.arange(columns)
@@ -180,20 +200,34 @@ def grid(x, y):
     vertices = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
     faces = []
     for i, j in itertools.product(range(rows - 1), range(columns - 1)):
-        a, b, c, d = i * columns + j, i * columns + j + 1, (i + 1) * columns + j, (i + 1) * columns + j + 1
+        a, b, c, d = (
+            i * columns + j,
+            i * columns + j + 1,
+            (i + 1) * columns + j,
+            (i + 1) * columns + j + 1,
+        )
         faces += [[a, b, c], [b, d, c]] if (i + j) % 2 else [[a, b, d], [a, d, c]]
     return vertices, np.array(faces)
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-7, 1e-6, 1e-3, 0.2]), st.sampled_from([1.0, 1.4]))
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from([0.0, 1e-7, 1e-6, 1e-3, 0.2]),
+    st.sampled_from([1.0, 1.4]),
+)
 def test_sheet_has_no_holes(seed, jitter, spacing):
     """Vertices on pixel centres, edges through pixel centres, or both missed by roundings."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[-1:23, -1:35].astype(np.float64)
     x, y = (spacing * a + 0.5 - (spacing - 1) + jitter * rng.normal(size=a.shape) for a in (x, y))
     vertices, faces = grid(x, y)
-    faces = np.stack([np.roll(face, turn) for face, turn in zip(faces, rng.integers(0, 3, len(faces)), strict=True)])
+    faces = np.stack(
+        [
+            np.roll(face, turn)
+            for face, turn in zip(faces, rng.integers(0, 3, len(faces)), strict=True)
+        ]
+    )
     faces[::2] = faces[::2, ::-1]  # neither winding nor the first corner may matter
     fragments = draw(vertices, faces, flat_camera(), RasterConfig())
     assert (np.asarray(fragments.face_ids) >= 0).all()
@@ -229,7 +263,9 @@ def test_of_equal_depths_the_lowest_face_wins_whatever_the_step():
 def test_edges_belong_to_the_face():
     vertices = np.array([[0.5, 0.5, 1], [4.5, 0.5, 1], [0.5, 4.5, 1]], np.float32)
     ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids)
-    expected = np.add.outer(np.arange(HEIGHT), np.arange(WIDTH)) <= 4  # the centres on both axes and on the diagonal too
+    expected = (
+        np.add.outer(np.arange(HEIGHT), np.arange(WIDTH)) <= 4
+    )  # the centres on both axes and on the diagonal too
     np.testing.assert_array_equal(ids == 0, expected)
 
 
@@ -248,12 +284,33 @@ def test_near_plane_drops_and_counts():
 @pytest.mark.slow
 def test_bad_faces_are_harmless():
     """Points, segments, NaN, infinity and coordinates near the largest float leave the other faces as they are."""
-    bad = np.array([[7, 7, 1], [np.nan, 7, 1], [7, np.inf, 1], [3e38, 3e38, 1], [4.5, 4.5, 0.5], [8.5, 8.5, 0.5]])
+    bad = np.array(
+        [
+            [7, 7, 1],
+            [np.nan, 7, 1],
+            [7, np.inf, 1],
+            [3e38, 3e38, 1],
+            [4.5, 4.5, 0.5],
+            [8.5, 8.5, 0.5],
+        ]
+    )
     vertices = np.concatenate([SQUARE, bad]).astype(np.float32)
-    faces = [[4, 4, 4], [0, 3, 0], [0, 3, 3], [0, 1, 5], [6, 1, 2], [7, 0, 1], [8, 8, 9], [8, 9, 9], [8, 9, 8]]
+    faces = [
+        [4, 4, 4],
+        [0, 3, 0],
+        [0, 3, 3],
+        [0, 1, 5],
+        [6, 1, 2],
+        [7, 0, 1],
+        [8, 8, 9],
+        [8, 9, 9],
+        [8, 9, 8],
+    ]
     faces = np.concatenate([faces, SQUARE_FACES])
     with_bad = rasterize_mesh(jnp.asarray(vertices), jnp.asarray(faces), flat_camera(), SMALL_STEPS)
-    without = rasterize_mesh(jnp.asarray(SQUARE), jnp.asarray(SQUARE_FACES), flat_camera(), SMALL_STEPS)
+    without = rasterize_mesh(
+        jnp.asarray(SQUARE), jnp.asarray(SQUARE_FACES), flat_camera(), SMALL_STEPS
+    )
     ids = np.asarray(with_bad.face_ids)
     np.testing.assert_array_equal(np.where(ids >= 0, ids - len(faces) + 2, -1), without.face_ids)
     np.testing.assert_array_equal(with_bad.depth, without.depth)
@@ -267,7 +324,11 @@ def test_faces_without_area_cover_nothing():
     step = rng.integers(1, 1 << 18, (40, 1, 2)) * rng.choice([-1, 1], (40, 1, 2)) * 2.0**-20
     points = 0.5 + step * np.array([-3, 1, 5])[:, None]
     z = np.array([0.25, 0.5, 1.0])[:, None]
-    vertices = np.concatenate([points * z, np.broadcast_to(z, (40, 3, 1))], axis=-1).reshape(-1, 3).astype(np.float32)
+    vertices = (
+        np.concatenate([points * z, np.broadcast_to(z, (40, 3, 1))], axis=-1)
+        .reshape(-1, 3)
+        .astype(np.float32)
+    )
     ids = np.asarray(draw(vertices, np.arange(120).reshape(40, 3), flat_camera()).face_ids)
     assert (ids == -1).all()
 
@@ -282,12 +343,16 @@ def test_huge_faces_cover_everything():
 @pytest.mark.slow
 def test_images_of_one_pixel_and_meshes_of_nothing():
     vertices = jnp.asarray(SQUARE)
-    assert draw(vertices, SQUARE_FACES, Camera.from_opencv(np.eye(3), np.eye(4), 1, 1)).face_ids == -1
+    assert (
+        draw(vertices, SQUARE_FACES, Camera.from_opencv(np.eye(3), np.eye(4), 1, 1)).face_ids == -1
+    )
     shifted = Camera.from_opencv([[1, 0, -6.0], [0, 1, -5.0], [0, 0, 1]], np.eye(4), 1, 1)
     assert draw(vertices, SQUARE_FACES, shifted).face_ids == 0
     empty = rasterize_mesh(vertices, jnp.zeros((0, 3), jnp.int32), flat_camera())
     assert (np.asarray(empty.face_ids) == -1).all() and (np.asarray(empty.depth) == -1).all()
-    image = interpolate_attributes(empty, jnp.zeros((0, 3), jnp.int32), vertices, jnp.asarray([1.0, 2.0, 3.0]))
+    image = interpolate_attributes(
+        empty, jnp.zeros((0, 3), jnp.int32), vertices, jnp.asarray([1.0, 2.0, 3.0])
+    )
     np.testing.assert_array_equal(image, np.broadcast_to([1.0, 2.0, 3.0], (HEIGHT, WIDTH, 3)))
 
 
@@ -297,8 +362,18 @@ def test_images_of_one_pixel_and_meshes_of_nothing():
 @pytest.mark.slow
 def test_vmap_equals_loop_and_steps_do_not_matter():
     vertices, faces = sphere()
-    cameras = orbit(jnp.zeros(3), 3.0, jnp.asarray([0.0, 1.0, 4.0]), 0.3, intrinsics_from_fov(0.8, WIDTH, HEIGHT), WIDTH, HEIGHT)
-    moved = jnp.asarray(vertices) * jnp.asarray([1.0, 0.3, 1.2])[:, None, None]  # different numbers of steps
+    cameras = orbit(
+        jnp.zeros(3),
+        3.0,
+        jnp.asarray([0.0, 1.0, 4.0]),
+        0.3,
+        intrinsics_from_fov(0.8, WIDTH, HEIGHT),
+        WIDTH,
+        HEIGHT,
+    )
+    moved = (
+        jnp.asarray(vertices) * jnp.asarray([1.0, 0.3, 1.2])[:, None, None]
+    )  # different numbers of steps
     batch = jax.vmap(lambda v, camera: draw(v, faces, camera))(moved, cameras)
     for i in range(3):
         one = draw(moved[i], faces, cameras[i], RasterConfig())
@@ -312,20 +387,31 @@ def test_interpolation_of_positions_is_the_seen_point():
     camera = some_camera(2)
     fragments = draw(vertices, faces, camera)
     background = jnp.asarray([5.0, 6.0, 7.0])
-    points = np.asarray(interpolate_attributes(fragments, jnp.asarray(faces), jnp.asarray(vertices), background), np.float64)
+    points = np.asarray(
+        interpolate_attributes(fragments, jnp.asarray(faces), jnp.asarray(vertices), background),
+        np.float64,
+    )
     covered = np.asarray(fragments.face_ids) >= 0
-    np.testing.assert_array_equal(points[~covered], np.broadcast_to(background, points[~covered].shape))
+    np.testing.assert_array_equal(
+        points[~covered], np.broadcast_to(background, points[~covered].shape)
+    )
     transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
     seen = (points[covered] @ transform[:3, :3].T + transform[:3, 3]) @ K.T
     rows, columns = np.nonzero(covered)
-    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], np.stack([columns, rows], -1) + 0.5, atol=PIXEL_ERROR)
+    np.testing.assert_allclose(
+        seen[:, :2] / seen[:, 2:], np.stack([columns, rows], -1) + 0.5, atol=PIXEL_ERROR
+    )
     np.testing.assert_allclose(seen[:, 2], np.asarray(fragments.depth)[covered], rtol=1e-5)
 
 
 def test_corner_attributes_have_their_own_numbering():
     fragments = draw(SQUARE, SQUARE_FACES, flat_camera())
     attributes = jnp.asarray([[1.0], [2.0]])
-    image = np.asarray(interpolate_attributes(fragments, jnp.asarray([[0, 0, 0], [1, 1, 1]]), attributes, jnp.zeros(1)))[..., 0]
+    image = np.asarray(
+        interpolate_attributes(
+            fragments, jnp.asarray([[0, 0, 0], [1, 1, 1]]), attributes, jnp.zeros(1)
+        )
+    )[..., 0]
     np.testing.assert_allclose(image, np.asarray(fragments.face_ids) + 1, atol=1e-6)
 
 
@@ -345,7 +431,9 @@ def test_gradients_reach_attributes_and_nothing_else():
     ids = np.asarray(fragments.face_ids)
     np.add.at(expected, SQUARE_FACES[ids[ids >= 0]], np.asarray(fragments.barycentrics)[ids >= 0])
     np.testing.assert_allclose(to_attributes[:, 0], expected, rtol=1e-5)
-    np.testing.assert_allclose(to_attributes.sum(), 100, rtol=1e-5)  # the square holds 10 x 10 pixel centres
+    np.testing.assert_allclose(
+        to_attributes.sum(), 100, rtol=1e-5
+    )  # the square holds 10 x 10 pixel centres
 
 
 TEXEL_ROUNDING = 2e-6
@@ -359,7 +447,10 @@ def lookup(texture, u, v):
     total = 0
     for row in range(height):
         for column in range(width):
-            total = total + max(0, 1 - abs(x - column)) * max(0, 1 - abs(y - row)) * texture[row, column]
+            total = (
+                total
+                + max(0, 1 - abs(x - column)) * max(0, 1 - abs(y - row)) * texture[row, column]
+            )
     return total
 
 
@@ -367,9 +458,14 @@ def lookup(texture, u, v):
 @given(st.integers(0, 10_000))
 def test_lookup_equals_loop(seed):
     rng = np.random.default_rng(seed)
-    texture, uv = rng.uniform(size=(3, 5, 2)).astype(np.float32), rng.uniform(-0.3, 1.3, (4, 6, 2)).astype(np.float32)
+    texture, uv = (
+        rng.uniform(size=(3, 5, 2)).astype(np.float32),
+        rng.uniform(-0.3, 1.3, (4, 6, 2)).astype(np.float32),
+    )
     expected = [[lookup(texture.astype(np.float64), *uv[i, j]) for j in range(6)] for i in range(4)]
-    np.testing.assert_allclose(sample_texture(jnp.asarray(texture), jnp.asarray(uv)), expected, atol=TEXEL_ROUNDING)
+    np.testing.assert_allclose(
+        sample_texture(jnp.asarray(texture), jnp.asarray(uv)), expected, atol=TEXEL_ROUNDING
+    )
 
 
 def test_gradient_is_the_weights_of_the_texels():

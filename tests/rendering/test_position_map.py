@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.mesh.rasterizer import gouraud_position_map, plain_position_map, rasterize_mesh, vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import (
+    gouraud_position_map,
+    plain_position_map,
+    rasterize_mesh,
+    vertex_normals,
+)
 
 STORED_AS_FLOAT16 = 5e-4
 """Half of float16's spacing below 1."""
@@ -24,7 +29,10 @@ def golden():
 
 
 def mesh(golden):
-    posed, canonical = jnp.asarray(golden["posed_vertices"]), jnp.asarray(golden["canonical_vertices"])
+    posed, canonical = (
+        jnp.asarray(golden["posed_vertices"]),
+        jnp.asarray(golden["canonical_vertices"]),
+    )
     return posed, canonical, jnp.asarray(golden["faces"].astype(np.int32))
 
 
@@ -39,7 +47,9 @@ def camera_of(golden, view):
 def test_maps_equal_the_release(golden, view):
     posed, canonical, faces = mesh(golden)
     camera = camera_of(golden, view)
-    np.testing.assert_array_equal(rasterize_mesh(posed, faces, camera).face_ids, golden["face_ids"][view])
+    np.testing.assert_array_equal(
+        rasterize_mesh(posed, faces, camera).face_ids, golden["face_ids"][view]
+    )
     plain, depth = plain_position_map(posed, canonical, faces, camera)
     gouraud, gouraud_depth = gouraud_position_map(posed, canonical, faces, camera)
     np.testing.assert_allclose(plain, golden["position_map_plain"][view], atol=STORED_AS_FLOAT16)
@@ -56,7 +66,17 @@ def test_maps_equal_the_release(golden, view):
 def test_vertex_normals():
     """An octahedron's normals are its vertices; a vertex without faces, or of faces without area, has none."""
     corners = np.concatenate([np.eye(3), -np.eye(3), np.full((2, 3), 5.0)])
-    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5], [6, 6, 6]]
+    faces = [
+        [0, 1, 2],
+        [1, 3, 2],
+        [3, 4, 2],
+        [4, 0, 2],
+        [1, 0, 5],
+        [3, 1, 5],
+        [4, 3, 5],
+        [0, 4, 5],
+        [6, 6, 6],
+    ]
     normals = vertex_normals(jnp.asarray(corners, jnp.float32), jnp.asarray(faces))
     np.testing.assert_allclose(normals[:6], corners[:6], atol=1e-6)
     np.testing.assert_array_equal(normals[6:], 0)

@@ -36,7 +36,14 @@ def test_covariance_is_that_of_the_linearised_camera(float64):
     centers, expected = linearised(gaussians)
     seen = np.asarray(projected.visible)
     assert not seen[9] and seen[10] and seen.sum() == len(seen) - 1
-    planes = (projected.x, projected.y, projected.xx, projected.xy, projected.yy, projected.determinant)
+    planes = (
+        projected.x,
+        projected.y,
+        projected.xx,
+        projected.xy,
+        projected.yy,
+        projected.determinant,
+    )
     xx, xy, yy = expected[:, 0, 0], expected[:, 0, 1], expected[:, 1, 1]
     exact = (centers[:, 0], centers[:, 1], xx, xy, yy, xx * yy - xy * xy)
     for plane, expected_plane in zip(planes, exact, strict=True):
@@ -51,7 +58,10 @@ def test_moving_world_and_camera_together_changes_nothing(float64):
     q = quaternion.normalize(jnp.asarray([0.3, -0.5, 0.7, 0.2]))
     move = transform.make(quaternion.to_matrix(q), jnp.asarray([1.0, -2.0, 0.5]))
     moved = replace(
-        gaussians, means=transform.apply(move, gaussians.means), quats=quaternion.multiply(q, gaussians.quats), deformations=None
+        gaussians,
+        means=transform.apply(move, gaussians.means),
+        quats=quaternion.multiply(q, gaussians.quats),
+        deformations=None,
     )
     moved_view = replace(view, cam_from_world=view.cam_from_world @ transform.invert_rigid(move))
     pair = project(replace(gaussians, deformations=None), view), project(moved, moved_view)
@@ -63,25 +73,34 @@ def test_determinant_of_a_needle_is_accurate_in_float32():
     scales = [[1000.0, 1e-4, 1e-4]] * 3
     quats = [[np.cos(a), 0, 0, np.sin(a)] for a in (0.1, np.pi / 8, 1.0)]  # turned within the image
     gaussians = lambda dtype: Gaussians(
-        *(jnp.asarray(a, dtype) for a in ([[0.1, 0.2, 2.0]] * 3, quats, scales, [1.0] * 3, [[1.0] * 3] * 3))
+        *(
+            jnp.asarray(a, dtype)
+            for a in ([[0.1, 0.2, 2.0]] * 3, quats, scales, [1.0] * 3, [[1.0] * 3] * 3)
+        )
     )
     with jax.enable_x64(True):
         exact = project(gaussians(np.float64), camera(np.float64))
     rounded = project(gaussians(np.float32), camera(np.float32))
     np.testing.assert_allclose(rounded.determinant, exact.determinant, rtol=FLOAT32)
     xx, xy, yy = (np.asarray(plane) for plane in (rounded.xx, rounded.xy, rounded.yy))
-    assert np.abs((xx * yy - xy * xy) / np.asarray(exact.determinant) - 1).max() > 0.01  # what this guards against
+    assert (
+        np.abs((xx * yy - xy * xy) / np.asarray(exact.determinant) - 1).max() > 0.01
+    )  # what this guards against
 
 
 def test_what_is_not_drawn_is_finite_and_passes_no_gradient():
     gaussians = replace(
         random_gaussians(2, np.float32),
-        means=jnp.asarray([[0, 0, -1], [0, 0, 0.01], [0, 0, 0], [1e20, 0, 0.02], [0, 0, 2]], jnp.float32)[jnp.arange(32) % 5],
+        means=jnp.asarray(
+            [[0, 0, -1], [0, 0, 0.01], [0, 0, 0], [1e20, 0, 0.02], [0, 0, 2]], jnp.float32
+        )[jnp.arange(32) % 5],
         scales=jnp.full((32, 3), 0.1, jnp.float32).at[jnp.arange(4, 32, 5)].set(1e15),
     )
     view = replace(camera(np.float32), cam_from_world=jnp.eye(4))
     projected = project(gaussians, view)[:-2]
-    pull = jax.jit(lambda cotangent: jax.vjp(lambda g, v: project(g, v)[:-2], gaussians, view)[1](cotangent))
+    pull = jax.jit(
+        lambda cotangent: jax.vjp(lambda g, v: project(g, v)[:-2], gaussians, view)[1](cotangent)
+    )
     assert not project(gaussians, view).visible.any()
     for plane in projected:
         assert np.isfinite(plane).all()
@@ -92,8 +111,12 @@ def test_what_is_not_drawn_is_finite_and_passes_no_gradient():
 def test_zero_quaternion_is_the_identity_and_degenerate_scales_have_gradients():
     gaussians = random_gaussians(4, np.float32)
     identity = replace(gaussians, quats=gaussians.quats.at[:].set(jnp.asarray([1.0, 0, 0, 0])))
-    zero = replace(gaussians, quats=jnp.zeros_like(gaussians.quats), scales=gaussians.scales.at[::3].set(0))
-    for a, b in zip(project(zero, camera(np.float32)), project(identity, camera(np.float32)), strict=True):
+    zero = replace(
+        gaussians, quats=jnp.zeros_like(gaussians.quats), scales=gaussians.scales.at[::3].set(0)
+    )
+    for a, b in zip(
+        project(zero, camera(np.float32)), project(identity, camera(np.float32)), strict=True
+    ):
         np.testing.assert_array_equal(np.delete(a, np.s_[::3]), np.delete(b, np.s_[::3]))
     total = lambda g: sum(jnp.sum(plane) for plane in project(g, camera(np.float32))[:-2])
     for leaf in jax.tree.leaves(jax.jit(jax.grad(total))(zero)):
@@ -102,7 +125,9 @@ def test_zero_quaternion_is_the_identity_and_degenerate_scales_have_gradients():
 
 def test_clamped_jacobian_bounds_the_footprint_beside_a_near_camera(float64):
     """INRIA's is that of the point at 1.3 times half the field of view."""
-    ball = replace(few(random_gaussians(5), np.asarray([15])), deformations=None, scales=jnp.full((1, 3), 0.01))
+    ball = replace(
+        few(random_gaussians(5), np.asarray([15])), deformations=None, scales=jnp.full((1, 3), 0.01)
+    )
     view = camera()
     view = replace(view, K=view.K.at[0, 2].set(view.width / 2), cam_from_world=jnp.eye(4))
     beside = replace(ball, means=jnp.asarray([[2.0, 0.1, 0.2]]))
@@ -110,7 +135,9 @@ def test_clamped_jacobian_bounds_the_footprint_beside_a_near_camera(float64):
     free, clamped = (project(beside, view, SplatConfig(jacobian_margin=m)) for m in (None, margin))
     focal = view.K[0, 0]
     at = 1.3 * 0.5 * view.width / focal
-    np.testing.assert_allclose(clamped.xx[0], (0.01 * focal / 0.2) ** 2 * (1 + at**2) + EPS2D, rtol=FLOAT64)
+    np.testing.assert_allclose(
+        clamped.xx[0], (0.01 * focal / 0.2) ** 2 * (1 + at**2) + EPS2D, rtol=FLOAT64
+    )
     assert clamped.xx[0] < 0.1 * free.xx[0]
     np.testing.assert_array_equal(clamped.x, free.x)  # the centre stays where it is
 
@@ -144,10 +171,17 @@ def test_gradient_along_the_long_axis_of_a_needle_is_accurate_in_float32():
     for dtype in (np.float32, np.float64):
         with jax.enable_x64(dtype == np.float64):
             gaussians = Gaussians(*(jnp.asarray(np.asarray(a, np.float32), dtype) for a in arrays))
-            view = jax.tree.map(lambda a, dtype=dtype: jnp.asarray(np.asarray(a), dtype), camera(np.float32))
-            values[dtype] = [np.asarray(a) for a in gradients(gaussians, view, jnp.asarray(d, dtype))]
+            view = jax.tree.map(
+                lambda a, dtype=dtype: jnp.asarray(np.asarray(a), dtype), camera(np.float32)
+            )
+            values[dtype] = [
+                np.asarray(a) for a in gradients(gaussians, view, jnp.asarray(d, dtype))
+            ]
     for found, exact in zip(values[np.float32], values[np.float64], strict=True):
         assert np.linalg.norm(found - exact) < bound(FLOAT32) * np.linalg.norm(exact)
-    long, thin = np.abs(values[np.float64][0][:, 0]).max(), np.abs(values[np.float64][0][:, 1:]).max()
+    long, thin = (
+        np.abs(values[np.float64][0][:, 0]).max(),
+        np.abs(values[np.float64][0][:, 1:]).max(),
+    )
     assert long < 1e-3 * thin  # so that it could drown
     assert np.abs(values[np.float32][0] - values[np.float64][0])[:, 0].max() < 1e-3 * long

@@ -33,7 +33,9 @@ def test_visibility_is_the_largest_weight():
         gaussians = random_gaussians(3)
         weights = jax.vmap(
             lambda i: render_reference(
-                replace(gaussians, colors=jnp.zeros((COUNT, 3)).at[i, 0].set(1.0)), camera(), background=jnp.zeros(3)
+                replace(gaussians, colors=jnp.zeros((COUNT, 3)).at[i, 0].set(1.0)),
+                camera(),
+                background=jnp.zeros(3),
             ).rgb[..., 0]
         )(jnp.arange(COUNT))
         rendering = render(gaussians, camera(), knobs(visibility=True))
@@ -84,21 +86,33 @@ def test_extent_cuts_whole_tiles_only():
         narrow = render(gaussians, view, knobs(radius_sigma=2.0))
         # at most the alpha of one splat beyond two deviations: no pixel here loses more
         assert 1e-3 < np.abs(narrow.rgb - exact.rgb).max() < 0.9 * np.exp(-2)
-        assert plan_buffers(gaussians, view, knobs(radius_sigma=2.0)).max_pairs < plan_buffers(gaussians, view, SMALL).max_pairs
+        assert (
+            plan_buffers(gaussians, view, knobs(radius_sigma=2.0)).max_pairs
+            < plan_buffers(gaussians, view, SMALL).max_pairs
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("near_exact", 0.01), ("fast", 0.05), ("inria", 0.02)])
 def test_presets_draw_nearly_the_same(name, most):
     gaussians, view = few(random_gaussians(9, np.float32), np.arange(15, COUNT)), camera(np.float32)
-    gaussians = replace(gaussians, quats=gaussians.quats / jnp.linalg.norm(gaussians.quats, axis=1, keepdims=True))
+    gaussians = replace(
+        gaussians, quats=gaussians.quats / jnp.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    )
     exact, ours = (render(gaussians, view, SPLAT_PRESETS[preset]) for preset in ("exact", name))
     assert SPLAT_PRESETS["exact"] == SplatConfig()
     assert 0 < np.abs(ours.rgb - exact.rgb).mean() < most
 
 
 def test_settings_are_checked():
-    several = {"radius_sigma": 0.0, "square": True, "chunk": 0, "alpha_min": 0.0, "alpha_max": 1.0, "near": -1.0}
+    several = {
+        "radius_sigma": 0.0,
+        "square": True,
+        "chunk": 0,
+        "alpha_min": 0.0,
+        "alpha_max": 1.0,
+        "near": -1.0,
+    }
     for wrong in ({name: value} for name, value in (several | {"max_pairs": 0}).items()):
         with pytest.raises(ValueError, match="SplatConfig"):
             SplatConfig(**wrong)
@@ -109,4 +123,6 @@ def test_cameras_of_a_batch_are_planned_together():
     near = camera(np.float32)
     far = Camera(near.K, near.cam_from_world.at[2, 3].add(3.0), WIDTH, HEIGHT)
     both = plan_buffers(gaussians, stack_cameras([near, far]), SMALL)
-    assert both == max((plan_buffers(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs)
+    assert both == max(
+        (plan_buffers(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs
+    )

@@ -45,11 +45,16 @@ def evaluate(draw, gaussians, view, background):
 
     def loss(gaussians, K, pose, background):
         r = draw(gaussians, Camera(K, pose, view.width, view.height), background)
-        value = sum(jnp.sum(w.astype(a.dtype) * a) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True))
+        value = sum(
+            jnp.sum(w.astype(a.dtype) * a)
+            for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True)
+        )
         return value, r
 
     arguments = gaussians, view.K, view.cam_from_world, background
-    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(*arguments)
+    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
+        *arguments
+    )
     return rendering, gradients
 
 
@@ -60,7 +65,9 @@ def tiled(gaussians, view, background, config=CHUNKS):
 
 @jax.jit
 def reference(gaussians, view, background):
-    return evaluate(lambda g, c, b: render_reference(g, c, background=b), gaussians, view, background)
+    return evaluate(
+        lambda g, c, b: render_reference(g, c, background=b), gaussians, view, background
+    )
 
 
 def background(dtype=np.float64):
@@ -73,7 +80,9 @@ def assert_close(ours, expected, tolerance):
     def check(path, a, b):
         a, b = np.asarray(a), np.asarray(b)
         assert np.isfinite(a).all(), path
-        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, np.abs(b).max(initial=0)), err_msg=str(path))
+        np.testing.assert_allclose(
+            a, b, rtol=0, atol=tolerance * max(1.0, np.abs(b).max(initial=0)), err_msg=str(path)
+        )
 
     jax.tree_util.tree_map_with_path(check, ours, expected)
 
@@ -95,14 +104,21 @@ def test_features_are_drawn_beside_the_colors():
     rng = np.random.default_rng(4)
     with jax.enable_x64(True):
         gaussians, view = random_gaussians(13), camera()
-        features, weights = jnp.asarray(rng.normal(size=(COUNT, 5))), jnp.asarray(rng.normal(size=(*VIEW, 5)))
+        features, weights = (
+            jnp.asarray(rng.normal(size=(COUNT, 5))),
+            jnp.asarray(rng.normal(size=(*VIEW, 5))),
+        )
 
         def loss(gaussians, features, draw, config):
             rendering = draw(gaussians, view, config, features=features)
             return jnp.sum(weights * rendering.features), rendering
 
-        found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=(2, 3))
-        ours, expected = (found(gaussians, features, draw, CHUNKS) for draw in (render, render_reference))
+        found = jax.jit(
+            jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=(2, 3)
+        )
+        ours, expected = (
+            found(gaussians, features, draw, CHUNKS) for draw in (render, render_reference)
+        )
         assert_close(ours, expected, FLOAT64)
     with pytest.raises(ValueError, match=r"features: expected shape \(32, n\), got \(31, 5\)"):
         render(random_gaussians(13, np.float32), camera(np.float32), features=jnp.zeros((31, 5)))
@@ -131,7 +147,10 @@ def test_gradients_are_derivatives():
 
         def loss(arguments):
             r = tiled(*arguments)[0]
-            return sum(float(np.sum(w * np.asarray(a))) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True))
+            return sum(
+                float(np.sum(w * np.asarray(a)))
+                for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True)
+            )
 
         leaves, structure = jax.tree.flatten(arguments)
         slopes = jax.tree.leaves(gradients)
@@ -139,14 +158,19 @@ def test_gradients_are_derivatives():
         for i, slope in enumerate(slopes):
             direction = jnp.asarray(rng.normal(size=slope.shape))
             moved = [
-                jax.tree.unflatten(structure, [*leaves[:i], leaves[i] + s * direction, *leaves[i + 1 :]]) for s in (step, -step)
+                jax.tree.unflatten(
+                    structure, [*leaves[:i], leaves[i] + s * direction, *leaves[i + 1 :]]
+                )
+                for s in (step, -step)
             ]
             difference = (loss(moved[0]) - loss(moved[1])) / (2 * step)
             np.testing.assert_allclose(jnp.vdot(slope, direction), difference, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("config", [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)], ids=["default", "tile 5"])
+@pytest.mark.parametrize(
+    "config", [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)], ids=["default", "tile 5"]
+)
 def test_the_schedule_does_not_change_the_image(config):
     with jax.enable_x64(True):
         gaussians = random_gaussians(5)
@@ -157,11 +181,19 @@ def test_the_schedule_does_not_change_the_image(config):
 @pytest.mark.slow
 def test_every_knob_means_the_same_as_in_the_reference():
     config = dataclasses.replace(
-        CHUNKS, near=2.5, eps2d=0.1, alpha_min=0.05, alpha_max=0.8, transmittance_stop=0.02, jacobian_margin=0.0
+        CHUNKS,
+        near=2.5,
+        eps2d=0.1,
+        alpha_min=0.05,
+        alpha_max=0.8,
+        transmittance_stop=0.02,
+        jacobian_margin=0.0,
     )
     with jax.enable_x64(True):
         gaussians = random_gaussians(6)
-        ours, expected = (f(gaussians, camera(), config, background()) for f in (render, render_reference))
+        ours, expected = (
+            f(gaussians, camera(), config, background()) for f in (render, render_reference)
+        )
         assert_close(ours, expected, FLOAT64)
 
 
@@ -170,10 +202,15 @@ def test_float32_differs_only_by_rounding_and_by_decisions():
     gaussians, view = random_gaussians(8, np.float32), camera(np.float32)
     ours = tiled(gaussians, view, background(np.float32))
     with jax.enable_x64(True):
-        exact = jax.tree.map(lambda a: jnp.asarray(np.asarray(a, np.float64)), (gaussians, view, background(np.float32)))
+        exact = jax.tree.map(
+            lambda a: jnp.asarray(np.asarray(a, np.float64)),
+            (gaussians, view, background(np.float32)),
+        )
         expected = reference(*exact)
     error = np.abs(np.asarray(ours[0].rgb) - np.asarray(expected[0].rgb)).max(axis=-1)
-    assert np.sum(error > bound(FLOAT32)) <= 2  # pixels at which alpha = 1/255, the stop or the order fell the other way
+    assert (
+        np.sum(error > bound(FLOAT32)) <= 2
+    )  # pixels at which alpha = 1/255, the stop or the order fell the other way
     assert error.max() < 2 / 255
     assert_close(ours[1], jax.tree.map(np.asarray, expected[1]), FLOAT32_GRADIENT)
     assert ours[0].rgb.dtype == np.float32
@@ -184,9 +221,13 @@ def test_coincident_depths_are_drawn_by_index():
         gaussians = random_gaussians(10)
         level = replace(camera(), cam_from_world=jnp.eye(4))
         flat = replace(gaussians, means=gaussians.means.at[:, 2].set(3.0))
-        image, reverse = (tiled(g, level, background())[0] for g in (flat, few(flat, np.arange(COUNT)[::-1])))
+        image, reverse = (
+            tiled(g, level, background())[0] for g in (flat, few(flat, np.arange(COUNT)[::-1]))
+        )
         assert_close(image, reference(flat, level, background())[0], FLOAT64)
-        assert np.abs(image.rgb - reverse.rgb).max() > 0.01  # the order is visible, and is that of the index
+        assert (
+            np.abs(image.rgb - reverse.rgb).max() > 0.01
+        )  # the order is visible, and is that of the index
 
 
 def views(dtype=np.float32):
@@ -204,9 +245,13 @@ def test_batches_of_subjects_and_views_equal_the_loop():
         @jax.jit
         def together(batch):
             def loss(batch):
-                renderings = jax.vmap(jax.vmap(draw, (None, 0, None)), (0, None, None))(batch, cameras, background())
+                renderings = jax.vmap(jax.vmap(draw, (None, 0, None)), (0, None, None))(
+                    batch, cameras, background()
+                )
                 outputs = renderings.rgb, renderings.alpha, renderings.depth
-                return sum(jnp.sum(w * a) for w, a in zip(loss_weights(), outputs, strict=True)), renderings
+                return sum(
+                    jnp.sum(w * a) for w, a in zip(loss_weights(), outputs, strict=True)
+                ), renderings
 
             (_, renderings), gradients = jax.value_and_grad(loss, has_aux=True)(batch)
             return renderings, gradients
@@ -215,8 +260,12 @@ def test_batches_of_subjects_and_views_equal_the_loop():
         for i, subject in enumerate(subjects):
             singles = [tiled(subject, cameras[j], background()) for j in range(3)]
             for j, (rendering, _) in enumerate(singles):
-                assert_close(jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], renderings), rendering, FLOAT64)
-            total = jax.tree.map(lambda *leaves: sum(leaves), *(gradient[0] for _, gradient in singles))
+                assert_close(
+                    jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], renderings), rendering, FLOAT64
+                )
+            total = jax.tree.map(
+                lambda *leaves: sum(leaves), *(gradient[0] for _, gradient in singles)
+            )
             assert_close(jax.tree.map(lambda leaf, i=i: leaf[i], gradients), total, FLOAT64)
 
 
@@ -243,17 +292,26 @@ def test_overflow_is_counted_under_jit_and_refused_eagerly():
     pairs = needed(gaussians, view)
     config = dataclasses.replace(CHUNKS, max_pairs=pairs - 20, max_rows=256)
     assert jax.jit(render, static_argnums=2)(gaussians, view, config).overflow == 20
-    with pytest.raises(ValueError, match=rf"20 .*max_pairs >= {pairs} .*got max_pairs = {pairs - 20}"):
+    with pytest.raises(
+        ValueError, match=rf"20 .*max_pairs >= {pairs} .*got max_pairs = {pairs - 20}"
+    ):
         render(gaussians, view, config)
 
 
 @pytest.mark.parametrize("draw", [render, pytest.param(render_views, marks=pytest.mark.slow)])
 def test_traced_calls_warn_of_what_did_not_fit_where_asked(draw, caplog):
-    gaussians, cameras = random_gaussians(0, np.float32), camera(np.float32) if draw is render else views()
+    gaussians, cameras = (
+        random_gaussians(0, np.float32),
+        camera(np.float32) if draw is render else views(),
+    )
     small = dataclasses.replace(CHUNKS, max_pairs=64)
     asking = dataclasses.replace(small, warn_overflow=True)
-    loss = lambda opacities, config: draw(replace(gaussians, opacities=opacities), cameras, config).rgb.sum()
-    program = lambda config: str(jax.make_jaxpr(jax.grad(loss), static_argnums=1)(gaussians.opacities, config))
+    loss = lambda opacities, config: draw(
+        replace(gaussians, opacities=opacities), cameras, config
+    ).rgb.sum()
+    program = lambda config: str(
+        jax.make_jaxpr(jax.grad(loss), static_argnums=1)(gaussians.opacities, config)
+    )
     assert "callback" not in program(small) and "debug_callback" in program(asking)
     drawn = jax.jit(loss, static_argnums=1)
     with caplog.at_level(logging.WARNING):
@@ -271,12 +329,16 @@ def test_fitted_buffers_hold_every_view():
     config = plan_buffers(gaussians, cameras, CHUNKS, margin=1.0)
     most = max(needed(gaussians, cameras[i]) for i in range(3))
     assert most <= config.max_pairs < 1.5 * most
-    assert default_pairs(COUNT, WIDTH, HEIGHT) == COUNT * 6  # never more than every Gaussian in every tile
+    assert (
+        default_pairs(COUNT, WIDTH, HEIGHT) == COUNT * 6
+    )  # never more than every Gaussian in every tile
     assert default_pairs(50_000, 512, 512) == 12 * 50_000 + 16 * 4096
 
 
 def test_lowers_for_every_platform():
     gaussians, view = with_harmonics(random_gaussians(0, np.float32), 15), camera(np.float32)
     function = jax.grad(lambda gaussians, view: jnp.sum(render(gaussians, view, CHUNKS).rgb))
-    exported = jax.export.export(jax.jit(function), platforms=("cpu", "cuda", "tpu"))(gaussians, view)
+    exported = jax.export.export(jax.jit(function), platforms=("cpu", "cuda", "tpu"))(
+        gaussians, view
+    )
     assert "callback" not in exported.mlir_module()

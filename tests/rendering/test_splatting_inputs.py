@@ -29,7 +29,10 @@ def test_a_batch_of_cameras_is_told_where_to_go():
 
 
 def test_a_single_camera_is_told_where_to_go():
-    with pytest.raises(ValueError, match="render_views draws cameras with one leading axis, got a single camera: use render"):
+    with pytest.raises(
+        ValueError,
+        match="render_views draws cameras with one leading axis, got a single camera: use render",
+    ):
         render_views(scene(), camera(np.float32))
     nested = jax.tree.map(lambda leaf: leaf[None], BATCH)
     with pytest.raises(ValueError, match=r"got a batch \(1, 3\)"):
@@ -38,7 +41,10 @@ def test_a_single_camera_is_told_where_to_go():
 
 def test_a_batch_of_sets_is_told_where_to_go():
     sets = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scene())
-    with pytest.raises(ValueError, match=r"expected one set of Gaussians, got a batch \(2,\): draw it with jax.vmap"):
+    with pytest.raises(
+        ValueError,
+        match=r"expected one set of Gaussians, got a batch \(2,\): draw it with jax.vmap",
+    ):
         render(sets, camera(np.float32))
 
 
@@ -58,8 +64,14 @@ def test_wrong_values_of_gaussians_are_named(name, entry, words):
     array = getattr(gaussians, name)
     array = jnp.broadcast_to(jnp.eye(3), (len(gaussians.means), 3, 3)) if array is None else array
     wrong = replace(gaussians, **{name: array.at[5, *[1] * (array.ndim - 1)].set(entry)})
-    for draw in (lambda: render(wrong, camera(np.float32), CONFIG), lambda: render_views(wrong, BATCH, CONFIG)):
-        with pytest.raises(ValueError, match=rf"^render: gaussians.{name}: {words}, but 1 of \d+ are not, the first at \[5"):
+    for draw in (
+        lambda: render(wrong, camera(np.float32), CONFIG),
+        lambda: render_views(wrong, BATCH, CONFIG),
+    ):
+        with pytest.raises(
+            ValueError,
+            match=rf"^render: gaussians.{name}: {words}, but 1 of \d+ are not, the first at \[5",
+        ):
             draw()
 
 
@@ -68,7 +80,10 @@ def test_wrong_values_of_cameras_are_named():
     for change, words in (
         ({"K": view.K.at[0, 2].set(np.nan)}, "camera.K: expected finite numbers"),
         ({"K": view.K.at[1, 1].set(-500.0)}, "camera.K focal lengths: expected finite numbers > 0"),
-        ({"cam_from_world": view.cam_from_world.at[0, 3].set(np.inf)}, "camera.cam_from_world: expected finite numbers"),
+        (
+            {"cam_from_world": view.cam_from_world.at[0, 3].set(np.inf)},
+            "camera.cam_from_world: expected finite numbers",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             render(scene(), replace(view, **change), CONFIG)

@@ -30,7 +30,9 @@ def test_cumsum_is_exact(n):
 @pytest.mark.slow
 def test_cumsum_saturates_instead_of_wrapping():
     x = np.full(40_000, (1 << 18) - 1, np.int32)  # 1e10 in all
-    np.testing.assert_array_equal(tiling.cumsum(jnp.asarray(x)), np.minimum(np.cumsum(x, dtype=np.int64), tiling.SUM_LIMIT))
+    np.testing.assert_array_equal(
+        tiling.cumsum(jnp.asarray(x)), np.minimum(np.cumsum(x, dtype=np.int64), tiling.SUM_LIMIT)
+    )
 
 
 @pytest.mark.slow
@@ -51,7 +53,9 @@ def test_lists_hold_the_pairs_of_each_tile_in_order(item_count):
     items = np.sort(rng.choice(item_count, 200)).astype(np.int32)
     tiles = rng.integers(0, tile_count + 1, 200).astype(np.int32)  # tile_count: no tile
     order = rng.permutation(200)
-    lists = tiling.sort_into_tiles(jnp.asarray(tiles[order]), jnp.asarray(items[order]), tile_count, item_count)
+    lists = tiling.sort_into_tiles(
+        jnp.asarray(tiles[order]), jnp.asarray(items[order]), tile_count, item_count
+    )
     for tile in range(tile_count):
         start, count = int(lists.starts[tile]), int(lists.counts[tile])
         np.testing.assert_array_equal(lists.items[start : start + count], items[tiles == tile])
@@ -81,12 +85,16 @@ def test_blocks_come_by_falling_length_and_skip_empty_tiles(counts, block):
     assert int(blocks.used) == -(-np.count_nonzero(counts) // block)
 
 
-@pytest.mark.parametrize(("width", "height", "tile_size"), [(16, 8, 8), (13, 21, 8), (1, 1, 8), (5, 3, 1), (7, 30, 16)])
+@pytest.mark.parametrize(
+    ("width", "height", "tile_size"), [(16, 8, 8), (13, 21, 8), (1, 1, 8), (5, 3, 1), (7, 30, 16)]
+)
 def test_pixel_positions_are_those_of_the_image(width, height, tile_size):
     grid = TileGrid(width, height, tile_size)
     y, x = np.mgrid[:height, :width] + 0.5
     tiles = tile_centers(grid)[:, :, None] + grid.offsets()
-    np.testing.assert_array_equal(tiling.tiles_to_image(jnp.asarray(tiles), grid), np.stack([x, y], axis=-1))
+    np.testing.assert_array_equal(
+        tiling.tiles_to_image(jnp.asarray(tiles), grid), np.stack([x, y], axis=-1)
+    )
 
 
 GRID = TileGrid(WIDTH, HEIGHT, 4)
@@ -96,7 +104,9 @@ SAMPLES = 400
 
 @jax.jit
 def ellipses(gaussians):
-    return tiling.footprints(project(gaussians, camera(np.float32)), tiling.squared_reach(gaussians.opacities))
+    return tiling.footprints(
+        project(gaussians, camera(np.float32)), tiling.squared_reach(gaussians.opacities)
+    )
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
@@ -119,7 +129,9 @@ def least_distance(e, i, tile):
         return 0.0
     s = np.linspace(0, 1, SAMPLES)[:, None]
     corners = [low, np.asarray([high[0], low[1]]), high, np.asarray([low[0], high[1]])]
-    border = np.concatenate([a + s * (b - a) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)])
+    border = np.concatenate(
+        [a + s * (b - a) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)]
+    )
     d = border - center
     return np.einsum("ni,ij,nj->n", d, np.linalg.inv(cov), d).min()
 
@@ -129,7 +141,13 @@ def test_pairs_are_those_whose_ellipse_meets_the_tile(seed):
     e = jax.tree.map(np.asarray, ellipses(random_gaussians(seed, np.float32)))
     pairs = emit(e, 1024, 2048)
     used = np.asarray(pairs.tiles) < GRID.tiles
-    emitted = set(zip(np.asarray(pairs.tiles)[used].tolist(), np.asarray(pairs.splats)[used].tolist(), strict=True))
+    emitted = set(
+        zip(
+            np.asarray(pairs.tiles)[used].tolist(),
+            np.asarray(pairs.splats)[used].tolist(),
+            strict=True,
+        )
+    )
     assert len(emitted) == used.sum() == int(pairs.needed) and pairs.overflow == 0
     close = 0.02  # sampling of the border, and the slack
     for i in np.flatnonzero(e.reach > 0):
@@ -157,7 +175,9 @@ def test_overflow_counts_exactly_what_is_missing(max_rows, max_pairs):
 
 
 def test_counts_saturate():
-    huge = tiling.Footprints(*(jnp.full(3000, x, jnp.float32) for x in (8192.0, 8192.0, 1e10, 0.0, 1e10, 1e20, 10.0)))
+    huge = tiling.Footprints(
+        *(jnp.full(3000, x, jnp.float32) for x in (8192.0, 8192.0, 1e10, 0.0, 1e10, 1e20, 10.0))
+    )
     rows, pairs = count(huge, TileGrid(16384, 16384, 16))  # 3000 x 2^20 tiles
     assert rows == 3000 * 1024 and pairs == 1 << 30
 

@@ -51,7 +51,11 @@ def captures(body, tmp_path_factory):
 @pytest.fixture(scope="session")
 def variables():
     """Fresh variables of `tiny`; without LLVM's optimisations the many small random draws compile four times faster."""
-    draw = jax.jit(init_humangs.__wrapped__, static_argnames="config", compiler_options={"xla_backend_optimization_level": 0})
+    draw = jax.jit(
+        init_humangs.__wrapped__,
+        static_argnames="config",
+        compiler_options={"xla_backend_optimization_level": 0},
+    )
     return draw(jax.random.key(0), tiny().model)
 
 

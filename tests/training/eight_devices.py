@@ -27,7 +27,10 @@ def on_mesh(specs, mesh):
 def a_linear_model():
     """A state divided among 8 or 4 devices: values survive, the gradient of the mean is that of one device."""
     generator = np.random.default_rng(0)
-    params = {"kernel": generator.normal(size=(64, 48)).astype(np.float32), "bias": np.ones(48, np.float32)}
+    params = {
+        "kernel": generator.normal(size=(64, 48)).astype(np.float32),
+        "bias": np.ones(48, np.float32),
+    }
     x, y = (generator.normal(size=(16, width)).astype(np.float32) for width in (64, 48))
     loss = lambda params, x, y: jnp.mean((x @ params["kernel"] + params["bias"] - y) ** 2)
     expected = jax.grad(loss)(params, x, y)
@@ -42,10 +45,14 @@ def a_linear_model():
         batch = sharding.place((x, y), sharding.batch_sharding(mesh))
 
         def gradient(params, x, y, specs=specs, mesh=mesh):
-            return sharding.mean_parts(jax.grad(loss)(sharding.gather(params, specs), x, y), specs, mesh)
+            return sharding.mean_parts(
+                jax.grad(loss)(sharding.gather(params, specs), x, y), specs, mesh
+            )
 
         rows = PartitionSpec(sharding.AXES)
-        mapped = jax.shard_map(gradient, mesh=mesh, in_specs=(specs, rows, rows), out_specs=specs, check_vma=False)
+        mapped = jax.shard_map(
+            gradient, mesh=mesh, in_specs=(specs, rows, rows), out_specs=specs, check_vma=False
+        )
         found = jax.jit(mapped)(placed, *batch)
         assert found["kernel"].sharding.is_equivalent_to(named["kernel"], 2)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), found, expected)
@@ -70,18 +77,29 @@ def a_training_step():
     with tempfile.TemporaryDirectory() as folder:
         write_subject(Path(folder) / "someone", body, 0)
         cache = CaptureCache(find_captures(folder), body)
-        source = CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
+        source = CaptureSource(
+            cache, config.views, config.model.conventions.image_size, config.target_size
+        )
 
         def result(fsdp, at_once):
             part, mesh = dataclasses.replace(config, microbatch_size=at_once), None
-            params, statistics, rest, rows = variables["params"], variables["batch_stats"], (body, LossNetworks()), keys
+            params, statistics, rest, rows = (
+                variables["params"],
+                variables["batch_stats"],
+                (body, LossNetworks()),
+                keys,
+            )
             if fsdp:
                 mesh = sharding.training_mesh(fsdp)
                 specs = sharding.partition(params, mesh)
                 params = sharding.place(params, on_mesh(specs, mesh))
-                statistics, rest = (sharding.place(x, sharding.replicated(mesh)) for x in (statistics, rest))
+                statistics, rest = (
+                    sharding.place(x, sharding.replicated(mesh)) for x in (statistics, rest)
+                )
                 rows = jax.device_put(keys, sharding.batch_sharding(mesh))
-            batch = Loader(source, 8, sharding=None if mesh is None else sharding.batch_sharding(mesh)).batch_at(0)
+            batch = Loader(
+                source, 8, sharding=None if mesh is None else sharding.batch_sharding(mesh)
+            ).batch_at(0)
             step = jax.jit(lambda *x: batch_gradients(*x[:2], x[2][0], *x[3:], part, x[2][1], mesh))
             return jax.device_get(step(params, statistics, rest, batch, rows))
 
@@ -93,10 +111,14 @@ def a_training_step():
             apart = jax.tree.map(lambda a, b: np.abs(a - b).max(initial=0), other[1], gradients)
             apart = np.asarray(jax.tree.leaves(apart)) / norm
             assert np.quantile(apart, 0.9) < GRADIENTS and apart.max() < DECISIONS
-            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), other[2], statistics)
+            jax.tree.map(
+                lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), other[2], statistics
+            )
             assert other[3].keys() == metrics.keys()
             for name, value in metrics.items():
-                np.testing.assert_allclose(other[3][name], value, rtol=1e-5, atol=1e-9, err_msg=name)
+                np.testing.assert_allclose(
+                    other[3][name], value, rtol=1e-5, atol=1e-9, err_msg=name
+                )
 
 
 if __name__ == "__main__":

@@ -43,16 +43,29 @@ class Nobody:
 
 def run(tmp_path, **how):
     nobody = how.pop("people", [])
-    return ablate(how.pop("base", "tiny"), how.pop("variants", WITHOUT), out=tmp_path, people=nobody, **how, progress=False)
+    return ablate(
+        how.pop("base", "tiny"),
+        how.pop("variants", WITHOUT),
+        out=tmp_path,
+        people=nobody,
+        **how,
+        progress=False,
+    )
 
 
 def test_differences_are_paired_by_seed(trained, tmp_path):
     result = run(tmp_path, validation=[], seeds=3)
     assert trained == [(name, seed) for seed in range(3) for name in ("base", "no_class_token")]
     base, without = result.rows
-    assert (base.mean, without.mean, without.difference) == (1.0, pytest.approx(7 / 3), pytest.approx(4 / 3))
+    assert (base.mean, without.mean, without.difference) == (
+        1.0,
+        pytest.approx(7 / 3),
+        pytest.approx(4 / 3),
+    )
     # differences 1, 1, 2: deviation 0.577, t(0.975; 2) = 4.303
-    assert without.interval == pytest.approx(4.3027 * 0.57735 / 3**0.5, rel=1e-4) and not without.clear
+    assert (
+        without.interval == pytest.approx(4.3027 * 0.57735 / 3**0.5, rel=1e-4) and not without.clear
+    )
     assert "+1.33  +-1.43, unclear" in str(result)
 
 
@@ -74,7 +87,9 @@ def test_a_budget_that_was_too_small_says_which_would_do(trained, tmp_path, monk
     assert run(tmp_path, validation=[], seeds=2, budget="3h").missing == 0
 
 
-@pytest.mark.parametrize("scores", [{"base": {0: 1.0}, "a": {}}, {"base": {}, "a": {}}, {"base": {}, "a": {0: 2.0}}])
+@pytest.mark.parametrize(
+    "scores", [{"base": {0: 1.0}, "a": {}}, {"base": {}, "a": {}}, {"base": {}, "a": {0: 2.0}}]
+)
 def test_a_plot_without_a_difference_says_so_and_has_no_axis(scores):
     pytest.importorskip("matplotlib")
     figure = Ablation("psnr", scores, missing=1, longest=100.0).plot()
@@ -84,14 +99,23 @@ def test_a_plot_without_a_difference_says_so_and_has_no_axis(scores):
 
 def test_variants_of_like_names_have_folders_of_their_own_inside_of_out(trained, tmp_path):
     names = ("a b", "a_b", "A_B", "..", ".", "a/../../b", "x" * 300)
-    run(tmp_path / "out", validation=[], seeds=1, variants={name: {"loss.squared": 0.5} for name in names})
+    run(
+        tmp_path / "out",
+        validation=[],
+        seeds=1,
+        variants={name: {"loss.squared": 0.5} for name in names},
+    )
     folders = {folder for folder, _ in trained}
-    assert len({folder.lower() for folder in folders}) == len(names) + 1 and {"base", "a_b"} <= folders
+    assert (
+        len({folder.lower() for folder in folders}) == len(names) + 1 and {"base", "a_b"} <= folders
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert {path.name for path in (tmp_path / "out").iterdir()} == folders
 
 
-def test_all_variants_are_compared_on_the_photos_and_targets_of_the_base(trained, tmp_path, monkeypatch):
+def test_all_variants_are_compared_on_the_photos_and_targets_of_the_base(
+    trained, tmp_path, monkeypatch
+):
     asked, validated = [], []
     stand_in = ablation.train
 
@@ -101,7 +125,12 @@ def test_all_variants_are_compared_on_the_photos_and_targets_of_the_base(trained
         stand_in(config, body, people, folder, **how)
 
     monkeypatch.setattr(ablation, "train", watched)
-    larger = {"model.conventions.image_size": 64, "views.input_counts": (1, 3), "views.target_count": 5, "steps": 80}
+    larger = {
+        "model.conventions.image_size": 64,
+        "views.input_counts": (1, 3),
+        "views.target_count": 5,
+        "steps": 80,
+    }
 
     def make(config):
         validated.append(config)
@@ -151,7 +180,10 @@ def test_one_seed_has_no_interval():
         ({"metric": "mse"}, "'mse': is none of validation: psnr_fg"),
         ({"metric": "lpips"}, "'lpips': is none of validation: psnr_fg"),
         ({"variants": {"a": {"seed": 5}}}, "'a': seed: all variants have the seeds 0, 1"),
-        ({"variants": {"a": {}, "b": {"loss.lpips": 0.1}}}, "'b': loss.lpips: expected its network in networks"),
+        (
+            {"variants": {"a": {}, "b": {"loss.lpips": 0.1}}},
+            "'b': loss.lpips: expected its network in networks",
+        ),
         (
             {"variants": {"a": {"model.architecture.encoder.transformer.head_width": 7}}},
             "'a': width 16 is not a multiple of head_width 7",

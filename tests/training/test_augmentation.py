@@ -35,7 +35,12 @@ def photos():
 
 @pytest.fixture(scope="module")
 def example(body, captures):
-    views = CaptureCache(captures, body), CONFIG.views, CONFIG.model.conventions.image_size, CONFIG.target_size
+    views = (
+        CaptureCache(captures, body),
+        CONFIG.views,
+        CONFIG.model.conventions.image_size,
+        CONFIG.target_size,
+    )
     return jax.tree.map(lambda x: x[0], Loader(CaptureSource(*views), 1).batch_at(0))
 
 
@@ -55,7 +60,10 @@ def test_masks_grow_and_shrink_by_squares(photos):
     _, masks = changed(1, *photos, OTHER_MASKS)
     possible = [photos[1][0]]
     for size in (3, 5):
-        possible += [filter_(photos[1][0], size, mode="nearest") for filter_ in (ndimage.maximum_filter, ndimage.minimum_filter)]
+        possible += [
+            filter_(photos[1][0], size, mode="nearest")
+            for filter_ in (ndimage.maximum_filter, ndimage.minimum_filter)
+        ]
     which = [[np.array_equal(mask, other) for other in possible] for mask in np.asarray(masks)]
     assert np.all(np.sum(which, axis=1) == 1), "each mask is one of five"
     assert np.all(np.any(which, axis=0)), "each of the five occurs in 64 photos"
@@ -82,11 +90,19 @@ def test_exposure_has_its_standard_deviation():
 
 def test_cameras_turn_about_the_person_wherever_it_stands(example):
     """The posed pelvis stays where the photo shows it, also 5 m from the world's origin."""
-    pelvis, views, settings = np.float32([0.0, 0.9, 0.1]), example.inputs, dataclasses.replace(NOTHING, camera_degrees=2.0)
+    pelvis, views, settings = (
+        np.float32([0.0, 0.9, 0.1]),
+        example.inputs,
+        dataclasses.replace(NOTHING, camera_degrees=2.0),
+    )
     views = replace(views, translations=views.translations + jnp.asarray([5.0, 0.0, 0.0]))
     turn = jax.jit(lambda key: augment_views(key, views, jnp.asarray(pelvis), settings))
-    before, after = (np.asarray(x.cameras.cam_from_world)[:, :3] for x in (views, turn(jax.random.key(5))))
-    place = np.append(np.asarray(views.translations) + pelvis, np.ones((len(before), 1)), axis=1)[..., None]
+    before, after = (
+        np.asarray(x.cameras.cam_from_world)[:, :3] for x in (views, turn(jax.random.key(5)))
+    )
+    place = np.append(np.asarray(views.translations) + pelvis, np.ones((len(before), 1)), axis=1)[
+        ..., None
+    ]
     np.testing.assert_allclose(after @ place, before @ place, atol=1e-4)
     traces = np.einsum("vij,vij->v", after[..., :3], before[..., :3])
     degrees = np.degrees(np.arccos(np.minimum(1, (traces - 1) / 2)))
@@ -94,16 +110,23 @@ def test_cameras_turn_about_the_person_wherever_it_stands(example):
 
 
 def test_all_photos_of_an_example_have_the_same_wrong_body(example):
-    views, settings = example.inputs, dataclasses.replace(NOTHING, pose_degrees=1.0, body_metres=0.01)
+    views, settings = (
+        example.inputs,
+        dataclasses.replace(NOTHING, pose_degrees=1.0, body_metres=0.01),
+    )
     off = jax.jit(lambda key: augment_views(key, views, jnp.zeros(3), settings))(jax.random.key(4))
     for name in ("rotations", "translations"):
         change = np.asarray(getattr(off, name) - getattr(views, name))
         np.testing.assert_allclose(change, np.repeat(change[:1], len(change), 0), atol=ROUNDING)
         assert np.abs(change).max() > 1e-3
-    np.testing.assert_allclose(off.cameras.cam_from_world, views.cameras.cam_from_world, atol=ROUNDING)
+    np.testing.assert_allclose(
+        off.cameras.cam_from_world, views.cameras.cam_from_world, atol=ROUNDING
+    )
 
 
-def test_every_example_has_its_exposures_a_share_the_rest_and_targets_keep_photos_and_cameras(example, body):
+def test_every_example_has_its_exposures_a_share_the_rest_and_targets_keep_photos_and_cameras(
+    example, body
+):
     settings = Augmentation(share=0.5)
     augment = jax.jit(lambda key: augmentation.augment(key, example, body, settings))
     changed = []
@@ -123,7 +146,9 @@ def test_every_example_has_its_exposures_a_share_the_rest_and_targets_keep_photo
 
 def _check_one_gain_a_channel(images, before):
     """Whole pixels of the person have the ratio of their photo, the background is as white as before."""
-    for image, own, mask in zip(*map(np.asarray, (images, before.images, before.masks)), strict=True):
+    for image, own, mask in zip(
+        *map(np.asarray, (images, before.images, before.masks)), strict=True
+    ):
         whole = (mask == 1)[..., None] & (image < 1) & (own > 0.1)
         for channel in range(3):
             at = whole[..., channel]

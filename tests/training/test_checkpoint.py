@@ -12,7 +12,13 @@ import pytest
 from training_cases import without_upsampler
 
 from humangs_jax.io.reading import FileError
-from humangs_jax.training.checkpoint import Checkpoints, _checksum, _without_score, load_config, save_config
+from humangs_jax.training.checkpoint import (
+    Checkpoints,
+    _checksum,
+    _without_score,
+    load_config,
+    save_config,
+)
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import OptimizerConfig, TrainState, make_optimizer
 
@@ -47,7 +53,9 @@ def test_a_restored_state_has_the_same_bits_and_can_be_donated(checkpoints, same
     assert same(restored, state_at(3))
     double = jax.jit(lambda state: jax.tree.map(lambda x: 2 * x, state), donate_argnums=0)
     assert int(double(restored).step) == 6
-    checkpoints.save(dataclasses.replace(state_at(5), step=jnp.asarray(3, jnp.int32)))  # is there: the first one stays
+    checkpoints.save(
+        dataclasses.replace(state_at(5), step=jnp.asarray(3, jnp.int32))
+    )  # is there: the first one stays
     assert same(checkpoints.restore(state_at(0)), state_at(3))
     with pytest.raises(FileNotFoundError, match="no checkpoint of step 7"):
         checkpoints.restore(state_at(0), 7)
@@ -109,7 +117,9 @@ def test_what_cannot_be_written_is_one_line_that_names_the_folder(tmp_path, monk
         raise RuntimeError("RESOURCE_EXHAUSTED: Error writing\nlocal file: No space left on device")
 
     monkeypatch.setattr(checkpoints._manager, "wait_until_finished", fail)
-    with pytest.raises(FileError, match=r"checkpoints: a checkpoint cannot be written: .*No space left") as error:
+    with pytest.raises(
+        FileError, match=r"checkpoints: a checkpoint cannot be written: .*No space left"
+    ) as error:
         checkpoints.wait()
     assert "\n" not in str(error.value) and str(tmp_path) in str(error.value)
     assert capfd.readouterr() == ("", "")
@@ -132,7 +142,9 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, 
         again.wait()
         assert same(again.restore(state_at(0, LARGE)), state_at(3, LARGE)), damage
         again.close()
-        assert sorted(path.name for path in folder.iterdir()) == ["1", "2", "3", "damaged-3"], damage
+        assert sorted(path.name for path in folder.iterdir()) == ["1", "2", "3", "damaged-3"], (
+            damage
+        )
     gc.collect()  # what Orbax left behind ends here, not in a later test
 
 
@@ -179,7 +191,9 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     save_config(tmp_path, dataclasses.replace(tiny(), log_every=7))
     with pytest.raises(ValueError, match=r"started with steps = 60, not 5"):
         save_config(tmp_path, dataclasses.replace(tiny(), steps=5))
-    with pytest.raises(ValueError, match="steps = 60, not 90"):  # not finished: its learning rate would change on the way
+    with pytest.raises(
+        ValueError, match="steps = 60, not 90"
+    ):  # not finished: its learning rate would change on the way
         save_config(tmp_path, dataclasses.replace(tiny(), steps=90))
     (tmp_path / "checkpoints" / "60").mkdir(parents=True)
     with pytest.raises(ValueError, match="steps = 60, not 5"):
@@ -189,5 +203,9 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     other = dataclasses.replace(tiny(), loss=dataclasses.replace(tiny().loss, structural=9.0))
     with pytest.raises(ValueError, match=r"loss\.structural = "):
         save_config(tmp_path, other)
-    with pytest.raises(ValueError, match=r"model\.architecture\.encoder\.upsampler.* not None"):  # a part is gone
-        save_config(tmp_path, dataclasses.replace(tiny(), steps=90, model=without_upsampler(tiny().model)))
+    with pytest.raises(
+        ValueError, match=r"model\.architecture\.encoder\.upsampler.* not None"
+    ):  # a part is gone
+        save_config(
+            tmp_path, dataclasses.replace(tiny(), steps=90, model=without_upsampler(tiny().model))
+        )

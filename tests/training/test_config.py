@@ -12,16 +12,31 @@ from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read
 from humangs_jax.training.sources import training_people
 
 STAGED = dataclasses.replace(
-    tiny(), steps=10, batch_size=3, stages=(Stage(4, image_size=64, batch_size=2), Stage(8, target_size=32))
+    tiny(),
+    steps=10,
+    batch_size=3,
+    stages=(Stage(4, image_size=64, batch_size=2), Stage(8, target_size=32)),
 )
 
 
 def test_a_stage_changes_what_it_names_until_the_next_adds_to_it():
     assert STAGED.at(3) == dataclasses.replace(STAGED, stages=())
-    assert (STAGED.at(4).model.conventions.image_size, STAGED.at(4).batch_size, STAGED.at(4).target_size) == (64, 2, 16)
-    assert (STAGED.at(9).model.conventions.image_size, STAGED.at(9).batch_size, STAGED.at(9).target_size) == (64, 2, 32)
+    assert (
+        STAGED.at(4).model.conventions.image_size,
+        STAGED.at(4).batch_size,
+        STAGED.at(4).target_size,
+    ) == (64, 2, 16)
+    assert (
+        STAGED.at(9).model.conventions.image_size,
+        STAGED.at(9).batch_size,
+        STAGED.at(9).target_size,
+    ) == (64, 2, 32)
     assert STAGED.spans(0, 10) == [(0, 4), (4, 8), (8, 10)]
-    assert STAGED.spans(5, 7) == [(5, 7)] and STAGED.spans(4, 9) == [(4, 8), (8, 9)] and STAGED.spans(3, 3) == []
+    assert (
+        STAGED.spans(5, 7) == [(5, 7)]
+        and STAGED.spans(4, 9) == [(4, 8), (8, 9)]
+        and STAGED.spans(3, 3) == []
+    )
 
 
 def test_examples_are_counted_over_stages():
@@ -48,8 +63,14 @@ def test_runs_survive_json(name):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"stages": [{"start": 5, "size": 3}]}', r"config\.stages\[0\]\.size: Stage has no such field"),
-        ('{"optimizer": {"name": "sgd"}}', r"config\.optimizer\.name: expected .*adamw.*, got 'sgd'"),
+        (
+            '{"stages": [{"start": 5, "size": 3}]}',
+            r"config\.stages\[0\]\.size: Stage has no such field",
+        ),
+        (
+            '{"optimizer": {"name": "sgd"}}',
+            r"config\.optimizer\.name: expected .*adamw.*, got 'sgd'",
+        ),
         ('{"model": {"runtime": {"dtype": "float16"}}}', "float16: gradients underflow"),
         ('{"steps": 2', "the configuration is not JSON"),
     ],
@@ -64,7 +85,9 @@ def test_errors_name_file_and_field(text, message, tmp_path):
 
 def test_presets_by_name_and_files_that_are_not_there():
     assert read_config("tiny") == tiny()
-    with pytest.raises(FileNotFoundError, match=r"huge: neither a file nor one of the presets published, paper"):
+    with pytest.raises(
+        FileNotFoundError, match=r"huge: neither a file nor one of the presets published, paper"
+    ):
         read_config("huge")
 
 
@@ -72,7 +95,10 @@ def test_a_loss_without_its_network_gives_way_and_says_so(caplog):
     with caplog.at_level(logging.WARNING):
         fitted = fitting_losses(config.published(), LossNetworks())
     assert (fitted.loss.perceptual, fitted.loss.lpips, fitted.loss.structural) == (0, 0, 0.2)
-    assert "no network is given for the loss perceptual and lpips" in caplog.text and "structural dissimilarity" in caplog.text
+    assert (
+        "no network is given for the loss perceptual and lpips" in caplog.text
+        and "structural dissimilarity" in caplog.text
+    )
     assert fitting_losses(config.small(), LossNetworks()) == config.small()
 
 

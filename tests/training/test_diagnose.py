@@ -70,14 +70,21 @@ def test_the_numbers_are_those_of_the_step(body, batch, variables):
     named = {name for stage in diagnosis.stages for name in stage.gradients}
     assert named == {name for name, _ in inexact_leaves(variables["params"])}
     lines = str(diagnosis).splitlines()
-    assert lines[-1].startswith("loss ") and len(lines) == 4 + len(diagnosis.stored) + len(diagnosis.stages)
+    assert lines[-1].startswith("loss ") and len(lines) == 4 + len(diagnosis.stored) + len(
+        diagnosis.stages
+    )
     spike = dataclasses.replace(diagnosis, skip_norm=1e-9)
-    assert re.search("of its square is of stage 'decoder.[a-z]*_out'", spike.verdict)  # at the start it has nearly all
+    assert re.search(
+        "of its square is of stage 'decoder.[a-z]*_out'", spike.verdict
+    )  # at the start it has nearly all
 
 
 TOKENS = "encoder.tokenizer.linear"
 IN_BATCH = {
-    "inputs.images": ((0, 1, 16, 16, 2), TOKENS),  # a pixel of the person; the background is not read
+    "inputs.images": (
+        (0, 1, 16, 16, 2),
+        TOKENS,
+    ),  # a pixel of the person; the background is not read
     "targets.images": ((0, 0, 5, 6, 0), "loss: squared"),
     "targets.masks": ((0, 1, 2, 3), "loss: silhouette"),
     "inputs.betas": ((0, 0), "position maps"),
@@ -92,10 +99,19 @@ IN_BATCH = {
 @pytest.mark.parametrize("path", IN_BATCH)
 def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, path):
     index, stage = IN_BATCH[path]
-    value = np.nan if "camera" in path else np.inf  # an infinite camera may show nothing at all, which is finite
-    diagnosis = diagnose_step(init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG)
+    value = (
+        np.nan if "camera" in path else np.inf
+    )  # an infinite camera may show nothing at all, which is finite
+    diagnosis = diagnose_step(
+        init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG
+    )
     stored, computed = diagnosis.faults
-    assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == ("stored", "batch", path, 1)
+    assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == (
+        "stored",
+        "batch",
+        path,
+        1,
+    )
     assert stored.leaf.first == index[1:] and f"first at {list(index[1:])}" in str(diagnosis)
     assert (computed.direction, computed.stage) == ("forward", stage)
 
@@ -116,7 +132,12 @@ def test_a_bad_parameter_is_named_and_the_stage_that_uses_it(body, batch, variab
     state = init_state(CONFIG, variables)
     state = replace(state, params=with_leaf(state.params, path, planted(np.nan)))
     stored, computed = diagnose_step(state, batch, body, CONFIG).faults
-    assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == ("stored", "parameters", path, 1)
+    assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == (
+        "stored",
+        "parameters",
+        path,
+        1,
+    )
     assert (computed.direction, computed.stage) == ("forward", IN_PARAMETERS[path])
 
 
@@ -124,7 +145,9 @@ def test_a_bad_parameter_is_named_and_the_stage_that_uses_it(body, batch, variab
 def test_a_stage_that_overflows_from_finite_parameters_is_named(body, batch, variables):
     state, block = init_state(CONFIG, variables), "encoder.transformer.block_1"
     for name in ("mlp_in", "mlp_out"):
-        state = replace(state, params=with_leaf(state.params, f"{block}.{name}.kernel", lambda x: 1e25 * x))
+        state = replace(
+            state, params=with_leaf(state.params, f"{block}.{name}.kernel", lambda x: 1e25 * x)
+        )
     (fault,) = diagnose_step(state, batch, body, CONFIG).faults
     assert (fault.direction, fault.stage) == ("forward", block)
 
@@ -135,7 +158,9 @@ def test_moments_and_averages_are_looked_at(body, batch, variables):
     state = init_state(config, variables)
     assert state.ema_params is not None
     moments = state.opt_state.inner
-    for path in [path for path, _ in inexact_leaves(moments) if path.endswith("decoder.trunk_0.kernel")]:
+    for path in [
+        path for path, _ in inexact_leaves(moments) if path.endswith("decoder.trunk_0.kernel")
+    ]:
         moments = with_leaf(moments, path, planted(np.inf))
     averages = with_leaf(state.ema_params, "decoder.trunk_0.bias", planted(np.nan, 3))
     state = replace(state, opt_state=state.opt_state._replace(inner=moments), ema_params=averages)
@@ -151,8 +176,17 @@ def test_networks_that_run_again_for_every_target_are_diagnosed(name):
     config = dataclasses.replace(CONFIG, model=small(name), target_size=SIZE)
     shapes = jax.eval_shape(lambda: init_state(config))
     example = Example(views(), views(seed=1))
-    traced = functools.partial(inspect.unwrap(diagnose.observe_subject), config=config, networks=LossNetworks())
-    observed = jax.eval_shape(traced, shapes.params, shapes.batch_stats, mapped_tube(small(name)), example, jax.random.key(0))[1]
+    traced = functools.partial(
+        inspect.unwrap(diagnose.observe_subject), config=config, networks=LossNetworks()
+    )
+    observed = jax.eval_shape(
+        traced,
+        shapes.params,
+        shapes.batch_stats,
+        mapped_tube(small(name)),
+        example,
+        jax.random.key(0),
+    )[1]
     found = {parameter for stage in observed for parameter in stage.gradients}
     assert found == {parameter for parameter, _ in inexact_leaves(shapes.params)}
 
@@ -163,7 +197,10 @@ def nan_gradient(x):
 
 
 nan_gradient.defvjp(
-    lambda x: (x, None), lambda _, g: (g.at[(-1,) * g.ndim].set(jnp.nan) if jnp.issubdtype(g.dtype, jnp.inexact) else g,)
+    lambda x: (x, None),
+    lambda _, g: (
+        g.at[(-1,) * g.ndim].set(jnp.nan) if jnp.issubdtype(g.dtype, jnp.inexact) else g,
+    ),
 )
 
 
@@ -192,7 +229,9 @@ def test_gradients_are_known_where_a_stage_takes_and_gives():
         recorder = recorder or Recorder(probes)
         with nn.intercept_methods(recorder):
             y = network.apply(variables, x)
-            terms = stage("loss", lambda y: {"a": jnp.sum(y), "b": jnp.sum(nan_gradient(y))}, y, apart=True)
+            terms = stage(
+                "loss", lambda y: {"a": jnp.sum(y), "b": jnp.sum(nan_gradient(y))}, y, apart=True
+            )
         return terms["a"] + terms["b"], recorder.given
 
     loss(recorder=(dry := Recorder()))
@@ -200,7 +239,10 @@ def test_gradients_are_known_where_a_stage_takes_and_gives():
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), dry.shapes)
     sent = jax.grad(lambda probes: loss(probes)[0])(zeros)
     assert float(loss(zeros)[0]) == float(loss()[0])
-    fine = {name: [all(np.isfinite(g).all() for g in side.values()) for side in both] for name, both in sent.items()}
+    fine = {
+        name: [all(np.isfinite(g).all() for g in side.values()) for side in both]
+        for name, both in sent.items()
+    }
     assert fine["loss: a"] == [True, True] and fine["loss: b"] == [False, True]
     assert fine["reader.second"] == fine["reader.first"] == [False, False]
 
@@ -210,7 +252,12 @@ def number(name, bad=0):
 
 
 def test_going_back_the_innermost_last_stage_with_good_gradients_behind_it_is_blamed():
-    good = {"values": number("out"), "returned": number("out"), "taken": number("in"), "gradients": number("kernel")}
+    good = {
+        "values": number("out"),
+        "returned": number("out"),
+        "taken": number("in"),
+        "gradients": number("kernel"),
+    }
     spoilt = good | {"taken": number("in", 3), "returned": number("out", 1)}
     stages = {
         "tokenizer": good | {"gradients": number("kernel", 1)},  # going back, it comes later
@@ -220,7 +267,9 @@ def test_going_back_the_innermost_last_stage_with_good_gradients_behind_it_is_bl
         "encoder": good | {"taken": number("in", 3)},
         "loss": good,
     }
-    of = lambda stages: Diagnosis(7, 0, 1.0, 100.0, (), tuple(StageReport(name, **x) for name, x in stages.items()))
+    of = lambda stages: Diagnosis(
+        7, 0, 1.0, 100.0, (), tuple(StageReport(name, **x) for name, x in stages.items())
+    )
     assert of(stages).fault == Fault("backward", "encoder.block_1", number("kernel", 2)["kernel"])
     between = stages | {"encoder.block_1": good | {"returned": number("out", 1)}}
     assert of(between).fault == Fault("backward", "encoder", number("in", 3)["in"])
@@ -246,7 +295,10 @@ def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, t
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     events = [line for line in lines if "samples" in line]
     assert [(event["step"], len(event["samples"])) for event in events] == [(4, 1)]
-    assert "targets.images" in events[0]["samples"][0] and str(captures[0].parent) in events[0]["samples"][0]
+    assert (
+        "targets.images" in events[0]["samples"][0]
+        and str(captures[0].parent) in events[0]["samples"][0]
+    )
     diagnosis = diagnose_run(tmp_path, body, source(3), variables=variables)
     assert diagnosis.step == 3 and first_failed_step(tmp_path / "log.jsonl") == 3
     assert diagnosis.fault is not None and diagnosis.fault.leaf.name == "targets.images"
@@ -257,7 +309,9 @@ def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, t
 def fresh(monkeypatch):
     """`observe_subject` traced anew, after something was exchanged; quick to compile."""
     options = {"xla_backend_optimization_level": 0}
-    function = functools.partial(inspect.unwrap(diagnose.observe_subject))  # another one, or it would come from the cache
+    function = functools.partial(
+        inspect.unwrap(diagnose.observe_subject)
+    )  # another one, or it would come from the cache
     traced = jax.jit(function, static_argnames="config", compiler_options=options)
     monkeypatch.setattr(diagnose, "observe_subject", traced)
 
@@ -268,7 +322,10 @@ def spoilt(original):
 
 SPOILT = {
     "reader": (reader, "sum_over_views"),
-    "encoder.transformer.block_3": (transformer, "attention"),  # in all blocks: going back it is the first
+    "encoder.transformer.block_3": (
+        transformer,
+        "attention",
+    ),  # in all blocks: going back it is the first
     "decoder": (vertex_decoder, "activate"),
     "images": (forward, "draw_projected"),
 }
@@ -285,20 +342,32 @@ def test_a_stage_whose_gradient_alone_is_bad_is_named(monkeypatch, body, batch, 
 
 
 @pytest.mark.slow
-def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypatch, body, batch, variables):
+def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(
+    monkeypatch, body, batch, variables
+):
     networks = random_networks()
     loss = dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25)
-    config = dataclasses.replace(CONFIG, loss=loss, model=CONFIG.model.with_runtime(dtype="bfloat16"))
+    config = dataclasses.replace(
+        CONFIG, loss=loss, model=CONFIG.model.with_runtime(dtype="bfloat16")
+    )
     fresh(monkeypatch)
     whole = diagnose_step(init_state(config, variables), batch, body, config, networks)
     _, metrics = train_step(init_state(config, variables), batch, body, config, networks)
     assert whole.fault is None and whole.loss == pytest.approx(float(metrics["loss"]), rel=BFLOAT16)
     stages = {stage.name: stage for stage in whole.stages}
     for name in ("perceptual", "lpips"):
-        assert stages[f"loss: {name}"].values[""].mean == pytest.approx(float(metrics[name]), rel=BFLOAT16)
+        assert stages[f"loss: {name}"].values[""].mean == pytest.approx(
+            float(metrics[name]), rel=BFLOAT16
+        )
     networks = with_leaf(networks, "lpips.heads.2", planted(jnp.nan, 5))
-    stored, computed = diagnose_step(init_state(config, variables), batch, body, config, networks).faults
-    assert (stored.stage, stored.leaf.name, stored.leaf.first) == ("loss networks", "lpips.heads.2", (5,))
+    stored, computed = diagnose_step(
+        init_state(config, variables), batch, body, config, networks
+    ).faults
+    assert (stored.stage, stored.leaf.name, stored.leaf.first) == (
+        "loss networks",
+        "lpips.heads.2",
+        (5,),
+    )
     assert (computed.direction, computed.stage) == ("forward", "loss: lpips")
 
 
@@ -307,11 +376,17 @@ def test_networks_of_other_parts_have_the_same_stages(monkeypatch, body, batch):
     """Blocks in a loop and recomputed, all patches, no upsampler, corrected skinning weights, rotated quaternions."""
     decoder = dataclasses.replace(CONFIG.model.architecture.decoder, skinning_joints=2)
     model = without_upsampler(CONFIG.model).with_parts(decoder=decoder)
-    model = model.with_conventions(skinning="rotation").with_runtime(tokens="all", scan=True, remat="full")
+    model = model.with_conventions(skinning="rotation").with_runtime(
+        tokens="all", scan=True, remat="full"
+    )
     config = dataclasses.replace(CONFIG, model=model)
     fresh(monkeypatch)
     whole = diagnose_step(init_state(config), batch, body, config)
     _, metrics = train_step(init_state(config), batch, body, config)
-    assert whole.fault is None and {"encoder.transformer.block_3", "encoder", "loss"} <= {stage.name for stage in whole.stages}
+    assert whole.fault is None and {"encoder.transformer.block_3", "encoder", "loss"} <= {
+        stage.name for stage in whole.stages
+    }
     assert whole.loss == pytest.approx(float(metrics["loss"]), rel=bound(FLOAT32))
-    assert whole.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=1e-3)  # without the compiler's fusions
+    assert whole.gradient_norm == pytest.approx(
+        float(metrics["grad_norm"]), rel=1e-3
+    )  # without the compiler's fusions

@@ -27,7 +27,11 @@ def batched(tree):
 def layered(seed=0):
     """Translucent Gaussians in front of each other."""
     rng = np.random.default_rng(seed)
-    places = [0.1 * rng.normal(size=COUNT), 0.1 * rng.normal(size=COUNT), rng.uniform(1.5, 4.0, COUNT)]
+    places = [
+        0.1 * rng.normal(size=COUNT),
+        0.1 * rng.normal(size=COUNT),
+        rng.uniform(1.5, 4.0, COUNT),
+    ]
     return Gaussians(
         means=jnp.asarray(np.stack(places, axis=-1), jnp.float32),
         quats=jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (COUNT, 1)),
@@ -60,7 +64,12 @@ def test_the_spread_of_rays_does_not_depend_on_harmonics():
     gaussians, targets = layered(), one_target()
     drawn = drawn_for_training(gaussians, targets)
     z = gaussians.means[:, 2] - jnp.mean(gaussians.means[:, 2])
-    expected = render(gaussians, targets.cameras[0], CONFIG.splat, features=jnp.stack([z, z**2, jnp.ones_like(z)], -1))
+    expected = render(
+        gaussians,
+        targets.cameras[0],
+        CONFIG.splat,
+        features=jnp.stack([z, z**2, jnp.ones_like(z)], -1),
+    )
     mean, squared = (safe_divide(expected.features[..., i], expected.alpha) for i in (0, 1))
     spread = 2 * expected.alpha**2 * (squared - mean**2)
     assert float(jnp.max(spread)) > 0.05
@@ -77,4 +86,6 @@ def test_without_harmonics_the_spread_is_what_it_was():
     colored = replace(gaussians, colors=jnp.stack([z, z**2, 0 * z], -1))
     moments = jax.jit(lambda g: render(g, targets.cameras[0], CONFIG.splat, jnp.zeros(3)))(colored)
     mean, squared = (safe_divide(moments.rgb[..., i], moments.alpha) for i in (0, 1))
-    np.testing.assert_allclose(drawn.spread[0], 2 * moments.alpha**2 * (squared - mean**2), atol=1e-6)
+    np.testing.assert_allclose(
+        drawn.spread[0], 2 * moments.alpha**2 * (squared - mean**2), atol=1e-6
+    )

@@ -18,14 +18,16 @@ def finished_checkpoints(out):
 
 def kill_in_a_checkpoint_write(arguments, out, delay):
     """Start a run, wait until a checkpoint is being written, wait a little more, kill; the newest checkpoint there was."""
-    process = subprocess.Popen([*worker(), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        [*worker(), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     deadline = time.monotonic() + WAIT_SECONDS
     try:
         known = finished_checkpoints(out)
         # not the first write: some steps should come through
-        while not any(".orbax-checkpoint-tmp" in path.name for path in (out / "checkpoints").glob("*")) or (
-            finished_checkpoints(out)[-1:] == known[-1:]
-        ):
+        while not any(
+            ".orbax-checkpoint-tmp" in path.name for path in (out / "checkpoints").glob("*")
+        ) or (finished_checkpoints(out)[-1:] == known[-1:]):
             assert process.poll() is None, process.stdout.read()
             assert time.monotonic() < deadline, "no checkpoint was written"
             time.sleep(0.001)
@@ -45,14 +47,23 @@ def test_killed_in_checkpoint_writes_a_run_ends_as_one_that_never_was(tmp_path, 
     folder = str(captures[0].parent)
     done = 0
     for _ in range(KILLS):
-        newest = kill_in_a_checkpoint_write([str(killed), folder, *options], killed, generator.uniform(0, 0.05))
+        newest = kill_in_a_checkpoint_write(
+            [str(killed), folder, *options], killed, generator.uniform(0, 0.05)
+        )
         assert newest > done, "a checkpoint was lost"
         done = newest
     end = done + 3
     for out in (killed, whole):
-        subprocess.run([*worker(), str(out), folder, *options, "--stop-at", str(end)], check=True, timeout=WAIT_SECONDS)
+        subprocess.run(
+            [*worker(), str(out), folder, *options, "--stop-at", str(end)],
+            check=True,
+            timeout=WAIT_SECONDS,
+        )
     curve = losses(killed)
     assert list(curve) == list(range(1, end + 1)) and curve == losses(whole)
     weights = load_file(whole / "weights.safetensors")
-    assert all((tensor == weights[name]).all() for name, tensor in load_file(killed / "weights.safetensors").items())
+    assert all(
+        (tensor == weights[name]).all()
+        for name, tensor in load_file(killed / "weights.safetensors").items()
+    )
     assert not list((killed / "checkpoints").glob("*tmp*"))

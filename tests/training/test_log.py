@@ -38,7 +38,12 @@ def tensorboard_events(folder):
 
 def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
     path = tmp_path / "log.jsonl"
-    whole = [{"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.4}, {"step": 2, "val_psnr": 20.0}, {"step": 3, "loss": 0.3}]
+    whole = [
+        {"step": 1, "loss": 0.5},
+        {"step": 2, "loss": 0.4},
+        {"step": 2, "val_psnr": 20.0},
+        {"step": 3, "loss": 0.3},
+    ]
     path.write_text("".join(json.dumps(line) + "\n" for line in whole) + '{"step": 2, "lo')
     forget_after(path, 2)
     assert read(path) == whole[:3]
@@ -48,7 +53,11 @@ def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
 
 def test_what_is_no_log_is_one_line_and_stays_as_it_is(tmp_path):
     path = tmp_path / "log.jsonl"
-    for content in (b"\xff\xfe", b'{"step": 1}\n[' + b"[" * 10_000 + b'\n{"step": 2}\n', b'{"step": 1}\nhello\n{"step": 2}\n'):
+    for content in (
+        b"\xff\xfe",
+        b'{"step": 1}\n[' + b"[" * 10_000 + b'\n{"step": 2}\n',
+        b'{"step": 1}\nhello\n{"step": 2}\n',
+    ):
         path.write_bytes(content)
         with pytest.raises(FileError, match=re.escape(str(path))) as error:
             forget_after(path, 2)
@@ -59,14 +68,24 @@ def test_tensorboard_reads_the_numbers_and_the_images(tmp_path):
     waiting = Waiting()
     with RunLog(tmp_path, 0, 10, progress=False) as log:
         waiting.add(0.5)
-        log.steps(4, {"loss": jnp.asarray(0.25), "psnr": jnp.asarray(21.0)}, subjects=2, waiting=waiting, broken=1)
+        log.steps(
+            4,
+            {"loss": jnp.asarray(0.25), "psnr": jnp.asarray(21.0)},
+            subjects=2,
+            waiting=waiting,
+            broken=1,
+        )
         log.numbers(4, {"val_psnr": 19.0}, "validation")
         log.image(4, "validation/sheet", np.random.default_rng(0).random((8, 16, 3)))
     training, validation = read(tmp_path / "log.jsonl")
     assert np.isclose(training["samples_per_second"] * training["seconds_per_step"], 2.0)
     assert training["data_seconds_per_step"] == 0.5 / 4 and training["broken_folders"] == 1
     assert validation == {"step": 4, "val_psnr": 19.0}
-    values = {v.tag: (e.step, v) for e in tensorboard_events(tmp_path / "tensorboard") for v in e.summary.value}
+    values = {
+        v.tag: (e.step, v)
+        for e in tensorboard_events(tmp_path / "tensorboard")
+        for v in e.summary.value
+    }
     for name, value in training.items():
         if name != "step":
             step, found = values[f"train/{name}"]
@@ -78,10 +97,15 @@ def test_tensorboard_reads_the_numbers_and_the_images(tmp_path):
 def test_numbers_that_are_not_finite_are_no_json_and_a_full_disk_names_the_log(tmp_path):
     with RunLog(tmp_path, 0, 10, progress=False) as log:
         log.event(3, "skipped", "skipped", loss=float("nan"), grad_norm=2.0)
-    assert (tmp_path / "log.jsonl").read_text() == '{"step": 3, "event": "skipped", "loss": null, "grad_norm": 2.0}\n'
+    assert (
+        tmp_path / "log.jsonl"
+    ).read_text() == '{"step": 3, "event": "skipped", "loss": null, "grad_norm": 2.0}\n'
     (tmp_path / "log.jsonl").unlink()
     (tmp_path / "log.jsonl").symlink_to("/dev/full")
-    with pytest.raises(OSError, match=r"No space left on device: .*log\.jsonl"), RunLog(tmp_path, 0, 10, progress=False) as log:
+    with (
+        pytest.raises(OSError, match=r"No space left on device: .*log\.jsonl"),
+        RunLog(tmp_path, 0, 10, progress=False) as log,
+    ):
         log.event(3, "skipped", "skipped")
 
 
@@ -95,12 +119,19 @@ def test_a_process_that_does_not_record_writes_nothing(tmp_path):
 
 def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
     config = tiny()
-    loader = Loader(source_of(CaptureCache(captures, body), config, spoilt_at=3, bright_at=4), batch_size=2)
+    loader = Loader(
+        source_of(CaptureCache(captures, body), config, spoilt_at=3, bright_at=4), batch_size=2
+    )
     assert bad_samples(loader, 0) == bad_samples(loader, 0, loader.batch_at(0)) == []
     (one,), (other,) = bad_samples(loader, 1), bad_samples(loader, 2, loader.batch_at(2))
     order = [captures[i] for epoch in (0, 1) for i in subject_order(0, epoch, len(captures))]
-    assert one.endswith(f"the first at [0, 1, 2, 0]: nan ({order[3]})") and "sample 1: targets.images: " in one
-    assert "sample 0: inputs.masks: expected numbers in [0, 1]" in other and other.endswith(f"({order[4]})")
+    assert (
+        one.endswith(f"the first at [0, 1, 2, 0]: nan ({order[3]})")
+        and "sample 1: targets.images: " in one
+    )
+    assert "sample 0: inputs.masks: expected numbers in [0, 1]" in other and other.endswith(
+        f"({order[4]})"
+    )
     (event,) = watched(tmp_path, [(2, 1, 1, np.nan, 0.0)], lambda: bad_samples(loader, 1))
     assert event["samples"] == [one] and one in capsys.readouterr().out
 
@@ -108,7 +139,9 @@ def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
 def watched(folder, steps, bad_samples=list, before=0):
     """What the log has after `Watch` saw steps: number, skipped and nonfinite so far, loss, norm of the gradient."""
     names = ("skipped", "nonfinite", "loss", "grad_norm")
-    state = TrainState(jnp.asarray(0), {}, {}, GuardState(*[jnp.asarray(before)] * 2, jnp.zeros(()), ()), None)
+    state = TrainState(
+        jnp.asarray(0), {}, {}, GuardState(*[jnp.asarray(before)] * 2, jnp.zeros(()), ()), None
+    )
     with RunLog(folder, 0, 100, progress=False) as log:
         watch = Watch(log, state)
         for done, *numbers in steps:

@@ -31,7 +31,11 @@ SIDE, TARGETS, VERTICES = 32, 2, 800
 STEP_SIZES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
 """Of central differences, relative to the size of what is varied. Thousands of Gaussians move: within the longer steps some
 exchange places in the depth order, and colors jump."""
-TERMS = [each.name for each in dataclasses.fields(LossConfig) if each.name not in ("structural_scales", "random_background")]
+TERMS = [
+    each.name
+    for each in dataclasses.fields(LossConfig)
+    if each.name not in ("structural_scales", "random_background")
+]
 PLAIN = [name for name in TERMS if name not in NETWORKS]
 
 
@@ -47,8 +51,13 @@ def agreement(values, point, names, directions=3, steps=STEP_SIZES):
     gradient = jax.jit(jax.grad(lambda point, weights: jnp.dot(weights, vector(point))))
     rng = np.random.default_rng(0)
     size = lambda x: np.sqrt(np.mean(np.square(x)))
-    ways = [jax.tree.map(lambda x: rng.normal(size=x.shape) * size(np.asarray(x)), point) for _ in range(directions)]
-    inner = lambda a, b: sum(np.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    ways = [
+        jax.tree.map(lambda x: rng.normal(size=x.shape) * size(np.asarray(x)), point)
+        for _ in range(directions)
+    ]
+    inner = lambda a, b: sum(
+        np.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
     gradients = [jax.device_get(gradient(point, weights)) for weights in np.eye(len(names))]
     derivatives = np.asarray([[inner(g, way) for way in ways] for g in gradients])
     best = np.full((len(names), directions), np.inf)
@@ -139,7 +148,9 @@ def test_terms_on_their_own_inputs():
 @pytest.mark.slow
 def test_terms_with_networks_of_their_own():
     with jax.enable_x64(True):
-        errors = agreement(*own_case(list(NETWORKS)), list(NETWORKS), directions=1, steps=(1e-6, 1e-8))
+        errors = agreement(
+            *own_case(list(NETWORKS)), list(NETWORKS), directions=1, steps=(1e-6, 1e-8)
+        )
     assert set(errors) == set(NETWORKS) and all(error < WHOLE for error in errors.values()), errors
 
 
@@ -147,5 +158,7 @@ def test_terms_with_networks_of_their_own():
 def test_terms_of_the_whole_network(tmp_path):
     """Without those with networks of their own: minutes of convolutions in float64."""
     with jax.enable_x64(True):
-        errors = agreement(*network_case(PLAIN, tmp_path), PLAIN, directions=1, steps=(1e-6, 1e-8, 1e-9))
+        errors = agreement(
+            *network_case(PLAIN, tmp_path), PLAIN, directions=1, steps=(1e-6, 1e-8, 1e-9)
+        )
     assert set(errors) == set(PLAIN) and all(error < WHOLE for error in errors.values()), errors

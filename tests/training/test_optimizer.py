@@ -23,7 +23,12 @@ from humangs_jax.training.state import (
 
 FLOAT32 = 1e-6
 CONFIG = OptimizerConfig(learning_rate=0.1, warmup_steps=0)
-PARAMS = {"kernel": jnp.ones((2, 3)), "bias": jnp.ones(3), "texture": jnp.ones((3, 2, 2, 2)), "scale": jnp.ones(2)}
+PARAMS = {
+    "kernel": jnp.ones((2, 3)),
+    "bias": jnp.ones(3),
+    "texture": jnp.ones((3, 2, 2, 2)),
+    "scale": jnp.ones(2),
+}
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -54,11 +59,15 @@ def test_moments_see_clipped_gradients_and_the_first_step_is_adams(size):
     unclipped = size * np.sqrt(sum(x.size for x in PARAMS.values()))
     assert float(state.norm) == pytest.approx(unclipped, rel=bound(FLOAT32))
     assert norm == pytest.approx(min(unclipped, CONFIG.clip_norm), rel=1e-4)
-    np.testing.assert_allclose(params["bias"], 1 - CONFIG.learning_rate, rtol=1e-5)  # eps of Adam against the clipped
+    np.testing.assert_allclose(
+        params["bias"], 1 - CONFIG.learning_rate, rtol=1e-5
+    )  # eps of Adam against the clipped
 
 
 @pytest.mark.parametrize(
-    ("gradient", "value"), [(1e4, 1.0), (0.1, np.nan), (0.1, np.inf)], ids=["large", "nan loss", "infinite loss"]
+    ("gradient", "value"),
+    [(1e4, 1.0), (0.1, np.nan), (0.1, np.inf)],
+    ids=["large", "nan loss", "infinite loss"],
 )
 def test_a_bad_step_changes_nothing_and_is_counted(gradient, value):
     _, before = stepped(filled(0.1))
@@ -82,14 +91,20 @@ def test_bad_entries_alone_skip_no_step():
     gradients["bias"] = np.asarray([np.nan, np.inf, -np.inf], np.float32)
     params, state = stepped(gradients)
     assert int(state.skipped) == 0
-    assert float(params["bias"][0]) == 1.0 and float(params["bias"][1]) < 1 < float(params["bias"][2])
+    assert float(params["bias"][0]) == 1.0 and float(params["bias"][1]) < 1 < float(
+        params["bias"][2]
+    )
 
 
 def test_schedule_warms_up_and_ends_at_zero():
     rate = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=10), 110)
     assert [float(rate(i)) for i in (0, 5, 10)] == pytest.approx([0.0, 0.2, 0.4])
-    assert float(rate(60)) == pytest.approx(0.2, rel=1e-5) and float(rate(110)) == pytest.approx(0.0, abs=1e-9)
-    shorter_than_its_warm_up = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=3000), 4)
+    assert float(rate(60)) == pytest.approx(0.2, rel=1e-5) and float(rate(110)) == pytest.approx(
+        0.0, abs=1e-9
+    )
+    shorter_than_its_warm_up = learning_rate(
+        OptimizerConfig(learning_rate=0.4, warmup_steps=3000), 4
+    )
     assert float(shorter_than_its_warm_up(4)) == pytest.approx(0.4)
 
 
@@ -99,4 +114,6 @@ def test_every_optimizer_by_name_goes_downhill_and_keeps_the_guard(name):
     params, state = stepped(filled(0.5), config)
     assert all(np.isfinite(x).all() and (x < 1).all() for x in jax.tree.leaves(params))
     same, skipped = stepped(filled(1e4), config, state=state)
-    assert int(skipped.skipped) == 1 and jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, PARAMS))
+    assert int(skipped.skipped) == 1 and jax.tree.all(
+        jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, PARAMS)
+    )

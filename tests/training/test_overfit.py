@@ -38,12 +38,16 @@ def configuration() -> TrainConfig:
     encoder, reader, decoder = paper_parts(model.architecture)
     model = model.with_parts(
         encoder=dataclasses.replace(
-            encoder, transformer=TransformerConfig(width=128, layers=4), upsampler=UpsamplerConfig(hidden=64)
+            encoder,
+            transformer=TransformerConfig(width=128, layers=4),
+            upsampler=UpsamplerConfig(hidden=64),
         ),
         reader=dataclasses.replace(reader, output_width=128),
         decoder=dataclasses.replace(decoder, tight=1, free=4),
     )
-    model = model.with_conventions(image_size=SIZE, longest_edge=0.03).with_runtime(token_capacity=288)
+    model = model.with_conventions(image_size=SIZE, longest_edge=0.03).with_runtime(
+        token_capacity=288
+    )
     return TrainConfig(
         model=model,
         loss=LossConfig(structural=0.0, tightness=0.0, random_background=0.0),
@@ -70,7 +74,9 @@ def test_the_network_overfits_to_one_subject(photos):
     state = init_state(config)
     for _ in range(STEPS):
         state, metrics = train_step(state, batch, body, config)
-    assert int(metrics["skipped"]) == int(metrics["dropped_tokens"]) == int(metrics["overflow"]) == 0
+    assert (
+        int(metrics["skipped"]) == int(metrics["dropped_tokens"]) == int(metrics["overflow"]) == 0
+    )
     _, numbers = evaluate(state.variables, body, example, config)  # with the running statistics
     seconds = time.process_time() - start
     print(f"{float(numbers['psnr']):.2f} dB after {STEPS} steps and {seconds:.0f} CPU s")

@@ -17,7 +17,13 @@ from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.people.bank import build_bank
 from humangs_jax.people.subject import SPLITS
 from humangs_jax.training.config import PRESETS, fitting_losses
-from humangs_jax.training.sources import captured_people, mixed_people, on_the_fly_people, people_on_disk, stage_loader
+from humangs_jax.training.sources import (
+    captured_people,
+    mixed_people,
+    on_the_fly_people,
+    people_on_disk,
+    stage_loader,
+)
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 
@@ -33,17 +39,23 @@ def shrunk(name):
     encoder = dataclasses.replace(
         parts.encoder,
         texture=dataclasses.replace(parts.encoder.texture, resolution=8, channels=2),
-        transformer=dataclasses.replace(parts.encoder.transformer, width=16, layers=4, head_width=8),
+        transformer=dataclasses.replace(
+            parts.encoder.transformer, width=16, layers=4, head_width=8
+        ),
         upsampler=upsampler,
     )
     reader = dataclasses.replace(parts.reader, output_width=None if upsampler is None else 8)
-    model = config.model.with_parts(encoder=encoder, reader=reader, decoder=dataclasses.replace(parts.decoder, hidden=16))
+    model = config.model.with_parts(
+        encoder=encoder, reader=reader, decoder=dataclasses.replace(parts.decoder, hidden=16)
+    )
     model = model.with_conventions(image_size=SIZE, body_vertices=None, longest_edge=None)
     return dataclasses.replace(
         config,
         model=model.with_runtime(token_capacity=16),
         views=dataclasses.replace(config.views, input_counts=(2,), target_count=1),
-        loss=dataclasses.replace(config.loss, structural_scales=1),  # images of 32 pixels have no third scale
+        loss=dataclasses.replace(
+            config.loss, structural_scales=1
+        ),  # images of 32 pixels have no third scale
         target_size=SIZE,
         batch_size=4,
         stages=(),
@@ -108,6 +120,8 @@ def test_every_preset_makes_a_step(name, kind, captures, body, data_set, request
     if kind == "mixture":
         people, body = request.getfixturevalue("mixture")
     batch = stage_loader(people, config, 0).batch_at(MIXED)
-    state, metrics = train_step(init_state(config), batch, gaussian_body(body, config.model), config)
+    state, metrics = train_step(
+        init_state(config), batch, gaussian_body(body, config.model), config
+    )
     assert int(state.step) == 1 and int(metrics["skipped"]) == int(metrics["nonfinite"]) == 0
     assert math.isfinite(float(metrics["loss"])) and float(metrics["grad_norm"]) > 0

@@ -25,7 +25,10 @@ def state_of(out, step):
 
 
 def largest_difference(a, b):
-    return max(float(np.abs(np.asarray(x) - np.asarray(y)).max()) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))
+    return max(
+        float(np.abs(np.asarray(x) - np.asarray(y)).max())
+        for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True)
+    )
 
 
 @pytest.mark.slow
@@ -50,7 +53,9 @@ def test_resume_of_eight_devices_on_four_and_of_two_processes(captures, tmp_path
     run_several(2, two_stopped, folder, "--stop-at", 4, *on(1, 4))
     assert same(state_of(two_stopped, 4), state_of(two, 4)) and losses(two_stopped) == losses(two)
     assert largest_difference(state_of(two, 4).params, state_of(four, 4).params) < bound(ACROSS)
-    assert list(losses(two).values()) == pytest.approx(list(losses(four).values()), abs=bound(ACROSS))
+    assert list(losses(two).values()) == pytest.approx(
+        list(losses(four).values()), abs=bound(ACROSS)
+    )
 
 
 @pytest.mark.slow

@@ -12,7 +12,13 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec
 
-from humangs_jax.training.sharding import SMALLEST_DIVIDED, divided_axis, join_processes, mean_parts, training_mesh
+from humangs_jax.training.sharding import (
+    SMALLEST_DIVIDED,
+    divided_axis,
+    join_processes,
+    mean_parts,
+    training_mesh,
+)
 
 EIGHT_DEVICES = Path(__file__).with_name("eight_devices.py")
 
@@ -31,19 +37,28 @@ def test_a_mesh_of_what_does_not_divide_is_refused():
     with pytest.raises(ValueError, match="fsdp 3 does not divide"):
         training_mesh(3, jax.devices()[:1])
     assert dict(training_mesh(devices=jax.devices()[:1]).shape) == {"data": 1, "fsdp": 1}
-    with pytest.raises(ValueError, match="give coordinator, number of processes and process index, or none"):
+    with pytest.raises(
+        ValueError, match="give coordinator, number of processes and process index, or none"
+    ):
         join_processes("localhost:1234", 2, None)
 
 
 def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
     """Four devices, two by two, as nested maps with the names of a mesh's axes."""
-    gradients = jnp.asarray(np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32)  # data, fsdp, rows, columns
+    gradients = jnp.asarray(
+        np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32
+    )  # data, fsdp, rows, columns
     mesh = SimpleNamespace(size=4)
     parts = lambda spec: jax.vmap(
-        jax.vmap(lambda g: inspect.unwrap(mean_parts)({"x": g}, {"x": spec}, mesh)["x"], axis_name="fsdp"), axis_name="data"
+        jax.vmap(
+            lambda g: inspect.unwrap(mean_parts)({"x": g}, {"x": spec}, mesh)["x"], axis_name="fsdp"
+        ),
+        axis_name="data",
     )(gradients)
     mean = np.asarray(gradients).mean(axis=(0, 1))
-    np.testing.assert_allclose(parts(PartitionSpec()), np.broadcast_to(mean, (2, 2, 3, 4)), rtol=1e-5)
+    np.testing.assert_allclose(
+        parts(PartitionSpec()), np.broadcast_to(mean, (2, 2, 3, 4)), rtol=1e-5
+    )
     divided = parts(PartitionSpec(None, "fsdp"))
     for data in range(2):
         np.testing.assert_allclose(np.concatenate(divided[data], axis=1), mean, rtol=1e-5)
@@ -52,7 +67,11 @@ def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
 def on_eight_devices(name):
     """Run a function of eight_devices.py in a process that has eight."""
     finished = subprocess.run(
-        [sys.executable, str(EIGHT_DEVICES), name], capture_output=True, text=True, timeout=900, check=False
+        [sys.executable, str(EIGHT_DEVICES), name],
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
     )
     assert finished.returncode == 0, finished.stdout + finished.stderr
 

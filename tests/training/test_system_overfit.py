@@ -28,7 +28,11 @@ def test_a_system_learns_one_person(name, body, captures):
     views = ViewSampling(input_counts=(1 if name in ONE_PHOTO else 2,), target_count=2)
     config = dataclasses.replace(tiny(), model=model, views=views)
     source = CaptureSource(CaptureCache(captures[:1], body), views, 32, config.target_size)
-    batch, own_body, state = Loader(source, 1).batch_at(0), gaussian_body(body, model), init_state(config)
+    batch, own_body, state = (
+        Loader(source, 1).batch_at(0),
+        gaussian_body(body, model),
+        init_state(config),
+    )
     history = []
     for _ in range(config.steps):
         state, metrics = train_step(state, batch, own_body, config)
@@ -36,6 +40,11 @@ def test_a_system_learns_one_person(name, body, captures):
     assert history[-1]["skipped"] == history[-1]["dropped_tokens"] == history[-1]["overflow"] == 0
     # a half of the steps has random backgrounds, before which errors are others
     mean = lambda steps, term: float(np.mean([metrics[term] for metrics in steps]))
-    first, last = ({term: mean(steps, term) for term in ("squared", "silhouette")} for steps in (history[:10], history[-10:]))
+    first, last = (
+        {term: mean(steps, term) for term in ("squared", "silhouette")}
+        for steps in (history[:10], history[-10:])
+    )
     print(name, first, last)
-    assert last["squared"] < 0.8 * first["squared"] and last["silhouette"] < 0.8 * first["silhouette"]
+    assert (
+        last["squared"] < 0.8 * first["squared"] and last["silhouette"] < 0.8 * first["silhouette"]
+    )

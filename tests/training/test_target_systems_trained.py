@@ -33,9 +33,18 @@ def configuration(name: str) -> TrainConfig:
     model = small(name)
     if model.architecture.surface_map is not None:  # as many texels as the person has pixels
         surface = SurfaceMap(model.architecture.surface_map.kind, 32)
-        having = [part for part in ("reader", "decoder") if hasattr(getattr(model.architecture, part), "surface_map")]
-        moved = {part: dataclasses.replace(getattr(model.architecture, part), surface_map=surface) for part in having}
-        model = model.with_parts(**moved, driver=dataclasses.replace(model.architecture.driver, widths=(8, 16)))
+        having = [
+            part
+            for part in ("reader", "decoder")
+            if hasattr(getattr(model.architecture, part), "surface_map")
+        ]
+        moved = {
+            part: dataclasses.replace(getattr(model.architecture, part), surface_map=surface)
+            for part in having
+        }
+        model = model.with_parts(
+            **moved, driver=dataclasses.replace(model.architecture.driver, widths=(8, 16))
+        )
     return TrainConfig(
         model=model,
         loss=LossConfig(structural_scales=1, tightness=0.01),
@@ -65,14 +74,22 @@ def test_one_person_is_learnt_and_shown_by_the_evaluator(name, body, captures):
     _, numbers = forward.evaluate(state.variables, mapped, Example(views, views), config)
     scored = evaluate(Case("tube", chosen, chosen), weights=(state.variables, config.model))
     assert scored.means["psnr"].mean == pytest.approx(float(numbers["psnr"]), abs=0.05)
-    assert np.isnan(numbers["semi_transparent"]) == (scored.means["iou"] is None) == (name in PIXELS)
+    assert (
+        np.isnan(numbers["semi_transparent"]) == (scored.means["iou"] is None) == (name in PIXELS)
+    )
     if name in PIXELS:
         with pytest.raises(ValueError, match="shows people on white; background 0 was asked for"):
-            evaluate(Case("tube", chosen, chosen), weights=(state.variables, config.model), protocol="ghg")
+            evaluate(
+                Case("tube", chosen, chosen),
+                weights=(state.variables, config.model),
+                protocol="ghg",
+            )
 
 
 @pytest.mark.slow
-def test_a_run_of_a_network_that_draws_pixels_is_validated_logged_and_saved(body, captures, tmp_path):
+def test_a_run_of_a_network_that_draws_pixels_is_validated_logged_and_saved(
+    body, captures, tmp_path
+):
     config = dataclasses.replace(tiny(), model=small("humanram"), target_size=SIZE, steps=2)
     train(config, body, captures[:2], tmp_path / "run", validation=captures[2:], progress=False)
     lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]

@@ -44,7 +44,9 @@ def without_person(views, which):
         views,
         images=views.images.at[:, which].set(1.0),
         masks=views.masks.at[:, which].set(0.0),
-        cameras=replace(cameras, cam_from_world=cameras.cam_from_world.at[:, which, 0, 3].add(OUTSIDE)),
+        cameras=replace(
+            cameras, cam_from_world=cameras.cam_from_world.at[:, which, 0, 3].add(OUTSIDE)
+        ),
     )
 
 
@@ -52,13 +54,25 @@ EVERY, SECOND = slice(None), slice(1, 2)
 
 
 @pytest.mark.parametrize(
-    "which", [{"inputs": SECOND}, {"targets": SECOND}, {"inputs": EVERY}, {"inputs": EVERY, "targets": EVERY}], ids=str
+    "which",
+    [
+        {"inputs": SECOND},
+        {"targets": SECOND},
+        {"inputs": EVERY},
+        {"inputs": EVERY, "targets": EVERY},
+    ],
+    ids=str,
 )
 def test_views_of_background_alone(body, batch, variables, which):
-    seen = replace(batch, **{views: without_person(getattr(batch, views), some) for views, some in which.items()})
+    seen = replace(
+        batch,
+        **{views: without_person(getattr(batch, views), some) for views, some in which.items()},
+    )
     _, metrics = step_without_harm(init_state(CONFIG, variables), seen, body)
     if which.get("targets") == EVERY:
-        assert metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9  # background is drawn as it was in the photo
+        assert (
+            metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9
+        )  # background is drawn as it was in the photo
 
 
 @pytest.mark.parametrize("offset", [(OUTSIDE, 0, 0), (0, 0, OUTSIDE), (0, 0, 1e6)], ids=str)
@@ -66,7 +80,9 @@ def test_a_subject_outside_of_the_frame_or_behind_the_camera(body, batch, variab
     """The photos show a person where the poses say that there is none."""
     moved = lambda views: replace(views, translations=views.translations + jnp.asarray(offset))
     step_without_harm(
-        init_state(CONFIG, variables), replace(batch, inputs=moved(batch.inputs), targets=moved(batch.targets)), body
+        init_state(CONFIG, variables),
+        replace(batch, inputs=moved(batch.inputs), targets=moved(batch.targets)),
+        body,
     )
 
 
@@ -77,26 +93,43 @@ def test_a_camera_inside_of_the_body(body, batch, variables):
 
 
 def test_black_photos_and_masks_that_cover_all(body, batch, variables):
-    full = lambda views: replace(views, images=jnp.zeros_like(views.images), masks=jnp.ones_like(views.masks))
-    step_without_harm(init_state(CONFIG, variables), replace(batch, inputs=full(batch.inputs)), body)
-    step_without_harm(init_state(CONFIG, variables), replace(batch, targets=full(batch.targets)), body)
+    full = lambda views: replace(
+        views, images=jnp.zeros_like(views.images), masks=jnp.ones_like(views.masks)
+    )
+    step_without_harm(
+        init_state(CONFIG, variables), replace(batch, inputs=full(batch.inputs)), body
+    )
+    step_without_harm(
+        init_state(CONFIG, variables), replace(batch, targets=full(batch.targets)), body
+    )
 
 
-@pytest.mark.parametrize(("views", "value"), [("inputs", np.nan), ("targets", np.inf), ("inputs", 1e30), ("targets", 1e30)])
+@pytest.mark.parametrize(
+    ("views", "value"),
+    [("inputs", np.nan), ("targets", np.inf), ("inputs", 1e30), ("targets", 1e30)],
+)
 def test_a_bad_photo_costs_its_step_and_the_run_goes_on(body, batch, variables, views, value, same):
     """A pixel of the person, so that the network sees it."""
     row, column = np.argwhere(np.asarray(getattr(batch, views).masks[0, 0]) > 0.9)[0]
     shown = getattr(batch, views)
-    bad = replace(batch, **{views: replace(shown, images=shown.images.at[0, 0, row, column].set(value))})
+    bad = replace(
+        batch, **{views: replace(shown, images=shown.images.at[0, 0, row, column].set(value))}
+    )
     before = init_state(CONFIG, variables)
     state, metrics = train_step(init_state(CONFIG, variables), bad, body, CONFIG)
     assert finite(state.params) and finite(state.batch_stats) and finite(state.opt_state.inner)
     if not np.isfinite(value):
         assert int(metrics["skipped"]) == int(metrics["nonfinite"]) == 1
-        assert same(state.params, before.params) and same(state.opt_state.inner, before.opt_state.inner)
+        assert same(state.params, before.params) and same(
+            state.opt_state.inner, before.opt_state.inner
+        )
     skipped = int(metrics["skipped"])
     state, metrics = train_step(state, batch, body, CONFIG)
-    assert int(state.step) == 2 and int(metrics["skipped"]) == skipped and np.isfinite(float(metrics["loss"]))
+    assert (
+        int(state.step) == 2
+        and int(metrics["skipped"]) == skipped
+        and np.isfinite(float(metrics["loss"]))
+    )
     assert not same(state.params, before.params)
 
 
@@ -114,7 +147,9 @@ def with_geometry(state, free_offset=0.0, log_scale=None):
 
 @pytest.mark.parametrize("log_scale", [-1e4, 10.0, 1e30])
 def test_gaussians_of_no_size_and_of_any(body, batch, variables, log_scale):
-    step_without_harm(with_geometry(init_state(CONFIG, variables), log_scale=log_scale), batch, body)
+    step_without_harm(
+        with_geometry(init_state(CONFIG, variables), log_scale=log_scale), batch, body
+    )
 
 
 def decoder_of(**changes):
@@ -139,7 +174,9 @@ def test_one_view(body, captures):
     for step in range(3):
         state, _ = step_without_harm(state, batch_of(body, captures, config, step), body, config)
     batch = batch_of(body, captures, config)
-    step_without_harm(state, replace(batch, inputs=without_person(batch.inputs, EVERY)), body, config)
+    step_without_harm(
+        state, replace(batch, inputs=without_person(batch.inputs, EVERY)), body, config
+    )
 
 
 @pytest.mark.slow
@@ -156,13 +193,19 @@ def test_hundreds_of_free_gaussians_per_vertex_far_away(body, batch):
 @pytest.mark.slow
 def test_a_hundred_times_the_learning_rate(body, captures):
     rate = 100 * CONFIG.optimizer.learning_rate
-    config = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, learning_rate=rate))
+    config = dataclasses.replace(
+        CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, learning_rate=rate)
+    )
     state, skipped = init_state(config), 0
     batches = [batch_of(body, captures, config, step) for step in range(3)]
     for step in range(CONFIG.steps):
         state, metrics = train_step(state, batches[step % 3], body, config)
         assert np.isfinite(float(metrics["grad_norm"]))
-        assert int(metrics["skipped"]) - skipped == (float(metrics["grad_norm"]) > config.optimizer.skip_norm)
+        assert int(metrics["skipped"]) - skipped == (
+            float(metrics["grad_norm"]) > config.optimizer.skip_norm
+        )
         skipped = int(metrics["skipped"])
-    assert int(state.step) == CONFIG.steps and finite((state.params, state.opt_state, state.batch_stats))
+    assert int(state.step) == CONFIG.steps and finite(
+        (state.params, state.opt_state, state.batch_stats)
+    )
     assert np.isfinite(float(metrics["loss"]))

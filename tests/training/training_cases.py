@@ -21,7 +21,8 @@ def without_upsampler(model):
     """The network whose vertices read the token maps themselves."""
     encoder, reader, _ = paper_parts(model.architecture)
     return model.with_parts(
-        encoder=dataclasses.replace(encoder, upsampler=None), reader=dataclasses.replace(reader, output_width=None)
+        encoder=dataclasses.replace(encoder, upsampler=None),
+        reader=dataclasses.replace(reader, output_width=None),
     )
 
 
@@ -33,7 +34,9 @@ def tube():
     template = 0.25 * around + height[:, None] * [0, 1, 0]
     ring, side = np.divmod(np.arange((RINGS - 1) * SIDES), SIDES)
     a, b = ring * SIDES + side, ring * SIDES + (side + 1) % SIDES
-    faces = np.concatenate([np.stack([a, b, a + SIDES], -1), np.stack([b, b + SIDES, a + SIDES], -1)])
+    faces = np.concatenate(
+        [np.stack([a, b, a + SIDES], -1), np.stack([b, b + SIDES, a + SIDES], -1)]
+    )
     upper = np.clip(0.5 + 2 * height, 0, 1)
     regressor = np.stack([height < -0.7, np.abs(height) < 0.2]).astype(float)
     return BodyModel(
@@ -69,7 +72,9 @@ def write_subject(path, body, seed):
     rest = shape_body(body, jnp.asarray(betas))
     rotations = 0.3 * generator.normal(size=(POSES, 2, 3)).astype(np.float32)
     K = intrinsics_from_fov(0.8, SIZE, SIZE)
-    cameras = orbit(jnp.zeros(3), 2.6, jnp.arange(VIEWS) * 2 * jnp.pi / VIEWS + 0.1 * seed, 0.1, K, SIZE, SIZE)
+    cameras = orbit(
+        jnp.zeros(3), 2.6, jnp.arange(VIEWS) * 2 * jnp.pi / VIEWS + 0.1 * seed, 0.1, K, SIZE, SIZE
+    )
     weights = generator.dirichlet([1, 1, 1], 40)
     corner_colors = generator.random((len(body.template), 3))
     faces = np.asarray(body.faces)
@@ -78,7 +83,9 @@ def write_subject(path, body, seed):
     for view in range(VIEWS):
         frames.append(view % POSES)
         posed = pose_body(body, rest, BodyPose(jnp.asarray(rotations[frames[-1]]), jnp.zeros(3)))
-        image, mask = draw_points(fill(np.asarray(posed.vertices)), fill(corner_colors), cameras[view])
+        image, mask = draw_points(
+            fill(np.asarray(posed.vertices)), fill(corner_colors), cameras[view]
+        )
         images.append(image)
         masks.append(mask)
     capture = capture_from_arrays(
@@ -113,7 +120,9 @@ class Spoilt(CaptureSource):
 
 
 def source_of(cache, config, **spoilt):
-    return Spoilt(cache, config.views, config.model.conventions.image_size, config.target_size, **spoilt)
+    return Spoilt(
+        cache, config.views, config.model.conventions.image_size, config.target_size, **spoilt
+    )
 
 
 def batch_of(body, captures, config, step=0):
@@ -122,8 +131,12 @@ def batch_of(body, captures, config, step=0):
 
 def random_networks():
     """VGG-19, and LPIPS over VGG-16."""
-    from experiments.training import random_weights  # not on the path of the programs that tests start
+    from experiments.training import (
+        random_weights,
+    )  # not on the path of the programs that tests start
 
     keys = jax.random.split(jax.random.key(0))
     heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
-    return LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
+    return LossNetworks(
+        Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg")
+    )

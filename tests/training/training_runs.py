@@ -17,7 +17,13 @@ def worker():
 
 def run(*arguments):
     """One process, to its end."""
-    finished = subprocess.run([*worker(), *map(str, arguments)], capture_output=True, text=True, timeout=SECONDS, check=False)
+    finished = subprocess.run(
+        [*worker(), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
+    )
     assert finished.returncode == 0, finished.stdout + finished.stderr
 
 
@@ -59,6 +65,10 @@ def lines(out):
 
 def losses(out):
     """Step -> loss, each step once."""
-    found = [(line["step"], line["loss"]) for line in lines(out) if "loss" in line and "event" not in line]
+    found = [
+        (line["step"], line["loss"])
+        for line in lines(out)
+        if "loss" in line and "event" not in line
+    ]
     assert len(dict(found)) == len(found)
     return dict(found)

@@ -23,7 +23,10 @@ from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
 from humangs_jax.geometry import transform
 from humangs_jax.viewer.page import page_server, write_page
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing())),
+]
 
 WHOLE, PERSON = 55.0, 48.0
 """dB. Asked for are 38 and 30; measured 65 and 56, which is what 8 bits of the screenshot leave (10 log10(12 255^2) = 58.9 where
@@ -84,7 +87,10 @@ def test_so_is_its_own_image_after_a_hundred_frames_of_motion(browser, avatar):
 
 
 def test_the_page_asks_for_nothing(browser):
-    assert browser.run("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
+    assert (
+        browser.run("return performance.getEntriesByType('resource').map((entry) => entry.name)")
+        == []
+    )
     with pytest.raises(RuntimeError, match="fetch"):
         browser.run("await fetch('http://127.0.0.1:1/')")
     assert len(browser.problems()) > 0  # the browser's own protest
@@ -115,7 +121,9 @@ def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
         await humangs.settle();"""
     )
     taller, view = content_height(browser), browser.run("return humangs.view()")
-    said = browser.run("return [...document.querySelectorAll('#shape .slider')].map((row) => row.innerText.split(/\\s*\\n\\s*/))")
+    said = browser.run(
+        "return [...document.querySelectorAll('#shape .slider')].map((row) => row.innerText.split(/\\s*\\n\\s*/))"
+    )
     browser.run("document.getElementById('reset-shape').click(); await humangs.settle();")
     assert taller > content_height(browser) * 1.01
     from humangs_jax.viewer.page import known_body
@@ -179,7 +187,9 @@ def test_keys_and_mouse_do_what_the_help_says(browser):
     press("t")
     before = np.asarray(state()["cam_from_world"])
     np.testing.assert_allclose(state()["rotations"], 0, atol=1e-9)
-    drag = ActionChains(browser.driver).move_to_element_with_offset(canvas, -300, 0).click_and_hold()
+    drag = (
+        ActionChains(browser.driver).move_to_element_with_offset(canvas, -300, 0).click_and_hold()
+    )
     drag.move_by_offset(120, 0).release().perform()
     turned = np.asarray(state()["cam_from_world"])
     # to the right: the camera goes to the left about the vertical axis, at the same distance from the target
@@ -240,13 +250,19 @@ def random_motion(frames=4, columns=165, seed=3):
 def test_a_dropped_npz_is_read_as_python_reads_it(browser, avatar, tmp_path):
     """The other formats: test_page_motions.py."""
     poses, trans = random_motion()
-    content = npz(poses=np.asfortranarray(poses[:, :156] * 0.3), trans=trans.astype("f4"), mocap_frame_rate=60)
+    content = npz(
+        poses=np.asfortranarray(poses[:, :156] * 0.3), trans=trans.astype("f4"), mocap_frame_rate=60
+    )
     (tmp_path / "m.npz").write_bytes(content)
     assert "4 frames" in drop(browser, "m.npz", content)
-    expected = grounded(load_motion(tmp_path / "m.npz"), RestBody(avatar.rest_vertices, avatar.rest_joints), PARENTS)
+    expected = grounded(
+        load_motion(tmp_path / "m.npz"), RestBody(avatar.rest_vertices, avatar.rest_joints), PARENTS
+    )
     for frame in (0, 3):
         rotations, translation = shown_pose(browser, frame)
-        np.testing.assert_allclose(matrices(rotations), matrices(expected.rotations[frame]), atol=1e-5)
+        np.testing.assert_allclose(
+            matrices(rotations), matrices(expected.rotations[frame]), atol=1e-5
+        )
         np.testing.assert_allclose(translation, expected.translations[frame], atol=1e-4)
 
 
@@ -258,16 +274,24 @@ def bone_directions(avatar, rotations):
     pose = BodyPose(jnp.asarray(rotations, jnp.float32), jnp.zeros(3))
     transforms = joint_transforms(avatar.rest_joints, PARENTS, pose.rotations, pose.translation)
     joints = np.asarray(transform.apply(transforms, avatar.rest_joints))
-    pairs = [(JOINT_NAMES.index(name), PARENTS[JOINT_NAMES.index(name)]) for name in BODY if name != "pelvis"]
+    pairs = [
+        (JOINT_NAMES.index(name), PARENTS[JOINT_NAMES.index(name)])
+        for name in BODY
+        if name != "pelvis"
+    ]
     bones = np.stack([joints[j] - joints[p] for j, p in pairs])
     return bones / np.linalg.norm(bones, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize(("names", "arms_down", "turned"), [(MIXAMO, 0, 0), (CMU, 48, 0), (MIXAMO, 40, 90)])
+@pytest.mark.parametrize(
+    ("names", "arms_down", "turned"), [(MIXAMO, 0, 0), (CMU, 48, 0), (MIXAMO, 40, 90)]
+)
 def test_a_dropped_bvh_moves_the_bones_as_the_file_does(browser, avatar, names, arms_down, turned):
     poses = random_motion(3)[0].reshape(3, 55, 3)
     poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in BODY]] = 0
-    content = write_bvh(np.asarray(avatar.rest_joints, float), poses, names, rest_frames(arms_down, turned)).encode()
+    content = write_bvh(
+        np.asarray(avatar.rest_joints, float), poses, names, rest_frames(arms_down, turned)
+    ).encode()
     assert "3 frames" in drop(browser, "dance.bvh", content)
     for frame in (0, 2):
         rotations, _ = shown_pose(browser, frame)
@@ -282,11 +306,19 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
     for poses in clips:
         poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in BODY]] = 0
     rest, still = np.asarray(avatar.rest_joints, float), np.zeros((3, 3))
-    write_glb(tmp_path / "two.glb", rest, clips[0], still, MIXAMO, more=clips[1:], titles=("walk", "run"))
+    write_glb(
+        tmp_path / "two.glb", rest, clips[0], still, MIXAMO, more=clips[1:], titles=("walk", "run")
+    )
     said = drop(browser, "two.glb", (tmp_path / "two.glb").read_bytes())
     assert "3 frames" in said and "2 animations (walk, run): the first is taken" in said
-    np.testing.assert_allclose(matrices(shown_pose(browser, 2)[0]), matrices(clips[0][2]), atol=ANGLE)
-    assert browser.run("return document.getElementById('clip-row').innerText").split() == ["Animation", "walk", "run"]
+    np.testing.assert_allclose(
+        matrices(shown_pose(browser, 2)[0]), matrices(clips[0][2]), atol=ANGLE
+    )
+    assert browser.run("return document.getElementById('clip-row').innerText").split() == [
+        "Animation",
+        "walk",
+        "run",
+    ]
     browser.run(
         """document.getElementById("message").textContent = "";
         const select = document.getElementById("clip");
@@ -294,15 +326,25 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
         select.dispatchEvent(new Event("change"));
         while (!document.getElementById("message").textContent) await new Promise((resolve) => setTimeout(resolve, 20));"""
     )
-    np.testing.assert_allclose(matrices(shown_pose(browser, 2)[0]), matrices(clips[1][2]), atol=ANGLE)
-    drop(browser, "one.npz", npz(rotations=np.zeros((2, 55, 3)), translations=np.zeros((2, 3)), fps=24))
+    np.testing.assert_allclose(
+        matrices(shown_pose(browser, 2)[0]), matrices(clips[1][2]), atol=ANGLE
+    )
+    drop(
+        browser,
+        "one.npz",
+        npz(rotations=np.zeros((2, 55, 3)), translations=np.zeros((2, 3)), fps=24),
+    )
     assert browser.run("return document.getElementById('clip-row').hidden")
 
 
 def test_a_file_that_is_no_motion_gets_one_line_and_changes_nothing(browser):
     before = browser.run("return document.getElementById('motion-name').textContent")
     said = drop(browser, "notes.txt", b"hello")
-    assert said.startswith("notes.txt") and "expected a motion as .npz (ours, AMASS), .bvh or .glb" in said and "\n" not in said
+    assert (
+        said.startswith("notes.txt")
+        and "expected a motion as .npz (ours, AMASS), .bvh or .glb" in said
+        and "\n" not in said
+    )
     assert browser.run("return document.getElementById('motion-name').textContent") == before
 
 

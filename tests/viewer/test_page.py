@@ -34,8 +34,12 @@ def text():
 
 def test_the_page_is_one_file_that_asks_nobody(text):
     assert "connect-src 'none'" in text and "default-src 'none'" in text
-    assert re.findall(r'<\w[^>]*\b(?:src|href|action|data)="([^"]*)"', text) == ["data:,"]  # the icon
-    assert not re.search(r"https?:|@import|url\(|fetch\(|XMLHttpRequest|WebSocket|importScripts", text)
+    assert re.findall(r'<\w[^>]*\b(?:src|href|action|data)="([^"]*)"', text) == [
+        "data:,"
+    ]  # the icon
+    assert not re.search(
+        r"https?:|@import|url\(|fetch\(|XMLHttpRequest|WebSocket|importScripts", text
+    )
 
 
 def test_every_part_is_in_its_place_and_none_ends_a_script_early(text):
@@ -69,7 +73,11 @@ def test_shape_sliders_come_with_the_shipped_body_and_vertex_major_gaussians():
     means = jnp.repeat(rest.vertices, each, axis=0)
     count = len(means)
     gaussians = Gaussians(
-        means, jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1)), 0.01 + 0 * means, means[:, 0] * 0 + 0.5, 0 * means
+        means,
+        jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1)),
+        0.01 + 0 * means,
+        means[:, 0] * 0 + 0.5,
+        0 * means,
     )
     weights = np.repeat(np.asarray(body.skinning_weights), each, axis=0)
     names = (body.parents, body.joint_names)
@@ -105,7 +113,9 @@ def test_the_server_serves_the_page_to_this_machine_and_nothing_else():
         assert server.server_address[0] == "127.0.0.1"
         url = f"http://127.0.0.1:{server.server_address[1]}"
         with urllib.request.urlopen(url + "/?x") as answer:
-            assert answer.read().decode() == "<p>é</p>" and "utf-8" in answer.headers["Content-Type"]
+            assert (
+                answer.read().decode() == "<p>é</p>" and "utf-8" in answer.headers["Content-Type"]
+            )
         with pytest.raises(urllib.error.HTTPError, match="404") as refused:
             urllib.request.urlopen(url + "/etc/passwd")
         refused.value.close()
@@ -123,10 +133,16 @@ def avatar_file(tmp_path):
 
 def test_export_writes_page_and_ply(avatar_file, tmp_path, monkeypatch, capsys):
     written = tmp_path / "me.html", tmp_path / "me.ply"
-    code, out, err = run(monkeypatch, capsys, "export", avatar_file, "--html", written[0], "--out", written[1])
-    assert (code, err) == (0, "") and str(written[0]) in out and "MB" in out and str(written[1]) in out
+    code, out, err = run(
+        monkeypatch, capsys, "export", avatar_file, "--html", written[0], "--out", written[1]
+    )
+    assert (
+        (code, err) == (0, "") and str(written[0]) in out and "MB" in out and str(written[1]) in out
+    )
     assert out.splitlines()[-1] == f"next: humangs animate {avatar_file} --out video.mp4"
-    assert written[0].read_text() == page.page_html(small_avatar(), title="me") and written[1].exists()
+    assert (
+        written[0].read_text() == page.page_html(small_avatar(), title="me") and written[1].exists()
+    )
 
 
 def test_a_page_plays_the_motion_it_is_given(avatar_file, tmp_path, monkeypatch, capsys):
@@ -134,7 +150,9 @@ def test_a_page_plays_the_motion_it_is_given(avatar_file, tmp_path, monkeypatch,
     save_motion(tmp_path / "still.npz", motion)
     arguments = ("--html", tmp_path / "me.html", "--motion", tmp_path / "still.npz")
     assert run(monkeypatch, capsys, "export", avatar_file, *arguments)[0] == 0
-    assert (tmp_path / "me.html").read_text() == page.page_html(small_avatar(), motion, "me", "still")
+    assert (tmp_path / "me.html").read_text() == page.page_html(
+        small_avatar(), motion, "me", "still"
+    )
     assert {path.name for path in tmp_path.iterdir()} == {"me.npz", "me.html", "still.npz"}
 
 
@@ -148,7 +166,9 @@ def test_view_opens_the_browser_and_ends_quietly(avatar_file, monkeypatch, capsy
     monkeypatch.setattr(page.webbrowser, "open", opened.append)
     code, out, err = run(monkeypatch, capsys, "view", avatar_file)
     assert (code, err) == (0, "") and len(opened) == 1 and opened[0] in out
-    assert run(monkeypatch, capsys, "view", avatar_file, "--no-browser")[0] == 0 and len(opened) == 1
+    assert (
+        run(monkeypatch, capsys, "view", avatar_file, "--no-browser")[0] == 0 and len(opened) == 1
+    )
 
 
 # Live: what is followed, and, where a browser is at hand, that it shows the newest Gaussians ---------------------------------
@@ -205,7 +225,11 @@ def test_the_weights_of_a_run_reconstruct_someone(tmp_path, monkeypatch):
         ("runs/none", None, "no such run"),
         ("none.ply", None, "no such run"),
         ("none/avatar.npz", None, "no such run"),
-        ("avatar.npz", "demo_capture", "capture demo_capture: only for the folder of a training run"),
+        (
+            "avatar.npz",
+            "demo_capture",
+            "capture demo_capture: only for the folder of a training run",
+        ),
     ],
 )
 def test_what_cannot_be_followed_is_named(tmp_path, name, capture, message):
@@ -243,7 +267,10 @@ def test_the_server_answers_with_the_newest_avatar_and_refuses_a_taken_port(pers
             return answer.read().decode()
 
     with page.LiveView() as view:
-        assert "fetch" in read("") and json.loads(read("state")) == {"shown": 0, "status": "Waiting for the first avatar ..."}
+        assert "fetch" in read("") and json.loads(read("state")) == {
+            "shown": 0,
+            "status": "Waiting for the first avatar ...",
+        }
         view.show(person, "first")
         assert read("avatar?1") == page.page_html(person)
         assert json.loads(read("state")) == {"shown": 1, "status": "first"}
@@ -254,7 +281,9 @@ def test_the_server_answers_with_the_newest_avatar_and_refuses_a_taken_port(pers
 @pytest.mark.slow
 @pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))
 def test_a_browser_sees_the_person_and_the_next_one(person):
-    blue = replace(person, gaussians=replace(person.gaussians, colors=person.gaussians.colors[:, ::-1]))
+    blue = replace(
+        person, gaussians=replace(person.gaussians, colors=person.gaussians.colors[:, ::-1])
+    )
 
     def share(browser, channel):
         """Share of the window where a color is much brighter than the two others."""
@@ -274,8 +303,13 @@ def test_a_browser_sees_the_person_and_the_next_one(person):
         view.show(person)
         browser.driver.get(view.url)
         assert wait_for(browser, 0)
-        near = browser.run(inside + "const kept = page.state(); kept.orbit.distance *= 0.8; page.restore(kept); return kept")
+        near = browser.run(
+            inside
+            + "const kept = page.state(); kept.orbit.distance *= 0.8; page.restore(kept); return kept"
+        )
         view.show(blue)
         assert wait_for(browser, 2) and share(browser, 0) < 0.01
-        assert browser.run(inside + "return page.state()")["orbit"] == near["orbit"]  # as people had turned it
+        assert (
+            browser.run(inside + "return page.state()")["orbit"] == near["orbit"]
+        )  # as people had turned it
         assert browser.problems() == []

@@ -15,7 +15,10 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion
 from humangs_jax.viewer import page
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing())),
+]
 
 WIDTH, HEIGHT = 900, 600
 PHONE = (390, 844)
@@ -48,7 +51,11 @@ def ball_person():
     vertices = np.zeros((len(avatar.rest_vertices), 3), np.float32)
     vertices[:2, 1] = -0.6, 0.6
     rest_joints = jnp.zeros((3, 3))
-    changes = {"rest_vertices": jnp.asarray(vertices), "rest_joints": rest_joints, "joint_names": JOINTS}
+    changes = {
+        "rest_vertices": jnp.asarray(vertices),
+        "rest_joints": rest_joints,
+        "joint_names": JOINTS,
+    }
     return replace(avatar, gaussians=gaussians, **changes)
 
 
@@ -57,7 +64,12 @@ def file(tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "ball.html"
     turning = np.zeros((48, 3, 3))
     turning[:, 0, 1] = np.linspace(0, 2, 48)
-    page.write_page(path, ball_person(), Motion(jnp.asarray(turning), jnp.zeros((48, 3)), fps=24.0), title="ball")
+    page.write_page(
+        path,
+        ball_person(),
+        Motion(jnp.asarray(turning), jnp.zeros((48, 3)), fps=24.0),
+        title="ball",
+    )
     return path
 
 
@@ -112,11 +124,17 @@ def redness(image):
 def middle_of_the_ball(image):
     """Column and row, as shares of the image."""
     rows, columns = np.nonzero(redness(image) > 0.3)
-    return (columns.min() + columns.max() + 1) / 2 / image.shape[1], (rows.min() + rows.max() + 1) / 2 / image.shape[0]
+    return (columns.min() + columns.max() + 1) / 2 / image.shape[1], (
+        rows.min() + rows.max() + 1
+    ) / 2 / image.shape[0]
 
 
 def visible(browser, ids):
-    return [name for name in ids if browser.run("return document.getElementById(given[0]).checkVisibility()", name)]
+    return [
+        name
+        for name in ids
+        if browser.run("return document.getElementById(given[0]).checkVisibility()", name)
+    ]
 
 
 def lower_the_resolution(browser):
@@ -137,11 +155,18 @@ def lower_the_resolution(browser):
 def test_an_image_has_the_size_of_the_page_though_it_plays_at_half_of_it(browser, playing):
     assert lower_the_resolution(browser) == [WIDTH / 2, HEIGHT / 2]
     if not playing:
-        browser.run("document.getElementById('play').click(); await new Promise((resolve) => setTimeout(resolve, 600));")
+        browser.run(
+            "document.getElementById('play').click(); await new Promise((resolve) => setTimeout(resolve, 600));"
+        )
     assert saved_image(browser, 1, False).shape == (HEIGHT, WIDTH, 4)
-    size = browser.run("const canvas = document.getElementById('view'); return [canvas.width, canvas.height]")
+    size = browser.run(
+        "const canvas = document.getElementById('view'); return [canvas.width, canvas.height]"
+    )
     assert size == ([WIDTH / 2, HEIGHT / 2] if playing else [WIDTH, HEIGHT])
-    assert browser.run("return document.getElementById('message').textContent") == f"ball.png: {WIDTH} × {HEIGHT} pixels"
+    assert (
+        browser.run("return document.getElementById('message').textContent")
+        == f"ball.png: {WIDTH} × {HEIGHT} pixels"
+    )
 
 
 def test_images_may_be_twice_as_large_and_transparent_with_the_person_in_the_middle(browser):
@@ -169,14 +194,28 @@ def frames_of(video):
     """The frames (n, HEIGHT, WIDTH, 3); fails if they have another size."""
     import imageio_ffmpeg
 
-    arguments = ["-i", str(video), "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    done = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *arguments], capture_output=True, check=True)
+    arguments = [
+        "-i",
+        str(video),
+        "-fps_mode",
+        "passthrough",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
+    done = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), *arguments], capture_output=True, check=True
+    )
     assert f", {WIDTH}x{HEIGHT}" in done.stderr.decode()
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, HEIGHT, WIDTH, 3)
 
 
 def test_a_video_shows_the_motion_without_controls(browser, tmp_path):
-    browser.run("document.getElementById('record-video').click(); await new Promise((resolve) => setTimeout(resolve, 2500));")
+    browser.run(
+        "document.getElementById('record-video').click(); await new Promise((resolve) => setTimeout(resolve, 2500));"
+    )
     assert visible(browser, CONTROLS) == [] and visible(browser, ["stop-video"]) == ["stop-video"]
     assert "playing" in browser.run("return document.body.className")
     name, content = saved(browser, "stop-video")
@@ -197,7 +236,10 @@ def test_a_browser_without_a_recorder_has_no_button_for_it(file):
         assert visible(browser, ["save-image", "record-video"]) == ["save-image"]
 
 
-@pytest.mark.parametrize(("script", "reason"), [(NO_WEBGL, "WebGL 2 is missing."), (OLD, "DecompressionStream is missing.")])
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [(NO_WEBGL, "WebGL 2 is missing."), (OLD, "DecompressionStream is missing.")],
+)
 def test_a_browser_that_cannot_show_it_says_which_can_and_has_no_controls(file, script, reason):
     with chromium.Chromium(WIDTH, HEIGHT) as browser:
         before_the_page(browser, script)
@@ -284,7 +326,11 @@ def test_a_motion_without_a_rate_is_a_question_not_an_end(browser, size):
     drop(browser, "still.npz", **still)
     wait_for(browser, "!document.getElementById('ask-rate').hidden")
     form = browser.driver.find_element(By.ID, "ask-rate")
-    assert form.is_displayed() and "still.npz" in form.text and "how many frames are a second?" in form.text
+    assert (
+        form.is_displayed()
+        and "still.npz" in form.text
+        and "how many frames are a second?" in form.text
+    )
     assert form.location["x"] >= 0 and form.location["x"] + form.size["width"] <= size[0]
     browser.driver.find_element(By.ID, "leave-rate").click()
     assert not form.is_displayed() and browser.run(f"return {NAME}") == before
@@ -295,7 +341,9 @@ def test_a_motion_without_a_rate_is_a_question_not_an_end(browser, size):
     answer.send_keys("12.5", Keys.ENTER)
     wait_for(browser, f"{NAME} === 'still.npz: 9 frames'")
     assert not form.is_displayed()
-    shown = browser.run("return ['fps', 'time'].map((id) => document.getElementById(id)).map((x) => x.value)")
+    shown = browser.run(
+        "return ['fps', 'time'].map((id) => document.getElementById(id)).map((x) => x.value)"
+    )
     assert shown[0] == "12.5" and shown[1].endswith("/ 0.6 s")
     drop(browser, "one.npz", **{key: values[:1] for key, values in still.items()}, fps=30)
     wait_for(browser, f"{NAME} === 'one.npz: 1 frame'")
@@ -357,7 +405,11 @@ def test_a_page_that_embeds_it_shows_through_and_has_no_controls(embedded):
 def test_an_address_may_ask_for_a_colour_a_pose_and_a_time(embedded):
     browser = embedded("autoplay=0&panel=0&background=00aa33&floor=0&time=0.5")
     view = browser.run("return humangs.view()")
-    assert not view["playing"] and view["mode"] == "motion" and view["frame"] == pytest.approx(0.5 * 24)
+    assert (
+        not view["playing"]
+        and view["mode"] == "motion"
+        and view["frame"] == pytest.approx(0.5 * 24)
+    )
     np.testing.assert_allclose(browser.screenshot()[30, 30], [0, 0xAA / 255, 0x33 / 255], atol=0.01)
     browser = embedded("pose=t")
     assert browser.run("return humangs.view().mode") == "rest"

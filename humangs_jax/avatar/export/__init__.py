@@ -42,7 +42,12 @@ class ExportFormat(Format):
 EXPORTS = Formats(
     ply=ExportFormat(
         *("3DGS", f"{HERE}.splats:write_ply", (".ply",)),
-        **{"up": "-y", "rest_fields": True, "reader": f"{HERE}.splats:read_ply", "magic": (b"ply",)},
+        **{
+            "up": "-y",
+            "rest_fields": True,
+            "reader": f"{HERE}.splats:read_ply",
+            "magic": (b"ply",),
+        },
     ),
     splat=ExportFormat(
         *("antimatter15's viewer and others", f"{HERE}.splats:write_splat", (".splat",)),
@@ -50,14 +55,23 @@ EXPORTS = Formats(
     ),
     spz=ExportFormat(
         *("Niantic's, compressed", f"{HERE}.spz:write_spz", (".spz",)),
-        **{"backwards": True, "versions": (3, 4), "reader": f"{HERE}.spz:read_spz", "magic": (b"\x1f\x8b\x08", b"NGSP")},
+        **{
+            "backwards": True,
+            "versions": (3, 4),
+            "reader": f"{HERE}.spz:read_spz",
+            "magic": (b"\x1f\x8b\x08", b"NGSP"),
+        },
     ),
     glb=ExportFormat(
         *("glTF 2.0 with KHR_gaussian_splatting", f"{HERE}.splats:write_glb", (".glb",)),
         **{"reader": f"{HERE}.splats:read_glb", "magic": (b"glTF",)},
     ),
     mesh=ExportFormat(
-        *("with --mesh the body with texture, skin and motion", f"{HERE}.mesh:write_animation", (".glb",)),
+        *(
+            "with --mesh the body with texture, skin and motion",
+            f"{HERE}.mesh:write_animation",
+            (".glb",),
+        ),
         **{"mesh": True, "animated": True},
     ),
     obj=ExportFormat(
@@ -94,13 +108,23 @@ class VideoFormat(Format):
 _VIDEO = "humangs_jax.avatar.video"
 VIDEOS = Formats(
     mp4=VideoFormat("H.264, plays everywhere", f"{_VIDEO}:write_mp4", (".mp4",), even_sides=True),
-    webm=VideoFormat("VP9, may be transparent", f"{_VIDEO}:write_webm", (".webm",), transparent=True, even_sides=True),
+    webm=VideoFormat(
+        "VP9, may be transparent",
+        f"{_VIDEO}:write_webm",
+        (".webm",),
+        transparent=True,
+        even_sides=True,
+    ),
     gif=VideoFormat("256 colors, endless", f"{_VIDEO}:write_gif", (".gif",)),
-    images=VideoFormat("frame_00000.png and so on", f"{_VIDEO}:write_images", (FOLDER,), transparent=True),
+    images=VideoFormat(
+        "frame_00000.png and so on", f"{_VIDEO}:write_images", (FOLDER,), transparent=True
+    ),
 )
 
 
 def chosen_format(suffix: str, mesh: bool = False) -> ExportFormat | None:
     """The format of files with this suffix, None for none. mesh: of meshes alone, else of Gaussians where there is one."""
-    found = [each for each in EXPORTS.values() if suffix.lower() in each.suffixes and each.mesh >= mesh]
+    found = [
+        each for each in EXPORTS.values() if suffix.lower() in each.suffixes and each.mesh >= mesh
+    ]
     return min(found, key=lambda each: each.mesh, default=None)

@@ -22,7 +22,13 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, OTHERS, ExportFormat, Up, chosen_format
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.array_types import Float
-from humangs_jax.core.checks import BOUNDED, LARGEST, check_values, checked_arguments, require_concrete
+from humangs_jax.core.checks import (
+    BOUNDED,
+    LARGEST,
+    check_values,
+    checked_arguments,
+    require_concrete,
+)
 from humangs_jax.core.progress import printable
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import alternatives, imported
@@ -31,7 +37,13 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.io.arrays import check_array
 from humangs_jax.io.reading import Refused, read_bytes, reading
-from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, turned_harmonics, widened
+from humangs_jax.rendering.gaussians import (
+    Gaussians,
+    factored,
+    gaussian_values,
+    turned_harmonics,
+    widened,
+)
 
 logger = logging.getLogger(__name__)
 SH_C0 = 0.28209479177387814
@@ -104,8 +116,12 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
     """
     names = ("means", "quats", "scales", "colors", "harmonics")
     check_values("export", gaussian_values(gaussians))
-    check_values("export", {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names})
-    g = factored(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None))
+    check_values(
+        "export", {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names}
+    )
+    g = factored(
+        replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None)
+    )
     harmonics = np.zeros((len(g.means), 0, 3)) if g.harmonics is None else g.harmonics
     arrays = (g.means, g.quats, g.scales, g.opacities, g.colors, harmonics)
     means, quats, scales, opacities, colors, harmonics = (np.asarray(x, np.float64) for x in arrays)
@@ -163,7 +179,13 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
 
 
 @checked_arguments
-def save_gaussians(path: str | os.PathLike[str], gaussians: Gaussians, *, y_up: bool = False, version: int | None = None) -> None:
+def save_gaussians(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    y_up: bool = False,
+    version: int | None = None,
+) -> None:
     """Write Gaussians into a file for other programs; it appears whole or not at all.
 
     Deformations become quaternions and scales. A low-pass is taken out of the scales.
@@ -196,7 +218,9 @@ def _check_version(path: object, form: ExportFormat, version: int | None) -> Non
         return
     if not form.versions:
         holding = EXPORTS.where(lambda each: bool(each.versions)).suffixes
-        raise ValueError(f"{path}: has no versions: expected a name ending in {alternatives(holding)}")
+        raise ValueError(
+            f"{path}: has no versions: expected a name ending in {alternatives(holding)}"
+        )
     raise ValueError(f"version: expected {' or '.join(map(str, form.versions))}, got {version}")
 
 
@@ -285,7 +309,9 @@ DIGITS = 4
 def frame_range(text: str, count: int) -> range:
     """The frames that "a:b:step" names as Python does, of `count`; each part may be missing. Raises: ValueError."""
     parts = text.split(":")
-    if not 2 <= len(parts) <= 3 or not all(re.fullmatch(r"\s*(-?\d{1,9})?\s*", part) for part in parts):
+    if not 2 <= len(parts) <= 3 or not all(
+        re.fullmatch(r"\s*(-?\d{1,9})?\s*", part) for part in parts
+    ):
         raise ValueError(f"{text!r}: expected frames as a:b:step, such as 0:100:5 or : for all")
     numbers = [int(part) if part.strip() else None for part in parts]
     if len(numbers) > 2 and numbers[2] is not None and numbers[2] < 1:
@@ -337,25 +363,39 @@ def export(
     form = chosen_format(path.suffix, mesh)
     if form is None:
         known = EXPORTS.where(lambda each: each.mesh >= mesh).suffixes
-        raise ValueError(f"{path}: expected a name ending in {alternatives(known)}{' for a mesh' if mesh else ''}")
+        raise ValueError(
+            f"{path}: expected a name ending in {alternatives(known)}{' for a mesh' if mesh else ''}"
+        )
     if rest_fields and not form.rest_fields:
         holding = EXPORTS.where(lambda each: each.rest_fields).suffixes
-        raise ValueError(f"{path}: has no rest fields: expected a name ending in {alternatives(holding)}")
+        raise ValueError(
+            f"{path}: has no rest fields: expected a name ending in {alternatives(holding)}"
+        )
     _check_version(path, form, version)
     frames = 1 if motion is None else len(motion.translations)
     if not form.animated and frames != (1 if numbers is None else len(numbers)):
         given = "no numbers" if numbers is None else f"{len(numbers)} numbers"
         raise ValueError(f"numbers: expected one for each of the {frames} frames, got {given}")
     if motion is not None and (form.mesh or numbers is not None):
-        motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
+        motion = grounded(
+            motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents
+        )
     one = form.animated or numbers is None
-    files = [path] if one else [path.with_stem(f"{path.stem}_{number:0{DIGITS}d}") for number in numbers or ()]
+    files = (
+        [path]
+        if one
+        else [path.with_stem(f"{path.stem}_{number:0{DIGITS}d}") for number in numbers or ()]
+    )
     if form.mesh:
         form(path, files, avatar, motion, up or form.up, name)
         return files
     for i, file in enumerate(files):
         gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(i))
-        gaussians = turned(grounded_gaussians(gaussians) if numbers is None else gaussians, up or form.up)
+        gaussians = turned(
+            grounded_gaussians(gaussians) if numbers is None else gaussians, up or form.up
+        )
         gaussians = rotated(gaussians, BACKWARDS) if form.backwards else gaussians
-        form(file, gaussians, **({"rest_fields": True} if rest_fields else {}), **_versioned(version))
+        form(
+            file, gaussians, **({"rest_fields": True} if rest_fields else {}), **_versioned(version)
+        )
     return files

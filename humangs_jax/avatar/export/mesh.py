@@ -67,7 +67,9 @@ class BodyMesh:
 
     def posed(self, avatar: Avatar, pose: BodyPose) -> "BodyMesh":
         """The mesh in a pose of the avatar's joints; normals by the rotations of blended transforms."""
-        transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
+        transforms = joint_transforms(
+            avatar.rest_joints, avatar.parents, pose.rotations, pose.translation
+        )
         blended = blend_transforms(jnp.asarray(self.weights), transforms)
         normals = np.einsum("uab,ub->ua", np.asarray(blended[:, :3, :3]), self.normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -81,10 +83,16 @@ def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     Raises: ValueError for an avatar without faces or Gaussians, or with numbers that files cannot hold, or a size that is no
     multiple of 128.
     """
-    vertices, faces = np.asarray(avatar.rest_vertices, np.float32), np.asarray(avatar.faces, np.int32)
+    vertices, faces = (
+        np.asarray(avatar.rest_vertices, np.float32),
+        np.asarray(avatar.faces, np.int32),
+    )
     if len(faces) == 0 or len(avatar.gaussians.means) == 0:
         raise ValueError("a body mesh needs an avatar with faces and Gaussians")
-    own = {name: (getattr(avatar, name), BOUNDED) for name in ("rest_vertices", "rest_joints", "skinning_weights")}
+    own = {
+        name: (getattr(avatar, name), BOUNDED)
+        for name in ("rest_vertices", "rest_joints", "skinning_weights")
+    }
     check_values("export", own | {"gaussians.colors": (avatar.gaussians.colors, BOUNDED)})
     normals = np.asarray(vertex_normals(avatar.rest_vertices, avatar.faces))
     ones = np.ones(len(faces), np.float32)
@@ -110,12 +118,16 @@ def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
     each = avatar.gaussians_per_vertex
     if each is None:
         count = min(4, len(weights))
-        nearest = KDTree(np.asarray(avatar.gaussians.means)).query(np.asarray(avatar.rest_vertices), k=count)[1]
+        nearest = KDTree(np.asarray(avatar.gaussians.means)).query(
+            np.asarray(avatar.rest_vertices), k=count
+        )[1]
         return weights[nearest.reshape(-1, count)].mean(axis=1)
     return weights.reshape(-1, each, weights.shape[1]).mean(axis=1)
 
 
-def skin_colors(avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+def skin_colors(
+    avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]
+) -> Float[np.ndarray, "p 3"]:
     """What the Gaussians show at points of the skin to someone who looks along the normals, from outside.
 
     On the line x(t) = p + t n, a Gaussian of precision A and mean m is densest at t = n.A(m - p) / n.A n and there has the alpha
@@ -151,13 +163,20 @@ def skin_colors(avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float
 # glTF -----------------------------------------------------------------------------------------------------------------
 
 
-def write_animation(path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str) -> None:
+def write_animation(
+    path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
+) -> None:
     """All of a motion in one `.glb`, see `write_mesh_glb`."""
     write_mesh_glb(path, avatar, body_mesh(avatar), motion, name, up)
 
 
 def write_mesh_glb(
-    path: str | os.PathLike[str], avatar: Avatar, mesh: BodyMesh, motion: Motion | None = None, name: str = "motion", up: Up = "y"
+    path: str | os.PathLike[str],
+    avatar: Avatar,
+    mesh: BodyMesh,
+    motion: Motion | None = None,
+    name: str = "motion",
+    up: Up = "y",
 ) -> None:
     """Write mesh, skin and motion; the file appears whole or not at all.
 
@@ -169,26 +188,42 @@ def write_mesh_glb(
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [skeleton - 1, skeleton]}],
-        "nodes": [*_joint_nodes(avatar, mesh), _armature(avatar, up), {"name": "body", "mesh": 0, "skin": 0}],
+        "nodes": [
+            *_joint_nodes(avatar, mesh),
+            _armature(avatar, up),
+            {"name": "body", "mesh": 0, "skin": 0},
+        ],
         "meshes": [{"name": "body", "primitives": [_primitive(writer, mesh)]}],
         "skins": [_skin(writer, avatar)],
         "materials": [
             {
                 "name": "skin",
-                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0},
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "metallicFactor": 0.0,
+                    "roughnessFactor": 1.0,
+                },
                 "extensions": {"KHR_materials_unlit": {}},
             }
         ],
         "textures": [{"source": 0, "sampler": 0}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "images": [{"name": "skin", "mimeType": "image/png", "bufferView": writer.bytes_(png_bytes(mesh.texture / 255))}],
+        "images": [
+            {
+                "name": "skin",
+                "mimeType": "image/png",
+                "bufferView": writer.bytes_(png_bytes(mesh.texture / 255)),
+            }
+        ],
     }
     if motion is not None:
         document["animations"] = [_animation(writer, avatar, motion, name)]
     writer.write(path, document)
 
 
-def strongest(weights: Float[np.ndarray, "n j"]) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
+def strongest(
+    weights: Float[np.ndarray, "n j"],
+) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
     """The four joints of most weight of each row, strongest first, and their weights scaled to sum 1; joint 0 where that is 0."""
     weights = np.pad(weights, ((0, 0), (0, max(0, WEIGHTS - weights.shape[1]))))
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :WEIGHTS]
@@ -202,7 +237,9 @@ def _joint_nodes(avatar: Avatar, mesh: BodyMesh) -> list[dict[str, Any]]:
     joints = np.asarray(avatar.rest_joints, np.float64)
     nodes = []
     for j, (name, parent) in enumerate(zip(avatar.joint_names, avatar.parents, strict=True)):
-        place = joints[j] - (joints[parent] if parent >= 0 else [0, float(mesh.vertices[:, 1].min()), 0])
+        place = joints[j] - (
+            joints[parent] if parent >= 0 else [0, float(mesh.vertices[:, 1].min()), 0]
+        )
         node = {"name": name, "translation": place.tolist()}
         children = [i for i, p in enumerate(avatar.parents) if p == j]
         nodes.append(node | ({"children": children} if children else {}))
@@ -220,7 +257,9 @@ def _primitive(writer: GlbWriter, mesh: BodyMesh) -> dict[str, Any]:
     attributes = {
         "POSITION": writer.array("VEC3", mesh.vertices, VERTICES, bounds=True),
         "NORMAL": writer.array("VEC3", mesh.normals, VERTICES),
-        "TEXCOORD_0": writer.array("VEC2", np.stack([mesh.uvs[:, 0], 1 - mesh.uvs[:, 1]], axis=1), VERTICES),
+        "TEXCOORD_0": writer.array(
+            "VEC2", np.stack([mesh.uvs[:, 0], 1 - mesh.uvs[:, 1]], axis=1), VERTICES
+        ),
         "JOINTS_0": writer.array("VEC4", joints.astype(small), VERTICES),
         "WEIGHTS_0": writer.array("VEC4", weights, VERTICES),
     }
@@ -232,7 +271,11 @@ def _skin(writer: GlbWriter, avatar: Avatar) -> dict[str, Any]:
     matrices = np.tile(np.eye(4), (len(avatar.parents), 1, 1))
     matrices[:, 3, :3] = -np.asarray(avatar.rest_joints)  # column by column, as glTF has them
     inverse = writer.array("MAT4", matrices.reshape(-1, 16))
-    return {"joints": list(range(len(avatar.parents))), "inverseBindMatrices": inverse, "skeleton": avatar.parents.index(-1)}
+    return {
+        "joints": list(range(len(avatar.parents))),
+        "inverseBindMatrices": inverse,
+        "skeleton": avatar.parents.index(-1),
+    }
 
 
 def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> dict[str, Any]:
@@ -241,10 +284,27 @@ def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> 
     rotations = np.asarray(motion.rotations)
     quats = _continuous(np.asarray(quaternion.from_axis_angle(motion.rotations)))
     root = avatar.parents.index(-1)
-    tracks = [(j, "rotation", "VEC4", quats[:, j][:, [1, 2, 3, 0]]) for j in range(rotations.shape[1]) if rotations[:, j].any()]
-    tracks.append((root, "translation", "VEC3", np.asarray(motion.translations) + np.asarray(avatar.rest_joints)[root]))
-    samplers = [{"input": times, "output": writer.array(kind, values), "interpolation": "LINEAR"} for *_, kind, values in tracks]
-    channels = [{"sampler": i, "target": {"node": node, "path": path}} for i, (node, path, *_) in enumerate(tracks)]
+    tracks = [
+        (j, "rotation", "VEC4", quats[:, j][:, [1, 2, 3, 0]])
+        for j in range(rotations.shape[1])
+        if rotations[:, j].any()
+    ]
+    tracks.append(
+        (
+            root,
+            "translation",
+            "VEC3",
+            np.asarray(motion.translations) + np.asarray(avatar.rest_joints)[root],
+        )
+    )
+    samplers = [
+        {"input": times, "output": writer.array(kind, values), "interpolation": "LINEAR"}
+        for *_, kind, values in tracks
+    ]
+    channels = [
+        {"sampler": i, "target": {"node": node, "path": path}}
+        for i, (node, path, *_) in enumerate(tracks)
+    ]
     return {"name": name, "channels": channels, "samplers": samplers}
 
 
@@ -273,11 +333,15 @@ def _is_ours(file: Path) -> bool:
 
 def check_beside(path: Path) -> None:
     """Whether the texture and the material of an `.obj` replace no file of others. Raises: ValueError."""
-    advice = "it would become the texture or material: choose another name for the .obj, or move it away"
+    advice = (
+        "it would become the texture or material: choose another name for the .obj, or move it away"
+    )
     check_ours((path.with_suffix(suffix) for suffix in (".png", ".mtl")), _is_ours, advice)
 
 
-def write_poses(path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str) -> None:
+def write_poses(
+    path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
+) -> None:
     """An `.obj` for each pose of a motion, or of the T-pose with its feet on 0; all share the texture beside `path`."""
     check_beside(path)
     mesh = body_mesh(avatar)
@@ -285,21 +349,28 @@ def write_poses(path: Path, files: Sequence[Path], avatar: Avatar, motion: Motio
     floor = np.asarray([0, mesh.vertices[:, 1].min(), 0], np.float32)
     for i, file in enumerate(files):
         still = dataclasses.replace(mesh, vertices=mesh.vertices - floor)
-        write_obj(file, still if motion is None else mesh.posed(avatar, motion.pose(i)), material, up)
+        write_obj(
+            file, still if motion is None else mesh.posed(avatar, motion.pose(i)), material, up
+        )
 
 
 def write_material(path: Path, mesh: BodyMesh) -> Path:
     """Write the `.mtl` and the `.png` that an `.obj` of this path names; several poses share them. Returns the `.mtl`'s path."""
     texture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
     write_png(texture, mesh.texture.astype(np.float32) / 255, mark=DRAWN)
-    write_text(material, f"{WRITTEN}\nnewmtl skin\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture.name}\n")
+    write_text(
+        material,
+        f"{WRITTEN}\nnewmtl skin\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture.name}\n",
+    )
     return material
 
 
 def write_obj(path: Path, mesh: BodyMesh, material: Path, up: Up) -> None:
     """Write a mesh. material: what `write_material` wrote beside it. up: the axis that points up in the file."""
     turn = up_matrix(up)
-    rows = lambda key, values: [f"{key} " + " ".join(f"{x:.6g}" for x in row) for row in values.tolist()]
+    rows = lambda key, values: [
+        f"{key} " + " ".join(f"{x:.6g}" for x in row) for row in values.tolist()
+    ]
     corners = [" ".join(f"{i}/{i}/{i}" for i in face) for face in (mesh.faces + 1).tolist()]
     lines = [
         f"{WRITTEN}: metres, {up} up",

@@ -22,7 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import expit
 
-from humangs_jax.avatar.export.gaussians import colors_of, linear_of, loaded, plain_arrays, sh_of, with_largest
+from humangs_jax.avatar.export.gaussians import (
+    colors_of,
+    linear_of,
+    loaded,
+    plain_arrays,
+    sh_of,
+    with_largest,
+)
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.motion.clips import node_matrices
@@ -37,7 +44,16 @@ SMALLEST_SCALE = 1e-9
 """Metres; keeps the logarithm finite for flat Gaussians."""
 LONGEST_HEADER = 1 << 16
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
+TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+}
 TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
 CHUNK = 256
 REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
@@ -46,7 +62,9 @@ DEGREE_4 = 72
 """Properties of harmonics up to degree 4."""
 FILTER = "filter_3D"
 """The property of Mip-Splatting and GOF that belongs to scales and opacities."""
-KNOWN = re.compile(r"[xyz]|n[xyz]|red|green|blue|alpha|(f_dc|f_rest|scale|rot|packed|min|max)_\w+|opacity|filter_3D")
+KNOWN = re.compile(
+    r"[xyz]|n[xyz]|red|green|blue|alpha|(f_dc|f_rest|scale|rot|packed|min|max)_\w+|opacity|filter_3D"
+)
 """Properties that are used, or say the same as those."""
 SHOWN = 6
 """Names in a line."""
@@ -54,7 +72,9 @@ Columns = Mapping[str, np.ndarray]
 
 
 @checked_arguments
-def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, rest_fields: bool = False) -> None:
+def write_ply(
+    path: str | os.PathLike[str], gaussians: Gaussians, rest_fields: bool = False
+) -> None:
     """Write a 3DGS `.ply`; the file appears whole or not at all.
 
     rest_fields: all 45 `f_rest_*` fields, on which some importers (Unity) insist, zeros where there are no such harmonics.
@@ -101,7 +121,9 @@ def read_ply(data: bytes, said: list[str]) -> Gaussians:
 
 
 def _fused(
-    scales: Float[np.ndarray, "g 3"], opacities: Float[np.ndarray, " g"], smoothing: Float[np.ndarray, "g 1"]
+    scales: Float[np.ndarray, "g 3"],
+    opacities: Float[np.ndarray, " g"],
+    smoothing: Float[np.ndarray, "g 1"],
 ) -> tuple[Float[np.ndarray, "g 3"], Float[np.ndarray, " g"]]:
     """Scales and opacities with the 3D smoothing filter of Mip-Splatting, a Gaussian of that scale in metres.
 
@@ -115,7 +137,12 @@ def _fused(
 def _unused(elements: Mapping[str, Columns]) -> list[str]:
     """What is to be said of properties and elements that have no meaning here."""
     found = [name for name in elements if name not in ("chunk", "vertex", "sh", "face")]
-    found += [name for each in ("vertex", "chunk", "sh") for name in elements.get(each, {}) if not KNOWN.fullmatch(name)]
+    found += [
+        name
+        for each in ("vertex", "chunk", "sh")
+        for name in elements.get(each, {})
+        if not KNOWN.fullmatch(name)
+    ]
     more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
     return [f"properties that are not used: {', '.join(found[:SHOWN])}{more}"] if found else []
 
@@ -124,15 +151,23 @@ def _exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
     return np.exp(np.minimum(logs, 99))  # far too large, so refused
 
 
-def _harmonics(columns: Columns, values: np.ndarray | None = None) -> dict[str, Float[np.ndarray, "g k 3"]]:
+def _harmonics(
+    columns: Columns, values: np.ndarray | None = None
+) -> dict[str, Float[np.ndarray, "g k 3"]]:
     """Under their name, nothing if there are none. values: what the bytes of a column stand for."""
     count = sum(name.startswith("f_rest_") for name in columns)
     if count % 3 or count // 3 not in COUNTS:
         degree = " of degree 4" if count == DEGREE_4 else ""
-        raise Refused(f"f_rest_*: expected 9, 24 or 45 properties, of degree 1 to 3, got {count}{degree}")
+        raise Refused(
+            f"f_rest_*: expected 9, 24 or 45 properties, of degree 1 to 3, got {count}{degree}"
+        )
     if not count:
         return {}
-    rest = _columns(columns, *(f"f_rest_{i}" for i in range(count)), dtype=np.float32 if values is None else np.uint8)
+    rest = _columns(
+        columns,
+        *(f"f_rest_{i}" for i in range(count)),
+        dtype=np.float32 if values is None else np.uint8,
+    )
     rest = rest if values is None else values[rest]
     return {"f_rest_*": rest.reshape(len(rest), 3, count // 3).swapaxes(1, 2)}
 
@@ -140,19 +175,31 @@ def _harmonics(columns: Columns, values: np.ndarray | None = None) -> dict[str, 
 def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> Gaussians:
     """Gaussians of compressed columns."""
     words = {name: _columns(vertex, f"packed_{name}", dtype=np.uint32)[:, 0] for name in WORDS}
-    bits = {name: np.stack([_bits(words[name], *place) for place in places], axis=1) for name, places in WORDS.items()}
+    bits = {
+        name: np.stack([_bits(words[name], *place) for place in places], axis=1)
+        for name, places in WORDS.items()
+    }
     count, chunks = len(words["color"]), len(next(iter(chunk.values())))
     if chunks != -(-count // CHUNK):
-        raise Refused(f"chunk: expected one for each {CHUNK} of {count:,} Gaussians, got {chunks:,}")
+        raise Refused(
+            f"chunk: expected one for each {CHUNK} of {count:,} Gaussians, got {chunks:,}"
+        )
 
     def between(part: Float[np.ndarray, "g 3"], *names: str) -> Float[np.ndarray, "g 3"]:
-        low, high = (_columns(chunk, *(f"{end}_{name}" for name in names)) for end in ("min", "max"))
-        return np.repeat(low, CHUNK, axis=0)[:count] * (1 - part) + np.repeat(high, CHUNK, axis=0)[:count] * part
+        low, high = (
+            _columns(chunk, *(f"{end}_{name}" for name in names)) for end in ("min", "max")
+        )
+        return (
+            np.repeat(low, CHUNK, axis=0)[:count] * (1 - part)
+            + np.repeat(high, CHUNK, axis=0)[:count] * part
+        )
 
     colors = bits["color"][:, :3]
     arrays = {
         "packed_position": between(bits["position"], *"xyz"),
-        "packed_rotation": with_largest((bits["rotation"] - 0.5) * np.sqrt(2), words["rotation"] >> 30),
+        "packed_rotation": with_largest(
+            (bits["rotation"] - 0.5) * np.sqrt(2), words["rotation"] >> 30
+        ),
         "packed_scale": _exponential(between(bits["scale"], "scale_x", "scale_y", "scale_z")),
         "opacity": bits["color"][:, 3],
         "packed_color": between(colors, *"rgb") if "min_r" in chunk else colors,
@@ -179,7 +226,9 @@ def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64
     """Properties (g, names) as numbers of a type. Raises: Refused for one that is missing, or not of the bytes it is made of."""
     for name in names:
         if name not in columns:
-            raise Refused(f"{name}: missing: expected Gaussians (x, y, z, f_dc_*, opacity, scale_*, rot_* or packed_*)")
+            raise Refused(
+                f"{name}: missing: expected Gaussians (x, y, z, f_dc_*, opacity, scale_*, rot_* or packed_*)"
+            )
         if issubclass(dtype, np.integer) and columns[name].dtype.newbyteorder("=") != dtype:
             raise Refused(f"{name}: expected {np.dtype(dtype).name}, got {columns[name].dtype}")
     with np.errstate(over="ignore"):
@@ -198,11 +247,15 @@ def _elements(data: bytes) -> dict[str, Columns]:
                 pass
             case ["format", str(form), _] if form in ORDERS:
                 order = ORDERS[form]
-            case ["element", str(name), str(count)] if name not in counts and count.isdecimal() and len(count) < 20:
+            case ["element", str(name), str(count)] if (
+                name not in counts and count.isdecimal() and len(count) < 20
+            ):
                 counts[name], types[name] = int(count), []
             case ["property", "list", _, _, str(name)] if types:
                 list(types.values())[-1].append((name, None))
-            case ["property", str(kind), str(name)] if types and kind in TYPES and order is not None:
+            case ["property", str(kind), str(name)] if (
+                types and kind in TYPES and order is not None
+            ):
                 list(types.values())[-1].append((name, order + TYPES[kind]))
             case _:
                 raise Refused(f"header: {shown(line)}: not understood")
@@ -228,7 +281,9 @@ def _elements(data: bytes) -> dict[str, Columns]:
         elif count:
             rows = np.loadtxt(itertools.islice(lines, count), comments=None, ndmin=2)
             if rows.shape != (count, len(dtype.names)):
-                raise Refused(f"element {name}: expected {count} lines of {len(dtype.names)} numbers, got {rows.shape}")
+                raise Refused(
+                    f"element {name}: expected {count} lines of {len(dtype.names)} numbers, got {rows.shape}"
+                )
             found[name] = dict(zip(dtype.names, rows.T, strict=True))
     return found
 
@@ -253,9 +308,13 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         )
     rows = np.empty(len(means), ROW)
     rows["position"], rows["scale"] = means, scales
-    rows["rgba"] = np.rint(255 * np.clip(np.concatenate([colors, opacities[:, None]], axis=1), 0, 1))
+    rows["rgba"] = np.rint(
+        255 * np.clip(np.concatenate([colors, opacities[:, None]], axis=1), 0, 1)
+    )
     rows["rotation"] = np.clip(np.rint(128 * quats + 128), 0, 255)
-    order = np.argsort(-opacities * scales.prod(axis=1), kind="stable")  # viewers draw the first while the rest loads
+    order = np.argsort(
+        -opacities * scales.prod(axis=1), kind="stable"
+    )  # viewers draw the first while the rest loads
     write_bytes(path, rows[order].tobytes())
 
 
@@ -263,7 +322,9 @@ def read_splat(data: bytes, said: list[str]) -> Gaussians:
     """Gaussians of the bytes of a file. said: takes lines. Raises: Refused."""
     check_limit("gaussians", len(data) // ROW_BYTES, "Gaussians")
     if not data or len(data) % ROW_BYTES:
-        raise Refused(f"no .splat file: expected {ROW_BYTES} bytes for each Gaussian, got {len(data):,}")
+        raise Refused(
+            f"no .splat file: expected {ROW_BYTES} bytes for each Gaussian, got {len(data):,}"
+        )
     rows = np.ndarray((len(data) // ROW_BYTES,), ROW, data)
     rgba = rows["rgba"] / 255
     arrays = {
@@ -281,10 +342,16 @@ def read_splat(data: bytes, said: list[str]) -> Gaussians:
 
 
 EXTENSION, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
-COEFFICIENTS = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3) for i in range(2 * degree + 1)]
+COEFFICIENTS = [
+    f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"
+    for degree in (1, 2, 3)
+    for i in range(2 * degree + 1)
+]
 KERNEL = "ellipse"
 """The usual shape of a Gaussian, and the only one that is drawn."""
-NEEDED = tuple(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"))
+NEEDED = tuple(
+    f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0")
+)
 ATTRIBUTES = (*NEEDED, *COEFFICIENTS)
 """Those of the extension."""
 
@@ -305,18 +372,32 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         f"{EXTENSION}:OPACITY": ("SCALAR", np.clip(opacities, 0, 1)),
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": ("VEC3", sh_of(colors)),
     }
-    arrays |= {name: ("VEC3", harmonics[:, i]) for i, name in enumerate(COEFFICIENTS[: harmonics.shape[1]])}
+    arrays |= {
+        name: ("VEC3", harmonics[:, i]) for i, name in enumerate(COEFFICIENTS[: harmonics.shape[1]])
+    }
     writer = GlbWriter()
     attributes = {
-        name: writer.array(kind, values, VERTICES, bounds=name == "POSITION") for name, (kind, values) in arrays.items()
+        name: writer.array(kind, values, VERTICES, bounds=name == "POSITION")
+        for name, (kind, values) in arrays.items()
     }
-    about = {"kernel": KERNEL, "colorSpace": SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
+    about = {
+        "kernel": KERNEL,
+        "colorSpace": SRGB,
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
     document = {
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: about}}]}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: about}}
+                ]
+            }
+        ],
     }
     writer.write(path, document)
 
@@ -327,8 +408,12 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     Raises: Refused; what damaged numbers raise.
     """
     content, binary = parse_glb(data)
-    if needed := sorted(set(content.get("extensionsRequired", [])) - {EXTENSION, "KHR_mesh_quantization"}):
-        raise Refused(f"needs the extension {shown(needed[0])}: expected {EXTENSION} without compression")
+    if needed := sorted(
+        set(content.get("extensionsRequired", [])) - {EXTENSION, "KHR_mesh_quantization"}
+    ):
+        raise Refused(
+            f"needs the extension {shown(needed[0])}: expected {EXTENSION} without compression"
+        )
     places = node_matrices(content.get("nodes", []))
     placed = [
         (part, places[i])
@@ -343,7 +428,9 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     check_limit("gaussians", sum(counts), "Gaussians")
     spaces = {shown(part["extensions"][EXTENSION].get("colorSpace", SRGB)) for part, _ in placed}
     if spaces != {shown(SRGB)}:
-        said.append(f"colors of {', '.join(sorted(spaces))} are taken as they are: images of them have these colors, too")
+        said.append(
+            f"colors of {', '.join(sorted(spaces))} are taken as they are: images of them have these colors, too"
+        )
     said += _other_parts(placed)
     parts = [_part(content, binary, part["attributes"], place, said) for part, place in placed]
     if len({None if part.harmonics is None else part.harmonics.shape[1] for part in parts}) > 1:
@@ -353,14 +440,24 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
 
 def _other_parts(placed: Sequence[tuple[dict[str, Any], Any]]) -> list[str]:
     """What is to be said of kernels and attributes of the extension that have no meaning here."""
-    kernels = {shown(part["extensions"][EXTENSION].get("kernel", KERNEL)) for part, _ in placed} - {shown(KERNEL)}
-    names = {name for part, _ in placed for name in part["attributes"] if name.startswith(EXTENSION)} - set(ATTRIBUTES)
-    found = [f"kernel {kernel}" for kernel in sorted(kernels)] + [shown(name) for name in sorted(names)]
+    kernels = {shown(part["extensions"][EXTENSION].get("kernel", KERNEL)) for part, _ in placed} - {
+        shown(KERNEL)
+    }
+    names = {
+        name for part, _ in placed for name in part["attributes"] if name.startswith(EXTENSION)
+    } - set(ATTRIBUTES)
+    found = [f"kernel {kernel}" for kernel in sorted(kernels)] + [
+        shown(name) for name in sorted(names)
+    ]
     return [f"parts that are not used: {', '.join(found[:SHOWN])}"] if found else []
 
 
 def _part(
-    content: dict[str, Any], binary: bytes, attributes: dict[str, int], place: Float[np.ndarray, "4 4"], said: list[str]
+    content: dict[str, Any],
+    binary: bytes,
+    attributes: dict[str, int],
+    place: Float[np.ndarray, "4 4"],
+    said: list[str],
 ) -> Gaussians:
     def array(name: str) -> np.ndarray:
         if name not in attributes:
@@ -372,9 +469,16 @@ def _part(
     arrays[turns] = np.roll(arrays[turns], 1, axis=1)
     arrays[opacities] = arrays[opacities].reshape(-1)
     arrays[colors] = colors_of(arrays[colors])
-    if count := next(count for count in COUNTS[::-1] if not count or COEFFICIENTS[count - 1] in attributes):
+    if count := next(
+        count for count in COUNTS[::-1] if not count or COEFFICIENTS[count - 1] in attributes
+    ):
         arrays["SH"] = np.stack([array(name) for name in COEFFICIENTS[:count]], axis=1)
     gaussians = loaded(arrays, said)
     if np.array_equal(place, np.eye(4)):
         return gaussians
-    return factored(skin_gaussians(gaussians, jnp.broadcast_to(jnp.asarray(place, jnp.float32), (len(gaussians.means), 4, 4))))
+    return factored(
+        skin_gaussians(
+            gaussians,
+            jnp.broadcast_to(jnp.asarray(place, jnp.float32), (len(gaussians.means), 4, 4)),
+        )
+    )

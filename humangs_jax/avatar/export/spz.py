@@ -92,7 +92,9 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Versi
     farthest = np.abs(means).max(initial=1e-6)
     bits = min(MOST_FRACTIONAL_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
     if bits < 0:
-        raise ValueError(f"{path}: .spz holds Gaussians up to 8,388,607 m from the origin, got {farthest:g}")
+        raise ValueError(
+            f"{path}: .spz holds Gaussians up to 8,388,607 m from the origin, got {farthest:g}"
+        )
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     with np.errstate(divide="ignore"):
         steps = SCALE_STEPS * (np.log(scales) + SCALE_ZERO)
@@ -112,7 +114,9 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Versi
         return
     parts = [part for part in parts if part]
     streams = [zstd.compress(part, 12) for part in parts]
-    table = [TABLE_ROW.pack(len(stream), len(part)) for stream, part in zip(streams, parts, strict=True)]
+    table = [
+        TABLE_ROW.pack(len(stream), len(part)) for stream, part in zip(streams, parts, strict=True)
+    ]
     begin = HEADER.pack(*numbers, len(streams)) + TABLE_PLACE.pack(HEADER.size + TABLE_PLACE.size)
     write_bytes(path, begin + b"".join(table) + b"".join(streams))
 
@@ -126,10 +130,14 @@ def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g
     xyzw = quats[:, [1, 2, 3, 0]]
     largest = np.argmax(np.abs(xyzw), axis=1)
     xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
-    sizes = np.clip(np.floor(QUATERNION_STEPS * np.sqrt(2) * np.abs(xyzw) + 0.5), 0, QUATERNION_STEPS).astype("<u4")
+    sizes = np.clip(
+        np.floor(QUATERNION_STEPS * np.sqrt(2) * np.abs(xyzw) + 0.5), 0, QUATERNION_STEPS
+    ).astype("<u4")
     packed = largest.astype("<u4")
     for i in range(4):
-        component = packed << np.uint32(10) | np.where(xyzw[:, i] < 0, 512, 0).astype("<u4") | sizes[:, i]
+        component = (
+            packed << np.uint32(10) | np.where(xyzw[:, i] < 0, 512, 0).astype("<u4") | sizes[:, i]
+        )
         packed = np.where(largest == i, packed, component).astype("<u4")
     return packed
 
@@ -141,22 +149,31 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
     """Gaussians of the bytes of a file. said: takes lines. Raises: Refused; what gzip and zstd raise for damaged files."""
     header, parts = _with_table(data, said) if data.startswith(b"NGSP") else _of_gzip(data)
     if header.flags & ANTIALIASED:
-        said.append("trained antialiased, as Mip-Splatting does; drawn without that it looks thicker from afar")
+        said.append(
+            "trained antialiased, as Mip-Splatting does; drawn without that it looks thicker from afar"
+        )
     if header.flags & MORE_BEHIND and header.version < WITH_TABLE:
         said.append("records of other programs at its end are not used")
     count, version = header.count, header.version
     positions, opacities, colors, scales, quats, harmonics = (
-        np.frombuffer(part, "u1").reshape(count, width) for part, width in zip(parts, header.widths, strict=True)
+        np.frombuffer(part, "u1").reshape(count, width)
+        for part, width in zip(parts, header.widths, strict=True)
     )
     arrays = {
-        "positions": positions.view("<f2") if version == 1 else _fixed_point(positions, header.bits),
-        "rotations": with_largest(quats / 127.5 - 1, np.zeros(count)) if version < 3 else _smallest_three(quats),
+        "positions": positions.view("<f2")
+        if version == 1
+        else _fixed_point(positions, header.bits),
+        "rotations": with_largest(quats / 127.5 - 1, np.zeros(count))
+        if version < 3
+        else _smallest_three(quats),
         "scales": np.exp(scales / SCALE_STEPS - SCALE_ZERO),
         "alphas": opacities[:, 0] / 255,
         "colors": colors_of((colors / 255 - 0.5) / COLOR_SCALE),
     }
     if header.degree:
-        arrays["sh"] = harmonics.reshape(count, COUNTS[header.degree], 3) / np.float32(HARMONIC_STEPS) - 1
+        arrays["sh"] = (
+            harmonics.reshape(count, COUNTS[header.degree], 3) / np.float32(HARMONIC_STEPS) - 1
+        )
     return loaded(arrays, said)
 
 
@@ -164,7 +181,9 @@ def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header
     """The header at the start of a file of that many bytes, if it may unpack to what it says. Raises: Refused."""
     header = _Header(*HEADER.unpack(start[: HEADER.size].ljust(HEADER.size, b"\0")))
     if header.magic != SPZ_MAGIC or header.version not in versions:
-        raise Refused(f"no .spz of version 1 to 4: version {header.version} in what begins as version {versions[-1]} does")
+        raise Refused(
+            f"no .spz of version 1 to 4: version {header.version} in what begins as version {versions[-1]} does"
+        )
     if header.degree >= len(COUNTS):
         raise Refused(f"harmonics of degree {header.degree}: expected .spz of degree 0 to 3")
     check_limit("gaussians", header.count, "Gaussians")
@@ -186,7 +205,9 @@ def _of_gzip(data: bytes) -> tuple[_Header, list[bytes]]:
 def _check_size(size: int, header: _Header, more: bool = False) -> None:
     expected = header.count * sum(header.widths)
     if size < expected or (size > expected and not more):
-        raise Refused(f"expected {header.count:,} Gaussians in {expected:,} bytes, got {'more' if size > expected else 'less'}")
+        raise Refused(
+            f"expected {header.count:,} Gaussians in {expected:,} bytes, got {'more' if size > expected else 'less'}"
+        )
 
 
 def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
@@ -200,21 +221,29 @@ def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
     (place,) = TABLE_PLACE.unpack_from(data, HEADER.size)
     end = place + header.streams * TABLE_ROW.size
     if not begin <= place <= end <= len(data):
-        raise Refused(f"table of {header.streams} streams at {place:,}: expected it within {len(data):,} bytes")
+        raise Refused(
+            f"table of {header.streams} streams at {place:,}: expected it within {len(data):,} bytes"
+        )
     said += _records(data[begin:place])
     rows = list(TABLE_ROW.iter_unpack(data[place:end]))
     sizes = [header.count * width for width in header.widths]
     filled = [size for size in sizes if size]
-    rows = rows if len(rows) == len(filled) else [row for row in rows if row[1]]  # empty streams may be left out
+    rows = (
+        rows if len(rows) == len(filled) else [row for row in rows if row[1]]
+    )  # empty streams may be left out
     if [unpacked for _, unpacked in rows] != filled:
         found = ", ".join(f"{unpacked:,}" for _, unpacked in rows[: len(sizes)]) or "none"
         wanted = ", ".join(f"{size:,}" for size in filled)
-        raise Refused(f"table: {header.count:,} Gaussians: expected streams of {wanted} bytes, got {found}")
+        raise Refused(
+            f"table: {header.count:,} Gaussians: expected streams of {wanted} bytes, got {found}"
+        )
     streams = []
     at = end
     for packed, unpacked in TABLE_ROW.iter_unpack(data[place:end]):
         if packed > len(data) - at:
-            raise Refused(f"cut short: a stream of {packed:,} bytes from {at:,}, but there are {len(data):,}")
+            raise Refused(
+                f"cut short: a stream of {packed:,} bytes from {at:,}, but there are {len(data):,}"
+            )
         if unpacked:
             streams.append(_unpacked(data[at : at + packed], unpacked))
         at += packed
@@ -239,7 +268,9 @@ def _unpacked(stream: bytes, size: int) -> bytes:
     """That many bytes, of a zstd frame. Raises: Refused for another number; ZstdError."""
     content = zstd.ZstdDecompressor().decompress(stream, size + 1)
     if len(content) != size:
-        raise Refused(f"a stream unpacks to {'more' if len(content) > size else 'less'} than the {size:,} bytes of the table")
+        raise Refused(
+            f"a stream unpacks to {'more' if len(content) > size else 'less'} than the {size:,} bytes of the table"
+        )
     return content
 
 

@@ -14,7 +14,13 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.calibration.unknown import binary_kind, described
-from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, file_numbers, floats
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    checked_json,
+    checked_text,
+    file_numbers,
+    floats,
+)
 from humangs_jax.data.formats import CAMERAS, CameraFormat
 from humangs_jax.io.reading import limits, reading
 
@@ -34,7 +40,10 @@ ROTATION_TO_Y_UP = {
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """y down and z forward -> y up and z backwards; its own inverse."""
 CAM_FROM_WORLD, WORLD_FROM_CAM = "cam_from_world, OpenCV axes", "world_from_cam, OpenCV axes"
-CAM_FROM_WORLD_OPENGL, WORLD_FROM_CAM_OPENGL = "cam_from_world, OpenGL axes", "world_from_cam, OpenGL axes"
+CAM_FROM_WORLD_OPENGL, WORLD_FROM_CAM_OPENGL = (
+    "cam_from_world, OpenGL axes",
+    "world_from_cam, OpenGL axes",
+)
 CONVENTIONS = {
     CAM_FROM_WORLD: lambda matrix: matrix,
     WORLD_FROM_CAM: np.linalg.inv,
@@ -118,7 +127,9 @@ class Calibration:
             seen = Observations(seen.points[own], new[seen.cameras[own]], seen.pixels[own])
             seen = seen if own.any() else None
         stations = None if self.stations is None else min(self.stations, len(cameras))
-        return dataclasses.replace(self, cameras=tuple(cameras), observations=seen, stations=stations)
+        return dataclasses.replace(
+            self, cameras=tuple(cameras), observations=seen, stations=stations
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -141,10 +152,21 @@ class Source:
         return checked_json(self.path, self.text) if self.text.lstrip().startswith("{") else None
 
     def calibration(
-        self, format: CameraFormat, cameras: Sequence[CalibratedCamera], file: Path | None = None, **more: Any
+        self,
+        format: CameraFormat,
+        cameras: Sequence[CalibratedCamera],
+        file: Path | None = None,
+        **more: Any,
     ) -> Calibration:
         """These cameras, with what the format means. file: that errors name, `path` if None."""
-        what = format.about, file or self.path, tuple(cameras), format.per_image, format.pixel_centers, format.up
+        what = (
+            format.about,
+            file or self.path,
+            tuple(cameras),
+            format.per_image,
+            format.pixel_centers,
+            format.up,
+        )
         return Calibration(*what, unit=format.unit, **more)
 
 
@@ -177,7 +199,9 @@ def read_calibration(path: Path, photo_size: Callable[[str], tuple[int, int]]) -
         return format(source, format)
 
 
-def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel_centers: str) -> Calibration:
+def in_capture_convention(
+    calibration: Calibration, scale: float, up: str, pixel_centers: str
+) -> Calibration:
     """The same cameras and points in metres, y up, pixel centres at +0.5, rotations orthonormal.
 
     Arguments:
@@ -188,7 +212,9 @@ def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel
     shift = 0.5 if pixel_centers == "integer" else 0.0
     seen = calibration.observations
     if seen is not None:
-        seen = dataclasses.replace(seen, points=scale * seen.points @ turn.T, pixels=seen.pixels + shift)
+        seen = dataclasses.replace(
+            seen, points=scale * seen.points @ turn.T, pixels=seen.pixels + shift
+        )
     cameras = []
     for camera in calibration.cameras:
         K, pose = camera.K.copy(), camera.cam_from_world.copy()
@@ -196,7 +222,9 @@ def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel
         pose[:3, :3] = nearest_rotation(pose[:3, :3]) @ turn.T
         pose[:3, 3] *= scale
         cameras.append(dataclasses.replace(camera, K=K, cam_from_world=pose))
-    return dataclasses.replace(calibration, cameras=tuple(cameras), observations=seen, up="+y", pixel_centers="half")
+    return dataclasses.replace(
+        calibration, cameras=tuple(cameras), observations=seen, up="+y", pixel_centers="half"
+    )
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -213,8 +241,15 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def image_size(value: Any, file: object, field: str) -> tuple[int, int]:
     """Width and height in whole pixels."""
     width, height = floats(value, file, field, (2,)).tolist()
-    if not (width.is_integer() and height.is_integer() and min(width, height) > 0 and max(width, height) <= limits().side):
-        raise CaptureError(file, field, f"expected width and height in pixels, got {width:g} x {height:g}")
+    if not (
+        width.is_integer()
+        and height.is_integer()
+        and min(width, height) > 0
+        and max(width, height) <= limits().side
+    ):
+        raise CaptureError(
+            file, field, f"expected width and height in pixels, got {width:g} x {height:g}"
+        )
     return int(width), int(height)
 
 
@@ -223,7 +258,9 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, 
     return np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
-def pose_matrix(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def pose_matrix(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
     """[[R, t], [0, 0, 0, 1]]."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation
@@ -235,7 +272,11 @@ def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
     from scipy.spatial.transform import Rotation
 
     values = file_numbers(value, file, field)
-    return Rotation.from_rotvec(values.ravel()).as_matrix() if values.size == 3 else floats(values, file, field, (3, 3))
+    return (
+        Rotation.from_rotvec(values.ravel()).as_matrix()
+        if values.size == 3
+        else floats(values, file, field, (3, 3))
+    )
 
 
 # Lenses ---------------------------------------------------------------------------------------------------------------
@@ -245,7 +286,9 @@ def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
 #     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
 #     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-UNDISTORT_BEFORE = "undistort the photos before (cv2.undistort, cv2.fisheye or colmap image_undistorter)"
+UNDISTORT_BEFORE = (
+    "undistort the photos before (cv2.undistort, cv2.fisheye or colmap image_undistorter)"
+)
 COUNTS = (4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV's calibration writes: from the sixth on they are k4 k5 k6, s1..s4, tx ty."""
 
@@ -259,17 +302,24 @@ def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5
     if len(values) not in COUNTS:
         raise CaptureError(file, field, f"expected k1 k2 p1 p2 [k3], got {len(values)} numbers")
     if values[5:].any():
-        raise CaptureError(file, field, f"coefficients beyond k1 k2 p1 p2 k3 are not supported: {UNDISTORT_BEFORE}")
+        raise CaptureError(
+            file, field, f"coefficients beyond k1 k2 p1 p2 k3 are not supported: {UNDISTORT_BEFORE}"
+        )
     return np.pad(values[:5], (0, max(0, 5 - len(values)))) if values.any() else None
 
 
-def distort(points: Float[np.ndarray, "*n 2"], coefficients: Float[np.ndarray, "5"]) -> Float[np.ndarray, "*n 2"]:
+def distort(
+    points: Float[np.ndarray, "*n 2"], coefficients: Float[np.ndarray, "5"]
+) -> Float[np.ndarray, "*n 2"]:
     """Where the lens puts points of the plane z = 1."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    moved = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+    moved = (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
     return np.stack(moved, axis=-1)
 
 
@@ -288,9 +338,13 @@ def undistort(
 
     height, width = image.shape[:2]
     columns, rows = np.meshgrid(np.arange(width)[box[1]] + 0.5, np.arange(height)[box[0]] + 0.5)
-    where = np.moveaxis(_in_photo(np.stack([columns, rows], axis=-1), K, coefficients) - 0.5, -1, 0)[::-1]
+    where = np.moveaxis(
+        _in_photo(np.stack([columns, rows], axis=-1), K, coefficients) - 0.5, -1, 0
+    )[::-1]
     channels = np.atleast_3d(image).transpose(2, 0, 1)
-    warped = [warp(c, where, order=1, mode="constant", cval=fill, preserve_range=True) for c in channels]
+    warped = [
+        warp(c, where, order=1, mode="constant", cval=fill, preserve_range=True) for c in channels
+    ]
     result = np.full(image.shape, fill, np.float32)
     result[box] = np.stack(warped, axis=-1).reshape(result[box].shape)
     return result
@@ -308,16 +362,25 @@ def undistort_person(
     source = _in_photo(np.stack(np.meshgrid(columns, rows), axis=-1), K, coefficients)
     person = np.argwhere(mask > 0)[:, ::-1]
     # a cell more than the person on every side
-    near = [((source > person.min(0) - step) & (source < person.max(0) + step)).all(axis=-1)] if len(person) else []
+    near = (
+        [((source > person.min(0) - step) & (source < person.max(0) + step)).all(axis=-1)]
+        if len(person)
+        else []
+    )
     if not np.any(near):
         return np.ones_like(image), np.zeros_like(mask)
-    box = [slice(max(0, each.min() - 1) * step, (each.max() + 1) * step) for each in np.nonzero(near[0])]
+    box = [
+        slice(max(0, each.min() - 1) * step, (each.max() + 1) * step)
+        for each in np.nonzero(near[0])
+    ]
     both = undistort(np.dstack([1 - image, mask]), K, coefficients, 0.0, (box[0], box[1]))
     return 1 - both[..., :3], both[..., 3]
 
 
 def _in_photo(
-    pixels: Float[np.ndarray, "*n 2"], K: Float[np.ndarray, "3 3"], coefficients: Float[np.ndarray, "5"]
+    pixels: Float[np.ndarray, "*n 2"],
+    K: Float[np.ndarray, "3 3"],
+    coefficients: Float[np.ndarray, "5"],
 ) -> Float[np.ndarray, "*n 2"]:
     """Where the lens puts pixels (edges of the photo at whole numbers); far outside if it does not show them."""
     plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
@@ -329,7 +392,9 @@ def _in_photo(
 def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
     """r^2 up to which r (1 + k1 r^2 + ..) grows. Beyond it the formula folds the image back over itself."""
     k1, k2, _, _, k3 = np.clip(coefficients, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
-    roots = np.roots([1, 3 * k1, 5 * k2, 7 * k3])  # 1 / r^2, so that tiny coefficients are not divided by
+    roots = np.roots(
+        [1, 3 * k1, 5 * k2, 7 * k3]
+    )  # 1 / r^2, so that tiny coefficients are not divided by
     real = roots[(np.abs(roots.imag) <= 1e-9 * np.abs(roots.real)) & (roots.real > 0)].real
     return 1 / real.max() if len(real) else np.inf
 
@@ -373,21 +438,29 @@ class Checks:
 
 def check_calibration(source: Calibration, converted: Calibration, up: str) -> Checks:
     """Check cameras as their source has them, and as they came into the capture's convention with that axis up."""
-    matrices = lambda calibration: np.stack([camera.cam_from_world for camera in calibration.cameras])
+    matrices = lambda calibration: np.stack(
+        [camera.cam_from_world for camera in calibration.cameras]
+    )
     reprojection = mean_reprojection_error(converted)
     depths, _ = axes_meeting(matrices(converted))
     distance = None if depths is None else float(np.median(np.abs(depths)))
     warnings = []
     if reprojection is not None and reprojection > REPROJECTION_LIMIT:
         limit = f"(expected below {REPROJECTION_LIMIT:g})"
-        warnings.append(f"the mean reprojection error is {reprojection:.3g} px {limit}: are these its points?")
+        warnings.append(
+            f"the mean reprojection error is {reprojection:.3g} px {limit}: are these its points?"
+        )
     warnings += _convention_warnings(matrices(source), source.convention)
     low, high = DISTANCES
     if distance is not None and not low <= distance <= high:
         stand = f"the cameras stand {distance:.3g} m from where they look (expected {low:g} to {high:g})"
-        warnings.append(f"{stand}: is scale, the metres in a unit of the source, right? Measure one distance")
+        warnings.append(
+            f"{stand}: is scale, the metres in a unit of the source, right? Measure one distance"
+        )
     warnings += _up_warnings(matrices(converted), up)
-    warnings += [warning for camera in converted.cameras for warning in _center_warnings(camera)][:1]
+    warnings += [warning for camera in converted.cameras for warning in _center_warnings(camera)][
+        :1
+    ]
     count = 0 if converted.observations is None else len(converted.observations.points)
     return Checks(reprojection, count, distance, tuple(warnings))
 
@@ -437,7 +510,9 @@ def mean_reprojection_error(calibration: Calibration) -> float | None:
     return float(np.concatenate(errors).mean())
 
 
-def axes_meeting(poses: Float[np.ndarray, "v 4 4"]) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
+def axes_meeting(
+    poses: Float[np.ndarray, "v 4 4"],
+) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
     """Depth of the point nearest to all optical axes before each camera, and its distance from each axis.
 
     (None, None) if the axes are nearly parallel: they meet nowhere. `poses` are cam_from_world, in any unit.
@@ -449,14 +524,21 @@ def axes_meeting(poses: Float[np.ndarray, "v 4 4"]) -> tuple[Float[np.ndarray, "
     if np.linalg.eigvalsh(normal)[0] < NEARLY_PARALLEL:
         return None, None
     point = np.linalg.solve(normal, np.einsum("vij,vj->i", across, centers) / len(poses))
-    return ((point - centers) * axes).sum(axis=-1), np.linalg.norm(np.einsum("vij,vj->vi", across, point - centers), axis=-1)
+    return ((point - centers) * axes).sum(axis=-1), np.linalg.norm(
+        np.einsum("vij,vj->vi", across, point - centers), axis=-1
+    )
 
 
 def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
     """How far axes pass the point where they meet before all cameras, as a share of its distance; infinite if none is."""
     depths, misses = axes_meeting(poses)
     farthest = np.linalg.norm(poses[:, :3, 3], axis=-1).max()
-    if depths is None or misses is None or depths.min() <= 0 or np.median(depths) < COINCIDENT * farthest:
+    if (
+        depths is None
+        or misses is None
+        or depths.min() <= 0
+        or np.median(depths) < COINCIDENT * farthest
+    ):
         return np.inf
     share = float(np.sqrt(np.mean(misses**2)) / np.median(depths))
     return share if share < MISS else np.inf
@@ -466,12 +548,16 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
     """Whether another meaning of the matrices in the file would let the cameras look at one place."""
     if axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
         return []
-    matrices = np.linalg.inv(OPENGL_FROM_OPENCV @ poses) if convention == WORLD_FROM_CAM_OPENGL else poses
+    matrices = (
+        np.linalg.inv(OPENGL_FROM_OPENCV @ poses) if convention == WORLD_FROM_CAM_OPENGL else poses
+    )
     misses = {name: _miss(meaning(matrices)) for name, meaning in CONVENTIONS.items()}
     best = min(misses, key=lambda name: misses[name])
     problem = "the cameras do not look at one place before them"
     if np.isfinite(misses[best]):
-        return [f"{problem}; they would if the matrices in the file were {best} (the format says {convention})"]
+        return [
+            f"{problem}; they would if the matrices in the file were {best} (the format says {convention})"
+        ]
     return [f"{problem}: is this calibration of photos around a person?"]
 
 
@@ -482,13 +568,20 @@ def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
     if length < 0.5 or direction[1] / length >= np.cos(np.radians(TILT_LIMIT)):
         return []
     in_source = np.asarray(ROTATION_TO_Y_UP[up]).T @ direction
-    best = max(ROTATION_TO_Y_UP, key=lambda axis: float(f"{axis[0]}1") * in_source["xyz".index(axis[1])])
-    return [f"the photos do not stand upright with {up} up: --up={best} fits best (or were they taken sideways?)"]
+    best = max(
+        ROTATION_TO_Y_UP, key=lambda axis: float(f"{axis[0]}1") * in_source["xyz".index(axis[1])]
+    )
+    return [
+        f"the photos do not stand upright with {up} up: --up={best} fits best (or were they taken sideways?)"
+    ]
 
 
 def _center_warnings(camera: CalibratedCamera) -> list[str]:
     if np.abs(camera.K[:2, 2] / (camera.width, camera.height) - 0.5).max() < OFF_CENTER:
         return []
-    center, size = f"({camera.K[0, 2]:.1f}, {camera.K[1, 2]:.1f})", f"{camera.width} x {camera.height}"
+    center, size = (
+        f"({camera.K[0, 2]:.1f}, {camera.K[1, 2]:.1f})",
+        f"{camera.width} x {camera.height}",
+    )
     problem = f"the principal point {center} is far from the middle of {size}"
     return [f"{camera.name}: {problem}: is K that of photos of another size?"]

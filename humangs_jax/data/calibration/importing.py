@@ -46,7 +46,14 @@ from humangs_jax.data.calibration.photos import (
     with_photos,
 )
 from humangs_jax.data.calibration.videos import photos_of_videos
-from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera, counted, few
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    check_names,
+    check_place,
+    checked_camera,
+    counted,
+    few,
+)
 from humangs_jax.data.folders import STILL, Unused, scan_folder, unused_line
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
@@ -88,11 +95,17 @@ class ImportReport:
     def __str__(self) -> str:
         photos, cameras = counted(self.views, "photo"), counted(self.cameras, "camera")
         size = f"{self.width} x {self.height}"
-        lines = [f"{self.out}: {photos} of {size} pixels: {cameras}, {counted(self.frames, 'frame')}", self.read_as]
+        lines = [
+            f"{self.out}: {photos} of {size} pixels: {cameras}, {counted(self.frames, 'frame')}",
+            self.read_as,
+        ]
         if self.undistorted:
             lines.append(f"lens distortion removed from {counted(self.undistorted, 'photo')}")
         if self.checks.reprojection is not None:
-            error, points = self.checks.reprojection, counted(self.checks.observations, "observation")
+            error, points = (
+                self.checks.reprojection,
+                counted(self.checks.observations, "observation"),
+            )
             lines.append(f"mean reprojection error: {error:.3g} px ({points})")
         if self.checks.distance is not None:
             lines.append(f"the cameras stand {self.checks.distance:.3g} m from where they look")
@@ -143,13 +156,22 @@ def import_cameras(
         calibration = read_calibration(source, functools.partial(_size_of, found.images, source))
         calibration, left_out = with_photos(calibration, found.images)
         report = import_calibration(
-            calibration, found.images, out, masks=found.masks, scale=scale, up=up, pixel_centers=pixel_centers, also=also
+            calibration,
+            found.images,
+            out,
+            masks=found.masks,
+            scale=scale,
+            up=up,
+            pixel_centers=pixel_centers,
+            also=also,
         )
     unused = report.unused
     if found.images != images:  # frames of videos, which are all used
         unused = tuple(Unused(photo, STILL) for photo in scan_folder(images).photos)
     notes = (*report.notes, *found.notes, *([] if left_out is None else [left_out]))
-    return dataclasses.replace(report, unused=unused, notes=notes, warnings=(*report.warnings, *found.warnings))
+    return dataclasses.replace(
+        report, unused=unused, notes=notes, warnings=(*report.warnings, *found.warnings)
+    )
 
 
 def _size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
@@ -184,12 +206,24 @@ def import_calibration(
     turns = find_turns(calibration, photos)
     canvas = _canvas(images, photos, turns)
     about_masks = check_masks(photos)
-    converted = turned_cameras(in_capture_convention(calibration, scale, up, pixel_centers), photos, turns)
+    converted = turned_cameras(
+        in_capture_convention(calibration, scale, up, pixel_centers), photos, turns
+    )
     for camera in converted.cameras:
         assert camera.width is not None and camera.height is not None  # those of its photos
-        checked_camera(camera.K, camera.cam_from_world, camera.width, camera.height, calibration.file, camera.name)
+        checked_camera(
+            camera.K,
+            camera.cam_from_world,
+            camera.width,
+            camera.height,
+            calibration.file,
+            camera.name,
+        )
     checks = check_calibration(calibration, converted, up)
-    frames, cameras = 1 + max(photo.frame for photo in photos), calibration.stations or len(converted.cameras)
+    frames, cameras = (
+        1 + max(photo.frame for photo in photos),
+        calibration.stations or len(converted.cameras),
+    )
     notes, warnings = turn_notes(photos, turns)
     if heic := sum(map(_of_phones, photos)):
         notes.append(f"written as PNG: {counted(heic, 'HEIC photo')}")
@@ -218,7 +252,9 @@ def import_calibration(
 
     replace_folder(out, write, mark="capture.json")
     if cut:
-        warnings.append(f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background")
+        warnings.append(
+            f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background"
+        )
     centers = "whole numbers (0.5 added to cx and cy)" if pixel_centers == "integer" else "+0.5"
     said = f"{calibration.format} ({calibration.file}): {calibration.convention}"
     return ImportReport(
@@ -240,10 +276,17 @@ def import_calibration(
     )
 
 
-def _check_options(scale: float | None, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
+def _check_options(
+    scale: float | None, up: str | None, pixel_centers: str | None, every: int, frames: int | None
+) -> None:
     if scale is not None and not 0 < scale < float("inf"):
-        raise ArgumentError("scale", f"{scale:g}: expected metres per unit of the source, more than 0")
-    for name, word, known in (("up", up, tuple(ROTATION_TO_Y_UP)), ("pixel_centers", pixel_centers, get_args(PixelCenters))):
+        raise ArgumentError(
+            "scale", f"{scale:g}: expected metres per unit of the source, more than 0"
+        )
+    for name, word, known in (
+        ("up", up, tuple(ROTATION_TO_Y_UP)),
+        ("pixel_centers", pixel_centers, get_args(PixelCenters)),
+    ):
         if word is not None and word not in known:
             raise ArgumentError(name, f"{word}: expected one of {', '.join(known)}")
     for name, value in (("every", every), ("frames", frames)):
@@ -266,9 +309,13 @@ def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tup
     width, height = (max(turn.size[axis] for turn in turns) for axis in (0, 1))
     if any(turn.size != (width, height) for turn in turns):
         with reading(images, "folder of photos", CaptureError):
-            what = f"pixels ({_by(width, height)}), to which photos of several sizes would be padded"
+            what = (
+                f"pixels ({_by(width, height)}), to which photos of several sizes would be padded"
+            )
             check_limit("pixels", width * height, what)
-            check_limit("capture_pixels", width * height * len(photos), f"{what}, {len(photos):,} of them")
+            check_limit(
+                "capture_pixels", width * height * len(photos), f"{what}, {len(photos):,} of them"
+            )
     return width, height
 
 
@@ -280,7 +327,10 @@ def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> list[str]:
     counts = Counter(turn.size for turn in turns)
     if set(counts) == {canvas}:
         return []
-    sizes = ", ".join(f"{count} of {_by(*size)}" for size, count in sorted(counts.items(), reverse=True)[:SIZES_SHOWN])
+    sizes = ", ".join(
+        f"{count} of {_by(*size)}"
+        for size, count in sorted(counts.items(), reverse=True)[:SIZES_SHOWN]
+    )
     more = ", ..." if len(counts) > SIZES_SHOWN else ""
     return [
         f"photos of {len(counts)} sizes ({sizes}{more}): white was added on the right and below, so that all have "
@@ -304,7 +354,10 @@ def _write(
     if photos[0].mask is not None:
         (folder / "masks").mkdir()
     straight = all(camera.distortion is None for camera in calibration.cameras)
-    rewrites = [turn.rewrites or turn.size != canvas or _of_phones(photo) for photo, turn in zip(photos, turns, strict=True)]
+    rewrites = [
+        turn.rewrites or turn.size != canvas or _of_phones(photo)
+        for photo, turn in zip(photos, turns, strict=True)
+    ]
     changed = not straight or any(rewrites)
     transparent = changed and any(is_transparent(photo.image) for photo in photos)
     straight = straight and not transparent
@@ -324,7 +377,9 @@ def _write(
 
 def _of_phones(photo: Photo) -> bool:
     """Whether the photo or its mask is HEIC, which captures have none of: other programs cannot read it."""
-    return any(file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask))
+    return any(
+        file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask)
+    )
 
 
 def _copy(folder: Path, photo: Photo, name: str) -> dict[str, str]:
@@ -337,7 +392,13 @@ def _copy(folder: Path, photo: Photo, name: str) -> dict[str, str]:
 
 
 def _rewrite(
-    folder: Path, photo: Photo, turn: Turn, name: str, camera: CalibratedCamera, transparent: bool, canvas: tuple[int, int]
+    folder: Path,
+    photo: Photo,
+    turn: Turn,
+    name: str,
+    camera: CalibratedCamera,
+    transparent: bool,
+    canvas: tuple[int, int],
 ) -> tuple[dict[str, str], bool]:
     """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it does not see are white and
     background.
@@ -348,16 +409,25 @@ def _rewrite(
     image, alpha = read_checked(read_image, photo.image)
     image = turn.upright(image, turn.photo)
     alpha = turn.upright(alpha, turn.photo) if transparent and alpha is not None else None
-    mask = alpha if photo.mask is None else turn.upright(read_checked(read_grey, photo.mask), turn.mask)
+    mask = (
+        alpha
+        if photo.mask is None
+        else turn.upright(read_checked(read_grey, photo.mask), turn.mask)
+    )
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)
-        mask, alpha = (x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0) for x in (mask, alpha))
+        mask, alpha = (
+            x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0)
+            for x in (mask, alpha)
+        )
     if photo.mask is not None and alpha is not None:
         image = np.concatenate([image, alpha[..., None]], axis=-1)
     at_rim = False
     if mask is not None:
         person, (height, width) = mask > MASK_THRESHOLD, mask.shape
-        at_rim = (width < canvas[0] and person[:, -1].any()) or (height < canvas[1] and person[-1].any())
+        at_rim = (width < canvas[0] and person[:, -1].any()) or (
+            height < canvas[1] and person[-1].any()
+        )
     image, mask = _padded(image, canvas, 1.0), None if mask is None else _padded(mask, canvas, 0.0)
     files = {"image": f"images/{name}.png"}
     write_png(folder / files["image"], image)
@@ -368,8 +438,14 @@ def _rewrite(
     return files, bool(at_rim)
 
 
-def _padded(pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float) -> Float[np.ndarray, "height width *c"]:
+def _padded(
+    pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float
+) -> Float[np.ndarray, "height width *c"]:
     """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added are opaque white."""
     (height, width), (right, below) = pixels.shape[:2], canvas
     margins = ((0, below - height), (0, right - width), *((0, 0),) * (pixels.ndim - 2))
-    return pixels if pixels.shape[:2] == (below, right) else np.pad(pixels, margins, constant_values=fill)
+    return (
+        pixels
+        if pixels.shape[:2] == (below, right)
+        else np.pad(pixels, margins, constant_values=fill)
+    )

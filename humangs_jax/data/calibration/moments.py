@@ -49,7 +49,9 @@ def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
     moments = _all_moments(clocks, {camera: step or slowest for camera, step in steps.items()})
     frames = {camera: nearest(each, moments) for camera, each in clocks.items()}
     counts = {camera: len(each) for camera, each in times.items()}
-    return Moments(moments, frames, counts, _notes(clocks, frames, known), _warnings(clocks, frames, moments))
+    return Moments(
+        moments, frames, counts, _notes(clocks, frames, known), _warnings(clocks, frames, moments)
+    )
 
 
 def _step(times: Float[np.ndarray, " n"]) -> float | None:
@@ -60,7 +62,9 @@ def _step(times: Float[np.ndarray, " n"]) -> float | None:
     return float(np.mean(apart[apart < GAP * np.median(apart)]))
 
 
-def _clock(times: Float[np.ndarray, " n"], step: float | None, slowest: float, first: float) -> Float[np.ndarray, " n"]:
+def _clock(
+    times: Float[np.ndarray, " n"], step: float | None, slowest: float, first: float
+) -> Float[np.ndarray, " n"]:
     """Seconds after the first frame, or after the `first` one of all; a video that does not tell is as fast as the slowest."""
     if step is None:
         return np.arange(len(times)) * slowest
@@ -68,7 +72,9 @@ def _clock(times: Float[np.ndarray, " n"], step: float | None, slowest: float, f
     return times - times[0] + (late if LATE < late < MOST_LATE else 0.0)
 
 
-def _all_moments(clocks: Mapping[str, Float[np.ndarray, " n"]], steps: Mapping[str, float]) -> Float[np.ndarray, " m"]:
+def _all_moments(
+    clocks: Mapping[str, Float[np.ndarray, " n"]], steps: Mapping[str, float]
+) -> Float[np.ndarray, " m"]:
     """The times of the slowest camera, with those that it lacks at its start, in its gaps and behind its end."""
     slowest = max(steps.values())
     slow = [camera for camera, step in steps.items() if step > (1 - SAME_RATE) * slowest]
@@ -100,16 +106,24 @@ def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) ->
 
 
 def _notes(
-    clocks: Mapping[str, Float[np.ndarray, " n"]], frames: Mapping[str, Sequence[int | None]], steps: Sequence[float]
+    clocks: Mapping[str, Float[np.ndarray, " n"]],
+    frames: Mapping[str, Sequence[int | None]],
+    steps: Sequence[float],
 ) -> tuple[str, ...]:
     if not steps or max(steps) < (1 + SAME_RATE) * min(steps):
         return ()
     apart = 0.0
     for numbers in zip(*frames.values(), strict=True):
-        seen = [clock[number] for clock, number in zip(clocks.values(), numbers, strict=True) if number is not None]
+        seen = [
+            clock[number]
+            for clock, number in zip(clocks.values(), numbers, strict=True)
+            if number is not None
+        ]
         apart = max(apart, float(np.ptp(seen))) if seen else apart
     rates = " and ".join(dict.fromkeys(f"{1 / step:.3g}" for step in sorted(steps)))
-    return (f"videos of {rates} frames a second: paired by time, views of one moment are at most {apart:.3f} s apart",)
+    return (
+        f"videos of {rates} frames a second: paired by time, views of one moment are at most {apart:.3f} s apart",
+    )
 
 
 def _warnings(
@@ -128,7 +142,9 @@ def _warnings(
                 f"{camera}: no frame at {counted(len(inside), 'moment')} ({where}): left out there; were frames dropped?"
             )
         if len(behind := without[without >= clocks[camera][-1]]) > 1:
-            found.append(f"{camera}: ends at {clocks[camera][-1]:.2f} s, {counted(len(behind), 'moment')} before the last video")
+            found.append(
+                f"{camera}: ends at {clocks[camera][-1]:.2f} s, {counted(len(behind), 'moment')} before the last video"
+            )
     return tuple(found)
 
 

@@ -27,7 +27,14 @@ from humangs_jax.data.folders import (
     scan_folder,
 )
 from humangs_jax.data.photos import read_checked, read_mask
-from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_grey, read_image
+from humangs_jax.io.images import (
+    image_size,
+    open_image,
+    orientation,
+    oriented,
+    read_grey,
+    read_image,
+)
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
 """File types of photos that are looked for by a name without one; with one, any mix of cases will do."""
@@ -63,7 +70,9 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
         there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]
     else:
         there = [bool(photos) for photos in _frames_of(calibration, images)]
-    missing = [camera.name for camera, found in zip(calibration.cameras, there, strict=True) if not found]
+    missing = [
+        camera.name for camera, found in zip(calibration.cameras, there, strict=True) if not found
+    ]
     if not missing:
         return calibration, None
     if not any(there):
@@ -72,7 +81,9 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
     if calibration.per_image:
         unused = unused_photos(find_photos(kept, images, None), images, kept)
         if any(each.why.because.startswith(NO_CAMERA) for each in unused):
-            _refuse_missing(calibration, images, missing[0])  # their names do not match: which photo is meant?
+            _refuse_missing(
+                calibration, images, missing[0]
+            )  # their names do not match: which photo is meant?
     noun = "image" if calibration.per_image else "camera"
     whole = counted(len(there), noun)
     line = f"left out, without a photo: {len(missing)} of {whole} of {calibration.file.name} ({few(missing, NO_PHOTO_SHOWN)})"
@@ -83,7 +94,9 @@ def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
     """Raises: CaptureError."""
     if calibration.per_image:
         photo_of(images, name, calibration.file)
-    raise CaptureError(calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}")
+    raise CaptureError(
+        calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}"
+    )
 
 
 def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> tuple[Photo, ...]:
@@ -104,7 +117,11 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
     else:
         found = _of_cameras(calibration, images)
     mask_of = _masks_of(masks, images) if masks is not None else lambda photo: None
-    named = {} if masks is not None or calibration.mask_key is None else _named_masks(calibration, images)
+    named = (
+        {}
+        if masks is not None or calibration.mask_key is None
+        else _named_masks(calibration, images)
+    )
     photos = []
     for camera, frame, image in sorted(found, key=lambda entry: (entry[1], entry[0])):
         key = image.relative_to(images).with_suffix("").as_posix()
@@ -115,7 +132,9 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 
 def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibration) -> list[Unused]:
     """What the folder of photos holds and an import does not use, but for masks."""
-    used = {file.resolve() for photo in photos for file in (photo.image, photo.mask) if file is not None}
+    used = {
+        file.resolve() for photo in photos for file in (photo.image, photo.mask) if file is not None
+    }
     names = {photo.image.with_suffix("") for photo in photos}
     no_camera = Reason("photo", f"{NO_CAMERA} {calibration.file.name}")
     scan = scan_folder(images, lambda place: place.name in MASK_FOLDERS)
@@ -129,7 +148,9 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
 def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
     """The masks that a calibration names, by camera: in its folder, in that of the photos or in the one around. All or none."""
     found: dict[int, Path] = {}
-    for i, name in ((i, camera.mask) for i, camera in enumerate(calibration.cameras) if camera.mask):
+    for i, name in (
+        (i, camera.mask) for i, camera in enumerate(calibration.cameras) if camera.mask
+    ):
         for folder in (calibration.file.parent, images, images.parent):
             if (path := _any_suffix(folder / name.replace("\\", "/"))) is not None:
                 checked_path(folder, path.absolute(), folder)
@@ -156,7 +177,11 @@ def photo_of(folder: Path, name: str, file: Path) -> Path:
 
 
 def _photo_at(folder: Path, name: str) -> Path | None:
-    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")]
+    parts = [
+        part
+        for part in PurePosixPath(name.replace("\\", "/")).parts
+        if part not in (".", "..", "/")
+    ]
     found = (_any_suffix(folder.joinpath(*parts[start:])) for start in range(len(parts)))
     return next((photo for photo in found if photo is not None), None)
 
@@ -187,7 +212,11 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
         folder = place.parent
         if folder not in listed:
             files = sorted(folder.iterdir()) if folder.is_dir() else []
-            named = [(photo_of_mask(file.name), file) for file in files if is_photo(file) and file.is_file()]
+            named = [
+                (photo_of_mask(file.name), file)
+                for file in files
+                if is_photo(file) and file.is_file()
+            ]
             listed[folder] = {name.casefold(): file for name, file in named if name is not None}
         known = listed[folder]
         return known.get(place.name.casefold()) or known.get(place.stem.casefold())
@@ -198,7 +227,9 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
             for mask in (_any_suffix(place), by_words(place)):
                 if mask is not None and not mask.samefile(image):
                     return mask
-        raise CaptureError(masks / path, "", "no mask (PNG or JPEG): expected one for each photo, named like it")
+        raise CaptureError(
+            masks / path, "", "no mask (PNG or JPEG): expected one for each photo, named like it"
+        )
 
     return find
 
@@ -208,18 +239,27 @@ def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         checked_path(images, name, images)
-    of_frame = {folder.name: photos_in(folder) for folder in images.iterdir() if _may_be_frame(folder)}
+    of_frame = {
+        folder.name: photos_in(folder) for folder in images.iterdir() if _may_be_frame(folder)
+    }
     alone = photos_in(images)
     layouts: tuple[list[dict[str, Path]], ...] = (
         [photos_in(images / name) for name in names],
-        [{frame: photos[name] for frame, photos in of_frame.items() if name in photos} for name in names],
+        [
+            {frame: photos[name] for frame, photos in of_frame.items() if name in photos}
+            for name in names
+        ],
         [{"": alone[name]} if name in alone else {} for name in names],
     )
     return next((layout for layout in layouts if any(layout)), layouts[-1])
 
 
 def _may_be_frame(folder: Path) -> bool:
-    return folder.is_dir() and not folder.name.startswith(".") and folder.name not in (*MASK_FOLDERS, *SYSTEM_FOLDERS)
+    return (
+        folder.is_dir()
+        and not folder.name.startswith(".")
+        and folder.name not in (*MASK_FOLDERS, *SYSTEM_FOLDERS)
+    )
 
 
 def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, Path]]:
@@ -228,9 +268,15 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
         if not photos:
             _refuse_missing(calibration, images, camera.name)
     numbers = {frame for photos in frames_of for frame in photos}
-    order = sorted(numbers, key=lambda f: (int(f), f)) if all(f.isdecimal() for f in numbers) else sorted(numbers)
+    order = (
+        sorted(numbers, key=lambda f: (int(f), f))
+        if all(f.isdecimal() for f in numbers)
+        else sorted(numbers)
+    )
     frames = {frame: i for i, frame in enumerate(order)}  # 10 after 9
-    return [(i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()]
+    return [
+        (i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()
+    ]
 
 
 # Orientation ----------------------------------------------------------------------------------------------------------
@@ -258,7 +304,9 @@ class Turn:
     mirrored: bool
     """Whether pixels are mirrored back, because the calibration is of those as stored."""
 
-    def upright(self, pixels: Float[np.ndarray, "h w *c"], flag: int) -> Float[np.ndarray, "height width *c"]:
+    def upright(
+        self, pixels: Float[np.ndarray, "h w *c"], flag: int
+    ) -> Float[np.ndarray, "height width *c"]:
         """Pixels as a flag wants them shown, but not mirrored."""
         return oriented(oriented(pixels, flag), MIRROR if self.mirrored else 1)
 
@@ -274,13 +322,18 @@ def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn,
     Raises: CaptureError unless photos have the size that was calibrated, and masks that of their photo; and for a camera that was
     calibrated for pixels as stored, but whose photos have different flags.
     """
-    turns = tuple(_find_turn(calibration.cameras[photo.camera], photo, calibration.upright) for photo in photos)
+    turns = tuple(
+        _find_turn(calibration.cameras[photo.camera], photo, calibration.upright)
+        for photo in photos
+    )
     first: dict[int, tuple[Photo, Turn]] = {}
     for photo, turn in zip(photos, turns, strict=True):
         other, known = first.setdefault(photo.camera, (photo, turn))
         if known.quarters != turn.quarters:
             problem = f"EXIF orientation {turn.photo}, but {other.image.name} of the same camera has {known.photo}"
-            raise CaptureError(photo.image, "", f"{problem}: expected one; turn the photos before calibrating")
+            raise CaptureError(
+                photo.image, "", f"{problem}: expected one; turn the photos before calibrating"
+            )
     return turns
 
 
@@ -298,7 +351,10 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
         raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{told}, {problem}")
     as_stored = calibrated == stored and not upright
     mask = 1 if photo.mask is None else _mask_flag(photo.mask, flag, stored, shown)
-    quarters, certain = QUARTERS[MIRRORED.get(flag, flag)] if as_stored else 0, flag == 1 or stored != shown or upright
+    quarters, certain = (
+        QUARTERS[MIRRORED.get(flag, flag)] if as_stored else 0,
+        flag == 1 or stored != shown or upright,
+    )
     return Turn(flag, mask, quarters, shown, certain, as_stored and flag in MIRRORED)
 
 
@@ -314,7 +370,9 @@ def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int,
     if own == 1 and size == stored:
         return flag
     wanted = " or ".join(f"{width} x {height}" for width, height in dict.fromkeys((shown, stored)))
-    raise CaptureError(mask, "size", f"{size[0]} x {size[1]}, but its photo has {wanted}: expected the same")
+    raise CaptureError(
+        mask, "size", f"{size[0]} x {size[1]}, but its photo has {wanted}: expected the same"
+    )
 
 
 def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h w"]:
@@ -325,7 +383,9 @@ def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h
     return oriented(read_checked(read_grey, file), _mask_flag(file, flag, stored, shown))
 
 
-def turned_cameras(calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn]) -> Calibration:
+def turned_cameras(
+    calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn]
+) -> Calibration:
     """The calibration, in the convention of captures, of the photos as they are imported, sizes included."""
     cameras, seen = list(calibration.cameras), calibration.observations
     pixels = None if seen is None else seen.pixels.copy()
@@ -372,7 +432,10 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
     whole = "the calibration is of the turned photos"
     if any(turn.quarters or turn.mirrored for _, turn in flagged):
         whole = "their cameras, too: the calibration is of the pixels as stored"
-    notes, warnings = [f"turned upright by the EXIF orientation: {counted(len(flagged), 'photo')} ({whole})"], []
+    notes, warnings = (
+        [f"turned upright by the EXIF orientation: {counted(len(flagged), 'photo')} ({whole})"],
+        [],
+    )
     if unsure := [(photo, turn) for photo, turn in flagged if not turn.certain]:
         which = few([photo.image.name for photo, _ in unsure], 1)
         of_masks = ", the mask to be of the turned photo" if unsure[0][0].mask is not None else ""
@@ -381,7 +444,9 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
             "their sizes do not tell. If that is wrong, save the photos turned"
         )
     if mirrored := [photo.image.name for photo, turn in flagged if turn.mirrored]:
-        warnings.append(f"EXIF asks to mirror {mirrored[0]}: turned, not mirrored, as no camera sees so")
+        warnings.append(
+            f"EXIF asks to mirror {mirrored[0]}: turned, not mirrored, as no camera sees so"
+        )
     return notes, warnings
 
 
@@ -391,7 +456,9 @@ AROUND = 0.8
 """Share of a photo's border that no person covers: a mask that does is inverted."""
 EMPTY = "the mask is empty, the photo will be left out"
 FULL = "the mask covers the whole photo: is nothing of it background?"
-INVERTED = "the mask covers the border of the photo: is it inverted? expected 255 where the person is"
+INVERTED = (
+    "the mask covers the border of the photo: is it inverted? expected 255 where the person is"
+)
 
 
 def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
@@ -418,14 +485,24 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
         opaque = opaque and mask.min() == 1
         person = mask > MASK_THRESHOLD
         border = np.concatenate([person[0], person[-1], person[1:-1, 0], person[1:-1, -1]])
-        problem = EMPTY if not person.any() else FULL if person.all() else INVERTED if border.mean() > AROUND else None
+        problem = (
+            EMPTY
+            if not person.any()
+            else FULL
+            if person.all()
+            else INVERTED
+            if border.mean() > AROUND
+            else None
+        )
         if problem is not None:
             found.setdefault(problem, []).append((photo.mask or photo.image).name)
     if not masked and opaque:
         return ()  # many programs write an opaque alpha channel: it says nothing
     if len(found.get(EMPTY, ())) == len(photos):
         first = photos[0].mask or photos[0].image
-        raise CaptureError(first, "mask", "empty, as are all of them: expected 255 where the person is")
+        raise CaptureError(
+            first, "mask", "empty, as are all of them: expected 255 where the person is"
+        )
     return tuple(f"{problem}: {few(names)}" for problem, names in found.items())
 
 

@@ -46,11 +46,16 @@ Where = Callable[[str], tuple[Path, str]]
 
 def recognizes_opencv(source: Source) -> bool:
     """Whether a file has K, R and T of cameras."""
-    if not (source.text.lstrip().startswith(("{", "%YAML", "---")) or source.path.suffix in (".yml", ".yaml")):
+    if not (
+        source.text.lstrip().startswith(("{", "%YAML", "---"))
+        or source.path.suffix in (".yml", ".yaml")
+    ):
         return False
     values = _values(source)
     maps = (value for value in values.values() if isinstance(value, Mapping))
-    return any(key.startswith("K_") for key in values) or any({"K", "R", "T"} & set(each) for each in maps)
+    return any(key.startswith("K_") for key in values) or any(
+        {"K", "R", "T"} & set(each) for each in maps
+    )
 
 
 def read_opencv(source: Source, format: CameraFormat) -> Calibration:
@@ -60,7 +65,9 @@ def read_opencv(source: Source, format: CameraFormat) -> Calibration:
     if not nested:
         return source.calibration(format, _flat_cameras(values, lambda key: source.path))
     where = lambda name: lambda key: (source.path, f"{name}.{key}")
-    return source.calibration(format, [_one_camera(name, each, where(name)) for name, each in nested.items()])
+    return source.calibration(
+        format, [_one_camera(name, each, where(name)) for name, each in nested.items()]
+    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -76,28 +83,44 @@ def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
     values = {}
     for file in (inner, outer):
         content = parse_file_storage(checked_text(file), file)
-        values |= {key: value for key, value in content.items() if key == "names" or file_of(key) == file}
+        values |= {
+            key: value for key, value in content.items() if key == "names" or file_of(key) == file
+        }
     return source.calibration(format, _flat_cameras(values, file_of), file=outer)
 
 
-def _flat_cameras(values: Mapping[str, Any], file_of: Callable[[str], Path]) -> list[CalibratedCamera]:
+def _flat_cameras(
+    values: Mapping[str, Any], file_of: Callable[[str], Path]
+) -> list[CalibratedCamera]:
     """Cameras whose names stand behind their keys: those of the list `names`, else those that have a K."""
     names = list(values.get("names") or (key[2:] for key in values if key.startswith("K_")))
     if not names:
-        raise CaptureError(file_of("K"), "", "no camera: expected K, R and T of each, or K_NAME, R_NAME and T_NAME")
+        raise CaptureError(
+            file_of("K"), "", "no camera: expected K, R and T of each, or K_NAME, R_NAME and T_NAME"
+        )
     cameras = []
     for name in map(str, names):
         # dist_a_1 is of camera a_1, if there is one, and not of camera 1
         longer = tuple(f"_{other}" for other in names if len(str(other)) > len(name))
-        own = {key: each for key, each in values.items() if key.endswith(f"_{name}") and not key.endswith(longer)}
+        own = {
+            key: each
+            for key, each in values.items()
+            if key.endswith(f"_{name}") and not key.endswith(longer)
+        }
         own = {key.removesuffix(f"_{name}"): each for key, each in own.items()}
-        cameras.append(_one_camera(name, own, lambda key, name=name: (file_of(key), f"{key}_{name}")))
+        cameras.append(
+            _one_camera(name, own, lambda key, name=name: (file_of(key), f"{key}_{name}"))
+        )
     return cameras
 
 
-def _renamed_camera(name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str) -> CalibratedCamera:
+def _renamed_camera(
+    name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str
+) -> CalibratedCamera:
     """A camera of an entry in which OpenCV's keys have these names: theirs -> OpenCV's. Others are not looked at."""
-    theirs = {ours: key for key, ours in keys.items()} | {keys[key]: key for key in entry if key in keys}
+    theirs = {ours: key for key, ours in keys.items()} | {
+        keys[key]: key for key in entry if key in keys
+    }
     values = {ours: entry[key] for ours, key in theirs.items() if key in entry}
     return _one_camera(name, values, lambda key: (file, f"{field}.{theirs.get(key, key)}"))
 
@@ -105,19 +128,31 @@ def _renamed_camera(name: str, entry: Mapping[str, Any], keys: Mapping[str, str]
 def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> CalibratedCamera:
     if "K" not in values and {"fx", "fy", "cx", "cy", "T", "R"} <= values.keys():
         values = _of_shelf(values, where)
-    turn_key = "Rot" if "Rot" in values else "R"  # EasyMocap has both: the matrix and the rotation vector
+    turn_key = (
+        "Rot" if "Rot" in values else "R"
+    )  # EasyMocap has both: the matrix and the rotation vector
     for key in ("K", turn_key, "T"):
         if key not in values:
             raise CaptureError(*where(key), "missing")
-    pose = pose_matrix(rotation(values[turn_key], *where(turn_key)), floats(values["T"], *where("T"), (3,)))
+    pose = pose_matrix(
+        rotation(values[turn_key], *where(turn_key)), floats(values["T"], *where("T"), (3,))
+    )
     K, lens = floats(values["K"], *where("K"), (3, 3)), None
     for key, value in values.items():
-        if value.lower() in FISHEYE if isinstance(value, str) else key.lower() in FISHEYE and bool(value):
+        if (
+            value.lower() in FISHEYE
+            if isinstance(value, str)
+            else key.lower() in FISHEYE and bool(value)
+        ):
             raise CaptureError(*where(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
         if (key.lower() == "d" or key.lower().startswith("dist")) and not isinstance(value, str):
             lens = brown_conrady(value, *where(key))
     sizes = {key: values[key] for key in ("imgSize", "image_size") if key in values}
-    sizes |= {w: [values[w], values[h]] for w, h in (("width", "height"), ("W", "H")) if {w, h} <= values.keys()}
+    sizes |= {
+        w: [values[w], values[h]]
+        for w, h in (("width", "height"), ("W", "H"))
+        if {w, h} <= values.keys()
+    }
     size = next((image_size(value, *where(key)) for key, value in sizes.items()), (None, None))
     return CalibratedCamera(name, K, pose, *size, lens)
 
@@ -147,7 +182,11 @@ TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     """The values of a FileStorage text; matrices are (rows, cols) arrays. Raises: CaptureError naming the line."""
     with reading(file, "YAML file", CaptureError):
-        values = _matrices(parse_json(text), file, "") if text.lstrip().startswith("{") else _yaml(text, file)
+        values = (
+            _matrices(parse_json(text), file, "")
+            if text.lstrip().startswith("{")
+            else _yaml(text, file)
+        )
         if not isinstance(values, dict):
             raise Refused("expected keys with values")
         return values
@@ -160,7 +199,9 @@ def _yaml(text: str, file: Path) -> Any:
         root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        raise CaptureError(file, f"line {mark.line + 1}" if mark else "", error.problem or error) from error
+        raise CaptureError(
+            file, f"line {mark.line + 1}" if mark else "", error.problem or error
+        ) from error
     return {} if root is None else _value(root, file)
 
 
@@ -205,10 +246,16 @@ def _matrix(value: Any, tag: str, file: Path, where: str) -> Float[np.ndarray, "
     if tag != MATRIX:
         raise CaptureError(file, where, f"type {tag!r} is not supported: expected {MATRIX}")
     try:
-        channels = int(re.sub(r"\D.*", "", str(value["dt"])) or 1)  # dt is "d", or "3d" with three channels
-        return np.asarray(value["data"], np.float64).reshape(int(value["rows"]), int(value["cols"]) * channels)
+        channels = int(
+            re.sub(r"\D.*", "", str(value["dt"])) or 1
+        )  # dt is "d", or "3d" with three channels
+        return np.asarray(value["data"], np.float64).reshape(
+            int(value["rows"]), int(value["cols"]) * channels
+        )
     except (KeyError, TypeError, ValueError) as error:
-        raise CaptureError(file, where, f"not a matrix of rows, cols, dt and data: {error}") from error
+        raise CaptureError(
+            file, where, f"not a matrix of rows, cols, dt and data: {error}"
+        ) from error
 
 
 def _matrices(value: Any, file: Path, field: str) -> Any:
@@ -224,12 +271,23 @@ def _matrices(value: Any, file: Path, field: str) -> Any:
 
 # CMU Panoptic: a list `cameras` of K, distCoef, R, t (centimetres) and resolution --------------------------------------
 
-PANOPTIC_KEYS = {"K": "K", "distCoef": "dist", "R": "R", "T": "T", "t": "T", "resolution": "imgSize"}
+PANOPTIC_KEYS = {
+    "K": "K",
+    "distCoef": "dist",
+    "R": "R",
+    "T": "T",
+    "t": "T",
+    "resolution": "imgSize",
+}
 
 
 def recognizes_panoptic(source: Source) -> bool:
     """Whether a file has a list of cameras."""
-    return isinstance(source.json, dict) and isinstance(source.json.get("cameras"), list) and "frames" not in source.json
+    return (
+        isinstance(source.json, dict)
+        and isinstance(source.json.get("cameras"), list)
+        and "frames" not in source.json
+    )
 
 
 def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
@@ -237,7 +295,9 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
     cameras, file = [], source.path
     for i, entry in enumerate(source.json["cameras"]):
         expect(entry, dict, file, f"cameras[{i}]")
-        cameras.append(_renamed_camera(str(entry.get("name", i)), entry, PANOPTIC_KEYS, file, f"cameras[{i}]"))
+        cameras.append(
+            _renamed_camera(str(entry.get("name", i)), entry, PANOPTIC_KEYS, file, f"cameras[{i}]")
+        )
     return source.calibration(format, cameras)
 
 
@@ -249,7 +309,9 @@ RELATIVE = "_to_"
 
 def recognizes_multical(source: Source) -> bool:
     """Whether a file has maps of cameras and of their poses."""
-    return isinstance(source.json, dict) and all(isinstance(source.json.get(key), dict) for key in ("cameras", "camera_poses"))
+    return isinstance(source.json, dict) and all(
+        isinstance(source.json.get(key), dict) for key in ("cameras", "camera_poses")
+    )
 
 
 def read_multical(source: Source, format: CameraFormat) -> Calibration:
@@ -281,9 +343,13 @@ def read_multical(source: Source, format: CameraFormat) -> Calibration:
     for name, lens in lenses.items():
         expect(lens, dict, file, f"cameras.{name}")
         if name not in poses:
-            raise CaptureError(file, f"camera_poses.{name}", "missing: where does this camera stand?")
+            raise CaptureError(
+                file, f"camera_poses.{name}", "missing: where does this camera stand?"
+            )
         values = lens | {"R": poses[name][:3, :3].tolist(), "T": poses[name][:3, 3].tolist()}
-        cameras.append(_one_camera(name, values, lambda key, name=name: (file, f"cameras.{name}.{key}")))
+        cameras.append(
+            _one_camera(name, values, lambda key, name=name: (file, f"cameras.{name}.{key}"))
+        )
     return source.calibration(format, cameras)
 
 
@@ -299,7 +365,14 @@ def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
 
 # TOML of Caliscope, Anipose and Pose2Sim: a table of each camera -------------------------------------------------------
 
-TOML_KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "distortions": "dist", "size": "imgSize", "fisheye": "fisheye"}
+TOML_KEYS = {
+    "matrix": "K",
+    "rotation": "R",
+    "translation": "T",
+    "distortions": "dist",
+    "size": "imgSize",
+    "fisheye": "fisheye",
+}
 
 
 def recognizes_toml(source: Source) -> bool:
@@ -328,7 +401,10 @@ def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
     found = {}
     for key, value in content.items():
         if isinstance(value, dict) and key == "cameras":
-            found |= {f"cameras.{name}": expect(each, dict, source.path, f"cameras.{name}") for name, each in value.items()}
+            found |= {
+                f"cameras.{name}": expect(each, dict, source.path, f"cameras.{name}")
+                for name, each in value.items()
+            }
         elif isinstance(value, dict) and ("matrix" in value or "rotation" in value):
             found[key] = value
     return found
@@ -352,7 +428,11 @@ def read_qualisys(source: Source, format: CameraFormat) -> Calibration:
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):
         raise Refused("XML with entities, which are not read")
-    elements = [each for each in tree.fromstring(source.text).iter("camera") if each.find("transform") is not None]
+    elements = [
+        each
+        for each in tree.fromstring(source.text).iter("camera")
+        if each.find("transform") is not None
+    ]
     cameras = [_camera(element, f"camera {i}", source) for i, element in enumerate(elements)]
     if not cameras:
         raise CaptureError(source.path, "", "no camera with a transform")
@@ -365,15 +445,23 @@ def _camera(element: tree.Element, field: str, source: Source) -> CalibratedCame
         try:
             return float(floats(float(text), source.path, f"{field}.{part}.{key}", ()))
         except ValueError:
-            raise CaptureError(source.path, f"{field}.{part}.{key}", f"expected a finite number, got {text!r}") from None
+            raise CaptureError(
+                source.path, f"{field}.{part}.{key}", f"expected a finite number, got {text!r}"
+            ) from None
 
-    turn = np.diag([1.0, -1, -1]) @ [[number("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)]
+    turn = np.diag([1.0, -1, -1]) @ [
+        [number("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)
+    ]
     place = METRES * np.asarray([number("transform", axis) for axis in "xyz"])
-    left, top, right, bottom = (number("fov_video", side) for side in ("left", "top", "right", "bottom"))
+    left, top, right, bottom = (
+        number("fov_video", side) for side in ("left", "top", "right", "bottom")
+    )
     focal = [number("intrinsic", f"focalLength{axis}") / SUBPIXELS for axis in "UV"]
     center = [number("intrinsic", f"centerPoint{axis}") / SUBPIXELS for axis in "UV"]
     K = intrinsics(*focal, center[0] - left, center[1] - top)
     size = image_size([right - left + 1, bottom - top + 1], source.path, f"{field}.fov_video")
-    lens = brown_conrady([number("intrinsic", key) for key in LENS], source.path, f"{field}.intrinsic")
+    lens = brown_conrady(
+        [number("intrinsic", key) for key in LENS], source.path, f"{field}.intrinsic"
+    )
     name = element.get("serial") or element.get("name") or field
     return CalibratedCamera(name, K, pose_matrix(turn, -turn @ place), *size, lens)

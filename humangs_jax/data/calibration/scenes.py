@@ -27,7 +27,14 @@ from humangs_jax.data.calibration.calibration import (
     intrinsics,
     pose_matrix,
 )
-from humangs_jax.data.capture_checks import CaptureError, checked_text, expect, floats, members, required
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    checked_text,
+    expect,
+    floats,
+    members,
+    required,
+)
 from humangs_jax.data.formats import CameraFormat
 from humangs_jax.io.reading import Refused, read_bytes, reading, shown
 
@@ -47,25 +54,48 @@ def read_colmap(source: Source, format: CameraFormat) -> Calibration:
     """The registered images of a model, in the order of its file. Raises: CaptureError naming the file and, of text, the line."""
     binary = not any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
     suffix = ".bin" if binary else ".txt"
-    cameras_file, file, points_file = (source.path / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
+    cameras_file, file, points_file = (
+        source.path / f"{name}{suffix}" for name in ("cameras", "images", "points3D")
+    )
     lenses = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
     cameras, seen = [], []
     for where, name, camera_id, pose, points in (_binary_images if binary else _text_images)(file):
         if camera_id not in lenses:
             raise CaptureError(file, where, f"camera {camera_id} is not in {cameras_file.name}")
-        cameras.append(dataclasses.replace(lenses[camera_id], name=name, cam_from_world=_pose(pose, file, where)))
+        cameras.append(
+            dataclasses.replace(
+                lenses[camera_id], name=name, cam_from_world=_pose(pose, file, where)
+            )
+        )
         seen.append(points)
     if not cameras:
         raise CaptureError(file, "", "no image is registered in this model")
-    places = dict((_binary_points if binary else _text_points)(points_file)) if points_file.is_file() else {}
-    rows = [(i, x, y, *places[int(p)]) for i, points in enumerate(seen) for x, y, p in points if int(p) in places]
+    places = (
+        dict((_binary_points if binary else _text_points)(points_file))
+        if points_file.is_file()
+        else {}
+    )
+    rows = [
+        (i, x, y, *places[int(p)])
+        for i, points in enumerate(seen)
+        for x, y, p in points
+        if int(p) in places
+    ]
     table = np.asarray(rows, np.float64)
     found = Observations(table[:, 3:], table[:, 0].astype(int), table[:, 1:3]) if rows else None
     return source.calibration(format, cameras, file=file, observations=found)
 
 
-def _lens(model: str, size: Sequence[float | int], values: Sequence[float], file: Path, where: str) -> CalibratedCamera:
-    p = dict(zip(PARAMETERS[model], floats(values, file, where, (len(PARAMETERS[model]),)).tolist(), strict=True))
+def _lens(
+    model: str, size: Sequence[float | int], values: Sequence[float], file: Path, where: str
+) -> CalibratedCamera:
+    p = dict(
+        zip(
+            PARAMETERS[model],
+            floats(values, file, where, (len(PARAMETERS[model]),)).tolist(),
+            strict=True,
+        )
+    )
     K = intrinsics(p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0)), p["cx"], p["cy"])
     distortion = brown_conrady([p.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")], file, where)
     return CalibratedCamera("", K, np.eye(4), *image_size(size, file, where), distortion)
@@ -74,7 +104,11 @@ def _lens(model: str, size: Sequence[float | int], values: Sequence[float], file
 def _check_camera_model(model: str, file: Path, where: str) -> None:
     if model not in PARAMETERS:
         supported = ", ".join(PARAMETERS)
-        raise CaptureError(file, where, f"camera model {model}: expected one of {supported}; else {UNDISTORT_BEFORE}")
+        raise CaptureError(
+            file,
+            where,
+            f"camera model {model}: expected one of {supported}; else {UNDISTORT_BEFORE}",
+        )
 
 
 def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, "4 4"]:
@@ -110,7 +144,9 @@ def _text_cameras(file: Path) -> Iterator[tuple[str, CalibratedCamera]]:
         _check_camera_model(model, file, where)
         if len(values) != 2 + len(PARAMETERS[model]):
             wanted = f"WIDTH HEIGHT {' '.join(PARAMETERS[model])}"
-            raise CaptureError(file, where, f"{model}: expected {wanted}, got {len(values)} numbers")
+            raise CaptureError(
+                file, where, f"{model}: expected {wanted}, got {len(values)} numbers"
+            )
         numbers = _numbers(values, file, where)
         yield camera_id, _lens(model, numbers[:2], numbers[2:], file, where)
 
@@ -125,7 +161,9 @@ def _text_images(file: Path) -> Iterator[Registered]:
             raise CaptureError(file, where, "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
         below, line = next(lines, (where, ""))
         if len(words := line.split()) % 3:
-            raise CaptureError(file, below, "expected X Y POINT3D_ID of each point (or an empty line)")
+            raise CaptureError(
+                file, below, "expected X Y POINT3D_ID of each point (or an empty line)"
+            )
         points = np.reshape(_numbers(words, file, below), (-1, 3))
         yield where, parts[9].strip(), parts[8], _numbers(parts[1:8], file, where), points
 
@@ -133,7 +171,10 @@ def _text_images(file: Path) -> Iterator[Registered]:
 def _text_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
     for where, line in _lines(file):
         if line.strip():
-            yield int(line.split()[0]), floats(_numbers(line.split()[1:4], file, where), file, where, (3,)).tolist()
+            yield (
+                int(line.split()[0]),
+                floats(_numbers(line.split()[1:4], file, where), file, where, (3,)).tolist(),
+            )
 
 
 # Binary: read inside `reading`, which names the file -------------------------------------------------------------------
@@ -219,14 +260,22 @@ def read_transforms(source: Source, format: CameraFormat) -> Calibration:
     for i, frame in enumerate(frames):
         expect(frame, dict, file, f"frames[{i}]")
     mask_key = next((key for key in MASK_KEYS if any(key in frame for frame in frames)), None)
-    cameras = [_frame_camera(values | frame, file, f"frames[{i}].", source.photo_size) for i, frame in enumerate(frames)]
+    cameras = [
+        _frame_camera(values | frame, file, f"frames[{i}].", source.photo_size)
+        for i, frame in enumerate(frames)
+    ]
     masks = [frame.get(mask_key) for frame in frames]
     for i, mask in enumerate(masks):
         if mask is not None:
             expect(mask, str, file, f"frames[{i}].{mask_key}")
     moments, stations = _find_moments(frames, cameras, file)
-    placed = [dataclasses.replace(c, frame=f, mask=m) for c, f, m in zip(cameras, moments, masks, strict=True)]
-    return source.calibration(format, placed, convention=WORLD_FROM_CAM_OPENGL, stations=stations, mask_key=mask_key)
+    placed = [
+        dataclasses.replace(c, frame=f, mask=m)
+        for c, f, m in zip(cameras, moments, masks, strict=True)
+    ]
+    return source.calibration(
+        format, placed, convention=WORLD_FROM_CAM_OPENGL, stations=stations, mask_key=mask_key
+    )
 
 
 def _frame_camera(
@@ -240,10 +289,14 @@ def _frame_camera(
         raise CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
     for key in ("is_fisheye", "k4"):  # five coefficients do not describe these lenses
         if values.get(key):
-            raise CaptureError(file, f"{prefix}{key}", f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
+            raise CaptureError(
+                file, f"{prefix}{key}", f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
+            )
     size = None
     if "w" in values or "h" in values:
-        size = image_size([required(values, key, file, prefix) for key in ("w", "h")], file, f"{prefix}w, h")
+        size = image_size(
+            [required(values, key, file, prefix) for key in ("w", "h")], file, f"{prefix}w, h"
+        )
     elif not ({"fl_x", "cx", "cy"} <= values.keys() or values.keys() & set(MATRICES)):
         size = photo_size(name)
     width, height = size or (None, None)
@@ -256,29 +309,51 @@ def _frame_camera(
     if whole is not None:
         K = floats(values[whole], file, f"{prefix}{whole}", (3, 3))
     elif focal:
-        center = [number(key) if key in values else 0.5 * (side or 0) for key, side in (("cx", width), ("cy", height))]
+        center = [
+            number(key) if key in values else 0.5 * (side or 0)
+            for key, side in (("cx", width), ("cy", height))
+        ]
         K = intrinsics(*(focal.get(axis, next(iter(focal.values()))) for axis in "xy"), *center)
     else:
         raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
     lens = [number(key) if key in values else 0.0 for key in ("k1", "k2", "p1", "p2", "k3")]
-    pose = floats(required(values, "transform_matrix", file, prefix), file, f"{prefix}transform_matrix", (4, 4))
+    pose = floats(
+        required(values, "transform_matrix", file, prefix),
+        file,
+        f"{prefix}transform_matrix",
+        (4, 4),
+    )
     try:
         cam_from_world = CONVENTIONS[WORLD_FROM_CAM_OPENGL](pose)
     except np.linalg.LinAlgError:
-        raise CaptureError(file, f"{prefix}transform_matrix", "expected a rigid transform, got a singular one") from None
-    return CalibratedCamera(name, K, cam_from_world, width, height, brown_conrady(lens, file, f"{prefix}k1"))
+        raise CaptureError(
+            file, f"{prefix}transform_matrix", "expected a rigid transform, got a singular one"
+        ) from None
+    return CalibratedCamera(
+        name, K, cam_from_world, width, height, brown_conrady(lens, file, f"{prefix}k1")
+    )
 
 
 # Moments ---------------------------------------------------------------------------------------------------------------
 
-MOMENT_KEYS = ("timestep_index", "timestep", "timestep_index_original", "time", "timestamp", "time_id", "timestep_id")
+MOMENT_KEYS = (
+    "timestep_index",
+    "timestep",
+    "timestep_index_original",
+    "time",
+    "timestamp",
+    "time_id",
+    "timestep_id",
+)
 CAMERA_KEYS = ("camera_index", "camera_id", "cam_id", "camera_label")
 SAME_TIME = 1e-6
 """Times that differ by less are one moment written twice."""
 SAME_POSE = 1e-9
 
 
-def _find_moments(frames: Sequence[Mapping[str, Any]], cameras: Sequence[CalibratedCamera], file: Path) -> tuple[list[int], int]:
+def _find_moments(
+    frames: Sequence[Mapping[str, Any]], cameras: Sequence[CalibratedCamera], file: Path
+) -> tuple[list[int], int]:
     """The frame of each image, counted from 0 in the order of time, and how many cameras there are.
 
     Raises: CaptureError naming the key, for a value in some images only, for what is no time, for two images of one camera and
@@ -287,7 +362,10 @@ def _find_moments(frames: Sequence[Mapping[str, Any]], cameras: Sequence[Calibra
     key, times = _values(frames, MOMENT_KEYS, file)
     owner, owners = _values(frames, CAMERA_KEYS, file)
     if not owner:
-        owners = [tuple(np.round(camera.cam_from_world / SAME_POSE).ravel().tolist()) for camera in cameras]
+        owners = [
+            tuple(np.round(camera.cam_from_world / SAME_POSE).ravel().tolist())
+            for camera in cameras
+        ]
     first: dict[Any, int] = {}
     again = [(first.setdefault(each, i), i) for i, each in enumerate(owners)]
     repeated = next(((a, b) for a, b in again if a != b), None)
@@ -296,7 +374,11 @@ def _find_moments(frames: Sequence[Mapping[str, Any]], cameras: Sequence[Calibra
     if not key and repeated is not None:
         which = f"the {owner} {owners[repeated[0]]}" if owner else "the same camera pose"
         problem = f"frames[{repeated[0]}] and frames[{repeated[1]}] have {which}, so they show different moments"
-        raise CaptureError(file, "frames", f"{problem}: expected timestep_index or time in each frame to tell which are of one")
+        raise CaptureError(
+            file,
+            "frames",
+            f"{problem}: expected timestep_index or time in each frame to tell which are of one",
+        )
     ranks = _ranks(times, key, file) if key else [0] * len(frames)
     taken: dict[Any, int] = {}
     for i, moment in enumerate(zip(owners, ranks, strict=True)):
@@ -306,13 +388,19 @@ def _find_moments(frames: Sequence[Mapping[str, Any]], cameras: Sequence[Calibra
     return ranks, len(first)
 
 
-def _values(frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path) -> tuple[str, list[Any]]:
+def _values(
+    frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
+) -> tuple[str, list[Any]]:
     """The first key that an image has, and its value in all of them, numbers or names; "" if there is none."""
     key = next((key for key in keys if any(key in frame for frame in frames)), "")
     values = []
     for i, frame in enumerate(frames if key else ()):
         if key not in frame:
-            raise CaptureError(file, f"frames[{i}].{key}", "missing, but other frames have it: expected all or none")
+            raise CaptureError(
+                file,
+                f"frames[{i}].{key}",
+                "missing, but other frames have it: expected all or none",
+            )
         value = frame[key]
         if not isinstance(value, str):
             floats(expect(value, float, file, f"frames[{i}].{key}"), file, f"frames[{i}].{key}", ())
@@ -326,6 +414,8 @@ def _ranks(times: Sequence[Any], key: str, file: Path) -> list[int]:
     known = sorted(set(times))
     ranks = range(len(known))
     if not isinstance(known[0], str):
-        ranks = np.cumsum(np.diff(known, prepend=known[0]) > SAME_TIME * max(1.0, abs(known[-1]))).tolist()
+        ranks = np.cumsum(
+            np.diff(known, prepend=known[0]) > SAME_TIME * max(1.0, abs(known[-1]))
+        ).tolist()
     rank = dict(zip(known, ranks, strict=True))
     return [rank[time] for time in times]

@@ -16,7 +16,14 @@ BINARIES = {
 """How files begin that somebody may take for a calibration, and what they are."""
 HEAD = 4096
 """Bytes that are looked at."""
-INTRINSICS = ("camera_matrix", "cameraMatrix", "CameraMatrix", "camera matrix", "Camera_Matrix", "intrinsic_matrix")
+INTRINSICS = (
+    "camera_matrix",
+    "cameraMatrix",
+    "CameraMatrix",
+    "camera matrix",
+    "Camera_Matrix",
+    "intrinsic_matrix",
+)
 """Keys by which programs write the lens of one camera alone."""
 KEY = re.compile(r"""^[ \t]*["']?([A-Za-z_][\w .-]*?)["']?[ \t]*[:=]""", re.MULTILINE)
 """A key of JSON, YAML or TOML at the beginning of a line."""
@@ -29,7 +36,12 @@ def binary_kind(file: Path) -> str | None:
     with open_file(file) as opened:
         head = opened.read(HEAD)
     known = (kind for start, kind in BINARIES.items() if head.startswith(start))
-    return next(known, "a binary file" if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")) else None)
+    return next(
+        known,
+        "a binary file"
+        if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff"))
+        else None,
+    )
 
 
 def described(text: str) -> str:
@@ -40,6 +52,12 @@ def described(text: str) -> str:
     if "T_cn_cnm1" in keys or ("distortion_model" in keys and "intrinsics" in keys):
         return "a camchain of Kalibr: write R and T of each camera into calibration.json, docs/cameras.md"
     if any(key in INTRINSICS for key in keys):
-        return "the lens of one camera, without where it stands: K, R and T of each camera are needed"
+        return (
+            "the lens of one camera, without where it stands: K, R and T of each camera are needed"
+        )
     names = list(dict.fromkeys(keys))
-    return f"it has the keys {few(names, KEYS_SHOWN)}" if names else f"a text that begins with {text.split()[0][:40]!r}"
+    return (
+        f"it has the keys {few(names, KEYS_SHOWN)}"
+        if names
+        else f"a text that begins with {text.split()[0][:40]!r}"
+    )

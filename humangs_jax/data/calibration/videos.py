@@ -43,7 +43,11 @@ def find_videos(folder: Path) -> dict[str, Path]:
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if is_video(path):
             if path.stem in found:
-                raise CaptureError(path, "", f"camera {path.stem} has {found[path.stem].name} already: expected one video")
+                raise CaptureError(
+                    path,
+                    "",
+                    f"camera {path.stem} has {found[path.stem].name} already: expected one video",
+                )
             found[path.stem] = path
     return found
 
@@ -92,12 +96,22 @@ def photos_of_videos(
     videos = {kind: find_videos(folder) for kind, folder in given.items()}
     if not any(videos.values()):
         if asked:
-            raise CaptureError(images, "", f"no video ({', '.join(VIDEO_SUFFIXES)}): frames can be chosen of videos only")
+            raise CaptureError(
+                images,
+                "",
+                f"no video ({', '.join(VIDEO_SUFFIXES)}): frames can be chosen of videos only",
+            )
         yield VideoPhotos(images, masks)
         return
-    videos = {"images": videos.get("images", {})} | ({} if masks is None else {"masks": videos.get("masks", {})})
+    videos = {"images": videos.get("images", {})} | (
+        {} if masks is None else {"masks": videos.get("masks", {})}
+    )
     if lonely := sorted(set(videos["images"]) ^ set(videos.get("masks", videos["images"]))):
-        raise CaptureError(masks or images, lonely[0], "expected a video of photos and one of masks, or folders of both")
+        raise CaptureError(
+            masks or images,
+            lonely[0],
+            "expected a video of photos and one of masks, or folders of both",
+        )
     beside = next(folder for folder in place.resolve().parents if folder.is_dir())
     with tempfile.TemporaryDirectory(dir=beside, prefix=f".{place.name}.video-") as temporary:
         own, mattes = Path(temporary) / "images", Path(temporary) / "masks"
@@ -108,14 +122,22 @@ def photos_of_videos(
             pixels = split_video(path, own / camera, every, most, pixels, chosen=chosen)
         pixels = 0
         for camera, path in videos.get("masks", {}).items():
-            chosen = None if moments is None else _mask_frames(path, camera, moments, seconds)[::every][:most]
+            chosen = (
+                None
+                if moments is None
+                else _mask_frames(path, camera, moments, seconds)[::every][:most]
+            )
             photos = videos["images"][camera]
-            pixels = split_video(path, mattes / camera, every, most, pixels, chosen=chosen, mask_of=photos)
+            pixels = split_video(
+                path, mattes / camera, every, most, pixels, chosen=chosen, mask_of=photos
+            )
         notes = [note for path in videos["images"].values() if (note := _color_note(path))]
         notes += [] if moments is None else moments.notes
         warnings = () if moments is None else moments.warnings
         with named_after(own, images), named_after(mattes, masks or images):
-            yield VideoPhotos(own, mattes if "masks" in videos else masks, tuple(dict.fromkeys(notes)), warnings)
+            yield VideoPhotos(
+                own, mattes if "masks" in videos else masks, tuple(dict.fromkeys(notes)), warnings
+            )
 
 
 def _has_photos(folder: Path) -> bool:
@@ -138,7 +160,9 @@ def named_after(temporary: Path, folder: Path) -> Generator[None]:
         raise CaptureError("", "", said.replace(str(temporary), str(folder))) from error
 
 
-def _moments(videos: Mapping[str, Path], every: int, most: int | None) -> tuple[Moments | None, float | None]:
+def _moments(
+    videos: Mapping[str, Path], every: int, most: int | None
+) -> tuple[Moments | None, float | None]:
     """The moments of several videos, or None of one, or of the first frames; and the seconds that were looked at, None: all."""
     if len(videos) < 2 or most == 1:
         return None, None
@@ -147,17 +171,23 @@ def _moments(videos: Mapping[str, Path], every: int, most: int | None) -> tuple[
         with reading(path, "video", CaptureError):
             rates += filter(None, [_shown(path).rate])
     seconds = None if most is None or not rates else (most * every + 1) / min(rates)
-    return find_moments({camera: frame_times(path, seconds) for camera, path in videos.items()}), seconds
+    return find_moments(
+        {camera: frame_times(path, seconds) for camera, path in videos.items()}
+    ), seconds
 
 
-def _mask_frames(path: Path, camera: str, moments: Moments, seconds: float | None) -> list[int | None]:
+def _mask_frames(
+    path: Path, camera: str, moments: Moments, seconds: float | None
+) -> list[int | None]:
     """The numbers of a camera's masks at the moments: those of its photos if there are as many, else by their own times."""
     times = frame_times(path, seconds)
     if len(times) == moments.counts[camera] or not np.isfinite(times).all():
         return moments.frames[camera]
     numbers = nearest(times - times[0], moments.times)
     photos = moments.frames[camera]
-    return [number if photo is not None else None for number, photo in zip(numbers, photos, strict=True)]
+    return [
+        number if photo is not None else None for number, photo in zip(numbers, photos, strict=True)
+    ]
 
 
 def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, " n"]:
@@ -200,7 +230,13 @@ def split_video(
         folder.mkdir(parents=True)
         if chosen is None:
             room = max(0, limits().video_pixels - before) // (width * height)
-            count = _run(path, folder, f"not(mod(n\\,{every}))", room + 1 if most is None else min(most, room + 1), shown)
+            count = _run(
+                path,
+                folder,
+                f"not(mod(n\\,{every}))",
+                room + 1 if most is None else min(most, room + 1),
+                shown,
+            )
         else:
             count = sum(number is not None for number in chosen)
             _check_pixels(before + count * width * height, count, width, height)
@@ -216,8 +252,12 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
     if not numbers:
         raise Refused("has no frame at the moments of the others")
     if _run(path, folder, _expression(numbers), len(numbers), shown) != len(numbers):
-        raise Refused(f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it goes with")
-    for i, place in reversed(list(enumerate(places))):  # from the end: a name is free when it is taken
+        raise Refused(
+            f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it goes with"
+        )
+    for i, place in reversed(
+        list(enumerate(places))
+    ):  # from the end: a name is free when it is taken
         (folder / f"{i:08d}.png").rename(folder / f"{place:08d}.png")
 
 
@@ -228,7 +268,9 @@ MOST_RUNS = 2000
 def _expression(numbers: Sequence[int]) -> str:
     """ffmpeg's condition for frames of these numbers. Raises: Refused for too many that follow no rule."""
     terms = [
-        f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))" if step else f"eq(n\\,{first})"
+        f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))"
+        if step
+        else f"eq(n\\,{first})"
         for first, step, last in progressions(numbers)
     ]
     if len(terms) > MOST_RUNS:
@@ -240,7 +282,10 @@ def _expression(numbers: Sequence[int]) -> str:
 def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
     open_file(path).close()  # no devices, no pipes, not too large
     filters = shown.shape or "null"
-    first = _finished(path, [*_ffmpeg(path, filters), "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"])
+    first = _finished(
+        path,
+        [*_ffmpeg(path, filters), "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"],
+    )
     if not first:
         raise _said(path, b"")
     with image_in(first) as image:
@@ -268,7 +313,9 @@ def _shown(path: Path) -> _Shown:
     """What ffmpeg prints of a video. Raises: OSError; Refused for pixels that nobody shows."""
     open_file(path).close()
     # without an output ffmpeg fails, after it has printed what is there
-    printed = subprocess.run(_opened(path, "info"), capture_output=True, timeout=LONGEST_SECONDS, check=False).stderr
+    printed = subprocess.run(
+        _opened(path, "info"), capture_output=True, timeout=LONGEST_SECONDS, check=False
+    ).stderr
     text = printed.decode(errors="replace")
     line = STREAM.search(text)
     if line is None:
@@ -292,14 +339,20 @@ def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _
     if encoding is None:
         return shown
     wide = matrix.startswith("bt2020") or (bright and matrix == "unknown")
-    return shown._replace(matrix="bt2020" if wide else "auto", encoding=encoding, about=f"{primaries}, {transfer}")
+    return shown._replace(
+        matrix="bt2020" if wide else "auto", encoding=encoding, about=f"{primaries}, {transfer}"
+    )
 
 
 def _shown_as_mask(path: Path, photos: Path) -> _Shown:
     """Of a video of masks: the shape of its photos' pixels if frames have the size of theirs and say nothing; no colors."""
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()
-    if not own.shape and theirs.shape and _frame_size(path, as_stored) == _frame_size(photos, as_stored):
+    if (
+        not own.shape
+        and theirs.shape
+        and _frame_size(path, as_stored) == _frame_size(photos, as_stored)
+    ):
         width, height = _frame_size(photos, theirs)
         return _Shown(shape=f"scale=w={width}:h={height},setsar=1")
     return own._replace(encoding=None)
@@ -308,11 +361,17 @@ def _shown_as_mask(path: Path, photos: Path) -> _Shown:
 def _color_note(path: Path) -> str | None:
     with reading(path, "video", CaptureError):
         shown = _shown(path)
-    return None if shown.encoding is None else f"videos with other colors than sRGB's ({shown.about}): converted"
+    return (
+        None
+        if shown.encoding is None
+        else f"videos with other colors than sRGB's ({shown.about}): converted"
+    )
 
 
 def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
-    what = f"pixels in the frames of the videos, {count:,} or more of {width} x {height} in this one"
+    what = (
+        f"pixels in the frames of the videos, {count:,} or more of {width} x {height} in this one"
+    )
     check_limit("video_pixels", pixels, what)
 
 
@@ -323,7 +382,9 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
     """
     with reading(path, "video", CaptureError):
         folder.mkdir(parents=True)
-        if _run(path, folder, "+".join(f"eq(n\\,{i})" for i in chosen), len(chosen), _shown(path)) != len(chosen):
+        if _run(
+            path, folder, "+".join(f"eq(n\\,{i})" for i in chosen), len(chosen), _shown(path)
+        ) != len(chosen):
             raise Refused("its frames are not the same when they are read again")
         for i, frame in enumerate(chosen):
             (folder / f"{i:08d}.png").rename(folder / f"frame_{frame:08d}.png")
@@ -333,11 +394,17 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
     """All frames of a video, one after the other, grey and no larger than that. Raises: CaptureError naming the video."""
     with reading(path, "video", CaptureError):
         width, height = _frame_size(path, _shown(path))
-        room, scale = limits().video_pixels // (width * height), min(1.0, longer_side / max(width, height))
+        room, scale = (
+            limits().video_pixels // (width * height),
+            min(1.0, longer_side / max(width, height)),
+        )
         w, h = (max(1, round(side * scale)) for side in (width, height))
         command = [*_ffmpeg(path, f"scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
         command += ["-f", "rawvideo", "-pix_fmt", "gray", "pipe:1"]
-        with tempfile.TemporaryFile() as said, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said) as process:
+        with (
+            tempfile.TemporaryFile() as said,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said) as process,
+        ):
             assert process.stdout is not None
             clock, count = threading.Timer(LONGEST_SECONDS, process.kill), 0
             clock.start()
@@ -358,7 +425,14 @@ def _opened(path: Path, verbosity: str = "error") -> list[str]:
     """The beginning of a command of ffmpeg: the program, and the video."""
     import imageio_ffmpeg
 
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-v", verbosity, "-nostdin", "-xerror"]
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-hide_banner",
+        "-v",
+        verbosity,
+        "-nostdin",
+        "-xerror",
+    ]
     # a playlist in disguise may name other files and hosts; pictures may be larger than what is read later
     command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
     return [*command, "-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
@@ -373,11 +447,21 @@ def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int
     table, filters = folder / TABLE, [f"select={select}", *filter(None, [shown.shape])]
     if shown.encoding is not None:
         table.write_text(cube(shown.encoding))
-        whole = f"scale=in_color_matrix={shown.matrix}:flags=accurate_rnd+full_chroma_int,format=rgb48"
+        whole = (
+            f"scale=in_color_matrix={shown.matrix}:flags=accurate_rnd+full_chroma_int,format=rgb48"
+        )
         filters += [whole, f"lut3d=file={TABLE}:interp=tetrahedral", "format=rgb24"]
     # a PNG would say for each program in its own words that its values are a video's
     filters += ["setparams=color_primaries=unknown:color_trc=unknown"]
-    command = [*_ffmpeg(path, ",".join(filters)), "-frames:v", str(most), "-y", "-start_number", "0", "%08d.png"]
+    command = [
+        *_ffmpeg(path, ",".join(filters)),
+        "-frames:v",
+        str(most),
+        "-y",
+        "-start_number",
+        "0",
+        "%08d.png",
+    ]
     _finished(path, command, folder)  # in the folder: its path may hold a % of its own
     table.unlink(missing_ok=True)
     if not (count := sum(1 for _ in folder.iterdir())):
@@ -387,9 +471,13 @@ def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int
 
 def _finished(path: Path, command: Sequence[str], folder: Path | None = None) -> bytes:
     try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False)
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False
+        )
     except subprocess.TimeoutExpired:
-        raise Refused(f"its frames take more than {LONGEST_SECONDS:,} seconds: expected a shorter video") from None
+        raise Refused(
+            f"its frames take more than {LONGEST_SECONDS:,} seconds: expected a shorter video"
+        ) from None
     if done.returncode:
         raise _said(path, done.stderr)
     return done.stdout
@@ -415,7 +503,9 @@ NOTHING_NEW = 0.05
 """Root mean square of the difference of two thumbnails, in standard deviations of one."""
 
 
-def looked_at(frames: Iterable[UInt[np.ndarray, "h w"]]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
+def looked_at(
+    frames: Iterable[UInt[np.ndarray, "h w"]],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
     """Sharpness and thumbnail of each grey frame; the thumbnails have mean 0 and variance 1, or are 0 where nothing is shown.
 
     Sharpness is the mean square of the Laplacian over the variance of the frame: exposure does not change it.
@@ -438,17 +528,23 @@ def looked_at(frames: Iterable[UInt[np.ndarray, "h w"]]) -> tuple[Float[np.ndarr
     return np.asarray(sharpness, np.float32), np.asarray(thumbnails, np.float32).reshape(shape)
 
 
-def choose_frames(sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarray, "n p"], most: int) -> list[int]:
+def choose_frames(
+    sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarray, "n p"], most: int
+) -> list[int]:
     """Numbers of at most `most` frames, in order.
 
     Raises: Refused if no frame shows anything.
     """
     shown = np.flatnonzero(sharpness > 0)
     if not len(shown):
-        raise Refused(f"none of its {len(sharpness):,} frames shows anything: expected a video of a person")
+        raise Refused(
+            f"none of its {len(sharpness):,} frames shows anything: expected a video of a person"
+        )
     windows = np.array_split(shown, min(len(shown), WINDOWS))
     offered = np.asarray([window[np.argmax(sharpness[window])] for window in windows])
-    worth = np.minimum(1, sharpness[offered] / np.median(sharpness[offered]))  # of a window that is blurred as a whole: less
+    worth = np.minimum(
+        1, sharpness[offered] / np.median(sharpness[offered])
+    )  # of a window that is blurred as a whole: less
     chosen, new = [int(np.argmax(worth))], np.full(len(offered), np.inf)
     while len(chosen) < min(most, len(offered)):
         apart = thumbnails[offered] - thumbnails[offered[chosen[-1]]]

@@ -65,7 +65,15 @@ from humangs_jax.data.datasets.subject import (
 )
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_in, read_grey, read_image
-from humangs_jax.io.reading import Refused, check_limit, limits, open_file, read_text, reading, visible
+from humangs_jax.io.reading import (
+    Refused,
+    check_limit,
+    limits,
+    open_file,
+    read_text,
+    reading,
+    visible,
+)
 
 PARAMETERS, MISSING = "smpl_params.npz", "missing_img_files.txt"
 ON_PERSON = 128.5 / 255
@@ -76,7 +84,13 @@ PHOTO = re.compile(r"(?:[\w-]+_(?:rgb|mask))?(\d+)\.\w+")
 T = TypeVar("T")
 Photo = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
 """Image on white and mask, both in [0, 1]."""
-_ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "left_hand_pose": 45, "right_hand_pose": 45}
+_ANGLES = {
+    "global_orient": 3,
+    "body_pose": 63,
+    "jaw_pose": 3,
+    "left_hand_pose": 45,
+    "right_hand_pose": 45,
+}
 
 
 def read_parameters(file: Path, body: FileBody) -> BodyParameters:
@@ -86,16 +100,22 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     """
     values = open_arrays(file)
     count = len(values.numbers("global_orient", (None, 3), LARGEST_ANGLE))
-    angles = {key: values.numbers(key, (count, size), LARGEST_ANGLE) for key, size in _ANGLES.items()}
+    angles = {
+        key: values.numbers(key, (count, size), LARGEST_ANGLE) for key, size in _ANGLES.items()
+    }
     translations = values.numbers("transl", (count, 3), FARTHEST)
     eyes = np.zeros((count, 6))
     parts = [angles[key] for key in ("global_orient", "body_pose", "jaw_pose")]
-    rotations = np.concatenate([*parts, eyes, angles["left_hand_pose"], angles["right_hand_pose"]], axis=1)
+    rotations = np.concatenate(
+        [*parts, eyes, angles["left_hand_pose"], angles["right_hand_pose"]], axis=1
+    )
     shape = []
     for key in ("betas", "expression"):
         rows = np.atleast_2d(values.numbers(key, None, LARGEST_COEFFICIENT))
         if rows.ndim != 2 or len(rows) not in (1, count):
-            raise CaptureError(file, key, f"expected shape (1, any) or ({count}, any), got {rows.shape}")
+            raise CaptureError(
+                file, key, f"expected shape (1, any) or ({count}, any), got {rows.shape}"
+            )
         shape.append(rows[0])
     betas = coefficients(body.model, shape[0], shape[1], file)
     return BodyParameters(betas, rotations.reshape(count, -1, 3), translations)
@@ -122,7 +142,14 @@ def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
             raise CaptureError(calibration.file, camera.name, problem)
         if camera.width is None or camera.height is None:
             raise CaptureError(calibration.file, f"{camera.name}.imgSize", "missing")
-        checked_camera(camera.K, camera.cam_from_world, camera.width, camera.height, calibration.file, camera.name)
+        checked_camera(
+            camera.K,
+            camera.cam_from_world,
+            camera.width,
+            camera.height,
+            calibration.file,
+            camera.name,
+        )
         if (away := float(np.linalg.norm(camera.cam_from_world[:3, 3]))) > FARTHEST:
             problem = f"the camera stands {away:.4g} m from the origin: expected metres and at most {FARTHEST:g}"
             raise CaptureError(calibration.file, f"{camera.name}.T", problem)
@@ -131,7 +158,11 @@ def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
 
 def numbered(folder: Path) -> dict[int, Path]:
     """Frame -> its file, of the photos in a folder that are called by a number; empty if it does not exist."""
-    names = [name for name in (os.listdir(folder) if folder.is_dir() else ()) if name.lower().endswith(PHOTO_SUFFIXES)]
+    names = [
+        name
+        for name in (os.listdir(folder) if folder.is_dir() else ())
+        if name.lower().endswith(PHOTO_SUFFIXES)
+    ]
     return {int(found[1]): folder / name for name in names if (found := PHOTO.fullmatch(name))}
 
 
@@ -144,7 +175,9 @@ def read_missing(file: Path) -> set[tuple[str, int]]:
         if line.strip():
             named = re.search(r"([^\\/]+)[\\/]+([0-9]{1,18})(?:\.[^\\/]*)?$", line.strip())
             if named is None:
-                raise CaptureError(file, f"line {number}", f"expected CAMERA/FRAME.jpg, got {line.strip()[:60]!r}")
+                raise CaptureError(
+                    file, f"line {number}", f"expected CAMERA/FRAME.jpg, got {line.strip()[:60]!r}"
+                )
             found.add((named[1], int(named[2])))
     return found
 
@@ -165,13 +198,18 @@ def video_subject(
     frame) that are known to be missing. digits: of a frame in the name of a view.
     Raises: CaptureError if there is no photo.
     """
-    count, missing = len(parameters.translations), {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0}
+    count, missing = (
+        len(parameters.translations),
+        {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0},
+    )
     shown = []
     for number, (camera, there, masked) in enumerate(zip(cameras, photos, masks, strict=True)):
         known = {frame for owner, frame in listed if owner == camera.name}
         usable = {frame for frame in there if frame not in known and 0 <= frame < count}
         missing["listed as missing"] += len(known)
-        missing["no photo"] += sum(frame not in there and frame not in known for frame in range(count))
+        missing["no photo"] += sum(
+            frame not in there and frame not in known for frame in range(count)
+        )
         missing["no pose"] += len(set(there) - known - usable)
         missing["no mask"] += len(usable - set(masked))
         shown += [(frame, number) for frame in usable & set(masked)]
@@ -213,12 +251,18 @@ def folder_subject(
     return video_subject(name, cameras, photos, masks, on_white, parameters, listed)
 
 
-def on_white(photo: Path, mask: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+def on_white(
+    photo: Path, mask: Path
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """A photo on white where its mask is at most 128, and the mask as 0 and 1. Raises: CaptureError naming the file."""
-    return _cut_out(read_checked(read_image, photo)[0], read_checked(read_grey, mask) > ON_PERSON, mask, "size")
+    return _cut_out(
+        read_checked(read_image, photo)[0], read_checked(read_grey, mask) > ON_PERSON, mask, "size"
+    )
 
 
-def _cut_out(image: Float[np.ndarray, "h w 3"], person: Bool[np.ndarray, "mh mw"], file: Path, field: str) -> Photo:
+def _cut_out(
+    image: Float[np.ndarray, "h w 3"], person: Bool[np.ndarray, "mh mw"], file: Path, field: str
+) -> Photo:
     if person.shape != image.shape[:2]:
         got = f"{person.shape[1]} x {person.shape[0]}, but its photo has {image.shape[1]} x {image.shape[0]}"
         raise CaptureError(file, field, f"{got}: expected the same")
@@ -240,10 +284,14 @@ AVATARREX = FolderLayout("calibration_full.json", "NAME", "NAME/mask/pha")
 def find_subjects(layout: FolderLayout, folder: str | Path) -> tuple[Path, ...]:
     """The subjects in a folder, sorted, or the folder itself; empty if there are none."""
     above = layout.photos.removesuffix("NAME")
-    return subfolders(folder, lambda path: (path / layout.calibration).is_file() and (path / above).is_dir())
+    return subfolders(
+        folder, lambda path: (path / layout.calibration).is_file() and (path / above).is_dir()
+    )
 
 
-def subfolders(folder: str | Path, is_one: Callable[[Path], bool], depth: int = 1) -> tuple[Path, ...]:
+def subfolders(
+    folder: str | Path, is_one: Callable[[Path], bool], depth: int = 1
+) -> tuple[Path, ...]:
     """The folder itself, or those up to `depth` folders below that are a subject, sorted."""
     folder = Path(folder)
     below = (path for level in range(depth) for path in visible(folder.glob("*/" * (level + 1))))
@@ -256,11 +304,21 @@ def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Su
     cameras = read_cameras(folder / layout.calibration)
     place = lambda part, camera: folder / part.replace("NAME", camera.name)
     places = [(place(layout.photos, camera), place(layout.masks, camera)) for camera in cameras]
-    return folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body), read_missing(folder / MISSING))
+    return folder_subject(
+        folder,
+        cameras,
+        places,
+        read_parameters(folder / PARAMETERS, body),
+        read_missing(folder / MISSING),
+    )
 
 
-find_thuman4, open_thuman4 = (functools.partial(do, THUMAN4) for do in (find_subjects, open_subject))
-find_avatarrex, open_avatarrex = (functools.partial(do, AVATARREX) for do in (find_subjects, open_subject))
+find_thuman4, open_thuman4 = (
+    functools.partial(do, THUMAN4) for do in (find_subjects, open_subject)
+)
+find_avatarrex, open_avatarrex = (
+    functools.partial(do, AVATARREX) for do in (find_subjects, open_subject)
+)
 
 
 # ActorsHQ --------------------------------------------------------------------------------------------------------------
@@ -271,7 +329,11 @@ COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
 
 def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
     """The sequences in a folder (of one actor or of several), sorted, or the folder itself; empty if there are none."""
-    return subfolders(folder, lambda path: any((path / scale / CALIBRATION).is_file() for scale in SCALES), depth=2)
+    return subfolders(
+        folder,
+        lambda path: any((path / scale / CALIBRATION).is_file() for scale in SCALES),
+        depth=2,
+    )
 
 
 def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
@@ -279,7 +341,10 @@ def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
     folder = Path(folder)
     scale = next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
     cameras = read_csv_cameras(folder / scale / CALIBRATION)
-    places = [(folder / scale / "rgbs" / camera.name, folder / scale / "masks" / camera.name) for camera in cameras]
+    places = [
+        (folder / scale / "rgbs" / camera.name, folder / scale / "masks" / camera.name)
+        for camera in cameras
+    ]
     return folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body))
 
 
@@ -290,19 +355,35 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
     cameras = []
     for number, row in enumerate(rows, 2):
         name = row.get("name")
-        if not name or not re.fullmatch(r"[\w-]+", name) or any(camera.name == name for camera in cameras):
-            raise CaptureError(file, f"line {number}: name", f"expected the name of a camera of its own, got {name!r}")
+        if (
+            not name
+            or not re.fullmatch(r"[\w-]+", name)
+            or any(camera.name == name for camera in cameras)
+        ):
+            raise CaptureError(
+                file,
+                f"line {number}: name",
+                f"expected the name of a camera of its own, got {name!r}",
+            )
         numbers = []
         for key in COLUMNS:
             try:
                 numbers.append(float(row[key]))
             except (KeyError, TypeError, ValueError):
-                raise CaptureError(file, f"{name}.{key}", f"expected a number, got {row.get(key)!r}") from None
+                raise CaptureError(
+                    file, f"{name}.{key}", f"expected a number, got {row.get(key)!r}"
+                ) from None
         values = checked_numbers(numbers, file, name, (len(COLUMNS),), largest=float(limits().side))
         width, height = image_size(values[:2], file, f"{name}.w")
-        turn, center, (fx, fy, px, py) = rotation(values[2:5], file, name).T, values[5:8], values[8:].tolist()
+        turn, center, (fx, fy, px, py) = (
+            rotation(values[2:5], file, name).T,
+            values[5:8],
+            values[8:].tolist(),
+        )
         if max(fx, fy) > 100:
-            raise CaptureError(file, f"{name}.fx", f"expected a share of the width, got {fx:g}: in pixels?")
+            raise CaptureError(
+                file, f"{name}.fx", f"expected a share of the width, got {fx:g}: in pixels?"
+            )
         K = intrinsics(fx * width, fy * height, px * width, py * height)
         cameras.append(CalibratedCamera(name, K, pose_matrix(turn, -turn @ center), width, height))
     if not cameras:
@@ -328,7 +409,9 @@ class Smc:
         try:
             h5py: Any = importlib.import_module("h5py")  # optional
         except ImportError:
-            raise CaptureError(path, "", "HDF5 files need the package h5py: pip install humangs_jax[hdf5]") from None
+            raise CaptureError(
+                path, "", "HDF5 files need the package h5py: pip install humangs_jax[hdf5]"
+            ) from None
         with reading(path, "HDF5 file", CaptureError):
             open_file(path).close()  # devices, pipes, folders
             self.file = h5py.File(path, "r")
@@ -360,10 +443,14 @@ class Smc:
                 raise Refused("expected numbers")
             if data.is_virtual or data.external:
                 raise Refused("refused numbers that lie in other files")
-            check_limit(limit, int(np.prod(data.shape, dtype=np.float64)) * data.dtype.itemsize, "bytes")
+            check_limit(
+                limit, int(np.prod(data.shape, dtype=np.float64)) * data.dtype.itemsize, "bytes"
+            )
             return np.asarray(data[()])
 
-    def numbers(self, key: str, shape: tuple[int | None, ...], largest: float = np.inf) -> Float[np.ndarray, "..."]:
+    def numbers(
+        self, key: str, shape: tuple[int | None, ...], largest: float = np.inf
+    ) -> Float[np.ndarray, "..."]:
         """Finite float64 numbers of a shape."""
         return checked_numbers(self.array(key), self.path, key, shape, largest=largest)
 
@@ -381,16 +468,24 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
     """One sequence of its main file. Raises: CaptureError naming file and key."""
     main = Path(main)
     photos, notes = Smc(main), Smc(main.parent.parent / "annotations" / f"{main.stem}_annots.smc")
-    places = {int(name): group for group in GROUPS for name in photos.names(group) if name.isdecimal()}
+    places = {
+        int(name): group for group in GROUPS for name in photos.names(group) if name.isdecimal()
+    }
     if not places:
         raise CaptureError(main, "", f"no camera: expected the groups {' and '.join(GROUPS)}")
     parameters = _parameters(notes, body)
     cameras, shown, masks = [], [], []
     for number, group in sorted(places.items()):
         there, masked = f"{group}/{number}/color", f"Mask/{number}/mask"
-        shown.append({int(name): f"{there}/{name}" for name in photos.names(there) if name.isdecimal()})
-        masks.append({int(name): f"{masked}/{name}" for name in notes.names(masked) if name.isdecimal()})
-        cameras.append(_camera(notes, number, photos, shown[-1][min(shown[-1])] if shown[-1] else None))
+        shown.append(
+            {int(name): f"{there}/{name}" for name in photos.names(there) if name.isdecimal()}
+        )
+        masks.append(
+            {int(name): f"{masked}/{name}" for name in notes.names(masked) if name.isdecimal()}
+        )
+        cameras.append(
+            _camera(notes, number, photos, shown[-1][min(shown[-1])] if shown[-1] else None)
+        )
 
     def read(photo: str, mask: str) -> Photo:
         image, person = (file.image(key, _colors) for file, key in ((photos, photo), (notes, mask)))
@@ -410,8 +505,13 @@ def _parameters(notes: Smc, body: FileBody) -> BodyParameters:
     translations = notes.numbers("SMPLx/transl", (len(poses), 3), FARTHEST)
     rotations = poses.copy()
     rotations[:, 25:] += np.asarray(body.hands.means, np.float64).reshape(30, 3)
-    shape = [notes.numbers(f"SMPLx/{key}", (None, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")]
-    return BodyParameters(coefficients(body.model, shape[0], shape[1], notes.path), rotations, translations)
+    shape = [
+        notes.numbers(f"SMPLx/{key}", (None, None), LARGEST_COEFFICIENT)[0]
+        for key in ("betas", "expression")
+    ]
+    return BodyParameters(
+        coefficients(body.model, shape[0], shape[1], notes.path), rotations, translations
+    )
 
 
 def _camera(notes: Smc, number: int, photos: Smc, first: str | None) -> CalibratedCamera:

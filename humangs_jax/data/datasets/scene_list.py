@@ -19,7 +19,14 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.calibration.calibration import intrinsics
-from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, checked_path, expect, members
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    checked_camera,
+    checked_json,
+    checked_path,
+    expect,
+    members,
+)
 from humangs_jax.data.datasets.subject import (
     STORED_SIZE,
     BodyParameters,
@@ -58,14 +65,20 @@ class SceneFrame(NamedTuple):
 def find_scene_list(path: str | Path) -> tuple[Path, ...]:
     """The path, if it is a list of scenes or a folder that holds one."""
     path = Path(path)
-    found = (path.is_file() and path.suffix == ".json") or any((path / name).is_file() for name in LISTS)
+    found = (path.is_file() and path.suffix == ".json") or any(
+        (path / name).is_file() for name in LISTS
+    )
     return (path,) if found else ()
 
 
 def _list_of(path: str | Path) -> Path:
     """The JSON file; of a folder train.json, else test.json."""
     file = Path(path)
-    return next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0]) if file.is_dir() else file
+    return (
+        next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
+        if file.is_dir()
+        else file
+    )
 
 
 def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -80,12 +93,16 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
     for i, scene in enumerate(content):
         (name,) = members(scene, file, f"[{i}]", scene_name=str)
         if name in scenes:
-            raise CaptureError(file, f"[{i}].scene_name", f"expected a name of its own, got {shown(name)}")
+            raise CaptureError(
+                file, f"[{i}].scene_name", f"expected a name of its own, got {shown(name)}"
+            )
         scenes[name] = scene
     return scenes
 
 
-def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -> tuple[Person, ...]:
+def open_scene_list(
+    path: str | Path, body: FileBody, size: int | None = None
+) -> tuple[Person, ...]:
     """The people of a list, each opened when it is asked for. size: of the stored squares; None: that of the images.
 
     Raises: CaptureError if the list cannot be read.
@@ -94,13 +111,17 @@ def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -
     scenes = read_scene_list(file)
     if size is None:
         # scenes without frames are refused when they are opened, and not all of the list
-        listed = (scene["frames"] for scene in scenes.values() if isinstance(scene.get("frames"), list))
+        listed = (
+            scene["frames"] for scene in scenes.values() if isinstance(scene.get("frames"), list)
+        )
         firsts = (frames[0] for frames in listed if frames and isinstance(frames[0], dict))
         images = (file.parent / str(frame.get("image_path")) for frame in firsts)
         first = next((image for image in images if image.is_file()), None)
         size = STORED_SIZE if first is None else max(read_checked(image_size, first))
     opened = lambda name, scene: functools.partial(open_scene, file, name, scene, body)
-    return tuple(Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items())
+    return tuple(
+        Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items()
+    )
 
 
 def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
@@ -124,7 +145,10 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
         return BodyParameters(betas, rotations, np.asarray([t for _, t in poses]).reshape(-1, 3))
 
     sizes = np.asarray([read_checked(image_size, _inside(file, name, views[0].image))] * len(views))
-    K, poses = np.stack([view.K for view in views]), np.stack([view.cam_from_world for view in views])
+    K, poses = (
+        np.stack([view.K for view in views]),
+        np.stack([view.cam_from_world for view in views]),
+    )
     for i in range(len(views)):
         checked_camera(K[i], poses[i], *sizes[i].tolist(), file, f"{name}.frames[{i}]")
     poses[:, :3, 3] /= scale
@@ -147,15 +171,27 @@ def scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneF
     views, (frames,) = [], members(scene, file, name, frames=list)
     for i, frame in enumerate(frames):
         at = f"{name}.frames[{i}]"
-        image, arrays, pose, inner = members(frame, file, at, image_path=str, smpl_path=str, w2c=list, fxfycxcy=list)
+        image, arrays, pose, inner = members(
+            frame, file, at, image_path=str, smpl_path=str, w2c=list, fxfycxcy=list
+        )
         K = intrinsics(*checked_numbers(inner, file, f"{at}.fxfycxcy", (4,)).tolist())
-        views.append(SceneFrame(image, checked_numbers(pose, file, f"{at}.w2c", (4, 4)), K, arrays, frame.get("mask_path")))
+        views.append(
+            SceneFrame(
+                image,
+                checked_numbers(pose, file, f"{at}.w2c", (4, 4)),
+                K,
+                arrays,
+                frame.get("mask_path"),
+            )
+        )
     if not views:
         raise CaptureError(file, f"{name}.frames", "expected at least one frame")
     return views
 
 
-def _present(file: Path, name: str, scene: Mapping[str, Any]) -> tuple[list[SceneFrame], dict[str, int]]:
+def _present(
+    file: Path, name: str, scene: Mapping[str, Any]
+) -> tuple[list[SceneFrame], dict[str, int]]:
     """Frames whose image and arrays are there, and how many are not."""
     views, missing = [], {"no image": 0, "no smpl_path": 0}
     is_there = functools.lru_cache(None)(lambda path: _inside(file, name, path).is_file())
@@ -175,7 +211,9 @@ def _inside(file: Path, name: str, path: Any) -> Path:
     return checked_path(file.parent, path, f"{file}: {name}")
 
 
-def _read_view(file: Path, name: str, view: SceneFrame) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "mask_h mask_w"]]:
+def _read_view(
+    file: Path, name: str, view: SceneFrame
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "mask_h mask_w"]]:
     path = _inside(file, name, view.image)
     image, alpha = read_checked(read_image, path)
     if view.mask is not None:
@@ -195,7 +233,9 @@ def not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 # Writing --------------------------------------------------------------------------------------------------------------
 
 
-def scene_entry(name: str, mesh_transform: Float[np.ndarray, "4 4"], frames: Sequence[SceneFrame]) -> dict[str, Any]:
+def scene_entry(
+    name: str, mesh_transform: Float[np.ndarray, "4 4"], frames: Sequence[SceneFrame]
+) -> dict[str, Any]:
     """A scene as it stands in a list."""
     return {
         "scene_name": name,
@@ -215,7 +255,9 @@ def scene_entry(name: str, mesh_transform: Float[np.ndarray, "4 4"], frames: Seq
 
 def rounded(array: Float[np.ndarray, "..."]) -> Any:
     """Nested lists of numbers of `SIGNIFICANT` digits."""
-    short = lambda x: [short(row) for row in x] if isinstance(x, list) else float(f"{x:.{SIGNIFICANT}g}")
+    short = lambda x: (
+        [short(row) for row in x] if isinstance(x, list) else float(f"{x:.{SIGNIFICANT}g}")
+    )
     return short(array.tolist())
 
 
@@ -228,7 +270,11 @@ def write_arrays(
 ) -> None:
     """The npz of a frame."""
     arrays = {"v_posed": posed, "v_cano": rest, "joint_transforms": joint_transforms}
-    write_npz(path, {name: array.astype(np.float32) for name, array in arrays.items()} | {"faces": faces.astype(np.int32)})
+    write_npz(
+        path,
+        {name: array.astype(np.float32) for name, array in arrays.items()}
+        | {"faces": faces.astype(np.int32)},
+    )
 
 
 def read_evaluation(path: str | Path) -> dict[str, dict[str, list[int]]]:
@@ -236,7 +282,13 @@ def read_evaluation(path: str | Path) -> dict[str, dict[str, list[int]]]:
     file = Path(path)
     content = checked_json(file)
     for name, views in expect(content, dict, file, "").items():
-        for key, chosen in zip(("context", "target"), members(views, file, name, context=list, target=list), strict=True):
+        for key, chosen in zip(
+            ("context", "target"),
+            members(views, file, name, context=list, target=list),
+            strict=True,
+        ):
             if not chosen or not all(type(view) is int and view >= 0 for view in chosen):
-                raise CaptureError(file, f"{name}.{key}", f"expected numbers of views, got {shown(chosen)}")
+                raise CaptureError(
+                    file, f"{name}.{key}", f"expected numbers of views, got {shown(chosen)}"
+                )
     return content

@@ -65,10 +65,16 @@ class FileBody:
         return load_hands(self.file)
 
     @functools.cached_property
-    def arrays(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 s"], Float[np.ndarray, "j n"]]:
+    def arrays(
+        self,
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 s"], Float[np.ndarray, "j n"]]:
         """Template, shape directions and joint regressor, float64."""
         model = self.model
-        template, directions, regressor = model.template, model.shape_directions, model.joint_regressor
+        template, directions, regressor = (
+            model.template,
+            model.shape_directions,
+            model.joint_regressor,
+        )
         return tuple(np.asarray(x, np.float64) for x in (template, directions, regressor))  # ty: ignore[invalid-explicit-return]
 
     def rest_joints(self, betas: Float[np.ndarray, " s"]) -> Float[np.ndarray, "j 3"]:
@@ -104,23 +110,34 @@ class PosedPerson:
 
 
 @jax.jit
-def _posed(body: BodyModel, betas: Any, rotations: Any, translation: Any) -> tuple[RestBody, PosedBody]:
+def _posed(
+    body: BodyModel, betas: Any, rotations: Any, translation: Any
+) -> tuple[RestBody, PosedBody]:
     rest = shape_body(body, betas)
     return rest, pose_body(body, rest, BodyPose(rotations, translation))
 
 
-def posed_people(body: BodyModel, parameters: BodyParameters, scale: float = 1.0) -> Iterator[PosedPerson]:
+def posed_people(
+    body: BodyModel, parameters: BodyParameters, scale: float = 1.0
+) -> Iterator[PosedPerson]:
     """A person in one pose after the other, all lengths times `scale`."""
     for rotations, translation in zip(parameters.rotations, parameters.translations, strict=True):
-        rest, posed = _posed(body, *(jnp.asarray(x, jnp.float32) for x in (parameters.betas, rotations, translation)))
-        lengths = (scale * np.asarray(x, np.float64) for x in (rest.vertices, posed.vertices, posed.joints))
+        rest, posed = _posed(
+            body, *(jnp.asarray(x, jnp.float32) for x in (parameters.betas, rotations, translation))
+        )
+        lengths = (
+            scale * np.asarray(x, np.float64) for x in (rest.vertices, posed.vertices, posed.joints)
+        )
         transforms = np.array(posed.joint_transforms, np.float64)
         transforms[:, :3, 3] *= scale
         yield PosedPerson(*lengths, transforms)
 
 
 def coefficients(
-    body: BodyModel, betas: Float[np.ndarray, " s"], expression: Float[np.ndarray, " e"], file: object
+    body: BodyModel,
+    betas: Float[np.ndarray, " s"],
+    expression: Float[np.ndarray, " e"],
+    file: object,
 ) -> Float[np.ndarray, " all"]:
     """Coefficients of all of the body's directions: shape, then expression. Those that a file has not are 0.
 
@@ -130,12 +147,18 @@ def coefficients(
     if not any(name.startswith("shape_") for name in body.shape_names):
         problem = f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model for body"
         raise CaptureError(file, "betas", problem)
-    names = [f"{kind}_{i}" for kind, values in (("shape", betas), ("expression", expression)) for i in range(len(values))]
+    names = [
+        f"{kind}_{i}"
+        for kind, values in (("shape", betas), ("expression", expression))
+        for i in range(len(values))
+    ]
     found = shape_coefficients(body, np.concatenate([betas, expression]), names, file)
     return np.pad(found, (0, body.shape_directions.shape[-1] - len(found)))
 
 
-def turned(parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis: Float[np.ndarray, "3"]) -> BodyParameters:
+def turned(
+    parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis: Float[np.ndarray, "3"]
+) -> BodyParameters:
     """The same poses in a world that a rigid transform moved. pelvis: (3,) its place in the T-pose of the person."""
     from scipy.spatial.transform import Rotation
 
@@ -147,7 +170,9 @@ def turned(parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis:
     return BodyParameters(parameters.betas, rotations, translations)
 
 
-def recover_shape(body: FileBody, rest: Float[np.ndarray, "n 3"], file: object) -> tuple[float, Float[np.ndarray, " s"]]:
+def recover_shape(
+    body: FileBody, rest: Float[np.ndarray, "n 3"], file: object
+) -> tuple[float, Float[np.ndarray, " s"]]:
     """Scale and shape coefficients of a T-pose `v_cano`, by least squares: rest = scale (template + directions betas).
 
     Where all vertices do not fit, the hands are left out, which the release bends by accident.
@@ -171,7 +196,9 @@ def recover_shape(body: FileBody, rest: Float[np.ndarray, "n 3"], file: object) 
 @functools.lru_cache(maxsize=2)
 def _shape_solvers(
     body: FileBody,
-) -> tuple[tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...]:
+) -> tuple[
+    tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...
+]:
     """(pseudo-inverse, columns, which vertices) of the least-squares problem of `recover_shape`: of all vertices, then
     without the hands.
     """
@@ -185,7 +212,11 @@ def _shape_solvers(
 
 
 def recover_pose(
-    body: FileBody, betas: Float[np.ndarray, " s"], scale: float, transforms: Float[np.ndarray, "j 4 4"], file: object
+    body: FileBody,
+    betas: Float[np.ndarray, " s"],
+    scale: float,
+    transforms: Float[np.ndarray, "j 4 4"],
+    file: object,
 ) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "3"]]:
     """Rotations and translation (metres) of a person from `joint_transforms`, which take the scaled T-pose to the pose.
 
@@ -240,7 +271,9 @@ class Subject:
         """Number of views."""
         return len(self.frames)
 
-    def squared_K(self, views: Sequence[int] | Int[np.ndarray, " any"], size: int) -> Float[np.ndarray, "any 3 3"]:
+    def squared_K(
+        self, views: Sequence[int] | Int[np.ndarray, " any"], size: int
+    ) -> Float[np.ndarray, "any 3 3"]:
         """Intrinsics of these views padded to squares and resized to `size` pixels."""
         width, height = self.sizes[views].T
         side = self.sizes[views].max(axis=1)
@@ -266,7 +299,9 @@ class Subject:
             image, mask = resized(image, size, size), resized(mask, size, size)
         return to_uint8(image), to_uint8(mask)
 
-    def tried(self, views: Sequence[int] | Int[np.ndarray, " any"], size: int) -> list[Photo | Exception]:
+    def tried(
+        self, views: Sequence[int] | Int[np.ndarray, " any"], size: int
+    ) -> list[Photo | Exception]:
         """Several of these, decoded in parallel; in place of those that cannot be read, why."""
 
         def photo(view: int) -> Photo | Exception:
@@ -290,7 +325,12 @@ class Subject:
             masks.append(photo[1])
         return np.stack(images), np.stack(masks)
 
-    def capture(self, views: Sequence[int] | Int[np.ndarray, " any"], body: FileBody, size: int = STORED_SIZE) -> Capture:
+    def capture(
+        self,
+        views: Sequence[int] | Int[np.ndarray, " any"],
+        body: FileBody,
+        size: int = STORED_SIZE,
+    ) -> Capture:
         """These views as a `Capture`, to reconstruct and to animate; its poses are those of the frames that are seen.
 
         Raises: ValueError naming file and field.
@@ -338,9 +378,13 @@ class Person:
         subject, every = self.subject, np.arange(len(self.subject))
         betas, *poses = subject.parameters([])
         K = subject.squared_K(every, self.size)
-        return StoredSubject.without_photos((self.size, self.size), K, subject.cam_from_world, subject.frames, *poses, betas)
+        return StoredSubject.without_photos(
+            (self.size, self.size), K, subject.cam_from_world, subject.frames, *poses, betas
+        )
 
-    def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "any h w 3"], UInt8[np.ndarray, "any h w"]]:
+    def decode(
+        self, views: Sequence[int]
+    ) -> tuple[UInt8[np.ndarray, "any h w 3"], UInt8[np.ndarray, "any h w"]]:
         """Images and masks of these views."""
         return self.subject.photos(views, self.size)
 
@@ -349,7 +393,9 @@ class Person:
         seen, frames = np.unique(subject.frames, return_inverse=True)
         _, rotations, translations = self.subject.parameters(seen.tolist())
         rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
-        return subject._replace(frames=frames.astype(np.int32), rotations=rotations, translations=translations)
+        return subject._replace(
+            frames=frames.astype(np.int32), rotations=rotations, translations=translations
+        )
 
 
 def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tuple[Person, ...]:
@@ -363,10 +409,14 @@ def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tu
         if not (folders := imported(data_set.find)(path)):
             continue
         if data_set.scans:
-            raise CaptureError(path, "", f"scans have no photos: make some with `humangs preprocess {name}`")
+            raise CaptureError(
+                path, "", f"scans have no photos: make some with `humangs preprocess {name}`"
+            )
         if data_set.lists:
             return data_set(path, body, size)
         opened = lambda folder, open_one=data_set: functools.partial(open_one, folder, body)
         return tuple(Person(str(folder), opened(folder), size or STORED_SIZE) for folder in folders)
     known = ", ".join(each.about for each in DATASETS.where(lambda each: not each.lists).values())
-    raise CaptureError(path, "", f"no captures, scene list or data set of {known} (docs/datasets.md)")
+    raise CaptureError(
+        path, "", f"no captures, scene list or data set of {known} (docs/datasets.md)"
+    )

@@ -88,7 +88,11 @@ def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
     if not (folder / "model").is_dir():
         raise CaptureError(folder, "model", "no such folder: expected THuman's model/ and smplx/")
     names, skipped = [], {}
-    for name in sorted(entry.name for entry in (folder / "model").iterdir() if entry.is_dir() and not entry.name.startswith(".")):
+    for name in sorted(
+        entry.name
+        for entry in (folder / "model").iterdir()
+        if entry.is_dir() and not entry.name.startswith(".")
+    ):
         missing = [file for file in scan_files(folder, name) if not file.is_file()]
         if missing:
             skipped[name] = f"{missing[0]}: no such file"
@@ -96,7 +100,9 @@ def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
             names.append(name)
     if not names:
         why = f" ({next(iter(skipped.values()))})" if skipped else ""
-        raise CaptureError(folder, "", f"no scan with a fit{why}: expected model/ID/ID.obj and smplx/ID/{FIT}")
+        raise CaptureError(
+            folder, "", f"no scan with a fit{why}: expected model/ID/ID.obj and smplx/ID/{FIT}"
+        )
     return names, skipped
 
 
@@ -108,7 +114,11 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     values = open_arrays(file)
     file = values.path
     if ("transl" in values) == ("translation" in values):
-        raise CaptureError(file, "transl", "expected either transl (THuman2.1, fixed fits) or translation (older fits)")
+        raise CaptureError(
+            file,
+            "transl",
+            "expected either transl (THuman2.1, fixed fits) or translation (older fits)",
+        )
     of_kind = "transl" if "transl" in values else "translation"
     keys = ("left_hand_pose", "right_hand_pose")
     hands = [values.numbers(key, (1, None), LARGEST_ANGLE)[0] for key in keys]
@@ -116,20 +126,30 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     lengths = (HAND_NUMBERS,) if of_kind == "transl" else (PCA_NUMBERS, HAND_NUMBERS)
     for key, hand in zip(keys, hands, strict=True):
         if len(hand) not in lengths or len(hand) != length:
-            raise CaptureError(file, key, f"expected {' or '.join(map(str, lengths))} numbers beside {of_kind}, got {len(hand)}")
+            raise CaptureError(
+                file,
+                key,
+                f"expected {' or '.join(map(str, lengths))} numbers beside {of_kind}, got {len(hand)}",
+            )
     kind: Kind = "C" if of_kind == "transl" else "A" if length == PCA_NUMBERS else "B"
     scale = values.number("scale")
     if not scale > 0:
         raise CaptureError(file, "scale", f"expected a positive number, got {scale:g}")
     offset = values.numbers(of_kind, (1, 3))
-    translation = checked_numbers(offset if kind == "C" else offset / scale, file, of_kind, largest=FARTHEST)
+    translation = checked_numbers(
+        offset if kind == "C" else offset / scale, file, of_kind, largest=FARTHEST
+    )
     parts = [values.numbers(key, (1, size), LARGEST_ANGLE)[0] for key, size in _ANGLES.items()]
     if kind == "A":
         components = np.asarray(body.hands.components, np.float64)
         hands = [hand @ components[side, :length] for side, hand in enumerate(hands)]
     means = np.asarray(body.hands.means, np.float64)
-    rotations = np.concatenate([*parts, *(hand + means[side] for side, hand in enumerate(hands))]).reshape(1, -1, 3)
-    shape = [values.numbers(key, (1, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")]
+    rotations = np.concatenate(
+        [*parts, *(hand + means[side] for side, hand in enumerate(hands))]
+    ).reshape(1, -1, 3)
+    shape = [
+        values.numbers(key, (1, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")
+    ]
     betas = coefficients(body.model, shape[0], shape[1], file)
     return Fit(file, kind, BodyParameters(betas, rotations, translation), scale)
 
@@ -165,7 +185,11 @@ def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
         for number, line in enumerate(read_text(file).splitlines(), 1):
             kind, *words = line.split() or [""]
             if (kind == "v" and len(words) < 3) or (kind == "f" and len(words) != 3):
-                expected = "three coordinates of a vertex" if kind == "v" else "three corners of a triangle"
+                expected = (
+                    "three coordinates of a vertex"
+                    if kind == "v"
+                    else "three corners of a triangle"
+                )
                 raise Refused(f"line {number}: expected {expected}, got {len(words)}")
             if kind == "v":
                 vertices.append(words[:3])
@@ -191,9 +215,15 @@ def read_scan(file: str | Path) -> Scan:
         image = getattr(getattr(mesh.visual, "material", None), "image", None)
         if uvs is None:
             raise Refused("no texture coordinates: expected a textured scan")
-        if image is None or max(image.size) <= 2:  # trimesh leaves out what it cannot read, or puts a placeholder there
-            raise Refused("no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file")
+        if (
+            image is None or max(image.size) <= 2
+        ):  # trimesh leaves out what it cannot read, or puts a placeholder there
+            raise Refused(
+                "no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file"
+            )
         vertices, uvs = np.asarray(mesh.vertices, np.float64), np.asarray(uvs, np.float32)
         check_array("vertices", vertices, (None, 3))
         check_array("texture coordinates", uvs, (len(vertices), 2))
-        return Scan(vertices, np.asarray(mesh.faces, np.int32), uvs, np.asarray(image.convert("RGB")))
+        return Scan(
+            vertices, np.asarray(mesh.faces, np.int32), uvs, np.asarray(image.convert("RGB"))
+        )

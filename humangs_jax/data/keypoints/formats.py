@@ -19,7 +19,13 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.capture_checks import CaptureError, checked_json, expect, file_numbers, members
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    checked_json,
+    expect,
+    file_numbers,
+    members,
+)
 from humangs_jax.data.formats import SourceFormat
 from humangs_jax.data.keypoints.keypoints import (
     KEYPOINT_SETS,
@@ -56,8 +62,12 @@ def read_own(source: Source, format: SourceFormat) -> Detections:
     nobody = np.zeros((len(kind.names), 6))
     columns = lambda each: nobody if each is None else np.column_stack([each.points, each.world])
     found = (tuple(map(columns, image.people)) for image in images)
-    seen = tuple(DetectedImage(i.image, source.path, p, i.size) for i, p in zip(images, found, strict=True))
-    return Detections(kind if any(any(image.people) for image in images) else None, seen, offset=0.0)
+    seen = tuple(
+        DetectedImage(i.image, source.path, p, i.size) for i, p in zip(images, found, strict=True)
+    )
+    return Detections(
+        kind if any(any(image.people) for image in images) else None, seen, offset=0.0
+    )
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
@@ -66,7 +76,9 @@ def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str])
     Raises: ValueError if the path does not end in .npz, or there is not one name per view.
     """
     if len(names) != len(keypoints.points):
-        raise ValueError(f"names: expected one for each of {len(keypoints.points)} views, got {len(names)}")
+        raise ValueError(
+            f"names: expected one for each of {len(keypoints.points)} views, got {len(names)}"
+        )
     arrays = {
         "points": np.asarray(keypoints.points, np.float32),
         "confidences": np.asarray(keypoints.confidences, np.float32),
@@ -88,7 +100,9 @@ def _saved(file: Path) -> Detections:
     confidences = file_numbers(values.array("confidences"), file, "confidences", shape, nulls=True)
     people = np.concatenate([points, confidences[..., None]], axis=-1)
     rows = zip(views.reshape(-1).tolist(), people, strict=True)
-    return Detections(kind, tuple(DetectedImage(str(view), file, (person,)) for view, person in rows), offset=0.0)
+    return Detections(
+        kind, tuple(DetectedImage(str(view), file, (person,)) for view, person in rows), offset=0.0
+    )
 
 
 def _set_of(name: str, file: Path) -> KeypointSet:
@@ -123,8 +137,19 @@ def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
     described = []
     for image in images:
         people = [None if person is None else _described(person) for person in image.people]
-        described.append({"image": image.image, "width": image.size[0], "height": image.size[1], "people": people})
-    write_json(path, {"format": FORMAT, "version": VERSION, "set": MEDIAPIPE_33.name, "images": described}, indent=None)
+        described.append(
+            {
+                "image": image.image,
+                "width": image.size[0],
+                "height": image.size[1],
+                "people": people,
+            }
+        )
+    write_json(
+        path,
+        {"format": FORMAT, "version": VERSION, "set": MEDIAPIPE_33.name, "images": described},
+        indent=None,
+    )
 
 
 def _described(person: SeenPerson) -> dict[str, Any]:
@@ -146,7 +171,9 @@ def read_people(path: Path, content: Any = None) -> tuple[KeypointSet, tuple[Ima
     if version != VERSION:
         raise CaptureError(path, "version", f"expected {VERSION}, got {version!r}")
     kind = _set_of(name, path)
-    return kind, tuple(_image(each, len(kind.names), path, f"images[{i}]") for i, each in enumerate(images))
+    return kind, tuple(
+        _image(each, len(kind.names), path, f"images[{i}]") for i, each in enumerate(images)
+    )
 
 
 def _is_people_file(content: Any) -> bool:
@@ -154,8 +181,12 @@ def _is_people_file(content: Any) -> bool:
 
 
 def _image(image: Any, count: int, path: Path, field: str) -> ImagePeople:
-    name, width, height, people = members(image, path, field, image=str, width=int, height=int, people=list)
-    found = (_own_person(each, count, path, f"{field}.people[{i}]") for i, each in enumerate(people))
+    name, width, height, people = members(
+        image, path, field, image=str, width=int, height=int, people=list
+    )
+    found = (
+        _own_person(each, count, path, f"{field}.people[{i}]") for i, each in enumerate(people)
+    )
     return ImagePeople(name, (width, height), tuple(found))
 
 
@@ -193,12 +224,17 @@ def read_openpose(source: Source, format: SourceFormat) -> Detections:
     """The people of one image, or of the frames of a video, which programs with nodes write as a list. Raises: CaptureError."""
     listed, frames = isinstance(source.json, list), source.json
     frames = frames if listed else [frames]
-    own = not any("canvas_width" in frame for frame in frames) and any("version" in frame for frame in frames)
+    own = not any("canvas_width" in frame for frame in frames) and any(
+        "version" in frame for frame in frames
+    )
     images = []
     for i, frame in enumerate(frames):
         field = f"[{i}]." if listed else ""
         (entries,) = members(frame, source.path, field.rstrip("."), people=list)
-        people = tuple(_openpose_person(each, source.path, f"{field}people[{j}]", own) for j, each in enumerate(entries))
+        people = tuple(
+            _openpose_person(each, source.path, f"{field}people[{j}]", own)
+            for j, each in enumerate(entries)
+        )
         people = people if any(person.any() for person in people) else ()
         name: str | int = source.name.removesuffix(SUFFIX)
         if len(frames) > 1:
@@ -211,7 +247,11 @@ def read_openpose(source: Source, format: SourceFormat) -> Detections:
 def _canvas(frame: dict[str, Any], file: Path) -> tuple[int, int] | None:
     """Width and height of the image that the points are of, where the file says so."""
     width, height = frame.get("canvas_width"), frame.get("canvas_height")
-    return None if width is None or height is None else _stated_size({"width": width, "height": height}, file)
+    return (
+        None
+        if width is None or height is None
+        else _stated_size({"width": width, "height": height}, file)
+    )
 
 
 def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np.ndarray, "k 3"]:
@@ -227,14 +267,22 @@ def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np
         found = f"{len(body)} numbers" if rest else f"{count} points{model}"
         known = ", ".join(map(str, sorted((*BODY_POINTS, *SETS_BY_COUNT))))
         hint = " (OpenPose: --model_pose BODY_25)" if own else ""
-        raise CaptureError(file, f"{field}.{BODY}", f"expected {known} points of x, y, confidence, got {found}{hint}")
+        raise CaptureError(
+            file,
+            f"{field}.{BODY}",
+            f"expected {known} points of x, y, confidence, got {found}{hint}",
+        )
     return _parts(person, {BODY: count or BODY_POINTS[0], **HANDS_OF_OPENPOSE}, file, field)
 
 
-def _parts(person: dict[str, Any], counts: dict[str, int], file: Path, field: str) -> Float[np.ndarray, "k 3"]:
+def _parts(
+    person: dict[str, Any], counts: dict[str, int], file: Path, field: str
+) -> Float[np.ndarray, "k 3"]:
     """The points of the parts of a person; those that were not detected are left out, null, or empty lists."""
     points = [
-        np.zeros((count, 3)) if person.get(key) in (None, []) else triples(person[key], file, f"{field}.{key}", count)
+        np.zeros((count, 3))
+        if person.get(key) in (None, [])
+        else triples(person[key], file, f"{field}.{key}", count)
         for key, count in counts.items()
     ]
     return np.concatenate(points)
@@ -263,21 +311,38 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
         )
         person = points("keypoints", None) if entry["keypoints"] else np.zeros((0, 3))
         if len(person) == 25:  # BODY_25, perhaps with hands
-            hands = [points(key, 21) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS]
+            hands = [
+                points(key, 21) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS
+            ]
             person = np.concatenate([person, *hands])
         number = entry.get("personID", i)
-        people[number if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people else len(people)] = person
+        people[
+            number
+            if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people
+            else len(people)
+        ] = person
     first = next(iter(people.values()), np.zeros((0, 3)))
     found = tuple(people.get(i, np.zeros_like(first)) for i in range(max(people, default=-1) + 1))
     name, size = content.get("filename"), (content.get("width"), content.get("height"))
     known = all(type(side) is int and side > 0 for side in size)
-    image = DetectedImage(name if isinstance(name, str) and name else source.name, file, found, size if known else None)
+    image = DetectedImage(
+        name if isinstance(name, str) and name else source.name,
+        file,
+        found,
+        size if known else None,
+    )
     return detections_of([image], OPENPOSE_67)
 
 
 # COCO ------------------------------------------------------------------------------------------------------------------
 
-COCO_PARTS = {"keypoints": 17, "foot_kpts": 6, "face_kpts": 68, "lefthand_kpts": 21, "righthand_kpts": 21}
+COCO_PARTS = {
+    "keypoints": 17,
+    "foot_kpts": 6,
+    "face_kpts": 68,
+    "lefthand_kpts": 21,
+    "righthand_kpts": 21,
+}
 """COCO-WholeBody's, in the order of its 133 points."""
 HIDDEN_CONFIDENCE = 0.5
 """For points that an annotator guessed behind something else."""
@@ -289,7 +354,9 @@ def recognizes_coco(source: Source) -> bool:
     if isinstance(source.json, dict):
         return "annotations" in source.json
     entries = source.json if isinstance(source.json, list) else []
-    return any(isinstance(entry, dict) and entry.keys() & {"image_id", "file_name"} for entry in entries)
+    return any(
+        isinstance(entry, dict) and entry.keys() & {"image_id", "file_name"} for entry in entries
+    )
 
 
 def read_coco(source: Source, format: SourceFormat) -> Detections:
@@ -322,34 +389,59 @@ def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage
             continue
         image = _image_label(entry.get("image_id"), file, f"{field}.image_id")
         if image not in images:
-            raise CaptureError(file, f"{field}.image_id", f"expected the id of one of the images, got {shown(image)}")
-        images[image][1].append(_by_visibility(_coco_person(entry, file, field, whole), file, field))
+            raise CaptureError(
+                file,
+                f"{field}.image_id",
+                f"expected the id of one of the images, got {shown(image)}",
+            )
+        images[image][1].append(
+            _by_visibility(_coco_person(entry, file, field, whole), file, field)
+        )
     name = lambda image, key: _image_label(image.get("file_name", key), file, f"image {key}")
     found = images.items()
-    return [DetectedImage(name(i, key), file, tuple(people), _stated_size(i, file)) for key, (i, people) in found]
+    return [
+        DetectedImage(name(i, key), file, tuple(people), _stated_size(i, file))
+        for key, (i, people) in found
+    ]
 
 
 def _image_label(value: Any, file: Path, field: str) -> str | int:
     if isinstance(value, bool) or not isinstance(value, str | int):
-        raise CaptureError(file, field, f"expected the name or number of an image, got {shown(value)}")
+        raise CaptureError(
+            file, field, f"expected the name or number of an image, got {shown(value)}"
+        )
     return value
 
 
 def _whole_body(entries: list[Any]) -> bool:
     """Whether some person has a part of COCO-WholeBody; those who lack it have its points with confidence 0."""
-    return any(isinstance(entry, dict) and len(COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries)
+    return any(
+        isinstance(entry, dict) and len(COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
+    )
 
 
-def _coco_person(entry: dict[str, Any], file: Path, field: str, whole: bool) -> Float[np.ndarray, "k 3"]:
+def _coco_person(
+    entry: dict[str, Any], file: Path, field: str, whole: bool
+) -> Float[np.ndarray, "k 3"]:
     (keypoints,) = members(entry, file, field, keypoints=list)
-    return _parts(entry, COCO_PARTS, file, field) if whole else triples(keypoints, file, f"{field}.keypoints")
+    return (
+        _parts(entry, COCO_PARTS, file, field)
+        if whole
+        else triples(keypoints, file, f"{field}.keypoints")
+    )
 
 
-def _by_visibility(person: Float[np.ndarray, "k 3"], file: Path, field: str) -> Float[np.ndarray, "k 3"]:
+def _by_visibility(
+    person: Float[np.ndarray, "k 3"], file: Path, field: str
+) -> Float[np.ndarray, "k 3"]:
     """Confidences from visibilities. Fractions occur in COCO-WholeBody, where any value above 0 means reliable."""
     visibility = person[:, 2]
-    if not np.isnan(visibility).all() and (np.nanmin(visibility) < 0 or np.nanmax(visibility) > LARGEST_VISIBILITY):
-        raise CaptureError(file, field, f"expected visibilities 0, 1 or 2, got {np.nanmax(np.abs(visibility)):g}")
+    if not np.isnan(visibility).all() and (
+        np.nanmin(visibility) < 0 or np.nanmax(visibility) > LARGEST_VISIBILITY
+    ):
+        raise CaptureError(
+            file, field, f"expected visibilities 0, 1 or 2, got {np.nanmax(np.abs(visibility)):g}"
+        )
     confidence = np.where(visibility == 1, HIDDEN_CONFIDENCE, np.where(visibility > 0, 1.0, 0.0))
     return np.column_stack([person[:, :2], np.where(np.isnan(visibility), np.nan, confidence)])
 
@@ -360,7 +452,9 @@ def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
     if not width or not height:
         return None
     if not all(isinstance(side, int | float) and 1 <= side <= limits().side for side in size):
-        raise CaptureError(file, "images", f"expected width and height in pixels, got {width!r} and {height!r}")
+        raise CaptureError(
+            file, "images", f"expected width and height in pixels, got {width!r} and {height!r}"
+        )
     return int(width), int(height)
 
 
@@ -375,7 +469,9 @@ def recognizes_mmpose(source: Source) -> bool:
     entries = _entries(source)
     if not isinstance(entries, list):
         return False
-    return not entries or any(isinstance(each, dict) and each.keys() & {"keypoint_scores", "frame_id"} for each in entries)
+    return not entries or any(
+        isinstance(each, dict) and each.keys() & {"keypoint_scores", "frame_id"} for each in entries
+    )
 
 
 def read_mmpose(source: Source, format: SourceFormat) -> Detections:
@@ -396,7 +492,9 @@ def _entries(source: Source) -> Any:
 
 
 def _people(instances: list[Any], file: Path, field: str) -> tuple[Float[np.ndarray, "k 3"], ...]:
-    return tuple(_mmpose_person(instance, file, f"{field}[{i}]") for i, instance in enumerate(instances))
+    return tuple(
+        _mmpose_person(instance, file, f"{field}[{i}]") for i, instance in enumerate(instances)
+    )
 
 
 def _mmpose_person(instance: Any, file: Path, field: str) -> Float[np.ndarray, "k 3"]:

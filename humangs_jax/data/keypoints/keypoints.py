@@ -67,37 +67,69 @@ class KeypointSet:
         known = {place.name: place.offset for place in self.places}
         return np.asarray([known.get(name, (0.0, 0.0, 0.0)) for name in self.names])
 
-    def adapted(self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]) -> "KeypointSet":
+    def adapted(
+        self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]
+    ) -> "KeypointSet":
         """The set as a detector is found to use it: with these offsets of the places, metres, and this certainty."""
         own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
         places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
-        return dataclasses.replace(self, places=places, certainty=tuple(np.asarray(certainty, float).tolist()))
+        return dataclasses.replace(
+            self, places=places, certainty=tuple(np.asarray(certainty, float).tolist())
+        )
 
 
 def hand_names(side: str) -> tuple[str, ...]:
     """The 21 points of one hand, in the order of OpenPose and COCO-WholeBody."""
-    return (f"{side}_hand_root", *(f"{side}_{finger}_{joint}" for finger in FINGERS for joint in FINGER_JOINTS))
+    return (
+        f"{side}_hand_root",
+        *(f"{side}_{finger}_{joint}" for finger in FINGERS for joint in FINGER_JOINTS),
+    )
 
 
 def _keypoint_set(name: str, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> KeypointSet:
-    return KeypointSet(name, names, tuple(names.index(mirrored_name(each)) for each in names), places or plain_places(names))
+    return KeypointSet(
+        name,
+        names,
+        tuple(names.index(mirrored_name(each)) for each in names),
+        places or plain_places(names),
+    )
 
 
 COCO_17 = _keypoint_set("coco17", _COCO)
 """COCO's 17 body points."""
 
 COCO_WHOLEBODY_133 = _keypoint_set(
-    "wholebody133", (*_COCO, *_FEET, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right"))
+    "wholebody133",
+    (
+        *_COCO,
+        *_FEET,
+        *(f"face_{i}" for i in range(FACE_POINTS)),
+        *hand_names("left"),
+        *hand_names("right"),
+    ),
 )
 """COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21 of the right hand."""
 
 HALPE_26 = _keypoint_set(
-    "halpe26", (*_COCO, "head_top", "neck", "mid_hip", *(f"{side}_{part}" for part in _FOOT for side in SIDES))
+    "halpe26",
+    (
+        *_COCO,
+        "head_top",
+        "neck",
+        "mid_hip",
+        *(f"{side}_{part}" for part in _FOOT for side in SIDES),
+    ),
 )
 """Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet."""
 
 HALPE_136 = _keypoint_set(
-    "halpe136", (*HALPE_26.names, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right"))
+    "halpe136",
+    (
+        *HALPE_26.names,
+        *(f"face_{i}" for i in range(FACE_POINTS)),
+        *hand_names("left"),
+        *hand_names("right"),
+    ),
 )
 """Halpe's 136, of AlphaPose: the 26, 68 of the face, 21 of the left and 21 of the right hand."""
 
@@ -111,7 +143,8 @@ OPENPOSE_60 = _keypoint_set(
 """The 18 points of OpenPose's COCO model with both hands."""
 
 OPENPOSE_67B = _keypoint_set(
-    "openpose_b67", (*_COCO, "upper_neck", "head_top", *_FEET, *hand_names("left"), *hand_names("right"))
+    "openpose_b67",
+    (*_COCO, "upper_neck", "head_top", *_FEET, *hand_names("left"), *hand_names("right")),
 )
 """OpenPose's BODY_25B with its left and right hand. Files do not say which of both they have, see `orders`."""
 
@@ -126,7 +159,9 @@ _BLAZEPOSE_PLACES = (
     *both_sides(_MIRRORED("ear"), "{side}_ear", ("head",), (-33, 1, 34)),
     *both_sides(("face_54", "face_48"), "jaw", ("head",), (15, 37, -2)),
     *both_sides(_MIRRORED("shoulder"), "{side}_shoulder", ("{side}_collar",), (-9, 36, -4)),
-    *both_sides(_MIRRORED("elbow"), "{side}_elbow", ("{side}_shoulder", "{side}_elbow"), (-1, 4, 6)),
+    *both_sides(
+        _MIRRORED("elbow"), "{side}_elbow", ("{side}_shoulder", "{side}_elbow"), (-1, 4, 6)
+    ),
     *both_sides(_MIRRORED("wrist"), "{side}_wrist", ("{side}_elbow", "{side}_wrist"), (2, 9, 1)),
     *both_sides(_MIRRORED("pinky_1"), "{side}_pinky_1", ("{side}_wrist",), (-9, -7, 24)),
     *both_sides(_MIRRORED("index_1"), "{side}_index_1", ("{side}_wrist",), (-21, -13, -16)),
@@ -141,20 +176,45 @@ _BLAZEPOSE_PLACES = (
 MEDIAPIPE_33 = _keypoint_set(
     "mediapipe33",
     (
-        *("nose", "face_42", "left_eye", "face_45", "face_39", "right_eye", "face_36", "left_ear", "right_ear"),
+        *(
+            "nose",
+            "face_42",
+            "left_eye",
+            "face_45",
+            "face_39",
+            "right_eye",
+            "face_36",
+            "left_ear",
+            "right_ear",
+        ),
         *("face_54", "face_48"),
         *(f"{side}_{part}" for part in ("shoulder", "elbow", "wrist") for side in SIDES),
         *(f"{side}_{part}" for part in ("pinky_1", "index_1", "thumb_2") for side in SIDES),
-        *(f"{side}_{part}" for part in ("hip", "knee", "ankle", "heel", "foot_index") for side in SIDES),
+        *(
+            f"{side}_{part}"
+            for part in ("hip", "knee", "ankle", "heel", "foot_index")
+            for side in SIDES
+        ),
     ),
     _BLAZEPOSE_PLACES,
 )
 """MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
 
-_DETECTORS = (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136, OPENPOSE_60, OPENPOSE_67, OPENPOSE_67B, MEDIAPIPE_33)
+_DETECTORS = (
+    COCO_17,
+    HALPE_26,
+    COCO_WHOLEBODY_133,
+    HALPE_136,
+    OPENPOSE_60,
+    OPENPOSE_67,
+    OPENPOSE_67B,
+    MEDIAPIPE_33,
+)
 KEYPOINT_SETS = {each.name: each for each in _DETECTORS}
 """The sets by name, as our npz files name them."""
-SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)}
+SETS_BY_COUNT = {
+    len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)
+}
 """The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""
 
 
@@ -251,7 +311,9 @@ def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detect
     return Detections(known[count], tuple(images))
 
 
-def triples(value: Any, file: Path, field: str, count: int | None = None) -> Float[np.ndarray, "k 3"]:
+def triples(
+    value: Any, file: Path, field: str, count: int | None = None
+) -> Float[np.ndarray, "k 3"]:
     """x, y and confidence of each point, from a flat list of them; null is NaN.
 
     Raises: CaptureError if these are no numbers, or not 3 * count (any multiple of 3 if count is None).
@@ -259,5 +321,7 @@ def triples(value: Any, file: Path, field: str, count: int | None = None) -> Flo
     array = file_numbers(value, file, field, nulls=True)
     wanted = "a multiple of 3" if count is None else f"{3 * count} ({count} times x, y, confidence)"
     if array.ndim != 1 or array.size % 3 or (count is not None and array.size != 3 * count):
-        raise CaptureError(file, field, f"expected a flat list of {wanted} numbers, got shape {array.shape}")
+        raise CaptureError(
+            file, field, f"expected a flat list of {wanted} numbers, got shape {array.shape}"
+        )
     return array.reshape(-1, 3)

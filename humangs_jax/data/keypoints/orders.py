@@ -43,11 +43,20 @@ ORDERS = {
     ),
 }
 """By the number of points, the usual one first."""
-_CHAIN = ("ear", "shoulder", "elbow", "wrist"), ("shoulder", "hip", "knee", "ankle", "heel"), ("ankle", "big_toe", "small_toe")
+_CHAIN = (
+    ("ear", "shoulder", "elbow", "wrist"),
+    ("shoulder", "hip", "knee", "ankle", "heel"),
+    ("ankle", "big_toe", "small_toe"),
+)
 BONES = (
     *(("nose", f"{side}_eye") for side in SIDES),
     *((f"{side}_eye", f"{side}_ear") for side in SIDES),
-    *((f"{side}_{a}", f"{side}_{b}") for side in SIDES for chain in _CHAIN for a, b in itertools.pairwise(chain)),
+    *(
+        (f"{side}_{a}", f"{side}_{b}")
+        for side in SIDES
+        for chain in _CHAIN
+        for a, b in itertools.pairwise(chain)
+    ),
     *((f"left_{part}", f"right_{part}") for part in ("shoulder", "hip")),
 )
 """Pairs of points that are near each other on a person."""
@@ -77,10 +86,14 @@ def in_order(detections: Detections, count: int) -> Detections:
     order = orders[best] if known else orders[0]
     said = () if known and best == 0 and count == 25 else (_said(order, known, count),)
     images = tuple(
-        dataclasses.replace(image, people=tuple(_sorted(person, order, count) for person in image.people))
+        dataclasses.replace(
+            image, people=tuple(_sorted(person, order, count) for person in image.people)
+        )
         for image in detections.images
     )
-    return dataclasses.replace(detections, set=order.set, images=images, warnings=(*detections.warnings, *said))
+    return dataclasses.replace(
+        detections, set=order.set, images=images, warnings=(*detections.warnings, *said)
+    )
 
 
 def _said(order: Order, known: bool, count: int) -> str:
@@ -90,7 +103,9 @@ def _said(order: Order, known: bool, count: int) -> str:
     return f"the order of the {count} points is not clear from where they lie: taken for {order.name}, not {others}"
 
 
-def _mean_bone(people: Sequence[Float[np.ndarray, "k columns"]], names: tuple[str, ...], count: int) -> float:
+def _mean_bone(
+    people: Sequence[Float[np.ndarray, "k columns"]], names: tuple[str, ...], count: int
+) -> float:
     """Mean length of the bones in an order, in sizes of their person; infinite for too few."""
     index = {name: i for i, name in enumerate(names)}
     pairs = np.asarray([[index[a], index[b]] for a, b in BONES if a in index and b in index])
@@ -106,7 +121,9 @@ def _mean_bone(people: Sequence[Float[np.ndarray, "k columns"]], names: tuple[st
     return float(np.mean(lengths)) if len(lengths) >= FEWEST_BONES else np.inf
 
 
-def _sorted(person: Float[np.ndarray, "k columns"], order: Order, count: int) -> Float[np.ndarray, "k columns"]:
+def _sorted(
+    person: Float[np.ndarray, "k columns"], order: Order, count: int
+) -> Float[np.ndarray, "k columns"]:
     """A person in the order of its set."""
     body = [order.points.index(name) for name in order.set.names[:count]]
     return np.concatenate([person[body], person[count:]])

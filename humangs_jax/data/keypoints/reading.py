@@ -42,7 +42,18 @@ LARGEST_PIXEL = 1e6
 """Coordinates beyond it mean nothing, and are not to become inf in float32."""
 UNSORTED = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
 """Sets whose files may be of another one with as many points, and their points of the body."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif")
+IMAGE_SUFFIXES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".webp",
+    ".avif",
+    ".heic",
+    ".heif",
+)
 
 
 def read_detections(path: Path) -> Detections:
@@ -52,9 +63,13 @@ def read_detections(path: Path) -> Detections:
     """
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
-    files = sorted(file for file in walk(path) if file.suffix == ".json") if path.is_dir() else [path]
+    files = (
+        sorted(file for file in walk(path) if file.suffix == ".json") if path.is_dir() else [path]
+    )
     if not files:
-        raise CaptureError(path, "", f"no JSON file in this folder: expected those of {KEYPOINTS.listed()}")
+        raise CaptureError(
+            path, "", f"no JSON file in this folder: expected those of {KEYPOINTS.listed()}"
+        )
     images: list[DetectedImage] = []
     known: tuple[str, Path, Detections] | None = None
     amount = 0
@@ -71,7 +86,9 @@ def read_detections(path: Path) -> Detections:
             what = f"{len(found.set.names)} points of {format.about}"
             known = known or (what, file, found)
             if what != known[0]:
-                problem = f"{what}, but {known[1].name} has {known[0]}: expected one set of one tool"
+                problem = (
+                    f"{what}, but {known[1].name} has {known[0]}: expected one set of one tool"
+                )
                 raise CaptureError(file, "", problem)
     if known is None:
         return Detections(None, tuple(images))
@@ -84,14 +101,21 @@ def _amount(content: Any) -> int:
     """How many people and images a JSON file has, before any is looked at."""
     lists = [content]
     if isinstance(content, dict):
-        lists = [content.get(key) for key in ("people", "images", "annotations", "instance_info", "annots")]
+        lists = [
+            content.get(key)
+            for key in ("people", "images", "annotations", "instance_info", "annots")
+        ]
     entries = [entry for each in lists if isinstance(each, list) for entry in each]
     keys = ("instances", "people")
-    inside = [entry[key] for entry in entries if isinstance(entry, dict) for key in keys if key in entry]
+    inside = [
+        entry[key] for entry in entries if isinstance(entry, dict) for key in keys if key in entry
+    ]
     return 1 + len(entries) + sum(len(each) for each in inside if isinstance(each, list))
 
 
-def read_keypoints(path: str | Path, names: Sequence[str], width: int, height: int, *, person: int | None = None) -> Keypoints:
+def read_keypoints(
+    path: str | Path, names: Sequence[str], width: int, height: int, *, person: int | None = None
+) -> Keypoints:
     """Keypoints of one person in the views of a capture.
 
     Arguments:
@@ -109,12 +133,16 @@ def read_keypoints(path: str | Path, names: Sequence[str], width: int, height: i
     """
     path = Path(path)
     if person is not None and person < 0:
-        raise ArgumentError("person", f"{person}: expected 0 for the first person, 1 for the second, ...")
+        raise ArgumentError(
+            "person", f"{person}: expected 0 for the first person, 1 for the second, ..."
+        )
     with reading(path, "keypoint file", CaptureError):
         return _read(path, names, width, height, person)
 
 
-def _read(path: Path, names: Sequence[str], width: int, height: int, person: int | None) -> Keypoints:
+def _read(
+    path: Path, names: Sequence[str], width: int, height: int, person: int | None
+) -> Keypoints:
     detections = read_detections(path)
     if (kind := detections.set) is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
@@ -141,11 +169,18 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
             raw[view], values[view] = people[which], usable[which]
         most = max(most, len(people))
     if person is not None and person >= most:
-        raise CaptureError(path, f"person {person}", f"no view has this many people: expected 0 to {max(most - 1, 0)}")
+        raise CaptureError(
+            path,
+            f"person {person}",
+            f"no view has this many people: expected 0 to {max(most - 1, 0)}",
+        )
     points, confidences = values[..., :2].astype(np.float32), values[..., 2].astype(np.float32)
     missing = tuple(name for name, row in zip(names, confidences, strict=True) if not row.any())
     finite = np.isfinite(raw).all(axis=-1)
-    dropped, far = int((~finite).sum()), int((finite & (raw[..., 2] > 0) & (confidences == 0)).sum())
+    dropped, far = (
+        int((~finite).sum()),
+        int((finite & (raw[..., 2] > 0) & (confidences == 0)).sum()),
+    )
     if not confidences.any():
         problem = f"no point has a confidence above 0 (not finite: {dropped}, far outside of the photos: {far})"
         raise CaptureError(path, "", f"{problem}: expected keypoints of these photos")
@@ -156,10 +191,19 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
     shifted = _shifted(images, names)
     lines = (
         (missing, f"no keypoints of {len(missing)} views: {few(missing)}"),
-        (shifted, f"frames and photos are counted from different numbers and were matched in order: {shifted}"),
-        (largest > 1, f"scores of up to {largest:.4g}, of another scale than [0, 1]: divided by that"),
+        (
+            shifted,
+            f"frames and photos are counted from different numbers and were matched in order: {shifted}",
+        ),
+        (
+            largest > 1,
+            f"scores of up to {largest:.4g}, of another scale than [0, 1]: divided by that",
+        ),
         (dropped, f"{dropped} keypoints are not finite numbers and are ignored"),
-        (far, f"{far} keypoints lie far outside of their photo and are ignored: of photos of another size?"),
+        (
+            far,
+            f"{far} keypoints lie far outside of their photo and are ignored: of photos of another size?",
+        ),
     )
     world = values[..., 3:].astype(np.float32) if columns > 3 else None
     said = (*detections.warnings, *(line for found, line in lines if found))
@@ -170,7 +214,10 @@ def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> st
     """An image and its view whose numbers differ, because one is counted from 0 and the other from 1; "" if there is none."""
     for image, name in zip(images, names, strict=True):
         if image is not None:
-            numbers = [re.findall(r"\d+", str(_stem(each) if isinstance(each, str) else each)) for each in (image.image, name)]
+            numbers = [
+                re.findall(r"\d+", str(_stem(each) if isinstance(each, str) else each))
+                for each in (image.image, name)
+            ]
             if all(numbers) and int(numbers[0][-1]) != int(numbers[1][-1]):
                 return f"{image.image} is view {name}"
     return ""
@@ -188,7 +235,10 @@ def _images_of_views(
     seen = [image for image, view in zip(detections.images, views, strict=True) if view is not None]
     sizes = [image.size for image in seen if image.size is not None]
     # an import pads photos of several sizes, each at its right and below, to the largest: pixels keep their places
-    before_padding = bool(sizes) and tuple(max(side) for side in zip(*sizes, strict=True)) == (width, height)
+    before_padding = bool(sizes) and tuple(max(side) for side in zip(*sizes, strict=True)) == (
+        width,
+        height,
+    )
     for image, view in zip(detections.images, views, strict=True):
         if view is None:
             continue
@@ -199,7 +249,9 @@ def _images_of_views(
         images[view] = image
     if not any(images):
         named = few([str(image.image) for image in detections.images])
-        raise CaptureError(path, "", f"images {named} are none of the views {few(names)}: expected the same names")
+        raise CaptureError(
+            path, "", f"images {named} are none of the views {few(names)}: expected the same names"
+        )
     return images
 
 
@@ -208,11 +260,18 @@ def _images_of_views(
 
 def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
     present = confidences[confidences > 0]
-    return len(present) > CLEAR_SHARE * len(confidences) and float(present.mean()) > CLEAR_CONFIDENCE
+    return (
+        len(present) > CLEAR_SHARE * len(confidences) and float(present.mean()) > CLEAR_CONFIDENCE
+    )
 
 
 def _usable(
-    people: Float[np.ndarray, "p k columns"], largest: float, offset: float, size: tuple[int, int], file: Path, view: str
+    people: Float[np.ndarray, "p k columns"],
+    largest: float,
+    offset: float,
+    size: tuple[int, int],
+    file: Path,
+    view: str,
 ) -> Float[np.ndarray, "p k columns"]:
     """Pixels with centres at +0.5, finite, and confidences in [0, 1], 0 for points that cannot be used."""
     finite = np.logical_and.reduce(np.isfinite(people), axis=-1)
@@ -246,13 +305,17 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     find = _finder(names)
     numbers = sorted({image for image in images if isinstance(image, int)})
     of_names = sorted(int(found[-1]) for name in names if (found := re.findall(r"\d+", name)))
-    one_for_each = len(numbers) == len(of_names) == len(names) and _no_gaps(numbers) and _no_gaps(of_names)
+    one_for_each = (
+        len(numbers) == len(of_names) == len(names) and _no_gaps(numbers) and _no_gaps(of_names)
+    )
     shift = of_names[0] - numbers[0] if one_for_each else 0
     found = {image: find(image + shift if isinstance(image, int) else image) for image in images}
     for image, views in found.items():
         if len(views) > 1:
             both = " and ".join(repr(names[view]) for view in views[:2])
-            raise ValueError(f"image number {image} could be view {both}: expected file names instead of numbers")
+            raise ValueError(
+                f"image number {image} could be view {both}: expected file names instead of numbers"
+            )
     videos: dict[str, list[tuple[int, str | int]]] = {}
     for image in found:
         prefix, number = _split_number(str(_stem(image))) if isinstance(image, str) else ("", None)
@@ -261,7 +324,12 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     of_view = [_split_number(name)[0] for name in names]
     for prefix, frames in videos.items():
         counts = sorted(number for number, _ in frames)
-        if counts[0] > 1 or len(counts) < 2 or not _no_gaps(counts) or all(found[image] for _, image in frames):
+        if (
+            counts[0] > 1
+            or len(counts) < 2
+            or not _no_gaps(counts)
+            or all(found[image] for _, image in frames)
+        ):
             continue
         moved = {image: find(f"{prefix}{number + 1 - 2 * counts[0]}") for number, image in frames}
         prefixes = {of_view[view] for views in moved.values() for view in views}
@@ -272,7 +340,9 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     matched = [found[image][0] if found[image] else None for image in images]
     for image, view in zip(images, matched, strict=True):
         if view in owner:
-            raise ValueError(f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one entry a view")
+            raise ValueError(
+                f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one entry a view"
+            )
         if view is not None:
             owner[view] = image
     return matched
@@ -285,7 +355,9 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
     for i, name in enumerate(names):
         plain[_plain(name)].append(i)
         parts = _plain(name).split("_")
-        for first in range(1, len(parts) - 1):  # ends of one part, such as a number, could be of any camera
+        for first in range(
+            1, len(parts) - 1
+        ):  # ends of one part, such as a number, could be of any camera
             ends["_".join(parts[first:])].append(i)
         if found := re.findall(r"\d+", name):
             numbers[int(found[-1])].append(i)
@@ -295,7 +367,9 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
             return numbers.get(image, [])
         parts = _stem(image).parts
         # the names of views are made from paths in this way; with as many of the folders as fit, then numbers as numbers
-        keys = [re.sub(r"[^\w.-]", "_", "_".join(parts[i:])).lstrip("._") for i in range(len(parts))]
+        keys = [
+            re.sub(r"[^\w.-]", "_", "_".join(parts[i:])).lstrip("._") for i in range(len(parts))
+        ]
         for key in keys:
             for table, label in ((exact, key), (plain, _plain(key)), (ends, _plain(key))):
                 if len(views := table.get(label, [])) == 1:

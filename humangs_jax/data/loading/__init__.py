@@ -21,7 +21,16 @@ from humangs_jax.core.array_types import Array
 from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, PeopleCache
 from humangs_jax.data.loading.examples import Example, Mixture, Source, ViewSampling, input_count_at
 
-__all__ = ["CaptureCache", "CaptureSource", "Example", "Loader", "Mixture", "PeopleCache", "Source", "ViewSampling"]
+__all__ = [
+    "CaptureCache",
+    "CaptureSource",
+    "Example",
+    "Loader",
+    "Mixture",
+    "PeopleCache",
+    "Source",
+    "ViewSampling",
+]
 
 AHEAD = 2
 """Batches prepared while one is worked on."""
@@ -68,7 +77,16 @@ class Loader:
         if self.sharding is None:
             return tuple(range(self.batch_size))
         parts = self.sharding.addressable_devices_indices_map((self.batch_size,)).values()
-        return tuple(sorted({row for part in parts if part is not None for row in range(self.batch_size)[part[0]]}))
+        return tuple(
+            sorted(
+                {
+                    row
+                    for part in parts
+                    if part is not None
+                    for row in range(self.batch_size)[part[0]]
+                }
+            )
+        )
 
     def input_count(self, step: int) -> int:
         """Number of input views of a step."""
@@ -92,18 +110,28 @@ class Loader:
         """
         return self._place([self.example_at(step, row) for row in self.rows])
 
-    def batches(self, start: int, stop: int, waiting: Waiting | None = None) -> Generator[tuple[int, Example], None, None]:
+    def batches(
+        self, start: int, stop: int, waiting: Waiting | None = None
+    ) -> Generator[tuple[int, Example], None, None]:
         """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices by threads meanwhile.
 
         Errors of the threads are raised here, in their turn. Closing the generator (or leaving the loop over it) ends them.
         waiting: the time that the loop waited for batches is added to it.
         """
         rows, begun = self.rows, collections.deque[list[Future]]()
-        with ThreadPoolExecutor(self.threads, "humangs-loader") as readers, ThreadPoolExecutor(1, "humangs-loader") as placer:
+        with (
+            ThreadPoolExecutor(self.threads, "humangs-loader") as readers,
+            ThreadPoolExecutor(1, "humangs-loader") as placer,
+        ):
 
             def begin(step: int) -> None:
                 examples = [readers.submit(self.example_at, step, row) for row in rows]
-                begun.append([placer.submit(lambda: self._place([each.result() for each in examples])), *examples])
+                begun.append(
+                    [
+                        placer.submit(lambda: self._place([each.result() for each in examples])),
+                        *examples,
+                    ]
+                )
 
             try:
                 for step in range(start, min(start + AHEAD, stop)):

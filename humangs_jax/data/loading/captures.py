@@ -24,7 +24,12 @@ from humangs_jax.data.loading.examples import (
     subject_views,
     view_generator,
 )
-from humangs_jax.data.photos import check_photos, read_checked, read_description, read_frames_and_matrices
+from humangs_jax.data.photos import (
+    check_photos,
+    read_checked,
+    read_description,
+    read_frames_and_matrices,
+)
 from humangs_jax.io.images import check_image, to_uint8
 
 logger = logging.getLogger("humangs_jax.data.loading")
@@ -36,14 +41,20 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     Raises: ValueError if there is none.
     """
     root = Path(root)
-    folders = [root] if (root / "capture.json").is_file() else sorted(p.parent for p in root.glob("*/capture.json"))
+    folders = (
+        [root]
+        if (root / "capture.json").is_file()
+        else sorted(p.parent for p in root.glob("*/capture.json"))
+    )
     folders = [folder for folder in folders if not folder.name.startswith(".")]  # half-written ones
     if not folders:
         raise ValueError(f"{root}: no capture folder here (a folder with a capture.json)")
     return tuple(folders)
 
 
-def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> StoredSubject:
+def read_summary(
+    path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
+) -> StoredSubject:
     """All of a capture but its pixels: parameters that belong to `body`, images and masks of no views but of the right size.
 
     Images are opened and their sizes compared; PNG files are checked by their checksums, others by decoding them.
@@ -60,7 +71,9 @@ def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
     if not _same_body(name, folder, body_file):
         problem = f"{name!r}, but all captures of a run have one body, {str(body_file)!r}: expected parameters of that"
         raise CaptureError(parameter_file, "body", problem)
-    betas, rotations, translations, _ = body_parameters(body, **parameters, file=parameter_file)  # bodies of training are bare
+    betas, rotations, translations, _ = body_parameters(
+        body, **parameters, file=parameter_file
+    )  # bodies of training are bare
     views, size = description["views"], None
     check_photos(folder, views, together=False)
     for view in views:
@@ -68,11 +81,15 @@ def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
         shape, has_alpha = read_checked(check_image, image)
         size = size or shape
         if shape != size:
-            raise CaptureError(image, "size", f"{shape}, but the first view has {size}: expected one size")
+            raise CaptureError(
+                image, "size", f"{shape}, but the first view has {size}: expected one size"
+            )
         if "mask" not in view and not has_alpha:
             raise CaptureError(folder, "", "no masks: training needs to know where the person is")
         if "mask" in view and (masked := read_checked(check_image, mask)[0]) != size:
-            raise CaptureError(mask, "size", f"{masked}, but its image has {size}: expected the same")
+            raise CaptureError(
+                mask, "size", f"{masked}, but its image has {size}: expected the same"
+            )
     assert size is not None  # a description has views
     width, height = size
     frames, K, cam_from_world = read_frames_and_matrices(views, len(rotations), file)
@@ -80,7 +97,9 @@ def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
         checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]")
     # coefficients that a capture leaves out are 0: one length for all, so that subjects stack
     betas = np.pad(betas, (0, body.shape_directions.shape[-1] - len(betas)))
-    return StoredSubject.without_photos((height, width), K, cam_from_world, frames, rotations, translations, betas)
+    return StoredSubject.without_photos(
+        (height, width), K, cam_from_world, frames, rotations, translations, betas
+    )
 
 
 def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
@@ -103,7 +122,9 @@ class StoredPerson(Protocol):
         """All of it but pixels, perhaps without poses. Raises: ValueError or OSError if it cannot be used."""
         ...
 
-    def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
+    def decode(
+        self, views: Sequence[int]
+    ) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
         """Images and masks of these views. Raises: as `summary`."""
         ...
 
@@ -124,11 +145,15 @@ class CaptureFolder:
         """See `read_summary`."""
         return read_summary(self.name, self.body, self.body_file)
 
-    def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
+    def decode(
+        self, views: Sequence[int]
+    ) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
         """See `StoredPerson`."""
         capture = load_capture(self.name, body=self.body, views=views)
         if capture.masks is None:
-            raise CaptureError(self.name, "", "alpha channels without a transparent pixel: expected masks")
+            raise CaptureError(
+                self.name, "", "alpha channels without a transparent pixel: expected masks"
+            )
         return to_uint8(capture.images), to_uint8(capture.masks)
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
@@ -178,15 +203,22 @@ class PeopleCache:
         person, name = self.people[index], self.name(index)
         with self._lock:
             summary = self._summaries.get(name)
-            decoded = {view: self._images[name, view] for view in views if (name, view) in self._images}
+            decoded = {
+                view: self._images[name, view] for view in views if (name, view) in self._images
+            }
         summary = person.summary() if summary is None else summary
         if missing := [view for view in views if view not in decoded]:
             for view, image, mask in zip(missing, *person.decode(missing), strict=True):
                 decoded[view] = image, mask
                 self._keep(name, view, image, mask)
         chosen = np.asarray(views)
-        images, masks = (np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True))
-        of_views = {name: getattr(summary, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
+        images, masks = (
+            np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True)
+        )
+        of_views = {
+            name: getattr(summary, name)[chosen]
+            for name in ("K", "cam_from_world", "frames", "azimuths")
+        }
         return person.posed(summary._replace(images=images, masks=masks, **of_views))
 
     def note(self, index: int, problem: str) -> None:
@@ -197,7 +229,9 @@ class PeopleCache:
             self.broken.setdefault(name, problem)
             count = len(self.broken)
         if not known:
-            logger.warning("left out %s (%d of %d folders so far): %s", name, count, len(self), problem)
+            logger.warning(
+                "left out %s (%d of %d folders so far): %s", name, count, len(self), problem
+            )
 
     def report(self, index: int, problem: str) -> None:
         """Leave person `index` out from now on. The reason must depend on the files alone, so that the order stays reproducible.
@@ -207,11 +241,22 @@ class PeopleCache:
         self.note(index, problem)
         with self._lock:
             self._summaries[self.name(index)] = None
-            nobody = all(person.name in self._summaries and self._summaries[person.name] is None for person in self.people)
+            nobody = all(
+                person.name in self._summaries and self._summaries[person.name] is None
+                for person in self.people
+            )
         if nobody:
-            raise ValueError(f"none of the {len(self)} capture folders can be used; the last one: {problem}")
+            raise ValueError(
+                f"none of the {len(self)} capture folders can be used; the last one: {problem}"
+            )
 
-    def _keep(self, name: Path | str, view: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> None:
+    def _keep(
+        self,
+        name: Path | str,
+        view: int,
+        image: UInt8[np.ndarray, "h w 3"],
+        mask: UInt8[np.ndarray, "h w"],
+    ) -> None:
         size = image.nbytes + mask.nbytes
         with self._lock:
             if (name, view) not in self._images and size <= self._free_bytes:
@@ -227,9 +272,15 @@ class CaptureCache(PeopleCache):
     """
 
     def __init__(
-        self, folders: Sequence[str | Path], body: BodyModel, limit_bytes: int = 4 << 30, body_file: str | Path = DEFAULT_BODY
+        self,
+        folders: Sequence[str | Path],
+        body: BodyModel,
+        limit_bytes: int = 4 << 30,
+        body_file: str | Path = DEFAULT_BODY,
     ):
-        super().__init__([CaptureFolder(Path(folder), body, body_file) for folder in folders], limit_bytes)
+        super().__init__(
+            [CaptureFolder(Path(folder), body, body_file) for folder in folders], limit_bytes
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,9 +326,13 @@ class CaptureSource:
             if summary is None:
                 continue
             try:
-                inputs, targets = draw_views(view_generator(seed, index), summary, input_count, self.sampling)
+                inputs, targets = draw_views(
+                    view_generator(seed, index), summary, input_count, self.sampling
+                )
                 for size in (self.input_size, self.target_size):
-                    shrink(summary.images, size)  # without views: whether images of this size can be shrunk so
+                    shrink(
+                        summary.images, size
+                    )  # without views: whether images of this size can be shrunk so
             except ValueError as error:
                 self.cache.report(subject_index, f"{self.cache.name(subject_index)}: {error}")
                 continue
@@ -287,14 +342,17 @@ class CaptureSource:
                 shown = [(mask > MASK_THRESHOLD * 255).any() for mask in seen.masks[: len(inputs)]]
                 if not all(shown):
                     empty = inputs[shown.index(False)]
-                    raise CaptureError(f"views[{empty}]", "mask", "empty: no photo to reconstruct the person from")
+                    raise CaptureError(
+                        f"views[{empty}]", "mask", "empty: no photo to reconstruct the person from"
+                    )
             except (ValueError, OSError) as error:
                 # this example goes to the next subject; others, of other views, do not: the order depends on files alone
                 self.cache.note(subject_index, str(error))
                 continue
             first, last = range(len(inputs)), range(len(inputs), len(seen.images))
             example = Example(
-                subject_views(seen, first, self.input_size, self.depths), subject_views(seen, last, self.target_size, self.depths)
+                subject_views(seen, first, self.input_size, self.depths),
+                subject_views(seen, last, self.target_size, self.depths),
             )
             return self.cache.name(subject_index), example
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")

@@ -59,7 +59,12 @@ class StoredSubject(NamedTuple):
 
     @classmethod
     def without_photos(
-        cls, size: tuple[int, int], K: np.ndarray, cam_from_world: np.ndarray, frames: np.ndarray, *body: np.ndarray
+        cls,
+        size: tuple[int, int],
+        K: np.ndarray,
+        cam_from_world: np.ndarray,
+        frames: np.ndarray,
+        *body: np.ndarray,
     ) -> "StoredSubject":
         """A subject of no photos yet, of that height and width. body: rotations, translations, betas."""
         centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
@@ -67,7 +72,9 @@ class StoredSubject(NamedTuple):
         images, masks = np.zeros((0, *size, 3), np.uint8), np.zeros((0, *size), np.uint8)
         azimuths = np.arctan2(offsets[:, 0], offsets[:, 2])
         arrays = (np.asarray(x, np.float32) for x in (K, cam_from_world))
-        return cls(images, masks, *arrays, frames, azimuths, *(np.asarray(x, np.float32) for x in body))
+        return cls(
+            images, masks, *arrays, frames, azimuths, *(np.asarray(x, np.float32) for x in body)
+        )
 
 
 @pytree_dataclass
@@ -147,7 +154,9 @@ def draw_views(
         allowed = free & (subject.frames == frame)
         inputs.append(nearest_view(subject, azimuth, allowed if allowed.any() else free))
         free[inputs[-1]] = False
-    return inputs, generator.choice(np.flatnonzero(free), sampling.target_count, replace=False).tolist()
+    return inputs, generator.choice(
+        np.flatnonzero(free), sampling.target_count, replace=False
+    ).tolist()
 
 
 def _draw_from_window(generator: np.random.Generator, count: int, wanted: int) -> list[int]:
@@ -170,7 +179,9 @@ def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray
     return found / np.float32(255)
 
 
-def subject_views(subject: StoredSubject, indices: Sequence[int], size: int, depths: bool = False) -> SubjectViews:
+def subject_views(
+    subject: StoredSubject, indices: Sequence[int], size: int, depths: bool = False
+) -> SubjectViews:
     """Some views of a stored subject at size x size pixels, numpy leaves. depths: whether they have any, all unknown.
 
     Raises: ValueError, see `shrink`.
@@ -184,7 +195,11 @@ def subject_views(subject: StoredSubject, indices: Sequence[int], size: int, dep
         images=shrink(subject.images[chosen], size),
         masks=shrink(subject.masks[chosen], size),
         cameras=_on_host(
-            Camera, K=subject.K[chosen] * scale[:, None], cam_from_world=subject.cam_from_world[chosen], width=size, height=size
+            Camera,
+            K=subject.K[chosen] * scale[:, None],
+            cam_from_world=subject.cam_from_world[chosen],
+            width=size,
+            height=size,
         ),
         rotations=subject.rotations[frames],
         translations=subject.translations[frames],
@@ -231,8 +246,14 @@ def block_counts(weights: Sequence[float | int]) -> Int[np.ndarray, " sources"]:
     Raises: ValueError unless the weights are positive and finite.
     """
     shares = np.asarray(weights, np.float64)
-    if len(shares) == 0 or len(shares) > MIX_BLOCK or not (np.isfinite(shares).all() and (shares > 0).all()):
-        raise ValueError(f"weights of mixed sources: expected positive numbers, got {list(weights)}")
+    if (
+        len(shares) == 0
+        or len(shares) > MIX_BLOCK
+        or not (np.isfinite(shares).all() and (shares > 0).all())
+    ):
+        raise ValueError(
+            f"weights of mixed sources: expected positive numbers, got {list(weights)}"
+        )
     exact = MIX_BLOCK * shares / shares.sum()
     counts = np.maximum(np.floor(exact), 1).astype(int)
     while counts.sum() != MIX_BLOCK:  # by largest remainder
@@ -271,7 +292,9 @@ class Mixture:
             raise ValueError(f"{len(self.sources)} sources, but {len(self.weights)} weights")
         block_counts(self.weights)
         if len({source.input_counts for source in self.sources}) > 1:
-            raise ValueError(f"input_counts differ: {[source.input_counts for source in self.sources]}")
+            raise ValueError(
+                f"input_counts differ: {[source.input_counts for source in self.sources]}"
+            )
 
     @functools.cached_property
     def _counts(self) -> Int[np.ndarray, " sources"]:

@@ -72,7 +72,9 @@ class Motion:
         last = len(self.translations) - 1
         count = max(1, round(min((last + 1) * fps / self.fps, 1e18)))
         check_limit("frames", count, "frames")
-        return replace(self._at(np.minimum(np.arange(count) * self.fps / fps, last)), fps=float(fps))
+        return replace(
+            self._at(np.minimum(np.arange(count) * self.fps / fps, last)), fps=float(fps)
+        )
 
     def _at(self, times: Float[np.ndarray, " n"]) -> "Motion":
         low = np.floor(times).astype(int)
@@ -161,15 +163,21 @@ def load_motion(
         with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
             return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)
     if fps is not None and not (np.isfinite(fps) and fps > 0):
-        raise MotionError(path, "fps", f"expected a positive number of frames per second, got {fps}")
+        raise MotionError(
+            path, "fps", f"expected a positive number of frames per second, got {fps}"
+        )
     with reading(path, "motion", MotionError):
-        options = Reading(None if fps is None else float(fps), person, None if clip is None else str(clip))
+        options = Reading(
+            None if fps is None else float(fps), person, None if clip is None else str(clip)
+        )
         return _load(Path(path), up, options, rest_joints)
 
 
 def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array | None) -> Motion:
     read = _reader(path)
-    body = lambda: skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
+    body = lambda: (
+        skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
+    )
     with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
         found = read(path, options)
         if isinstance(found, skeleton.Clip):
@@ -178,15 +186,21 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
         else:
             rate = found.fps
             axis, said = _up_of(found, body) if up == "auto" else (up, "")
-            rotations, translations = rules.turned_upright(found.rotations, found.translations, axis)
+            rotations, translations = rules.turned_upright(
+                found.rotations, found.translations, axis
+            )
     if rest_joints is not None and rotations.shape[1] != len(rest_joints):
-        raise MotionError(path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}")
+        raise MotionError(
+            path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}"
+        )
     with np.errstate(over="ignore"):  # what is no float32 is infinite from here on
         rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
     if not np.isfinite(rotations).all():
         raise MotionError(path, "", "expected rotations and a skeleton of finite size")
     if (largest := np.abs(rotations).max()) > LARGEST_TURN:
-        raise MotionError(path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}")
+        raise MotionError(
+            path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}"
+        )
     if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
         limit = f"at most {LARGEST_DISTANCE:g} from the origin"
         raise MotionError(path, "", f"expected metres, {limit}, got {farthest:g}")
@@ -232,14 +246,20 @@ def _reader(path: Path) -> MotionFormat:
     if found is None:
         got = path.suffix or "no suffix"
         hint = OTHERS.get(path.suffix.lower(), "")
-        raise MotionError(path, "", f"no motion: expected a file {alternatives(MOTIONS.suffixes)}, got {got}{hint}")
+        raise MotionError(
+            path,
+            "",
+            f"no motion: expected a file {alternatives(MOTIONS.suffixes)}, got {got}{hint}",
+        )
     return found
 
 
 def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
     rotations, translations, usual = poses.rotations, poses.translations, poses.up
     stands = None if poses.fixed else rules.standing_axis(rotations[:, 0])
-    if stands in (None, usual) or len(joints := body()) != rotations.shape[1]:  # another number is refused later
+    if (
+        stands in (None, usual) or len(joints := body()) != rotations.shape[1]
+    ):  # another number is refused later
         return usual, ""
     chosen = rules.sampled_frames(len(rotations))
     points = rules.joint_places(joints, rotations[chosen], translations[chosen])
@@ -248,7 +268,10 @@ def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
 
 def save_motion(path: str | Path, motion: Motion) -> None:
     """Write our own format, compressed; the file appears whole or not at all."""
-    write_npz(path, {"rotations": motion.rotations, "translations": motion.translations, "fps": motion.fps})
+    write_npz(
+        path,
+        {"rotations": motion.rotations, "translations": motion.translations, "fps": motion.fps},
+    )
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:

@@ -23,7 +23,14 @@ from humangs_jax.data.formats import DEFAULT_FPS
 from humangs_jax.data.motion import Reading
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.mesh import parse_glb, read_accessor
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes, read_text, shown
+from humangs_jax.io.reading import (
+    Refused,
+    check_limit,
+    check_unpacked,
+    read_bytes,
+    read_text,
+    shown,
+)
 
 CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
 _WORD = re.compile(r"(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+")
@@ -38,20 +45,28 @@ def read_bvh(path: Path, options: object = None) -> Clip:
     found = _MOTION.search(text)
     names, parents, offsets, channels = _tree(text[: found.start() if found else len(text)])
     if found is None:
-        raise Refused("cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints")
+        raise Refused(
+            "cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints"
+        )
     count, seconds = _number(found[1]), _number(found[2])
     if not (count >= 1 and count == int(count) and seconds > 0 and np.isfinite(1 / seconds)):
-        raise Refused(f"expected at least one frame and a positive Frame Time, got {found[1]} and {found[2]}")
+        raise Refused(
+            f"expected at least one frame and a positive Frame Time, got {found[1]} and {found[2]}"
+        )
     width = sum(len(each) for each in channels)
     numbers = _numbers(text[found.end() :])
     if width == 0 or len(numbers) != count * width:
-        raise Refused(f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers: cut short?")
+        raise Refused(
+            f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers: cut short?"
+        )
     check_unpacked(len(text), bytes_of_clip(int(count), len(names)))
     turns, places = _posed(parents, offsets, channels, numbers.reshape(int(count), width))
     return Clip(names, parents, _chained(parents, offsets), turns, places, 1 / seconds)
 
 
-def _tree(text: str) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "s 3"], list[list[str]]]:
+def _tree(
+    text: str,
+) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "s 3"], list[list[str]]]:
     found = _WORD.finditer(text, len("HIERARCHY") + text.index("HIERARCHY"))
     words = ((match[1] or match[0], match[2]) for match in found)  # and the name that follows
     number = lambda: _number(next(words)[0])
@@ -81,15 +96,23 @@ def _tree(text: str) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray
                     offsets[here] = offset
             elif word == "CHANNELS" and here is not None:
                 amount = number()
-                channels[here] = [next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))]
-                if amount != len(channels[here]) or any(name not in CHANNELS for name in channels[here]):
-                    raise Refused(f"joint {names[here]}: expected up to 6 channels such as Xrotation")
+                channels[here] = [
+                    next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))
+                ]
+                if amount != len(channels[here]) or any(
+                    name not in CHANNELS for name in channels[here]
+                ):
+                    raise Refused(
+                        f"joint {names[here]}: expected up to 6 channels such as Xrotation"
+                    )
             else:
                 raise Refused(f"unknown word {word}")
     except StopIteration:
         raise Refused("cut short") from None
     if open_joints or waiting is not None or not names:
-        raise Refused("cut short: a brace of the joints is open" if names else "cut short: no joints")
+        raise Refused(
+            "cut short: a brace of the joints is open" if names else "cut short: no joints"
+        )
     if parents.count(-1) != 1:
         raise Refused(f"expected one ROOT, got {parents.count(-1)}")
     return tuple(names), tuple(parents), np.stack(offsets), channels
@@ -111,11 +134,15 @@ def _numbers(text: str) -> Float[np.ndarray, " n"]:
     except ValueError as error:
         raise Refused(f"frames: expected numbers: {error}") from None
     if not np.isfinite(values).all():
-        raise Refused(f"frames: expected finite numbers, got {values[np.argmin(np.isfinite(values))]}")
+        raise Refused(
+            f"frames: expected finite numbers, got {values[np.argmin(np.isfinite(values))]}"
+        )
     return values
 
 
-def _chained(parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 3"]:
+def _chained(
+    parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]
+) -> Float[np.ndarray, "s 3"]:
     places = np.zeros_like(offsets)
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -124,7 +151,10 @@ def _chained(parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]) -> Flo
 
 
 def _posed(
-    parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"], channels: list[list[str]], numbers: Float[np.ndarray, "m n"]
+    parents: tuple[int, ...],
+    offsets: Float[np.ndarray, "s 3"],
+    channels: list[list[str]],
+    numbers: Float[np.ndarray, "m n"],
 ) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
     frames = len(numbers)
     turns, places = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
@@ -138,9 +168,15 @@ def _posed(
             move[:, "xyz".index(names[i][0])] = columns[:, i]
         turn = np.tile(np.eye(3), (frames, 1, 1))
         for i in turning:
-            turn = turn @ Rotation.from_euler(names[i][0], columns[:, [i]], degrees=True).as_matrix()
+            turn = (
+                turn @ Rotation.from_euler(names[i][0], columns[:, [i]], degrees=True).as_matrix()
+            )
         turns[:, joint] = turn if parent < 0 else turns[:, parent] @ turn
-        places[:, joint] = move if parent < 0 else places[:, parent] + np.einsum("mab,mb->ma", turns[:, parent], move)
+        places[:, joint] = (
+            move
+            if parent < 0
+            else places[:, parent] + np.einsum("mab,mb->ma", turns[:, parent], move)
+        )
     return turns, places
 
 
@@ -209,7 +245,11 @@ def _humanoid(content: dict[str, Any]) -> dict[int, str]:
         bones = each.get("humanoid", {}).get("humanBones", {}) if isinstance(each, dict) else {}
         if isinstance(bones, list):  # of VRM 0
             bones = {str(bone.get("bone")): bone for bone in bones if isinstance(bone, dict)}
-        named = {bone["node"]: name for name, bone in bones.items() if isinstance(bone, dict) and type(bone.get("node")) is int}
+        named = {
+            bone["node"]: name
+            for name, bone in bones.items()
+            if isinstance(bone, dict) and type(bone.get("node")) is int
+        }
         if named:
             return named
     return {}
@@ -226,7 +266,9 @@ def _parents(nodes: Nodes) -> list[int]:
     return parents
 
 
-def _joints(content: dict[str, Any], binary: bytes, nodes: Nodes) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
+def _joints(
+    content: dict[str, Any], binary: bytes, nodes: Nodes
+) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
     """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far as the file tells."""
     skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
     if not skins:
@@ -238,7 +280,9 @@ def _joints(content: dict[str, Any], binary: bytes, nodes: Nodes) -> tuple[list[
     joints = list(dict.fromkeys(joints))
     if "inverseBindMatrices" not in skin or len(joints) != len(skin["joints"]):
         return joints, {}
-    inverse = read_accessor(content, binary, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    inverse = (
+        read_accessor(content, binary, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    )
     _check(inverse, "inverseBindMatrices")
     return joints, dict(zip(joints, np.linalg.inv(inverse), strict=True))
 
@@ -266,7 +310,9 @@ def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> i
     return joint
 
 
-def _tracks(content: dict[str, Any], binary: bytes, animation: dict[str, Any], wanted: Container[int]) -> Tracks:
+def _tracks(
+    content: dict[str, Any], binary: bytes, animation: dict[str, Any], wanted: Container[int]
+) -> Tracks:
     tracks: dict[tuple[int, str], Any] = {}
     for channel in animation["channels"]:
         node, path = channel["target"].get("node"), channel["target"]["path"]
@@ -280,7 +326,11 @@ def _tracks(content: dict[str, Any], binary: bytes, animation: dict[str, Any], w
         if sampler.get("interpolation") == "CUBICSPLINE":
             values = values.reshape(-1, 3, values.shape[1])[:, 1]  # between the tangents
         _check(values, path)
-        if not len(times) or values.shape != (len(times), PATHS[path]) or not (np.diff(times) > 0).all():
+        if (
+            not len(times)
+            or values.shape != (len(times), PATHS[path])
+            or not (np.diff(times) > 0).all()
+        ):
             raise Refused(f"animation: expected one {path} for each of increasing times")
         _check(times, "times")
         tracks[node, path] = times, values, sampler.get("interpolation") == "STEP"
@@ -291,7 +341,9 @@ def _tracks(content: dict[str, Any], binary: bytes, animation: dict[str, Any], w
 
 def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
     """Times of the frames in seconds, as close as those of the densest track, and their rate."""
-    first, last = (pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1)))
+    first, last = (
+        pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1))
+    )
     dense = max((times for times, _, _ in tracks.values()), key=len)
     if len(dense) < 2 or not last > first:
         return np.asarray([first]), DEFAULT_FPS
@@ -303,11 +355,17 @@ def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
 
 
 def _world(
-    nodes: Nodes, parents: Sequence[int], order: Sequence[int], tracks: Tracks, times: Float[np.ndarray, " m"]
+    nodes: Nodes,
+    parents: Sequence[int],
+    order: Sequence[int],
+    tracks: Tracks,
+    times: Float[np.ndarray, " m"],
 ) -> dict[int, Float[np.ndarray, "m 4 4"]]:
     world: dict[int, np.ndarray] = {}
     for i in order:
-        local = _local(nodes[i], {path: tracks[i, path] for path in PATHS if (i, path) in tracks}, times)
+        local = _local(
+            nodes[i], {path: tracks[i, path] for path in PATHS if (i, path) in tracks}, times
+        )
         world[i] = local if parents[i] == -1 else world[parents[i]] @ local
     return world
 
@@ -319,7 +377,9 @@ def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
     return [world[i][0] for i in range(len(nodes))]
 
 
-def _local(node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4 4"]:
+def _local(
+    node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "m 4 4"]:
     local = np.tile(np.eye(4), (len(times), 1, 1))
     if "matrix" in node:
         local[:] = np.asarray(node["matrix"], np.float64).reshape(4, 4).T
@@ -330,8 +390,14 @@ def _local(node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.nd
     for path, still in usual.items():
         value = np.asarray(node.get(path, still), np.float64).reshape(1, PATHS[path])
         _check(value, path)
-        parts[path] = _sampled(tracks[path], times, path) if path in tracks else np.tile(value, (len(times), 1))
-    local[:, :3, :3] = Rotation.from_quat(parts["rotation"]).as_matrix() * parts["scale"][:, None, :]
+        parts[path] = (
+            _sampled(tracks[path], times, path)
+            if path in tracks
+            else np.tile(value, (len(times), 1))
+        )
+    local[:, :3, :3] = (
+        Rotation.from_quat(parts["rotation"]).as_matrix() * parts["scale"][:, None, :]
+    )
     local[:, :3, 3] = parts["translation"]
     return local
 
@@ -339,7 +405,9 @@ def _local(node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.nd
 def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[np.ndarray, "m c"]:
     keys, values, stepped = track
     if stepped or len(keys) == 1:
-        times = times + 0.01 * (times[1] - times[0] if len(times) > 1 else 1.0)  # keys are rounded to float32
+        times = times + 0.01 * (
+            times[1] - times[0] if len(times) > 1 else 1.0
+        )  # keys are rounded to float32
         return values[np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 1)]
     times = np.clip(times, keys[0], keys[-1])
     if path == "rotation":
@@ -352,7 +420,9 @@ def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3
     linear = matrices[..., :3, :3]
     lengths = np.linalg.norm(linear, axis=-2, keepdims=True)
     if not (lengths > 0).all() or not (np.linalg.det(linear) > 0).all():
-        raise Refused("a joint that is mirrored or without size: expected rotations, positions and scales")
+        raise Refused(
+            "a joint that is mirrored or without size: expected rotations, positions and scales"
+        )
     flat = (linear / lengths).reshape(-1, 3, 3)
     return Rotation.from_matrix(flat).as_matrix().reshape(linear.shape)
 

@@ -10,7 +10,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.motion.rules import ENDS, EXPECTED_NAMES, FEW, LIKE, MIDDLE, NEEDED, NOISE, SIDED, SIDES, UNDER
+from humangs_jax.data.motion.rules import (
+    ENDS,
+    EXPECTED_NAMES,
+    FEW,
+    LIKE,
+    MIDDLE,
+    NEEDED,
+    NOISE,
+    SIDED,
+    SIDES,
+    UNDER,
+)
 from humangs_jax.geometry.mesh import unit
 from humangs_jax.io.reading import Refused
 
@@ -19,7 +30,9 @@ Places = Float[np.ndarray, "s 3"]
 Pair = tuple[list[int], list[int]]
 
 
-def matched(names: Sequence[str], parents: Sequence[int], rest: Places, posed: Places) -> dict[str, int]:
+def matched(
+    names: Sequence[str], parents: Sequence[int], rest: Places, posed: Places
+) -> dict[str, int]:
     """Index of the file's joint for each of ours that it has. rest, posed: places in the rest pose and in the first frame.
 
     Raises: Refused if neither names nor the tree tell where those are that are needed.
@@ -29,11 +42,17 @@ def matched(names: Sequence[str], parents: Sequence[int], rest: Places, posed: P
     if hips := [source[name] for name in ("left_hip", "right_hip") if name in source][1:]:
         _place_pelvis(source, parents, (source["left_hip"], *hips))
     if any(name not in source for name in NEEDED) or not _descends(source, parents):
-        lengths = np.asarray([0.0 if p < 0 else np.linalg.norm(rest[i] - rest[p]) for i, p in enumerate(parents)])
+        lengths = np.asarray(
+            [0.0 if p < 0 else np.linalg.norm(rest[i] - rest[p]) for i, p in enumerate(parents)]
+        )
         limbs = _limbs(plain, parents, lengths, posed)
         if limbs is None:
             missing = [name for name in NEEDED if name not in source]
-            what = f"no joint for {', '.join(missing)}" if missing else "joints that do not hang below each other"
+            what = (
+                f"no joint for {', '.join(missing)}"
+                if missing
+                else "joints that do not hang below each other"
+            )
             found = ", ".join(names[:SHOWN])
             raise Refused(f"{what}: {EXPECTED_NAMES}, got {found}")
         body = {
@@ -41,7 +60,9 @@ def matched(names: Sequence[str], parents: Sequence[int], rest: Places, posed: P
             for side in SIDES
             for name in ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
         }
-        source = {name: i for name, i in source.items() if name not in body | {"pelvis", "neck", "head"}} | limbs
+        source = {
+            name: i for name, i in source.items() if name not in body | {"pelvis", "neck", "head"}
+        } | limbs
     _match_toes(source, parents, rest)
     _match_head(source, plain, parents)
     _match_spine(source, parents)
@@ -57,7 +78,9 @@ def _plain(names: Sequence[str]) -> list[str]:
     words = [[word for word in each if word not in NOISE] for each in words]
     plain = [re.sub(r"^mixamorig\d*", "", "".join(each)) for each in words]
     filled = [name for name in plain if name]
-    start = next((i for i, letters in enumerate(zip(*filled, strict=False)) if len(set(letters)) > 1), 0)
+    start = next(
+        (i for i, letters in enumerate(zip(*filled, strict=False)) if len(set(letters)) > 1), 0
+    )
     return [name[start if len(filled) >= FEW else 0 :] for name in plain]
 
 
@@ -75,7 +98,10 @@ def _named(plain: Sequence[str]) -> dict[str, int]:
         find(ours, theirs)
     for ours, theirs in SIDED.items():
         for side in SIDES:
-            find(f"{side}_{ours}", [form for x in theirs for form in (side + x, side[0] + x, x + side[0], x + side)])
+            find(
+                f"{side}_{ours}",
+                [form for x in theirs for form in (side + x, side[0] + x, x + side[0], x + side)],
+            )
     return source
 
 
@@ -99,7 +125,11 @@ def _place_pelvis(source: dict[str, int], parents: Sequence[int], hips: Sequence
 def _descends(source: dict[str, int], parents: Sequence[int]) -> bool:
     """Whether limbs hang below each other."""
     pairs = [(f"{side}_{a}", f"{side}_{b}") for a, b in UNDER for side in SIDES]
-    return all(source[a] in _ancestors(parents, source[b])[1:] for a, b in pairs if a in source and b in source)
+    return all(
+        source[a] in _ancestors(parents, source[b])[1:]
+        for a, b in pairs
+        if a in source and b in source
+    )
 
 
 # The tree ---------------------------------------------------------------------------------------------------------------
@@ -112,7 +142,9 @@ def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]
     return path
 
 
-def _limbs(plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: Places) -> dict[str, int] | None:
+def _limbs(
+    plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: Places
+) -> dict[str, int] | None:
     """The joints of arms, legs, pelvis and head by the tree; None where it is not one of a person."""
     children: list[list[int]] = [[] for _ in parents]
     for i, p in enumerate(parents):
@@ -124,7 +156,11 @@ def _limbs(plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, po
 
     def pair_below(joint: int) -> Pair | None:
         """The two longest limbs of like bones that hang on a joint, as their joints that bend."""
-        limbs = [limb for child in children[joint] if (limb := _bends(_path(child, children, reach), lengths))]
+        limbs = [
+            limb
+            for child in children[joint]
+            if (limb := _bends(_path(child, children, reach), lengths))
+        ]
         bones = lambda limb: lengths[limb[1:3]]
         pairs = [
             (a, b)
@@ -132,13 +168,21 @@ def _limbs(plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, po
             for b in limbs[:i]
             if np.abs(bones(a) - bones(b)).max() <= LIKE * max(bones(a).max(), bones(b).max())
         ]
-        return max(pairs, key=lambda pair: bones(pair[0]).sum() + bones(pair[1]).sum(), default=None)
+        return max(
+            pairs, key=lambda pair: bones(pair[0]).sum() + bones(pair[1]).sum(), default=None
+        )
 
     above = [_ancestors(parents, joint) for joint in range(len(parents))]
-    found = [(joint, pair) for joint in range(len(parents)) if (pair := pair_below(joint)) is not None]
+    found = [
+        (joint, pair) for joint in range(len(parents)) if (pair := pair_below(joint)) is not None
+    ]
     for pelvis, legs in found:
         feet = {leg[0] for leg in legs}
-        inside = [each for each in found if pelvis in above[each[0]][1:] and not feet.intersection(above[each[0]])]
+        inside = [
+            each
+            for each in found
+            if pelvis in above[each[0]][1:] and not feet.intersection(above[each[0]])
+        ]
         if inside:
             chest, arms = max(inside, key=lambda each: lengths[[*each[1][0][1:3]]].sum())
             return _sided(plain, parents, posed, pelvis, legs, chest, arms)
@@ -151,18 +195,31 @@ def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
     if len(bones) < 2:
         return None
     first = int(np.argmax(np.minimum(bones[1:], bones[:-1])))
-    return [path[first], path[first + 1], path[first + 2], *path[first + 3 : first + 4]] if bones[first] > 0 else None
+    return (
+        [path[first], path[first + 1], path[first + 2], *path[first + 3 : first + 4]]
+        if bones[first] > 0
+        else None
+    )
 
 
 def _sided(
-    plain: Sequence[str], parents: Sequence[int], posed: Places, pelvis: int, legs: Pair, chest: int, arms: Pair
+    plain: Sequence[str],
+    parents: Sequence[int],
+    posed: Places,
+    pelvis: int,
+    legs: Pair,
+    chest: int,
+    arms: Pair,
 ) -> dict[str, int]:
     up = unit(posed[chest] - posed[pelvis])
     toes = [posed[leg[3]] - posed[leg[2]] for leg in legs if len(leg) > 3]
     forward = np.sum(toes, axis=0) if toes else np.array([0.0, 0, 1])
     left = np.cross(up, forward)
     source = {"pelvis": pelvis}
-    for limbs, names in ((legs, ("hip", "knee", "ankle", "foot")), (arms, ("shoulder", "elbow", "wrist"))):
+    for limbs, names in (
+        (legs, ("hip", "knee", "ankle", "foot")),
+        (arms, ("shoulder", "elbow", "wrist")),
+    ):
         sides = [_side(plain, limb) for limb in limbs]
         if sorted(sides) != sorted(SIDES):
             across = [float(posed[limb[0]] @ left) for limb in limbs]
@@ -178,7 +235,10 @@ def _sided(
 def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
     """Left or right, if all names of a limb begin or end so."""
     for side in SIDES:
-        if all(plain[j].startswith((side, side[0])) or plain[j].endswith((side, side[0])) for j in limb[:3]):
+        if all(
+            plain[j].startswith((side, side[0])) or plain[j].endswith((side, side[0]))
+            for j in limb[:3]
+        ):
             return side
     return ""
 
@@ -189,9 +249,15 @@ def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
 def _match_toes(source: dict[str, int], parents: Sequence[int], rest: Places) -> None:
     for side in SIDES:
         ankle = source[f"{side}_ankle"]
-        below = [i for i, p in enumerate(parents) if p == ankle and np.linalg.norm(rest[i] - rest[ankle]) > 0]
+        below = [
+            i
+            for i, p in enumerate(parents)
+            if p == ankle and np.linalg.norm(rest[i] - rest[ankle]) > 0
+        ]
         if f"{side}_foot" not in source and below:
-            source[f"{side}_foot"] = max(below, key=lambda i: float(np.linalg.norm(rest[i] - rest[ankle])))
+            source[f"{side}_foot"] = max(
+                below, key=lambda i: float(np.linalg.norm(rest[i] - rest[ankle]))
+            )
 
 
 def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[int]) -> None:
@@ -218,11 +284,21 @@ def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[
 def _match_spine(source: dict[str, int], parents: Sequence[int]) -> None:
     """Spines have one to five joints, called differently everywhere: ours are the first, middle and last of the file's."""
     chain = []
-    at = parents[source["neck"]] if "neck" in source else parents[source["head"]] if "head" in source else -1
+    at = (
+        parents[source["neck"]]
+        if "neck" in source
+        else parents[source["head"]]
+        if "head" in source
+        else -1
+    )
     while at >= 0 and at != source.get("pelvis"):
         chain.insert(0, at)
         at = parents[at]
     last = len(chain) - 1
     if at >= 0:
-        ours = {"spine3": last, "spine1": 0 if last > 0 else -1, "spine2": last // 2 if last > 1 else -1}
+        ours = {
+            "spine3": last,
+            "spine1": 0 if last > 0 else -1,
+            "spine2": last // 2 if last > 1 else -1,
+        }
         source.update({name: chain[i] for name, i in ours.items() if i >= 0})

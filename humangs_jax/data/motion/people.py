@@ -20,7 +20,15 @@ from humangs_jax.io.reading import Refused, check_limit, open_file, read_json, v
 from humangs_jax.io.restricted_pickle import as_array, objects
 from humangs_jax.io.tensors import read_values
 
-INSIDE = ("smpl_params_global", "smplx_world", "smpl_params_incam", "smplx_cam", "pred_smpl_params", "smpl_params", "smpl")
+INSIDE = (
+    "smpl_params_global",
+    "smplx_world",
+    "smpl_params_incam",
+    "smplx_cam",
+    "pred_smpl_params",
+    "smpl_params",
+    "smpl",
+)
 """Keys of what was found of a person, the best first."""
 LISTS = ("people", "persons", "annots", "results")
 """Keys of all people."""
@@ -59,7 +67,10 @@ def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
 
 def read_people(path: Path) -> list[Person]:
     """The people of a file or a folder. Raises: FileError; Refused if it has nothing of any format."""
-    files, alone = _files(path) if path.is_dir() else [path], not path.is_dir() and path.suffix.lower() != ".json"
+    files, alone = (
+        _files(path) if path.is_dir() else [path],
+        not path.is_dir() and path.suffix.lower() != ".json",
+    )
     check_limit("frames", len(files), "files")
     if not alone and files[0].suffix.lower() not in OF_ONE:
         people = _stacked(_frames(files))
@@ -71,7 +82,11 @@ def read_people(path: Path) -> list[Person]:
             if alone and not found:
                 raise Refused(expected(content if isinstance(content, dict) else {}))
             name = (_numbers(file) or [file.stem])[-1]
-            people += [each._replace(name=name) for each in found] if len(found) == 1 and not alone else found
+            people += (
+                [each._replace(name=name) for each in found]
+                if len(found) == 1 and not alone
+                else found
+            )
     if not people:
         raise Refused(expected({}))
     return people
@@ -97,7 +112,9 @@ def _files(folder: Path) -> list[Path]:
     natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
     for place in (folder / name for name in FOLDERS):
         for suffix in (".json", ".npz", *OF_ONE):
-            files = [file for file in visible(place.glob("*" + suffix)) if file.name != "camera.npy"]
+            files = [
+                file for file in visible(place.glob("*" + suffix)) if file.name != "camera.npy"
+            ]
             if files:
                 return sorted(files, key=natural)
     raise Refused("no .json, .npz or other file of a motion in this folder")
@@ -114,7 +131,10 @@ def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
     frames = _listed_frames(content)
     if frames is not None:
         return _stacked([(f"frame {i}", each) for i, each in enumerate(frames)])
-    return [person._replace(frames=_frames_of(person.values), pickled=pickled) for person in _found(content, "", 0)]
+    return [
+        person._replace(frames=_frames_of(person.values), pickled=pickled)
+        for person in _found(content, "", 0)
+    ]
 
 
 def _found(content: Any, name: str, depth: int) -> list[Person]:
@@ -122,15 +142,23 @@ def _found(content: Any, name: str, depth: int) -> list[Person]:
     if depth > DEEPEST:
         return []
     if isinstance(content, list | tuple):
-        found = [p for i, each in enumerate(content) for p in _found(each, _id_of(each, i), depth + 1)]
+        found = [
+            p for i, each in enumerate(content) for p in _found(each, _id_of(each, i), depth + 1)
+        ]
     elif not isinstance(content, dict):
         return []
     elif (form := format_of(content)) is not None:
         return _split(content, form, name)
-    elif (key := next((key for key in INSIDE if isinstance(content.get(key), dict)), None)) is not None:
+    elif (
+        key := next((key for key in INSIDE if isinstance(content.get(key), dict)), None)
+    ) is not None:
         beside = {other: value for other, value in content.items() if other not in INSIDE}
         return _found(beside | content[key], name, depth + 1)
-    elif (key := next((key for key in LISTS if isinstance(objects(content.get(key)), dict | list)), None)) is not None:
+    elif (
+        key := next(
+            (key for key in LISTS if isinstance(objects(content.get(key)), dict | list)), None
+        )
+    ) is not None:
         return _found(content[key], name, depth + 1)
     else:
         found = [p for key, each in content.items() for p in _found(each, str(key), depth + 1)]
@@ -159,8 +187,12 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     several = several or (form.pivot == "head" and len(shape) == 3)
     if not several:
         return [Person(name, values)]
-    ids = next((np.ravel(as_array(values[key])) for key in IDS if key in values), np.arange(shape[0]))
-    arrays = {key: as_array(values[key]) for key in (*form.poses.values(), *form.moves) if key in values}
+    ids = next(
+        (np.ravel(as_array(values[key])) for key in IDS if key in values), np.arange(shape[0])
+    )
+    arrays = {
+        key: as_array(values[key]) for key in (*form.poses.values(), *form.moves) if key in values
+    }
     ids = ids if len(ids) == shape[0] else np.arange(shape[0])
     rest = {key: value for key, value in values.items() if key not in arrays}
     of = lambda array, i: array[i] if place == "root" else array[i : i + 1]
@@ -170,7 +202,11 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
 
 def are_rotations(array: np.ndarray) -> bool:
     """Whether the last two axes of an array are those of rotation matrices."""
-    return array.shape[-2:] == (3, 3) and _off_rotations(array) < ORTHONORMAL and bool((np.linalg.det(array) > 0).all())
+    return (
+        array.shape[-2:] == (3, 3)
+        and _off_rotations(array) < ORTHONORMAL
+        and bool((np.linalg.det(array) > 0).all())
+    )
 
 
 def _off_rotations(array: np.ndarray) -> float:
@@ -194,10 +230,16 @@ def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
 def _listed_frames(content: Any) -> list[list[Person]] | None:
     """The people of each frame in a list of lists, or in PHALP's dict by image; None for anything else."""
     content = objects(content)
-    if isinstance(content, list) and content and all(isinstance(objects(each), list) for each in content):
+    if (
+        isinstance(content, list)
+        and content
+        and all(isinstance(objects(each), list) for each in content)
+    ):
         return [_found(each, "", 1) for each in content]
     images = list(content.values()) if isinstance(content, dict) else []
-    if not images or not all(isinstance(each, dict) and isinstance(objects(each.get("smpl")), list) for each in images):
+    if not images or not all(
+        isinstance(each, dict) and isinstance(objects(each.get("smpl")), list) for each in images
+    ):
         return None
     return [_tracked(each) for each in images]
 
@@ -210,7 +252,9 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
     for i, values in enumerate(lists["smpl"]):
         if isinstance(values, dict):
             name = _word(tracks[i]) if isinstance(tracks, list) and i < len(tracks) else str(i)
-            camera = {"camera": cameras[i]} if isinstance(cameras, list) and i < len(cameras) else {}
+            camera = (
+                {"camera": cameras[i]} if isinstance(cameras, list) and i < len(cameras) else {}
+            )
             people.append(Person(name, values | camera))
     return people
 
@@ -244,12 +288,19 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
         begin, first = seen[0]
         form = format_of(first)
         assert form is not None
-        keys = [key for key in (*form.poses.values(), *form.moves, *form.rates, *MORE) if key in first]
+        keys = [
+            key for key in (*form.poses.values(), *form.moves, *form.rates, *MORE) if key in first
+        ]
         for i, values in seen:
             if missing := set(keys) - set(values):
-                raise Refused(f"{frames[i][0]}: {min(missing)}: missing, but {frames[begin][0]} has it")
+                raise Refused(
+                    f"{frames[i][0]}: {min(missing)}: missing, but {frames[begin][0]} has it"
+                )
         values = {key: [objects(values[key]) for _, values in seen] for key in keys}
-        values = {k: [x if isinstance(x, list | int | float) else as_array(x) for x in each] for k, each in values.items()}
+        values = {
+            k: [x if isinstance(x, list | int | float) else as_array(x) for x in each]
+            for k, each in values.items()
+        }
         stacked.append(Person(name, values, np.asarray([i for i, _ in seen])))
     return stacked
 
@@ -263,7 +314,11 @@ def expected(values: Mapping[Any, Any]) -> str:
     for what, needed in OTHER_FILES.items():
         if needed <= values.keys():
             return f"no motion: {what}"
-    first_keys = dict.fromkeys(row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None)
-    first = ", ".join(key for key in first_keys if not key.startswith("("))  # that of a single array
+    first_keys = dict.fromkeys(
+        row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None
+    )
+    first = ", ".join(
+        key for key in first_keys if not key.startswith("(")
+    )  # that of a single array
     keys = ", ".join(sorted(map(str, values))[:SHOWN]) or "none"
     return f"no motion: expected one of the keys {first}, got {keys}{hint_for(values)}"

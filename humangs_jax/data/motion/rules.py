@@ -22,7 +22,12 @@ from humangs_jax.geometry import quaternion
 
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
 HAND_NUMBERS = 45
-COLUMNS = {3 * len(JOINT_NAMES): "SMPL-X", BODY_NUMBERS + 2 * HAND_NUMBERS: "SMPL-H", 72: "SMPL", BODY_NUMBERS: "the body"}
+COLUMNS = {
+    3 * len(JOINT_NAMES): "SMPL-X",
+    BODY_NUMBERS + 2 * HAND_NUMBERS: "SMPL-H",
+    72: "SMPL",
+    BODY_NUMBERS: "the body",
+}
 """Numbers of a pose, by whose joints they are."""
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
@@ -39,8 +44,16 @@ def _finger(finger: str, i: int) -> tuple[str, ...]:
     """Names of the i-th joint of a finger, from 1 at the palm; Biped counts fingers from the thumb."""
     number = ("thumb", "index", "middle", "ring", "pinky").index(finger)
     words = (finger, "little") if finger == "pinky" else (finger,)
-    plain = [form for w in words for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")]
-    bones = (("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",)) if finger == "thumb" else _BONES
+    plain = [
+        form
+        for w in words
+        for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")
+    ]
+    bones = (
+        (("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",))
+        if finger == "thumb"
+        else _BONES
+    )
     plain += [w + bone for w in words for bone in bones[i - 1]]
     return (*plain, f"finger{number}{i - 1 or ''}")
 
@@ -50,7 +63,16 @@ SIDED = {
     "knee": ("leg", "shin", "lowleg", "lowerleg", "calf", "knee", "shinbend", "tibia", "leglower"),
     "ankle": ("ankle", "foot"),
     "foot": ("toebase", "toe", "toes", "toe0", "ball", "foot"),
-    "shoulder": ("arm", "uparm", "upperarm", "shldr", "shldrbend", "humerus", "armupper", "shoulder"),
+    "shoulder": (
+        "arm",
+        "uparm",
+        "upperarm",
+        "shldr",
+        "shldrbend",
+        "humerus",
+        "armupper",
+        "shoulder",
+    ),
     "collar": ("collar", "clavicle", "scapula", "shoulder"),
     "elbow": ("forearm", "lowarm", "lowerarm", "elbow", "forearmbend", "armlower"),
     "wrist": ("hand", "wrist"),
@@ -67,13 +89,36 @@ MIDDLE = {
     "jaw": ("jaw",),
 }
 NOISE = (
-    *("j", "c", "m", "bip", "bip01", "bip001", "bip1", "biped", "def", "org", "jnt", "joint", "bind", "bone", "skin", "sk"),
+    *(
+        "j",
+        "c",
+        "m",
+        "bip",
+        "bip01",
+        "bip001",
+        "bip1",
+        "biped",
+        "def",
+        "org",
+        "jnt",
+        "joint",
+        "bind",
+        "bone",
+        "skin",
+        "sk",
+    ),
     *("ctrl", "rig", "armature", "character", "valvebiped", "avatar"),
 )
 """Words in names that say nothing of the joint."""
 ENDS = ("end", "nub", "top", "tip", "site")
 """How names of the ends of bones end."""
-UNDER = (("hip", "knee"), ("knee", "ankle"), ("ankle", "foot"), ("shoulder", "elbow"), ("elbow", "wrist"))
+UNDER = (
+    ("hip", "knee"),
+    ("knee", "ankle"),
+    ("ankle", "foot"),
+    ("shoulder", "elbow"),
+    ("elbow", "wrist"),
+)
 """Which joints hang below which."""
 LIKE = 0.15
 """Share by which the bones of two limbs may differ."""
@@ -92,7 +137,10 @@ _CHAINS = (
 )
 """Bones: each joint points to the next of its last chain that the file has. Others are moved as their parents are."""
 NEXT = {name: chain[i + 1 :] for chain in _CHAINS for i, name in enumerate(chain)}
-NEEDED = ("pelvis", *(f"{s}_{n}" for n in ("hip", "knee", "ankle", "shoulder", "elbow") for s in SIDES))
+NEEDED = (
+    "pelvis",
+    *(f"{s}_{n}" for n in ("hip", "knee", "ankle", "shoulder", "elbow") for s in SIDES),
+)
 TOPS = ("spine3", "neck", "left_shoulder")
 """Where the trunk ends: the first that the file has."""
 FEET = tuple(tuple(f"{side}_{name}" for side in SIDES) for name in ("ankle", "foot"))
@@ -137,7 +185,9 @@ TREADMILL = 0.8
 """Share of the frames with the lowest joint at one height from which on another axis has a floor where nothing rests."""
 MOST_FRAMES = 1000
 """Of a motion, evenly spread, that are asked for a floor."""
-HANDS = tuple(i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS)))
+HANDS = tuple(
+    i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS))
+)
 """Joints that carry a person who is upside down."""
 
 
@@ -167,12 +217,18 @@ def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
 
 def sampled_frames(count: int) -> np.ndarray:
     """Frames that are asked for a floor, evenly spread, each followed by its next: 0, 1, 40, 41, ..."""
-    first = np.unique(np.linspace(0, max(count - 2, 0), min(max(count - 1, 1), MOST_FRAMES)).astype(int))
+    first = np.unique(
+        np.linspace(0, max(count - 2, 0), min(max(count - 1, 1), MOST_FRAMES)).astype(int)
+    )
     return np.minimum(np.stack([first, first + 1], axis=1), count - 1).reshape(-1)
 
 
 def up_axis(
-    points: Float[np.ndarray, "n k 3"], stands: str | None, usual: str, fps: float, also: tuple[str, ...] = ()
+    points: Float[np.ndarray, "n k 3"],
+    stands: str | None,
+    usual: str,
+    fps: float,
+    also: tuple[str, ...] = (),
 ) -> tuple[str, str]:
     """The axis that is up, and what is to be said about it ("": nothing).
 
@@ -188,9 +244,16 @@ def up_axis(
         return usual, ""
     here, there = _floors(points, (usual, stands), fps)
     if here < ON_THE_FLOOR <= there and here <= 0.5 * there:
-        return stands, f"{stands} is up, not {usual} as usual in such files: people stand and step on a floor below it"
+        return (
+            stands,
+            f"{stands} is up, not {usual} as usual in such files: people stand and step on a floor below it",
+        )
     contradicted = there < ON_THE_FLOOR <= here and there <= 0.5 * here
-    if stands in also and not contradicted and not (_opposite(stands, usual) and _on_hands(points, usual)):
+    if (
+        stands in also
+        and not contradicted
+        and not (_opposite(stands, usual) and _on_hands(points, usual))
+    ):
         return stands, f"{stands} is up, not {usual}: people stand along it"
     if contradicted or _opposite(stands, usual):
         return usual, ""
@@ -198,7 +261,9 @@ def up_axis(
     return usual, f"{lying}; if they should stand: --motion-up={stands} (in Python up={stands!r})"
 
 
-def _floors(points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int) -> list[float]:
+def _floors(
+    points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int
+) -> list[float]:
     """Share of the frames in which something is on the floor, for the usual axis and for another, which has to be surer."""
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))
@@ -210,7 +275,11 @@ def _floors(points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: fl
         resting.append(level[-1] & (moves[np.arange(len(moves)), lowest] <= limit))
     rests, stays = ([float(x.mean()) for x in shares] for shares in (resting, level))
     # on a treadmill nothing rests
-    return rests if max(rests) >= ON_THE_FLOOR else [stays[0], stays[1] if stays[1] >= TREADMILL else 0.0]
+    return (
+        rests
+        if max(rests) >= ON_THE_FLOOR
+        else [stays[0], stays[1] if stays[1] >= TREADMILL else 0.0]
+    )
 
 
 def _opposite(a: str, b: str) -> bool:
@@ -222,14 +291,20 @@ def _on_hands(points: Float[np.ndarray, "pairs s 3"], up: str) -> bool:
 
 
 def joint_places(
-    joints: Float[np.ndarray, "j 3"], rotations: Float[np.ndarray, "m j 3"], translations: Float[np.ndarray, "m 3"]
+    joints: Float[np.ndarray, "j 3"],
+    rotations: Float[np.ndarray, "m j 3"],
+    translations: Float[np.ndarray, "m 3"],
 ) -> Float[np.ndarray, "m j 3"]:
     """Joints in space of a body of SMPL-X's joints."""
     world, places = [], []
     for j, parent in enumerate(PARENTS):
         own = Rotation.from_rotvec(rotations[:, j]).as_matrix()
         world.append(own if parent < 0 else world[parent] @ own)
-        places.append(translations + joints[0] if parent < 0 else places[parent] + world[parent] @ (joints[j] - joints[parent]))
+        places.append(
+            translations + joints[0]
+            if parent < 0
+            else places[parent] + world[parent] @ (joints[j] - joints[parent])
+        )
     return np.stack(places, axis=1)
 
 
@@ -260,5 +335,9 @@ def page_rules() -> dict[str, Any]:
     HANDS ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}
-    formats = [dataclasses.asdict(each.arrays) for each in MOTIONS.values() if each.arrays is not None and each.arrays.page]
+    formats = [
+        dataclasses.asdict(each.arrays)
+        for each in MOTIONS.values()
+        if each.arrays is not None and each.arrays.page
+    ]
     return rules | {"PELVIS": PELVIS.tolist(), "COLUMNS": list(COLUMNS), "FORMATS": formats}

@@ -83,7 +83,9 @@ def retargeted(
     Raises: Refused if joints of the clip that are needed have no name we know, or the body is no body of SMPL-X's joints.
     """
     if joints.shape != (len(JOINT_NAMES), 3):
-        raise Refused(f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has {len(joints)}")
+        raise Refused(
+            f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has {len(joints)}"
+        )
     source = matched(clip.names, clip.parents, clip.rest, clip.places[0])
     standing, said = _stands(clip, source), ""
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.places[0], source), 1e-9)
@@ -93,11 +95,17 @@ def retargeted(
     turns, places = turn @ clip.turns, clip.places @ turn.T
     world = _body_turns(clip, source, joints, turns, places, by_motion=not standing)
     rotations = np.stack(
-        [_rotation(own if p < 0 else _transposed(world[p]) @ own) for p, own in zip(PARENTS, world, strict=True)], axis=1
+        [
+            _rotation(own if p < 0 else _transposed(world[p]) @ own)
+            for p, own in zip(PARENTS, world, strict=True)
+        ],
+        axis=1,
     )
     moves = scale * places[:, source["pelvis"]]
     soles = _soles(clip, source, joints) if standing else None
-    moves[:, 1] += _steps(scale * places[..., 1], source, soles) - _steps_of_body(world, joints, moves, source)
+    moves[:, 1] += _steps(scale * places[..., 1], source, soles) - _steps_of_body(
+        world, joints, moves, source
+    )
     return rotations, moves - joints[0], said
 
 
@@ -152,22 +160,37 @@ def _body_turns(
         elif name not in source:
             world.append(world[parent])
         elif child is None:
-            if by_motion and name.endswith("_ankle"):  # no toes tell where the foot points: as in T-pose on average
+            if by_motion and name.endswith(
+                "_ankle"
+            ):  # no toes tell where the foot points: as in T-pose on average
                 align = _mean(_transposed(world[parent]) @ turns[:, source[name]]).T
             world.append(turns[:, source[name]] @ align)
         else:
             bone = unit(joints[_INDEX[child]] - joints[j])
-            align = smallest_turns(align @ bone, unit(clip.rest[source[child]] - clip.rest[source[name]])) @ align
+            align = (
+                smallest_turns(
+                    align @ bone, unit(clip.rest[source[child]] - clip.rest[source[name]])
+                )
+                @ align
+            )
             if by_motion:
-                align = align @ _untwist(_transposed(world[parent]) @ turns[:, source[name]] @ align, bone)
+                align = align @ _untwist(
+                    _transposed(world[parent]) @ turns[:, source[name]] @ align, bone
+                )
             own = turns[:, source[name]] @ align
-            world.append(smallest_turns(own @ bone, unit(places[:, source[child]] - places[:, source[name]])) @ own)
+            world.append(
+                smallest_turns(own @ bone, unit(places[:, source[child]] - places[:, source[name]]))
+                @ own
+            )
         frames_of.append(align)
     return world
 
 
 def _pelvis_turns(
-    clip: Clip, source: Source, turns: Float[np.ndarray, "m s 3 3"], places: Float[np.ndarray, "m s 3"]
+    clip: Clip,
+    source: Source,
+    turns: Float[np.ndarray, "m s 3 3"],
+    places: Float[np.ndarray, "m s 3"],
 ) -> Float[np.ndarray, "m 3 3"]:
     """(m, 3, 3) from the rest pose to the frames: of the joint, or of those that carry the hips if these agree better with the
     trunk, turned so that the line of the hips is the file's.
@@ -189,7 +212,10 @@ def _pelvis_turns(
     own, top = meeting(turns[:, pelvis]), source[_top(source)]
     carriers = {clip.parents[left], clip.parents[right]}
     if min(carriers) >= 0 and carriers != {pelvis}:
-        a, b = (Rotation.from_matrix(turns[:, joint]) for joint in (clip.parents[left], clip.parents[right]))
+        a, b = (
+            Rotation.from_matrix(turns[:, joint])
+            for joint in (clip.parents[left], clip.parents[right])
+        )
         other = meeting((a * Rotation.from_rotvec(0.5 * (a.inv() * b).as_rotvec())).as_matrix())
         own_tilt, tilt = (np.abs(tilts(x, top)).mean() for x in (own, other))
         return other if tilt < own_tilt - rules.BETTER_TILT else own
@@ -197,14 +223,18 @@ def _pelvis_turns(
     while clip.parents[spine[0]] not in (-1, pelvis):
         spine.insert(0, clip.parents[spine[0]])
     apart = 0.01 * np.linalg.norm(clip.rest[top] - clip.rest[pelvis])
-    lowest = next((j for j in spine if np.linalg.norm(clip.rest[j] - clip.rest[pelvis]) > apart), top)
+    lowest = next(
+        (j for j in spine if np.linalg.norm(clip.rest[j] - clip.rest[pelvis]) > apart), top
+    )
     tilt = tilts(own, lowest)
     if np.abs(tilt).mean() <= rules.LARGEST_BEND:
         return own
     return Rotation.from_rotvec(tilt[:, None] * unit(line)).as_matrix() @ own
 
 
-def _pelvis_frame(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "3 3"]:
+def _pelvis_frame(
+    clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, "3 3"]:
     theirs = clip.rest[source["left_hip"]] - clip.rest[source["right_hip"]]
     top = joints[_INDEX[_top(source)]] - joints[0]
     ours = _frame(joints[_INDEX["left_hip"]] - joints[_INDEX["right_hip"]], top)
@@ -223,7 +253,9 @@ def _mean(turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "3 3"]:
     return Rotation.from_quat(signs @ quaternions).as_matrix()
 
 
-def _untwist(turns: Float[np.ndarray, "m 3 3"], bone: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def _untwist(
+    turns: Float[np.ndarray, "m 3 3"], bone: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
     """The rotation about a bone that takes the mean twist about it out of rotations (m, 3, 3).
 
     The twist of a quaternion (w, v) about b is 2 arg(w + i v.b); the square has no sign and weighs those less that swing far.
@@ -255,20 +287,27 @@ def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict
     return {name: height - min(found.values()) for name, height in found.items()}
 
 
-def _steps(heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, float] | None) -> Float[np.ndarray, " m"]:
+def _steps(
+    heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, float] | None
+) -> Float[np.ndarray, " m"]:
     """(m,) how high the feet are above the floor, which is where they are lowest.
 
     soles: of each joint of the feet, how high it is when the foot stands; None: each kind as high as in its lowest frame.
     """
     if soles is None:
-        lowest = [(kind, heights[:, [source[name] for name in kind]].min()) for kind in _feet(source)]
+        lowest = [
+            (kind, heights[:, [source[name] for name in kind]].min()) for kind in _feet(source)
+        ]
         soles = {name: low for kind, low in lowest for name in kind}
     feet = np.min([heights[:, source[name]] - sole for name, sole in soles.items()], axis=0)
     return feet - feet.min()
 
 
 def _steps_of_body(
-    world: Sequence[Float[np.ndarray, "m 3 3"]], joints: Float[np.ndarray, "j 3"], moves: Float[np.ndarray, "m 3"], source: Source
+    world: Sequence[Float[np.ndarray, "m 3 3"]],
+    joints: Float[np.ndarray, "j 3"],
+    moves: Float[np.ndarray, "m 3"],
+    source: Source,
 ) -> Float[np.ndarray, " m"]:
     places = {0: moves}
 

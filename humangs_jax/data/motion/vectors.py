@@ -19,9 +19,17 @@ MOTION_X = "(m,322)"
 """The key under which an array of Motion-X is read."""
 POSES = "(m,165/156/72/66)"
 """The key under which an array of poses is read."""
-_PARTS = {"root_orient": (0, 3), "pose_body": (3, 66), "pose_hand": (66, 156), "pose_jaw": (156, 159), "trans": (309, 312)}
+_PARTS = {
+    "root_orient": (0, 3),
+    "pose_body": (3, 66),
+    "pose_hand": (66, 156),
+    "pose_jaw": (156, 159),
+    "trans": (309, 312),
+}
 COLUMNS_OF_MOTION_X = 322
-_RENDER = "make rotations of them, as MDM's `python -m visualize.render_mesh` does (*_smpl_params.npy)"
+_RENDER = (
+    "make rotations of them, as MDM's `python -m visualize.render_mesh` does (*_smpl_params.npy)"
+)
 FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
 """Columns of vectors of features, and of which data set they are."""
 JOINTS = {22: "HumanML3D's new_joints", 21: "KIT-ML's new_joints"}
@@ -42,18 +50,28 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
     if array.ndim == 4 and shape[2:] == (3, 3):
         return {POSES: array}
     if array.ndim == 2 and columns in FEATURES:
-        raise Refused(f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints and {_RENDER}")
+        raise Refused(
+            f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints and {_RENDER}"
+        )
     if array.ndim == 3 and columns == 3:
         whose = f" ({JOINTS[shape[1]]})" if shape[1] in JOINTS else ""
         wanted = "expected a row of axis-angles a frame"
-        raise Refused(f"{shape[1]} joints in space{whose}, or axis-angles in three axes: {wanted}; {_RENDER}")
+        raise Refused(
+            f"{shape[1]} joints in space{whose}, or axis-angles in three axes: {wanted}; {_RENDER}"
+        )
     known = ", ".join(map(str, (COLUMNS_OF_MOTION_X, *COLUMNS)))
-    raise Refused(f"an array of shape {shape}: expected (frames, columns) with {known} columns, or a dict of arrays by name")
+    raise Refused(
+        f"an array of shape {shape}: expected (frames, columns) with {known} columns, or a dict of arrays by name"
+    )
 
 
 def hint_for(values: Mapping[Any, Any]) -> str:
     """What else is said of values that are no motion; "" for nothing."""
-    return f"; these are joints in space that MDM sampled: {_RENDER}" if values.keys() >= RESULTS else ""
+    return (
+        f"; these are joints in space that MDM sampled: {_RENDER}"
+        if values.keys() >= RESULTS
+        else ""
+    )
 
 
 def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[str, Any]:

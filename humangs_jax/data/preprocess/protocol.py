@@ -24,7 +24,11 @@ from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import face_areas, smallest_turns, unit, vertex_crosses
 from humangs_jax.io.images import to_uint8
-from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh, sample_texture
+from humangs_jax.rendering.mesh.rasterizer import (
+    interpolate_attributes,
+    rasterize_mesh,
+    sample_texture,
+)
 
 T = TypeVar("T")
 
@@ -45,7 +49,9 @@ EVERY = 10
 """Every how many frames of a video are taken."""
 
 
-def smallest_rotation(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def smallest_rotation(
+    start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
     """The rotation about start x end that takes the direction of `start` to that of `end`. Raises: ValueError for a zero."""
     lengths = np.linalg.norm(start), np.linalg.norm(end)
     if not min(lengths) > 0:
@@ -58,7 +64,9 @@ def box_middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     return 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64)
 
 
-def moved(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def moved(
+    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
     """Points through a rigid transform."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
@@ -85,7 +93,9 @@ def intrinsics(size: int) -> Float[np.ndarray, "3 3"]:
     return calibration.intrinsics(focal, focal, 0.5 * size, 0.5 * size)
 
 
-def scan_cameras(number: int, radius: float, views: int, factors: tuple[float, float]) -> Float[np.ndarray, "v 4 4"]:
+def scan_cameras(
+    number: int, radius: float, views: int, factors: tuple[float, float]
+) -> Float[np.ndarray, "v 4 4"]:
     """cam_from_world of cameras that look at the origin, y up; azimuth, elevation and distance are drawn uniformly.
 
     number: of the scan, so that its cameras depend on nothing else. Equal factors: all at that distance.
@@ -95,7 +105,9 @@ def scan_cameras(number: int, radius: float, views: int, factors: tuple[float, f
     elevations = np.deg2rad(rng.uniform(*ELEVATIONS, views))
     distances = radius * rng.uniform(*factors, views)
     flat = np.cos(elevations)
-    towards = np.stack([flat * np.sin(azimuths), np.sin(elevations), flat * np.cos(azimuths)], axis=-1)
+    towards = np.stack(
+        [flat * np.sin(azimuths), np.sin(elevations), flat * np.cos(azimuths)], axis=-1
+    )
     cameras = np.tile(np.eye(4), (views, 1, 1))
     right = np.stack([np.cos(azimuths), np.zeros(views), -np.sin(azimuths)], axis=-1)
     cameras[:, 0, :3] = right
@@ -120,7 +132,9 @@ def evaluation_indices(counts: Mapping[str, int], inputs: int) -> dict[str, dict
     generator, found = random.Random(EVALUATION_SEED), {}
     for name, count in counts.items():
         if count < inputs + TARGETS:
-            raise ValueError(f"{name}: {count} views, but {inputs} inputs and {TARGETS} targets are asked for")
+            raise ValueError(
+                f"{name}: {count} views, but {inputs} inputs and {TARGETS} targets are asked for"
+            )
         context = sorted(generator.sample(range(count), inputs))
         rest = [view for view in range(count) if view not in set(context)]
         found[name] = {"context": context, "target": sorted(generator.sample(rest, TARGETS))}
@@ -161,7 +175,14 @@ class ScanRenderer:
         flat = face_areas(np.pad(scan.uvs.astype(np.float64), ((0, 0), (0, 1))), scan.faces).sum()
         height, width = scan.texture.shape[:2]
         texel = float(np.sqrt(surface / max(flat, 1e-12) / (height * width)))
-        return cls(pad(vertices), pad(smooth_normals(vertices, scan.faces)), faces, pad(scan.uvs), scan, texel)
+        return cls(
+            pad(vertices),
+            pad(smooth_normals(vertices, scan.faces)),
+            faces,
+            pad(scan.uvs),
+            scan,
+            texel,
+        )
 
     def render(
         self, cam_from_world: Float[np.ndarray, "4 4"], size: int, supersample: int
@@ -181,12 +202,16 @@ class ScanRenderer:
         if level not in self.textures:
             step = 1 << level
             height, width = (side // step * step for side in self.scan.texture.shape[:2])
-            blocks = self.scan.texture[:height, :width].reshape(height // step, step, width // step, step, 3)
+            blocks = self.scan.texture[:height, :width].reshape(
+                height // step, step, width // step, step, 3
+            )
             self.textures[level] = jnp.asarray(blocks.mean(axis=(1, 3), dtype=np.float32) / 255)
         return self.textures[level]
 
 
-def smooth_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
+def smooth_normals(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "n 3"]:
     """Unit normals; vertices at one place, which texture seams double, share theirs. Zero where there is no face."""
     places, place = np.unique(vertices, axis=0, return_inverse=True)
     place = place.reshape(-1)
@@ -211,8 +236,12 @@ def _render(
     covered = (fragments.face_ids >= 0)[..., None]
     towards = camera.center - seen[..., :3]
     cosine = jnp.abs(jnp.sum(towards * seen[..., 3:6], -1, keepdims=True))
-    lengths = jnp.linalg.norm(towards, axis=-1, keepdims=True) * jnp.linalg.norm(seen[..., 3:6], axis=-1, keepdims=True)
+    lengths = jnp.linalg.norm(towards, axis=-1, keepdims=True) * jnp.linalg.norm(
+        seen[..., 3:6], axis=-1, keepdims=True
+    )
     light = AMBIENT + HEADLIGHT * cosine / jnp.maximum(lengths, 1e-12)
     color = jnp.where(covered, sample_texture(texture, seen[..., 6:]) * light, 1.0)
-    mean = lambda x: x.reshape(camera.height, supersample, camera.width, supersample, -1).mean(axis=(1, 3))
+    mean = lambda x: x.reshape(camera.height, supersample, camera.width, supersample, -1).mean(
+        axis=(1, 3)
+    )
     return mean(color), mean(covered.astype(color.dtype))[..., 0]

@@ -27,7 +27,15 @@ from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import DEFAULT_BODY, parameter_arrays
 from humangs_jax.data.capture_checks import CaptureError, checked_json, expect, members
 from humangs_jax.data.datasets.scene_list import SceneFrame, scene_entry, write_arrays
-from humangs_jax.data.datasets.subject import THREADS, BodyParameters, FileBody, Photo, PosedPerson, posed_people, turned
+from humangs_jax.data.datasets.subject import (
+    THREADS,
+    BodyParameters,
+    FileBody,
+    Photo,
+    PosedPerson,
+    posed_people,
+    turned,
+)
 from humangs_jax.data.datasets.thuman import (
     FIT_MESH,
     fit_error,
@@ -110,8 +118,12 @@ class Report:
     skipped: dict[str, str]
 
     def __str__(self) -> str:
-        lines = [f"{self.out}: {self.scenes} scenes, {self.views} views ({self.made} scenes made now)"]
-        return "\n".join(lines + [f"skipped {name}: {reason}" for name, reason in self.skipped.items()])
+        lines = [
+            f"{self.out}: {self.scenes} scenes, {self.views} views ({self.made} scenes made now)"
+        ]
+        return "\n".join(
+            lines + [f"skipped {name}: {reason}" for name, reason in self.skipped.items()]
+        )
 
 
 def preprocess(
@@ -141,13 +153,19 @@ def preprocess(
     begin_set(out, DATA_SET, made_with, alone=True)
     for name, reason in absent.items():
         _skip(out, name, reason)
-    due = {name: path for name, path in list(names.items())[index::count] if not (out / name / settings.mark).is_file()}
+    due = {
+        name: path
+        for name, path in list(names.items())[index::count]
+        if not (out / name / settings.mark).is_file()
+    }
     tasks = {name: (out / name, name, path, settings, progress) for name, path in due.items()}
     load = functools.partial(FileBody.load, None if body.file == DEFAULT_BODY else body.file)
     scans, done = DATASETS[settings.kind].scans, 0  # photos of videos are decoded by threads
     try:
         with bar(total=len(due), desc="scans", shown=progress and scans) as shown:
-            for name, error in made(_make_scan if scans else _make_video, tasks, workers if scans else 1, load):
+            for name, error in made(
+                _make_scan if scans else _make_video, tasks, workers if scans else 1, load
+            ):
                 shown.update()
                 if error is None:
                     done += 1
@@ -159,7 +177,9 @@ def preprocess(
     counts = manifest["counts"]
     if due and not counts["scenes"]:
         reason = next(iter(manifest["skipped"].values()), "nothing was made")
-        raise ValueError(f"{out}: none of {len(names)} subjects could be made; the first one: {reason}")
+        raise ValueError(
+            f"{out}: none of {len(names)} subjects could be made; the first one: {reason}"
+        )
     return Report(out, done, counts["scenes"], counts["views"], manifest["skipped"])
 
 
@@ -170,8 +190,12 @@ def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[s
         return dict.fromkeys(names, source), skipped
     folders = imported(data_set.find)(source)
     if not folders:
-        raise CaptureError(source, "", f"no subject in the layout of {settings.kind} (docs/datasets.md)")
-    named = lambda path: path.stem if path.is_file() else "_".join(path.relative_to(source).parts) or path.name
+        raise CaptureError(
+            source, "", f"no subject in the layout of {settings.kind} (docs/datasets.md)"
+        )
+    named = lambda path: (
+        path.stem if path.is_file() else "_".join(path.relative_to(source).parts) or path.name
+    )
     return {named(path): path for path in folders}, {}
 
 
@@ -181,7 +205,10 @@ def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[s
 def _made_with(source: Path, body: FileBody, settings: Settings) -> dict[str, Any]:
     """What the scenes depend on. The data set by the name of its folder: it may lie elsewhere on another machine."""
     shipped = body.file == DEFAULT_BODY
-    known = {"source": source.name, "body": body.file if shipped else file_checksum(Path(body.file))[:SHORT]}
+    known = {
+        "source": source.name,
+        "body": body.file if shipped else file_checksum(Path(body.file))[:SHORT],
+    }
     return {"settings": dataclasses.asdict(settings) | {"factors": list(settings.factors)} | known}
 
 
@@ -205,24 +232,41 @@ def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
     return content
 
 
-def _write_lists(out: Path, names: Sequence[str], settings: Settings, made_with: dict[str, Any]) -> dict[str, Any]:
+def _write_lists(
+    out: Path, names: Sequence[str], settings: Settings, made_with: dict[str, Any]
+) -> dict[str, Any]:
     """Lists and manifest of what is there."""
-    scenes = {name: _read_scene(out / name / SCENE, settings) for name in finished(out, settings.mark)}
+    scenes = {
+        name: _read_scene(out / name / SCENE, settings) for name in finished(out, settings.mark)
+    }
     skipped = {
         file.stem: members(checked_json(file), file, reason=str)[0]
         for file in sorted((out / SKIPPED).glob("*.json"))
         if file.stem not in scenes
     }
-    train, test = split_ids(names, settings.train, settings.test) if DATASETS[settings.kind].scans else ([], sorted(names))
-    split = {"train": [name for name in train if name in scenes], "test": [name for name in test if name in scenes]}
+    train, test = (
+        split_ids(names, settings.train, settings.test)
+        if DATASETS[settings.kind].scans
+        else ([], sorted(names))
+    )
+    split = {
+        "train": [name for name in train if name in scenes],
+        "test": [name for name in test if name in scenes],
+    }
     if settings.layout == "scenes":
         for part, chosen in split.items():
             if chosen or part == "test":  # compact: 2,300 scenes of 60 views are 50 MB
-                write_json(out / f"{part}.json", [scenes[name]["entry"] for name in chosen], indent=None)
+                write_json(
+                    out / f"{part}.json", [scenes[name]["entry"] for name in chosen], indent=None
+                )
         counts = {name: len(scenes[name]["entry"]["frames"]) for name in split["test"]}
         for inputs in INPUT_COUNTS:
             if counts and min(counts.values()) >= inputs + TARGETS:
-                write_json(out / f"evaluation_{inputs}.json", evaluation_indices(counts, inputs), indent=None)
+                write_json(
+                    out / f"evaluation_{inputs}.json",
+                    evaluation_indices(counts, inputs),
+                    indent=None,
+                )
     known = {name: scene["known"] for name, scene in scenes.items()}
     counts = {
         "scenes": len(scenes),
@@ -231,7 +275,9 @@ def _write_lists(out: Path, names: Sequence[str], settings: Settings, made_with:
         "unreadable_photos": sum(len(each.get("unreadable", ())) for each in known.values()),
         "missing_photos": sum(sum(each.get("missing", {}).values()) for each in known.values()),
     }
-    return write_manifest(out, DATA_SET, made_with, counts=counts, split=split, scenes=known, skipped=skipped)
+    return write_manifest(
+        out, DATA_SET, made_with, counts=counts, split=split, scenes=known, skipped=skipped
+    )
 
 
 # One scene ------------------------------------------------------------------------------------------------------------
@@ -269,7 +315,9 @@ class Content:
     known: dict[str, Any]
 
 
-def _make_scan(body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool) -> None:
+def _make_scan(
+    body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool
+) -> None:
     _write(folder, scan_content(source, name, body, settings), body, settings)
 
 
@@ -299,7 +347,9 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
     return Content(transform, [posed], faces, fit.parameters, fit.scale, views, known)
 
 
-def _make_video(body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool) -> None:
+def _make_video(
+    body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool
+) -> None:
     """Frames of a video from all cameras, `every` apart."""
     subject = DATASETS[settings.kind](source, body)
     chosen = np.flatnonzero(subject.frames % settings.every == 0)
@@ -315,16 +365,26 @@ def _make_video(body: FileBody, folder: Path, name: str, source: Path, settings:
     def views() -> Iterator[View]:
         with bar(total=len(chosen), desc=name, unit="photo", shown=progress) as done:
             for first in range(0, len(chosen), THREADS):
-                for i, photo in enumerate(subject.tried(chosen[first : first + THREADS], settings.size), first):
+                for i, photo in enumerate(
+                    subject.tried(chosen[first : first + THREADS], settings.size), first
+                ):
                     done.update()
                     view = subject.view_name(int(chosen[i]))
                     if isinstance(photo, Exception):
                         known["unreadable"][view] = str(photo)
                     else:
-                        yield View(view, int(shown[i]), K[i], subject.cam_from_world[chosen[i]] @ inverse, photo)
+                        yield View(
+                            view,
+                            int(shown[i]),
+                            K[i],
+                            subject.cam_from_world[chosen[i]] @ inverse,
+                            photo,
+                        )
 
     posed = posed_people(body.model, parameters)
-    content = Content(transform, posed, np.asarray(body.model.faces), parameters, 1.0, views(), known)
+    content = Content(
+        transform, posed, np.asarray(body.model.faces), parameters, 1.0, views(), known
+    )
     _write(folder, content, body, settings)
 
 
@@ -340,7 +400,9 @@ def _write(folder: Path, content: Content, body: FileBody, settings: Settings) -
                 write_png(temporary / path, pixels / np.float32(255))
             views.append(view._replace(photo=None))
         if not views:
-            raise ValueError(f"{folder.name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}")
+            raise ValueError(
+                f"{folder.name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}"
+            )
         known = {"views": len(views), "frames": len(content.parameters.rotations), **content.known}
         described: dict[str, Any] = {"known": known}
         if settings.layout == "scenes":
@@ -352,31 +414,45 @@ def _write(folder: Path, content: Content, body: FileBody, settings: Settings) -
     replace_folder(folder, write, mark=settings.mark)
 
 
-def _write_scene(folder: Path, name: str, content: Content, views: Sequence[View]) -> dict[str, Any]:
+def _write_scene(
+    folder: Path, name: str, content: Content, views: Sequence[View]
+) -> dict[str, Any]:
     """Writes the arrays of each frame; returns the entry for the list."""
     (folder / "smpl").mkdir()
     for i, posed in enumerate(content.posed):
         transforms = content.transform @ posed.joint_transforms
         vertices = moved(content.transform, posed.vertices)
-        write_arrays(folder / "smpl" / f"{i:06d}.npz", vertices, posed.rest, content.faces, transforms)
+        write_arrays(
+            folder / "smpl" / f"{i:06d}.npz", vertices, posed.rest, content.faces, transforms
+        )
     frames = []
     for view in views:
-        image, arrays, mask = (f"{name}/{path}" for path in (view.files[0], f"smpl/{view.frame:06d}.npz", view.files[1]))
+        image, arrays, mask = (
+            f"{name}/{path}"
+            for path in (view.files[0], f"smpl/{view.frame:06d}.npz", view.files[1])
+        )
         frames.append(SceneFrame(image, view.cam_from_world, view.K, arrays, mask))
     return scene_entry(name, content.transform, frames)
 
 
-def _write_capture(folder: Path, target: Path, content: Content, views: Sequence[View], body: FileBody) -> None:
+def _write_capture(
+    folder: Path, target: Path, content: Content, views: Sequence[View], body: FileBody
+) -> None:
     """In metres; the poses are those of the aligned world."""
     matrix = content.transform.copy()
     matrix[:3, 3] /= content.scale
     pelvis = body.rest_joints(content.parameters.betas)[0]
     betas, rotations, translations = turned(content.parameters, matrix, pelvis)
-    write_npz(folder / "body.npz", parameter_arrays(target, body.model, body.file, betas, rotations, translations))
+    write_npz(
+        folder / "body.npz",
+        parameter_arrays(target, body.model, body.file, betas, rotations, translations),
+    )
     described = []
     for view in views:
         pose = view.cam_from_world.copy()
         pose[:3, 3] /= content.scale
         files = dict(zip(("image", "mask"), view.files, strict=True))
-        described.append({**files, "frame": view.frame, "K": view.K.tolist(), "cam_from_world": pose.tolist()})
+        described.append(
+            {**files, "frame": view.frame, "K": view.K.tolist(), "cam_from_world": pose.tolist()}
+        )
     write_description(folder, described, "white")

@@ -15,7 +15,15 @@ from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
-from humangs_jax.fitting.state import FitState, Origin, PosePrior, betas_of, limit_residuals, pose_of, robust
+from humangs_jax.fitting.state import (
+    FitState,
+    Origin,
+    PosePrior,
+    betas_of,
+    limit_residuals,
+    pose_of,
+    robust,
+)
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.geometry.transform import EXACT
@@ -56,7 +64,11 @@ class Observations(Batchable):
 
 
 def make_observations(
-    points: AnyArray, confidences: AnyArray, K: AnyArray, cam_from_world: AnyArray, world: AnyArray | None = None
+    points: AnyArray,
+    confidences: AnyArray,
+    K: AnyArray,
+    cam_from_world: AnyArray,
+    world: AnyArray | None = None,
 ) -> Observations:
     """A batch of m frames from arrays (m, c, ...), with the noise that is expected of them."""
     noise = expected_noise(np.asarray(points), np.asarray(confidences))
@@ -66,14 +78,21 @@ def make_observations(
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
     """Keypoints of photos in pixels of resized cameras: a batch of views, each with one view (c = 1), and the noise of all."""
-    scale = np.asarray([cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype)
+    scale = np.asarray(
+        [cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype
+    )
     points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
     arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
     noise = expected_noise(points[None], keypoints.confidences[None])
-    return replace(make_observations(*(x[:, None] for x in arrays)), noise=jnp.asarray(np.repeat(noise, len(points))))
+    return replace(
+        make_observations(*(x[:, None] for x in arrays)),
+        noise=jnp.asarray(np.repeat(noise, len(points))),
+    )
 
 
-def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
+def group_by_frame(
+    photos: Photos | Capture, keypoints: Keypoints
+) -> tuple[Observations, Int[np.ndarray, "m c"]]:
     """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where there is none."""
     frames, count = np.asarray(photos.frames), photos.frame_count
     members = [np.flatnonzero(frames == frame) for frame in range(count)]
@@ -84,11 +103,17 @@ def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Obse
     points = np.where(confidences[..., None] > 0, keypoints.points[views], 0.0)
     cameras = photos.cameras
     world = None
-    if keypoints.world is not None and views.shape[1] == 1:  # several views say more than any of them alone
+    if (
+        keypoints.world is not None and views.shape[1] == 1
+    ):  # several views say more than any of them alone
         hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
-        middle = np.where((confidences * hips).any(-1, keepdims=True), confidences * hips, confidences)
+        middle = np.where(
+            (confidences * hips).any(-1, keepdims=True), confidences * hips, confidences
+        )
         world = in_camera_axes(keypoints.world[views], points, middle, np.asarray(cameras.K)[views])
-    return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views], world), views
+    return make_observations(
+        points, confidences, cameras.K[views], cameras.cam_from_world[views], world
+    ), views
 
 
 def in_camera_axes(
@@ -101,19 +126,29 @@ def in_camera_axes(
     total = weights.sum(-1, keepdims=True)
     middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
     focal, center = np.diagonal(K, axis1=-2, axis2=-1)[..., :2], K[..., :2, 2]
-    rays = np.concatenate([np.where(total > 0, (middle - center) / focal, 0), np.ones_like(total)], axis=-1)
+    rays = np.concatenate(
+        [np.where(total > 0, (middle - center) / focal, 0), np.ones_like(total)], axis=-1
+    )
     turns = smallest_turns(OPTICAL_AXIS, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
     return np.einsum("...ab,...kb->...ka", turns, world)
 
 
-def expected_noise(points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]) -> Float[np.ndarray, " m"]:
+def expected_noise(
+    points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
+) -> Float[np.ndarray, " m"]:
     """Pixels, from the size of the person in the views of a frame; 1 where nothing is seen."""
 
     def of_frame(points, seen):
-        sizes = [np.ptp(np.quantile(p[s], OUTER, axis=0), axis=0).max() for p, s in zip(points, seen, strict=True) if s.any()]
+        sizes = [
+            np.ptp(np.quantile(p[s], OUTER, axis=0), axis=0).max()
+            for p, s in zip(points, seen, strict=True)
+            if s.any()
+        ]
         return max(NOISE * float(np.median(sizes)), LEAST_NOISE) if sizes else 1.0
 
-    return np.asarray([of_frame(p, seen) for p, seen in zip(points, confidences > 0, strict=True)], np.float32)
+    return np.asarray(
+        [of_frame(p, seen) for p, seen in zip(points, confidences > 0, strict=True)], np.float32
+    )
 
 
 def found_noise(lengths: Array, expected: Array) -> Array:
@@ -125,7 +160,10 @@ def found_noise(lengths: Array, expected: Array) -> Array:
 
 def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:
     """Points of the world in the coordinates of every camera."""
-    rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
+    rotation, translation = (
+        observations.cam_from_world[:, :3, :3],
+        observations.cam_from_world[:, :3, 3],
+    )
     return jnp.einsum("cab,kb->cka", rotation, points, precision=EXACT) + translation[:, None]
 
 
@@ -134,7 +172,9 @@ def focal_lengths(observations: Observations) -> Float[Array, "c 1 2"]:
     return jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
 
 
-def keypoint_errors(observations: Observations, landmarks: Float[Array, "k 3"]) -> Float[Array, "c k 2"]:
+def keypoint_errors(
+    observations: Observations, landmarks: Float[Array, "k 3"]
+) -> Float[Array, "c k 2"]:
     """Projected landmarks minus detections, pixels."""
     seen = in_cameras(observations, landmarks)
     pixels = seen[..., :2] / jnp.maximum(seen[..., 2:], NEAR) * focal_lengths(observations)
@@ -148,7 +188,9 @@ def body_errors(
     poses: BodyPose,
     seen: Observations,
     frames: Int[Array | np.ndarray, " n"],
-    errors: Callable[[Observations, Float[Array, "k 3"]], Float[Array, "c k ..."]] = keypoint_errors,
+    errors: Callable[
+        [Observations, Float[Array, "k 3"]], Float[Array, "c k ..."]
+    ] = keypoint_errors,
 ) -> Float[Array, "n c k ..."]:
     """`errors` of a person in the poses `frames` of a batch, for a batch of n observations."""
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
@@ -167,11 +209,18 @@ def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
 
 
 def keypoint_residuals(
-    model: LandmarkModel, observations: Observations, landmarks: Float[Array, "k 3"], scale: Float[Array, ""] | float
+    model: LandmarkModel,
+    observations: Observations,
+    landmarks: Float[Array, "k 3"],
+    scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k 2"]:
     """Errors of keypoints in standard deviations; scale: robust scale, in standard deviations."""
-    errors = keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
-    return _roots(observations.confidences * np.asarray(model.known, np.float32))[..., None] * robust(errors, scale)
+    errors = (
+        keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
+    )
+    return _roots(observations.confidences * np.asarray(model.known, np.float32))[
+        ..., None
+    ] * robust(errors, scale)
 
 
 def _roots(weights: Float[Array, "c k"]) -> Float[Array, "c k"]:
@@ -180,12 +229,19 @@ def _roots(weights: Float[Array, "c k"]) -> Float[Array, "c k"]:
 
 
 def world_residuals(
-    model: LandmarkModel, observations: Observations, landmarks: Float[Array, "k 3"], scale: Float[Array, ""] | float
+    model: LandmarkModel,
+    observations: Observations,
+    landmarks: Float[Array, "k 3"],
+    scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k"]:
     """Depths of landmarks against those that the detector sees, of a person of the same size, in standard deviations."""
     weights = observations.confidences * np.asarray(model.known, np.float32)
-    centered = lambda x: x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
-    size = lambda x: jnp.sqrt(jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total + NEAR**2)[:, None]
+    centered = lambda x: (
+        x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
+    )
+    size = lambda x: jnp.sqrt(
+        jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total + NEAR**2
+    )[:, None]
     total = jnp.maximum(jnp.sum(weights, axis=1), 1e-6)
     ours, theirs = centered(in_cameras(observations, landmarks)), centered(observations.world)
     errors = ours[..., 2] / size(ours) - theirs[..., 2] / size(theirs)
@@ -218,9 +274,13 @@ class KeypointProblem:
         """The landmarks, where the state has their places."""
         return self.model if state.places is None else self.model.moved(PLACE_STD * state.places)
 
-    def landmarks_and_joints(self, state: FitState) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
+    def landmarks_and_joints(
+        self, state: FitState
+    ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
         """Landmarks and joints of a state, metres."""
-        return pose_landmarks(self.model_of(state), betas_of(self.origin, state), pose_of(self.origin, state))
+        return pose_landmarks(
+            self.model_of(state), betas_of(self.origin, state), pose_of(self.origin, state)
+        )
 
 
 def frame_residuals(
@@ -243,5 +303,7 @@ def frame_residuals(
         found["world"] = world_residuals(problem.model, observations, landmarks, scale)
     if targets is not None:
         known = (targets.known * problem.known)[:, None]
-        found["points"] = known * robust((landmarks - targets.points) / (targets.pixel * observations.noise), scale)
+        found["points"] = known * robust(
+            (landmarks - targets.points) / (targets.pixel * observations.noise), scale
+        )
     return found

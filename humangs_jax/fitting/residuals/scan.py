@@ -16,7 +16,14 @@ from scipy.spatial import KDTree
 
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
-from humangs_jax.body.model import BodyModel, BodyPose, SurfacePoints, pose_features, pose_points, surface_points
+from humangs_jax.body.model import (
+    BodyModel,
+    BodyPose,
+    SurfacePoints,
+    pose_features,
+    pose_points,
+    surface_points,
+)
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, static_field
@@ -89,7 +96,9 @@ def pose_vertices(
     """Some vertices (r, 3), the landmarks (k, 3) and the joints (j, 3) of a person in a pose, metres."""
     model, count = surface.landmarks, rows.shape[0]
     transforms, joints = pose_joints(model, betas, pose)
-    wanted = jax.tree.map(lambda own, marks: jnp.concatenate([own[rows], marks]), surface.points, model.points)
+    wanted = jax.tree.map(
+        lambda own, marks: jnp.concatenate([own[rows], marks]), surface.points, model.points
+    )
     posed = pose_points(wanted, betas, pose_features(pose.rotations), transforms)
     return posed[:count], landmarks_from(model, joints, posed[count:]), joints
 
@@ -149,7 +158,9 @@ class ScanMatches:
     @classmethod
     def none(cls) -> "ScanMatches":
         """One pair without weight."""
-        return cls(jnp.zeros(1, jnp.int32), jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.ones(1), jnp.zeros(1))
+        return cls(
+            jnp.zeros(1, jnp.int32), jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.ones(1), jnp.zeros(1)
+        )
 
 
 @pytree_dataclass
@@ -177,7 +188,11 @@ class Tolerances:
 
 
 def scan_residuals(
-    problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState
+    problem: ScanProblem,
+    matches: ScanMatches,
+    given: Given,
+    tolerances: Tolerances,
+    state: FitState,
 ) -> dict[str, Float[Array, "..."]]:
     """All residuals by kind, in standard deviations."""
     betas, pose = problem.body(state)
@@ -198,14 +213,19 @@ def scan_residuals(
     }
 
 
-def one_sided(away: Float[Array, " r"], outside: Float[Array, " r"], inside: Float[Array, ""]) -> Float[Array, " r"]:
+def one_sided(
+    away: Float[Array, " r"], outside: Float[Array, " r"], inside: Float[Array, ""]
+) -> Float[Array, " r"]:
     """Distances (r,), positive outside, in standard deviations of either side."""
     return away / jnp.where(away > 0, outside, inside)
 
 
 def _height(problem: ScanProblem, betas: Float[Array, " s"]) -> Float[Array, ""]:
     points = problem.surface.points
-    height = lambda i: points.rest[i, 1] + jnp.dot(points.directions[i, 1, : betas.shape[0]], betas, precision=EXACT)
+    height = lambda i: (
+        points.rest[i, 1]
+        + jnp.dot(points.directions[i, 1, : betas.shape[0]], betas, precision=EXACT)
+    )
     top, bottom = (height(i) for i in problem.ends)
     return top - bottom
 
@@ -220,14 +240,21 @@ class Target:
     together. normal: metres that a difference of 1 between normals counts like.
     """
 
-    def __init__(self, scan: Scan, align: Similarity, count: int, effective: float, normal: float) -> None:
+    def __init__(
+        self, scan: Scan, align: Similarity, count: int, effective: float, normal: float
+    ) -> None:
         self.points, self.normals = align(scan.points), scan.normals @ align.rotation.T
         self.count, self.effective = min(count, len(self.points)), effective
         self.normal = normal
         self.tree = KDTree(_with_normals(self.points, normal * self.normals))
 
     def matches(
-        self, problem: ScanProblem, state: FitState, gate: float, robust_scale: float, tolerances: Tolerances
+        self,
+        problem: ScanProblem,
+        state: FitState,
+        gate: float,
+        robust_scale: float,
+        tolerances: Tolerances,
     ) -> ScanMatches:
         """The pairs of a body in a state: first those that scan points found, `count` of them, then those that vertices found.
 
@@ -235,7 +262,9 @@ class Target:
         normal at which weights have fallen to a quarter.
         """
         rows, points, facing, away, good = self._pairs(problem, state, gate)
-        fading = np.square(1 / (1 + np.square(away / robust_scale)))  # Geman and McClure's loss, as weights
+        fading = np.square(
+            1 / (1 + np.square(away / robust_scale))
+        )  # Geman and McClure's loss, as weights
         inside, outside = float(tolerances.inside), float(tolerances.outside)
         covered = np.asarray(problem.surface.covered)[rows]
         number = lambda x: jnp.asarray(x, jnp.float32)
@@ -247,17 +276,23 @@ class Target:
             weights=number(good * fading * (self.effective / len(rows))),
         )
 
-    def distances(self, problem: ScanProblem, state: FitState, gate: float) -> tuple[Float[np.ndarray, " r"], float]:
+    def distances(
+        self, problem: ScanProblem, state: FitState, gate: float
+    ) -> tuple[Float[np.ndarray, " r"], float]:
         """How far scan points are outside of the skin (r,), in units of the frame; the share of them that has a partner."""
         away, good = (x[: self.count] for x in self._pairs(problem, state, gate)[3:])
         return away[good], float(good.mean())
 
     def _pairs(self, problem: ScanProblem, state: FitState, gate: float) -> tuple[np.ndarray, ...]:
         """Vertices (r,), points (r, 3), normals (r, 3), distances (r,), and which pairs are near and alike (r,)."""
-        vertices, normals = (np.asarray(x, np.float64) for x in pose_surface(problem.surface, *problem.body(state)))
+        vertices, normals = (
+            np.asarray(x, np.float64) for x in pose_surface(problem.surface, *problem.body(state))
+        )
         vertices = vertices / float(scale_of(state))
         looking = np.flatnonzero(np.asarray(problem.surface.order) < self.count)
-        of_body = self.tree.query(_with_normals(vertices[looking], self.normal * normals[looking]))[1]
+        of_body = self.tree.query(_with_normals(vertices[looking], self.normal * normals[looking]))[
+            1
+        ]
         some, like = self.points[: self.count], self.normals[: self.count]
         tree = KDTree(_with_normals(vertices, self.normal * normals))
         of_scan = tree.query(_with_normals(some, self.normal * like))[1]
@@ -266,9 +301,13 @@ class Target:
         facing = np.concatenate([normals[of_scan], self.normals[of_body]])
         other = np.concatenate([like, normals[looking]])
         apart = points - vertices[rows]
-        good = (np.einsum("ra,ra->r", facing, other) > LIKE) & (np.linalg.norm(apart, axis=1) < gate)
+        good = (np.einsum("ra,ra->r", facing, other) > LIKE) & (
+            np.linalg.norm(apart, axis=1) < gate
+        )
         return rows, points, facing, np.einsum("ra,ra->r", facing, apart), good
 
 
-def _with_normals(points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]) -> Float[np.ndarray, "r 6"]:
+def _with_normals(
+    points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]
+) -> Float[np.ndarray, "r 6"]:
     return np.concatenate([points, normals], axis=1)

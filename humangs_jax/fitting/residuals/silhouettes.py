@@ -90,18 +90,28 @@ def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: C
 
 
 @jax.jit
-def _look(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> tuple[Array, Array, Array, Array]:
+def _look(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera
+) -> tuple[Array, Array, Array, Array]:
     rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     seen = transform.apply(camera.cam_from_world, vertices)
     depths = seen[:, 2]
-    pixels = seen[:, :2] / jnp.where(depths > NEAREST_EDGE, depths, 1.0)[:, None] * focal + camera.K[:2, 2]
+    pixels = (
+        seen[:, :2] / jnp.where(depths > NEAREST_EDGE, depths, 1.0)[:, None] * focal
+        + camera.K[:2, 2]
+    )
     # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
-    normals = jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)[:, :2] / focal
+    normals = (
+        jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)[:, :2]
+        / focal
+    )
     normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     return pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0
 
 
-def body_boundary(view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int) -> Boundary:
+def body_boundary(
+    view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int
+) -> Boundary:
     """`count` points of the body's silhouette, or none if the image shows none."""
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -113,12 +123,16 @@ def body_boundary(view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges
     ends = mesh.ends[chosen]
     normals = unit(view.normals[ends].sum(axis=1))
     middles = view.pixels[ends].mean(axis=1)
-    outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(middles, view.covered.shape)
+    outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(
+        middles, view.covered.shape
+    )
     ends, normals = ends[outside], normals[outside]
     lengths = np.linalg.norm(view.pixels[ends[:, 1]] - view.pixels[ends[:, 0]], axis=1)
     edge, shares = _spread(lengths, count)
     ends, shares = ends[edge], shares.astype(np.float32)
-    positions = view.pixels[ends[:, 0]] * (1 - shares[:, None]) + view.pixels[ends[:, 1]] * shares[:, None]
+    positions = (
+        view.pixels[ends[:, 0]] * (1 - shares[:, None]) + view.pixels[ends[:, 1]] * shares[:, None]
+    )
     return Boundary(positions, normals[edge], ends, shares)
 
 
@@ -127,34 +141,49 @@ def mask_boundary(mask: Float[np.ndarray, "h w"], count: int) -> Boundary:
     from skimage.filters import gaussian
     from skimage.measure import find_contours
 
-    contours = [contour[:, ::-1] + 0.5 for contour in find_contours(mask, 0.5)]  # rows, columns of centres -> pixels
+    contours = [
+        contour[:, ::-1] + 0.5 for contour in find_contours(mask, 0.5)
+    ]  # rows, columns of centres -> pixels
     steps = [np.linalg.norm(np.diff(contour, axis=0), axis=1) for contour in contours]
     longest = max((step.sum() for step in steps), default=0.0)
     kept = [i for i, step in enumerate(steps) if step.sum() >= SPECK * longest]
     none = np.zeros((0, 2))
     starts = np.concatenate([none, *(contours[i][:-1] for i in kept)])
     ends = np.concatenate([none, *(contours[i][1:] for i in kept)])
-    lengths = np.linalg.norm(ends - starts, axis=1) * inside_image(starts, mask.shape) * inside_image(ends, mask.shape)
+    lengths = (
+        np.linalg.norm(ends - starts, axis=1)
+        * inside_image(starts, mask.shape)
+        * inside_image(ends, mask.shape)
+    )
     segment, shares = _spread(lengths, count)
     positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
     down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
     column, row = np.floor(positions).astype(int).T
-    return Boundary(positions.astype(np.float32), unit(-np.stack([right[row, column], down[row, column]], axis=-1)))
+    return Boundary(
+        positions.astype(np.float32),
+        unit(-np.stack([right[row, column], down[row, column]], axis=-1)),
+    )
 
 
-def inside_image(positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "*p"]:
+def inside_image(
+    positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]
+) -> Bool[np.ndarray, "*p"]:
     """Which positions are further than `BORDER` inside of an image of (height, width)."""
     size = np.asarray([shape[1], shape[0]])
     return np.all((positions > BORDER) & (positions < size - BORDER), axis=-1)
 
 
-def _covered(covered: Bool[np.ndarray, "h w"], positions: Float[np.ndarray, "p 2"]) -> Bool[np.ndarray, " p"]:
+def _covered(
+    covered: Bool[np.ndarray, "h w"], positions: Float[np.ndarray, "p 2"]
+) -> Bool[np.ndarray, " p"]:
     column, row = np.floor(positions).astype(int).T
     height, width = covered.shape
     return covered[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
 
 
-def _spread(lengths: Float[np.ndarray, " l"], count: int) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+def _spread(
+    lengths: Float[np.ndarray, " l"], count: int
+) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Points evenly along pieces of a line: (count,) the piece of each and its position there in [0, 1]; none without length."""
     ends = np.cumsum(lengths)
     if len(ends) == 0 or ends[-1] <= 0:
@@ -183,7 +212,9 @@ class Matches:
     weights: Float[Array, " e"]
 
 
-def match(body: Boundary, mask: Float[np.ndarray, "h w"], boundary: Boundary, reach: float, count: int) -> Matches:
+def match(
+    body: Boundary, mask: Float[np.ndarray, "h w"], boundary: Boundary, reach: float, count: int
+) -> Matches:
     """At most 2 `count` equations of a mask and its boundary, padded with weight 0. reach: pixels, how far points look."""
     pairs = zip(_ends_of_mask(body, mask, reach), _nearest(body, boundary, reach), strict=True)
     rows = [np.concatenate(pair) for pair in pairs]
@@ -208,7 +239,9 @@ def _ends_of_mask(body: Boundary, mask: Float[np.ndarray, "h w"], reach: float) 
     rows = np.arange(len(nearest))
     inner, outer = covered[rows, nearest], covered[rows, nearest + 1]
     found = ends[rows, nearest]
-    along = steps[nearest] + (steps[1] - steps[0]) * (inner - 0.5) / np.where(found, inner - outer, 1.0)
+    along = steps[nearest] + (steps[1] - steps[0]) * (inner - 0.5) / np.where(
+        found, inner - outer, 1.0
+    )
     offsets = np.sum(body.normals * body.positions, axis=-1) + along
     return np.flatnonzero(found), body.normals[found], offsets[found]
 
@@ -226,7 +259,11 @@ def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
     distances = np.where(mask.normals @ body.normals.T > FACING, distances, np.inf)
     nearest = np.argmin(distances, axis=1)
     found = distances[np.arange(len(nearest)), nearest] < reach
-    return nearest[found], mask.normals[found], np.sum(mask.normals * mask.positions, axis=-1)[found]
+    return (
+        nearest[found],
+        mask.normals[found],
+        np.sum(mask.normals * mask.positions, axis=-1)[found],
+    )
 
 
 def distances(matches: Matches, pixels: Float[Array, "p 2"]) -> Float[Array, " e"]:
@@ -259,9 +296,14 @@ def silhouette_residuals(
 # Points of silhouettes on the body --------------------------------------------------------------------------------------
 
 
-def boundary_points(body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int) -> SurfacePoints:
+def boundary_points(
+    body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int
+) -> SurfacePoints:
     """The points of v silhouettes as functions of shape and pose, (v, count, ...), padded with points that no equation uses."""
-    ends, shares = (np.stack([padded(getattr(each, name), count) for each in boundaries]) for name in ("ends", "shares"))
+    ends, shares = (
+        np.stack([padded(getattr(each, name), count) for each in boundaries])
+        for name in ("ends", "shares")
+    )
     return _between(body, ends, shares, coefficients)
 
 
@@ -272,7 +314,10 @@ def padded(rows: np.ndarray, count: int) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnames="coefficients")
 def _between(
-    body: BodyModel, ends: Int[Array | np.ndarray, "v p 2"], shares: Float[Array | np.ndarray, "v p"], coefficients: int
+    body: BodyModel,
+    ends: Int[Array | np.ndarray, "v p 2"],
+    shares: Float[Array | np.ndarray, "v p"],
+    coefficients: int,
 ) -> SurfacePoints:
     points = surface_points(body)
     points = replace(points, directions=points.directions[..., :coefficients])

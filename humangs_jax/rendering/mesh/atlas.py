@@ -56,7 +56,13 @@ class Atlas:
     texel: float
 
 
-def unwrap(vertices: Points, faces: Faces, pieces: Int[np.ndarray, " f"], size: int, density: Float[np.ndarray, " f"]) -> Atlas:
+def unwrap(
+    vertices: Points,
+    faces: Faces,
+    pieces: Int[np.ndarray, " f"],
+    size: int,
+    density: Float[np.ndarray, " f"],
+) -> Atlas:
     """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size texels.
 
     density: texels per metre of each face relative to others; the same all over a piece.
@@ -103,7 +109,9 @@ def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def fill_gaps(image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w c"]:
+def fill_gaps(
+    image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w c"]:
     """The image with every unknown texel replaced by the nearest known one."""
     from scipy.ndimage import distance_transform_edt
 
@@ -127,7 +135,9 @@ def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     sides = np.argmax(cosines, axis=1)
     source, target = np.concatenate([pairs, pairs[:, ::-1]]).T
     for _ in range(SMOOTHING_STEPS):
-        votes = np.bincount(target * len(SIDES) + sides[source], minlength=cosines.size).reshape(cosines.shape)
+        votes = np.bincount(target * len(SIDES) + sides[source], minlength=cosines.size).reshape(
+            cosines.shape
+        )
         sides = np.argmax(np.where(allowed, cosines + NEIGHBOUR_GAIN * votes, -np.inf), axis=1)
     return sides
 
@@ -143,13 +153,22 @@ def _connected(count: int, pairs: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _flatten(
-    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, charts: np.ndarray, sides: np.ndarray, density: np.ndarray
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    charts: np.ndarray,
+    sides: np.ndarray,
+    density: np.ndarray,
 ) -> _Flat:
     """Every chart in a plane across its mean normal, turned so that its box is small, as large as its density says."""
     count = int(charts.max()) + 1
-    keys, inverse = np.unique(charts.repeat(3) * len(vertices) + faces.reshape(-1), return_inverse=True)
+    keys, inverse = np.unique(
+        charts.repeat(3) * len(vertices) + faces.reshape(-1), return_inverse=True
+    )
     owner, vertex = keys // len(vertices), keys % len(vertices)
-    axis = unit(np.stack([np.bincount(charts, weights=normals[:, i], minlength=count) for i in range(3)], 1))
+    axis = unit(
+        np.stack([np.bincount(charts, weights=normals[:, i], minlength=count) for i in range(3)], 1)
+    )
     worst = np.full(count, np.inf)
     np.minimum.at(worst, charts, np.sum(normals * axis[charts], 1))
     some_side = np.zeros(count, np.int64)
@@ -162,7 +181,9 @@ def _flatten(
     flat = _turned(flat, owner, count)
     enlarged = np.ones(count)
     enlarged[charts] = density
-    points = ((flat - _extreme(np.minimum, flat, owner, count)[owner]) * enlarged[owner, None]).astype(np.float32)
+    points = (
+        (flat - _extreme(np.minimum, flat, owner, count)[owner]) * enlarged[owner, None]
+    ).astype(np.float32)
     heights = np.sum(vertices[vertex] * axis[owner], 1)
     return _Flat(points, heights, inverse.reshape(-1, 3), vertex, owner, charts)
 
@@ -173,7 +194,9 @@ def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) ->
     for angle in np.arange(angles) * (np.pi / angles):
         c, s = np.cos(angle), np.sin(angle)
         turned = flat @ np.asarray([[c, s], [-s, c]])
-        width, height = (_extreme(np.maximum, turned, owner, count) - _extreme(np.minimum, turned, owner, count)).T
+        width, height = (
+            _extreme(np.maximum, turned, owner, count) - _extreme(np.minimum, turned, owner, count)
+        ).T
         area = width * height + np.where(width < height, 1e-9, 0)
         better = area < best_area - 1e-12
         best_area = np.where(better, area, best_area)
@@ -228,8 +251,12 @@ def _rasterize(
     pixels: np.ndarray, depth: np.ndarray | np.floating, faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """(size, size) face of every texel (-1: none) and (size, size, 3) its weights; y up, row 0 on top."""
-    points = np.stack([pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1)
-    points = np.pad(points.astype(np.float32), ((0, -len(points) % VERTEX_STEP), (0, 0)), constant_values=1)
+    points = np.stack(
+        [pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1
+    )
+    points = np.pad(
+        points.astype(np.float32), ((0, -len(points) % VERTEX_STEP), (0, 0)), constant_values=1
+    )
     faces = np.pad(faces.astype(np.int32), ((0, -len(faces) % FACE_STEP), (0, 0)))
     camera = Camera(jnp.eye(3, dtype=jnp.float32), jnp.eye(4, dtype=jnp.float32), size, size)
     fragments = rasterize_mesh(jnp.asarray(points), jnp.asarray(faces), camera)
@@ -243,11 +270,20 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
 
 def _pack(flat: _Flat, size: int) -> Atlas:
     """Charts as bitmaps of cells at the first free place, shrunk together until all fit."""
-    scale = size / np.sqrt(np.prod(_sizes(flat), 0).sum())  # the boxes alone would fill the square: a start that is too large
+    scale = size / np.sqrt(
+        np.prod(_sizes(flat), 0).sum()
+    )  # the boxes alone would fill the square: a start that is too large
     while (corners := _place(flat, scale, size)) is None:
         scale *= SHRINKING
     uvs = (flat.points * scale + corners[flat.point_charts]) / size
-    return Atlas(uvs.astype(np.float32), flat.faces.astype(np.int32), flat.vertices, flat.charts, size, 1 / scale)
+    return Atlas(
+        uvs.astype(np.float32),
+        flat.faces.astype(np.int32),
+        flat.vertices,
+        flat.charts,
+        size,
+        1 / scale,
+    )
 
 
 def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
@@ -293,4 +329,6 @@ def _bitmaps(flat: _Flat, scale: float, cell: int) -> list[np.ndarray]:
     for step in np.ndindex(*((high - low).max(0) + 1)):
         x, y = np.minimum(low + step, high).T
         cells[start[flat.charts] + y * extent[flat.charts, 0] + x] = True
-    return [cells[a:b].reshape(h, w) for a, b, (w, h) in zip(start[:-1], start[1:], extent, strict=True)]
+    return [
+        cells[a:b].reshape(h, w) for a, b, (w, h) in zip(start[:-1], start[1:], extent, strict=True)
+    ]

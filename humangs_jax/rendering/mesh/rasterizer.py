@@ -83,7 +83,10 @@ class Fragments(Batchable):
 @functools.partial(jax.jit, static_argnames="config")
 @checked_arguments
 def rasterize_mesh(
-    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera, config: RasterConfig = DEFAULT_CONFIG
+    vertices: Float[Array, "n 3"],
+    faces: Int[Array, "f 3"],
+    camera: Camera,
+    config: RasterConfig = DEFAULT_CONFIG,
 ) -> Fragments:
     """The nearest face at every pixel centre of one camera; batch with `jax.vmap`."""
     vertices, camera = lax.stop_gradient((vertices, camera))
@@ -96,7 +99,9 @@ def rasterize_mesh(
     row_end = cumsum(rows)
     depth, face_ids = _z_buffer(corners, first_row, row_end - rows, row_end, width, height, config)
     covered = face_ids != NO_FACE
-    weights = _weights_by_pixel(corners, jnp.where(covered, face_ids, 0), width, config.fragments_per_step)
+    weights = _weights_by_pixel(
+        corners, jnp.where(covered, face_ids, 0), width, config.fragments_per_step
+    )
     weights = jnp.where(covered[:, None], weights, 0.0)
     return Fragments(
         face_ids=jnp.where(covered, face_ids, -1).reshape(height, width),
@@ -109,7 +114,10 @@ def rasterize_mesh(
 @jax.jit
 @checked_arguments
 def interpolate_attributes(
-    fragments: Fragments, faces: Int[Array, "f 3"], attributes: Float[Array, "n c"], background: Float[Array, " c"]
+    fragments: Fragments,
+    faces: Int[Array, "f 3"],
+    attributes: Float[Array, "n c"],
+    background: Float[Array, " c"],
 ) -> Float[Array, "h w c"]:
     """Values at the corners of the faces, blended over the seen surface; `background` where there is no face.
 
@@ -119,7 +127,9 @@ def interpolate_attributes(
     if faces.shape[0] == 0:
         return jnp.broadcast_to(background, (*fragments.face_ids.shape, background.shape[0]))
     covered = fragments.face_ids >= 0
-    corners = attributes[faces].reshape(faces.shape[0], -1)[jnp.where(covered, fragments.face_ids, 0)]
+    corners = attributes[faces].reshape(faces.shape[0], -1)[
+        jnp.where(covered, fragments.face_ids, 0)
+    ]
     # three terms, not a sum over an axis of three: 70 times as fast on XLA's CPU backend
     a, b, c = jnp.split(corners, 3, axis=-1)
     weight_a, weight_b, weight_c = jnp.split(fragments.barycentrics, 3, axis=-1)
@@ -129,8 +139,13 @@ def interpolate_attributes(
 def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
     """(n, 3): pixel position x, y and depth z. Written out: matrix products are of low precision on GPU and TPU."""
     R, t, K = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3], camera.K
-    x, y, z = (R[i, 0] * vertices[:, 0] + R[i, 1] * vertices[:, 1] + R[i, 2] * vertices[:, 2] + t[i] for i in range(3))
-    return jnp.stack([K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2], z], axis=-1).astype(vertices.dtype)
+    x, y, z = (
+        R[i, 0] * vertices[:, 0] + R[i, 1] * vertices[:, 1] + R[i, 2] * vertices[:, 2] + t[i]
+        for i in range(3)
+    )
+    return jnp.stack([K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2], z], axis=-1).astype(
+        vertices.dtype
+    )
 
 
 def _first_pixel(low: Array, size: int) -> Array:
@@ -152,13 +167,17 @@ def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
     z = corners[:, 2::3]
     ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
     area = jnp.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
-    rounding = AREA_ROUNDING * jnp.finfo(corners.dtype).eps * jnp.abs(ab).sum(-1) * jnp.abs(ac).sum(-1)
+    rounding = (
+        AREA_ROUNDING * jnp.finfo(corners.dtype).eps * jnp.abs(ab).sum(-1) * jnp.abs(ac).sum(-1)
+    )
     whole = (z > near).all(-1) & jnp.isfinite(area)
     lost = ~whole & ~(z <= near).all(-1)  # also where z is NaN
     return whole & (area > rounding), jnp.sum(lost, dtype=jnp.int32)
 
 
-def _rows(corners: Float[Array, "f 9"], drawn: Array, width: int, height: int) -> tuple[Array, Array]:
+def _rows(
+    corners: Float[Array, "f 9"], drawn: Array, width: int, height: int
+) -> tuple[Array, Array]:
     """First row of pixel centres of every face, and how many; 0 rows if its bounding box holds no pixel centre."""
     x, y = (jnp.where(drawn[:, None], corners[:, i::3], 0.0) for i in range(2))
     drawn &= _first_pixel(x.min(-1), width) <= _last_pixel(x.max(-1), width)
@@ -186,18 +205,25 @@ def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
 
 def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Array]:
     """Perspective-correct weights (three arrays), depth, and whether the face covers the points (x, y)."""
-    corner_x, corner_y = [corners[..., 3 * i] for i in range(3)], [corners[..., 3 * i + 1] for i in range(3)]
+    corner_x, corner_y = (
+        [corners[..., 3 * i] for i in range(3)],
+        [corners[..., 3 * i + 1] for i in range(3)],
+    )
     edges = []
     for a, b in ((1, 2), (2, 0), (0, 1)):
         ax, ay, bx, by = corner_x[a], corner_y[a], corner_x[b], corner_y[b]
         swap = (ay > by) | ((ay == by) & (ax > bx))
         ax, ay, bx, by = ax - x, ay - y, bx - x, by - y
-        low_x, low_y, high_x, high_y = (jnp.where(swap, p, q) for p, q in ((bx, ax), (by, ay), (ax, bx), (ay, by)))
+        low_x, low_y, high_x, high_y = (
+            jnp.where(swap, p, q) for p, q in ((bx, ax), (by, ay), (ax, bx), (ay, by))
+        )
         edge = low_x * high_y - low_y * high_x
         edges.append(jnp.where(swap, -edge, edge))
     smallest = jnp.minimum(jnp.minimum(edges[0], edges[1]), edges[2])
     largest = jnp.maximum(jnp.maximum(edges[0], edges[1]), edges[2])
-    inside = ((smallest >= 0) | (largest <= 0)) & (smallest != largest)  # both windings; equal only if all are 0
+    inside = ((smallest >= 0) | (largest <= 0)) & (
+        smallest != largest
+    )  # both windings; equal only if all are 0
     areas = [jnp.abs(edge) for edge in edges]
     total = areas[0] + areas[1] + areas[2]
     total = jnp.where(total > 0, total, 1.0)
@@ -225,7 +251,13 @@ def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, A
 
 
 def _z_buffer(
-    corners: Array, first_row: Array, row_begin: Array, row_end: Array, width: int, height: int, config: RasterConfig
+    corners: Array,
+    first_row: Array,
+    row_begin: Array,
+    row_end: Array,
+    width: int,
+    height: int,
+    config: RasterConfig,
 ) -> tuple[Array, Array]:
     """Depth and face of every pixel (h w): infinity and NO_FACE where there is none."""
 
@@ -249,13 +281,17 @@ def _z_buffer(
             depth = depth.at[drawn].min(z, mode="drop")
             nearest = depth.at[drawn].get(mode="fill", fill_value=-1.0)
             # a pixel that came nearer forgets its face; then the lowest of the faces at its new depth takes it
-            face_ids = face_ids.at[jnp.where(nearest < before, drawn, width * height)].set(NO_FACE, mode="drop")
+            face_ids = face_ids.at[jnp.where(nearest < before, drawn, width * height)].set(
+                NO_FACE, mode="drop"
+            )
             wins = jnp.where(z == nearest, drawn, width * height)
             face_ids = face_ids.at[wins].min(face[span], mode="drop")
             return start + config.fragments_per_step, depth, face_ids
 
         more = lambda state: state[0] < end[-1]
-        _, depth, face_ids = lax.while_loop(more, draw_fragments, (jnp.zeros((), jnp.int32), depth, face_ids))
+        _, depth, face_ids = lax.while_loop(
+            more, draw_fragments, (jnp.zeros((), jnp.int32), depth, face_ids)
+        )
         return start + config.rows_per_step, depth, face_ids
 
     depth = jnp.full(width * height, jnp.inf, corners.dtype)
@@ -264,7 +300,9 @@ def _z_buffer(
     return lax.while_loop(more, draw_rows, (jnp.zeros((), jnp.int32), depth, face_ids))[1:]
 
 
-def sample_texture(texture: Float[Array, "th tw c"], uv: Float[Array, "h w 2"]) -> Float[Array, "h w c"]:
+def sample_texture(
+    texture: Float[Array, "th tw c"], uv: Float[Array, "h w 2"]
+) -> Float[Array, "h w c"]:
     """Bilinear texture lookup. Differentiable with respect to the texture and, inside a texel, to uv.
 
     As in OBJ files: u to the right, v UP, (0, 0) the lower left corner of the texture and (1, 1) its upper right one; row 0 is
@@ -342,6 +380,10 @@ def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
     return albedo * (AMBIENT + DIFFUSE * jnp.maximum(facing, 0)) + SPECULAR * highlight
 
 
-def _map(vertices: Array, values: Array, faces: Array, camera: Camera, config: RasterConfig) -> tuple[Array, Array]:
+def _map(
+    vertices: Array, values: Array, faces: Array, camera: Camera, config: RasterConfig
+) -> tuple[Array, Array]:
     fragments = rasterize_mesh(vertices, faces, camera, config)
-    return interpolate_attributes(fragments, faces, values, jnp.full(3, BACKGROUND, values.dtype)), fragments.depth
+    return interpolate_attributes(
+        fragments, faces, values, jnp.full(3, BACKGROUND, values.dtype)
+    ), fragments.depth

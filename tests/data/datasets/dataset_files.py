@@ -35,7 +35,9 @@ def model_arrays(seed=0):
         "posedirs": 0.01 * rng.normal(size=(VERTICES, 3, 9 * (joints - 1))),
         "J_regressor": np.eye(joints, VERTICES),
         "weights": weights / weights.sum(1, keepdims=True),
-        "kintree_table": np.stack([np.where(np.asarray(PARENTS) < 0, 2**32 - 1, PARENTS), np.arange(joints)]),
+        "kintree_table": np.stack(
+            [np.where(np.asarray(PARENTS) < 0, 2**32 - 1, PARENTS), np.arange(joints)]
+        ),
         "hands_meanl": 0.2 * rng.normal(size=45),
         "hands_meanr": 0.2 * rng.normal(size=45),
         "hands_componentsl": rng.normal(size=(45, 45)),
@@ -88,7 +90,9 @@ def scan_vertices(arrays, values):
         if len(numbers) == 12:
             numbers = numbers @ arrays[f"hands_components{hand[0]}"][:12]
         hands.append(numbers + arrays[f"hands_mean{hand[0]}"])
-    pose = np.concatenate([*(values[key][0] for key in ANGLES), *hands]).reshape(-1, 3).astype(float)
+    pose = (
+        np.concatenate([*(values[key][0] for key in ANGLES), *hands]).reshape(-1, 3).astype(float)
+    )
     betas = np.concatenate([values["betas"][0], values["expression"][0]]).astype(float)
     scale = float(values["scale"][0])
     rest, vertices, transforms = oracle(arrays, betas, pose, np.zeros(3))
@@ -101,8 +105,15 @@ def write_obj(path, vertices, faces, uvs=None):
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(vertices, float).tolist()]
     corner = (lambda i: f"{i}/{i}") if uvs is not None else str
     if uvs is not None:
-        lines = ["mtllib material0.mtl", *lines, *(f"vt {u:.7g} {v:.7g}" for u, v in uvs.tolist()), "usemtl material0"]
-    lines += ["f " + " ".join(corner(i) for i in face) for face in (np.asarray(faces, int) + 1).tolist()]
+        lines = [
+            "mtllib material0.mtl",
+            *lines,
+            *(f"vt {u:.7g} {v:.7g}" for u, v in uvs.tolist()),
+            "usemtl material0",
+        ]
+    lines += [
+        "f " + " ".join(corner(i) for i in face) for face in (np.asarray(faces, int) + 1).tolist()
+    ]
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -130,7 +141,9 @@ def write_thuman(folder, arrays, kinds="ABC"):
         low, high = mesh.min(0), mesh.max(0)
         corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
         faces = np.asarray([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
-        faces = np.concatenate([faces, [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]])
+        faces = np.concatenate(
+            [faces, [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]]
+        )
         places, texture = low + corners * (high - low), np.full((8, 8, 3), 90, np.uint8)
         write_scan(folder / "model" / name, places, faces, corners[:, :2].astype(float), texture)
     return folder
@@ -163,7 +176,13 @@ def recording(frames=FRAMES):
     person[4:12, 3:9] = 255
     K, T = np.asarray([[20.0, 0, 5.5], [0, 20, 7.5], [0, 0, 1]]), np.tile([0, 0, 3.0], (CAMERAS, 1))
     return Recording(
-        K, np.asarray(turns), T, (WIDTH, HEIGHT), frames, lambda *_: (photo, person), parameter_arrays(frames=frames)
+        K,
+        np.asarray(turns),
+        T,
+        (WIDTH, HEIGHT),
+        frames,
+        lambda *_: (photo, person),
+        parameter_arrays(frames=frames),
     )
 
 
@@ -175,10 +194,22 @@ def write_photo(photo, mask, pixels):
 
 def parameter_arrays(seed=0, frames=FRAMES):
     rng = np.random.default_rng(seed)
-    sizes = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "left_hand_pose": 45, "right_hand_pose": 45}
+    sizes = {
+        "global_orient": 3,
+        "body_pose": 63,
+        "jaw_pose": 3,
+        "left_hand_pose": 45,
+        "right_hand_pose": 45,
+    }
     arrays = {key: 0.3 * rng.normal(size=(frames, size)) for key, size in sizes.items()}
-    arrays |= {"transl": 0.1 * rng.normal(size=(frames, 3)), "betas": np.tile(rng.normal(size=COLUMNS), (frames, 1))}
-    return {key: x.astype(np.float32) for key, x in (arrays | {"expression": np.zeros((frames, COLUMNS))}).items()}
+    arrays |= {
+        "transl": 0.1 * rng.normal(size=(frames, 3)),
+        "betas": np.tile(rng.normal(size=COLUMNS), (frames, 1)),
+    }
+    return {
+        key: x.astype(np.float32)
+        for key, x in (arrays | {"expression": np.zeros((frames, COLUMNS))}).items()
+    }
 
 
 def calibration(names, made):
@@ -192,9 +223,16 @@ def write_folders(folder, made, names, photos, masks, rig, every=1):
     for c, name in enumerate(names):
         for frame in range(made.frames):
             file = f"{every * frame:08d}.jpg"
-            write_photo(folder / photos.format(name) / file, folder / masks.format(name) / file, made.shot(c, frame))
+            write_photo(
+                folder / photos.format(name) / file,
+                folder / masks.format(name) / file,
+                made.shot(c, frame),
+            )
     (folder / rig).write_text(json.dumps(calibration(names, made)))
-    np.savez(folder / "smpl_params.npz", **{key: np.repeat(x, every, axis=0) for key, x in made.parameters.items()})
+    np.savez(
+        folder / "smpl_params.npz",
+        **{key: np.repeat(x, every, axis=0) for key, x in made.parameters.items()},
+    )
     return folder
 
 
@@ -217,15 +255,23 @@ def write_actorshq(folder, frames=FRAMES):
     scale.mkdir(parents=True)
     with open(scale / "calibration.csv", "w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(["name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"])
+        table.writerow(
+            ["name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
+        )
         K = made.K
         inner = K[0, 0] / WIDTH, K[1, 1] / HEIGHT, (K[0, 2] + 0.5) / WIDTH, (K[1, 2] + 0.5) / HEIGHT
         for c, (R, T) in enumerate(zip(made.R, made.T, strict=True)):
             name = f"Cam{c + 1:03d}"
-            table.writerow([name, WIDTH, HEIGHT, *Rotation.from_matrix(R.T).as_rotvec(), *(-R.T @ T), *inner])
+            table.writerow(
+                [name, WIDTH, HEIGHT, *Rotation.from_matrix(R.T).as_rotvec(), *(-R.T @ T), *inner]
+            )
             for frame in range(frames):
                 photo = scale / "rgbs" / name / f"{name}_rgb{frame:06d}.jpg"
-                write_photo(photo, scale / "masks" / name / f"{name}_mask{frame:06d}.png", made.shot(c, frame))
+                write_photo(
+                    photo,
+                    scale / "masks" / name / f"{name}_mask{frame:06d}.png",
+                    made.shot(c, frame),
+                )
     np.savez(folder / "smpl_params.npz", **made.parameters)
     return folder
 
@@ -258,13 +304,28 @@ def write_dna(folder, frames=FRAMES):
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = R, T
             at = f"Camera_Parameter/{c:02d}"
-            notes[f"{at}/K"], notes[f"{at}/D"], notes[f"{at}/RT"] = made.K, np.zeros(5), np.linalg.inv(pose)
+            notes[f"{at}/K"], notes[f"{at}/D"], notes[f"{at}/RT"] = (
+                made.K,
+                np.zeros(5),
+                np.linalg.inv(pose),
+            )
             for frame in range(frames):
                 photo, person = map(encode, made.shot(c, frame))
-                main[f"Camera_5mp/{c}/color/{frame}"], notes[f"Mask/{c}/mask/{frame}"] = photo, person
-        full = [values["global_orient"], values["body_pose"], values["jaw_pose"], np.zeros((frames, 6))]
+                main[f"Camera_5mp/{c}/color/{frame}"], notes[f"Mask/{c}/mask/{frame}"] = (
+                    photo,
+                    person,
+                )
+        full = [
+            values["global_orient"],
+            values["body_pose"],
+            values["jaw_pose"],
+            np.zeros((frames, 6)),
+        ]
         full = np.concatenate([*full, values["left_hand_pose"], values["right_hand_pose"]], 1)
-        notes["SMPLx/fullpose"], notes["SMPLx/transl"] = full.reshape(frames, 55, 3), values["transl"]
+        notes["SMPLx/fullpose"], notes["SMPLx/transl"] = (
+            full.reshape(frames, 55, 3),
+            values["transl"],
+        )
         for key in ("betas", "expression"):
             notes[f"SMPLx/{key}"] = values[key]
     return folder
@@ -285,7 +346,11 @@ def write_scenes(folder, arrays, scale=1.3, views=3):
         rest, vertices, transforms = oracle(arrays, betas, rotations, translation)
         transforms[:, :3, 3] *= scale
         (folder / "smpl").mkdir(parents=True, exist_ok=True)
-        numbers = {"v_posed": scale * vertices, "v_cano": scale * rest, "joint_transforms": transforms}
+        numbers = {
+            "v_posed": scale * vertices,
+            "v_cano": scale * rest,
+            "joint_transforms": transforms,
+        }
         numbers = {key: x.astype(np.float32) for key, x in numbers.items()}
         np.savez(folder / "smpl" / f"{i}.npz", faces=arrays["f"], **numbers)
         known.append((rotations, translation))
@@ -299,7 +364,14 @@ def write_scenes(folder, arrays, scale=1.3, views=3):
             (folder / "images").mkdir(exist_ok=True)
             Image.fromarray(image).save(folder / path)
             inner = [made.K[0, 0], made.K[1, 1], HEIGHT / 2, HEIGHT / 2]
-            frames.append({"image_path": path, "w2c": pose.tolist(), "fxfycxcy": inner, "smpl_path": f"smpl/{i}.npz"})
+            frames.append(
+                {
+                    "image_path": path,
+                    "w2c": pose.tolist(),
+                    "fxfycxcy": inner,
+                    "smpl_path": f"smpl/{i}.npz",
+                }
+            )
     content = [{"scene_name": "s0", "mesh_transform": np.eye(4).tolist(), "frames": frames}]
     (folder / "train.json").write_text(json.dumps(content))
     return folder / "train.json", betas, known

@@ -4,7 +4,15 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from data.datasets.dataset_files import ANGLES, AVATARREX, COLUMNS, THUMAN4, write_fit, write_folders, write_scan
+from data.datasets.dataset_files import (
+    ANGLES,
+    AVATARREX,
+    COLUMNS,
+    THUMAN4,
+    write_fit,
+    write_folders,
+    write_scan,
+)
 from scipy.spatial.transform import Rotation
 
 from experiments.bodies import write_smplx
@@ -32,7 +40,9 @@ def write_body(path, people, body, hand_poses):
 
     hand_poses: (people, 2, 45) that 12 components reach.
     """
-    directions = np.zeros((len(body.template), 3, 2 * COLUMNS), np.float32)  # shapes, no expressions
+    directions = np.zeros(
+        (len(body.template), 3, 2 * COLUMNS), np.float32
+    )  # shapes, no expressions
     for i, person in enumerate(people):
         directions[..., i] = np.asarray(body.shape_directions) @ person.betas
     rng = np.random.default_rng(7)
@@ -48,7 +58,9 @@ def write_body(path, people, body, hand_poses):
 def make_people(seeds, vertices=None):
     """Synthetic people, and the body of the model file: that which they are made of, decimated to `vertices`."""
     body = load_body()
-    return [in_tight_clothes(seed, body) for seed in seeds], body if vertices is None else decimate(body, vertices)
+    return [in_tight_clothes(seed, body) for seed in seeds], body if vertices is None else decimate(
+        body, vertices
+    )
 
 
 def in_tight_clothes(seed, body):
@@ -58,7 +70,9 @@ def in_tight_clothes(seed, body):
         seen = describe(other, body)
         for garment in seen.garments:
             if garment.kind in wanted:
-                sizes = {key: 0.0 if key == "loose" else size for key, size in garment.sizes.items()}
+                sizes = {
+                    key: 0.0 if key == "loose" else size for key, size in garment.sizes.items()
+                }
                 garments[garment.kind] = dataclasses.replace(garment, sizes=sizes)
                 wanted.discard(garment.kind)
         haircut = seen.haircut if haircut is None and seen.haircut.cut == "buzz" else haircut
@@ -72,7 +86,9 @@ def placed(rotations, translations, world, arrays, i):
     """Parameters of person i of a model file in another world."""
     shape = np.eye(2 * COLUMNS)[i]
     rest = arrays["v_template"] + arrays["shapedirs"] @ shape
-    return turned(BodyParameters(shape, rotations, translations), world, arrays["J_regressor"][0] @ rest)
+    return turned(
+        BodyParameters(shape, rotations, translations), world, arrays["J_regressor"][0] @ rest
+    )
 
 
 def random_rigid(rng):
@@ -102,9 +118,17 @@ def write_thuman(out, seeds=SEEDS, kinds="AC", texture_size=1024, vertices=None)
         points = scale * (pose.vertices @ matrix[:3, :3].T + matrix[:3, 3])[baked.atlas.vertices]
         scan = points, baked.atlas.faces, baked.atlas.uvs, lit_texture(pose, baked)
         write_scan(out / "thuman" / "model" / name, *scan)
-        parameters = placed(pose.rotations[None].astype(float), pose.translation[None].astype(float), matrix, arrays, i)
+        parameters = placed(
+            pose.rotations[None].astype(float),
+            pose.translation[None].astype(float),
+            matrix,
+            arrays,
+            i,
+        )
         fit = fit_values(parameters, kinds[i % len(kinds)], scale, arrays, i)
-        mesh = scale * next(posed_people(FileBody.load(out / "body.npz").model, parameters)).vertices
+        mesh = (
+            scale * next(posed_people(FileBody.load(out / "body.npz").model, parameters)).vertices
+        )
         write_fit(out / "thuman" / "smplx" / name, fit, mesh, arrays["f"])
     return out / "thuman"
 
@@ -118,9 +142,14 @@ def fit_values(parameters, kind, scale, arrays, person):
     for side, name in enumerate(("left", "right")):
         hand = rotations[at + 45 * side : at + 45 * (side + 1)] - arrays[f"hands_mean{name[0]}"]
         values[f"{name}_hand_pose"] = (np.eye(12)[person] if kind == "A" else hand)[None]
-    values |= {"betas": parameters.betas[None, :COLUMNS], "expression": parameters.betas[None, COLUMNS:]}
+    values |= {
+        "betas": parameters.betas[None, :COLUMNS],
+        "expression": parameters.betas[None, COLUMNS:],
+    }
     values["scale"] = np.asarray([scale])
-    values["transl" if kind == "C" else "translation"] = (translation if kind == "C" else scale * translation)[None]
+    values["transl" if kind == "C" else "translation"] = (
+        translation if kind == "C" else scale * translation
+    )[None]
     return {key: np.asarray(value, np.float32) for key, value in values.items()}
 
 
@@ -136,13 +165,18 @@ class Video:
         people, small = make_people([seed], vertices)
         motion = sample_motion(people[0], 30, "walk")
         rows = np.linspace(0, 29, frames).round().astype(int)
-        rotations, translations = (np.asarray(x, np.float64)[rows] for x in (motion.rotations, motion.translations))
+        rotations, translations = (
+            np.asarray(x, np.float64)[rows] for x in (motion.rotations, motion.translations)
+        )
         rotations[:, 23:25] = 0  # the layouts hold no eyes
         arrays = write_body(out / "body.npz", people, small, rotations[:1, 25:].reshape(1, 2, 45))
         world = random_rigid(np.random.default_rng(seed))
         body = placed(rotations, translations, world, arrays, 0)
         number = lambda x: np.asarray(x, np.float32)
-        self.posed = [pose_subject(people[0], number(r), number(t)) for r, t in zip(rotations, translations, strict=True)]
+        self.posed = [
+            pose_subject(people[0], number(r), number(t))
+            for r, t in zip(rotations, translations, strict=True)
+        ]
         self.size, self.frames = size, frames
         self.cameras = self._around(cameras)
         poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in self.cameras])
@@ -153,8 +187,13 @@ class Video:
         angles = body.rotations.reshape(frames, -1)
         parts = {"global_orient": slice(0, 3), "body_pose": slice(3, 66), "jaw_pose": slice(66, 69)}
         parts |= {"left_hand_pose": slice(75, 120), "right_hand_pose": slice(120, None)}
-        parameters = {key: angles[:, part] for key, part in parts.items()} | {"transl": body.translations}
-        parameters |= {"betas": np.tile(body.betas[:COLUMNS], (frames, 1)), "expression": np.zeros((frames, COLUMNS))}
+        parameters = {key: angles[:, part] for key, part in parts.items()} | {
+            "transl": body.translations
+        }
+        parameters |= {
+            "betas": np.tile(body.betas[:COLUMNS], (frames, 1)),
+            "expression": np.zeros((frames, COLUMNS)),
+        }
         self.parameters = {key: number(x) for key, x in parameters.items()}
 
     def _around(self, count):
@@ -166,7 +205,9 @@ class Video:
         return list(orbit(jnp.asarray((low + high) / 2), reach, azimuths, 0.1, K, *self.size))
 
     def shot(self, camera, frame):
-        return [to_uint8(x) for x in render_view(self.posed[frame], self.cameras[camera], BACKGROUND)]
+        return [
+            to_uint8(x) for x in render_view(self.posed[frame], self.cameras[camera], BACKGROUND)
+        ]
 
 
 def write_avatarrex(out, **how):

@@ -58,9 +58,16 @@ def damage_by(change):
 
 
 jsn, npz, pkl, text = map(damage_by, (edit_json, edit_npz, edit_pickle, edit_text))
-written, removed = damage_by(lambda path, content: path.write_text(content)), damage_by(lambda path: path.unlink())
+written, removed = (
+    damage_by(lambda path, content: path.write_text(content)),
+    damage_by(lambda path: path.unlink()),
+)
 resized = damage_by(lambda path: Image.new("L", (5, 5)).save(path, "PNG"))
-huge = damage_by(lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\1\0\0\0\1\0\0\x08\2\0\0\0" + bytes(40)))
+huge = damage_by(
+    lambda path: path.write_bytes(
+        b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\1\0\0\0\1\0\0\x08\2\0\0\0" + bytes(40)
+    )
+)
 
 
 def spoiled(value, at=0):
@@ -98,7 +105,14 @@ PHOTO, MASK = "22010708/00000001.jpg", "22010708/mask/pha/00000001.jpg"
 
 def rig(key, change):
     """A value of a camera changed; None removes it."""
-    return jsn(RIG, lambda c: c[CAMERA].pop(key) if change is None else c[CAMERA].update({key: change(c[CAMERA][key])}))
+    return jsn(
+        RIG,
+        lambda c: (
+            c[CAMERA].pop(key)
+            if change is None
+            else c[CAMERA].update({key: change(c[CAMERA][key])})
+        ),
+    )
 
 
 AVATARREX = {
@@ -107,22 +121,58 @@ AVATARREX = {
     "betas missing": (npz(POSES, betas=None), POSES, "betas", "missing"),
     "a NaN": (npz(POSES, body_pose=spoiled(np.nan, 5)), POSES, "body_pose", "finite", "[0, 5]"),
     "millimetres": (npz(POSES, transl=lambda x: 1000 * x + 500), POSES, "transl", "another unit?"),
-    "degrees": (npz(POSES, body_pose=lambda x: np.rad2deg(x) + 90), POSES, "body_pose", "another unit?"),
-    "hands of 12 numbers": (npz(POSES, left_hand_pose=lambda x: x[:, :12]), POSES, "left_hand_pose", "(3, 45)"),
-    "fewer frames in one array": (npz(POSES, transl=lambda x: x[:-1]), POSES, "transl", "(3, 3)", "(2, 3)"),
+    "degrees": (
+        npz(POSES, body_pose=lambda x: np.rad2deg(x) + 90),
+        POSES,
+        "body_pose",
+        "another unit?",
+    ),
+    "hands of 12 numbers": (
+        npz(POSES, left_hand_pose=lambda x: x[:, :12]),
+        POSES,
+        "left_hand_pose",
+        "(3, 45)",
+    ),
+    "fewer frames in one array": (
+        npz(POSES, transl=lambda x: x[:-1]),
+        POSES,
+        "transl",
+        "(3, 3)",
+        "(2, 3)",
+    ),
     "no frames": (npz(POSES, global_orient=lambda x: x[:0]), POSES, "global_orient", "(0, 3)"),
     "text": (npz(POSES, transl=lambda x: x.astype(str)), POSES, "transl", "real numbers"),
-    "betas in a column": (npz(POSES, betas=lambda x: np.zeros((10, 1))), POSES, "betas", "(3, any)", "(10, 1)"),
-    "300 shape coefficients": (npz(POSES, betas=lambda x: np.ones((3, 300))), POSES, "betas", "'shape_10' is no shape direction"),
+    "betas in a column": (
+        npz(POSES, betas=lambda x: np.zeros((10, 1))),
+        POSES,
+        "betas",
+        "(3, any)",
+        "(10, 1)",
+    ),
+    "300 shape coefficients": (
+        npz(POSES, betas=lambda x: np.ones((3, 300))),
+        POSES,
+        "betas",
+        "'shape_10' is no shape direction",
+    ),
     "calibration missing": (removed(RIG),),
     "no K": (rig("K", None), RIG, CAMERA, "K", "missing"),
     "no image size": (rig("imgSize", None), RIG, CAMERA, "imgSize"),
-    "frames without sizes": (written(RIG, json.dumps({"frames": [NO_SIZE]})), RIG, "a.imgSize", "missing"),
+    "frames without sizes": (
+        written(RIG, json.dumps({"frames": [NO_SIZE]})),
+        RIG,
+        "a.imgSize",
+        "missing",
+    ),
     "a NaN in R": (rig("R", lambda x: [float("nan"), *x[1:]]), RIG, CAMERA, "R", "finite"),
     "a mirrored R": (rig("R", lambda x: [-v for v in x]), RIG, CAMERA, "mirrored"),
     "T in millimetres": (rig("T", lambda x: [1000 * v for v in x]), RIG, CAMERA, "expected metres"),
     "the sizes exchanged": (rig("imgSize", lambda x: x[::-1]), CAMERA, "16 x 12"),
-    "a camera that leads out": (jsn(RIG, lambda c: c.update({"../../x": c.pop(CAMERA)})), RIG, "../../x"),
+    "a camera that leads out": (
+        jsn(RIG, lambda c: c.update({"../../x": c.pop(CAMERA)})),
+        RIG,
+        "../../x",
+    ),
     "a list": (written(RIG, "[1, 2]"), RIG),
     "nested 10,000 times": (written(RIG, '{"a":' * 10000), RIG),
     "a photo of another size": (resized(PHOTO), "size", "5 x 5"),
@@ -142,7 +192,12 @@ ACTORSHQ = {
     "focal lengths in pixels": (text(CSV, FOCAL, "2400"), CSV, "Cam001.fx", "in pixels?"),
     "a NaN": (text(CSV, FOCAL, "nan"), CSV, "Cam001", "finite"),
     "half a pixel": (text(CSV, "Cam001,12,", "Cam001,12.5,"), CSV, "Cam001", "pixels"),
-    "a centre in millimetres": (text(CSV, ",3.0,1.6", ",3000.0,1.6"), CSV, "Cam001", "expected metres"),
+    "a centre in millimetres": (
+        text(CSV, ",3.0,1.6", ",3000.0,1.6"),
+        CSV,
+        "Cam001",
+        "expected metres",
+    ),
     "a name that leads out": (text(CSV, "Cam001", "../../x"), CSV, "name"),
 }
 
@@ -158,21 +213,54 @@ THUMAN = {
     "both of them": (pkl(FIT, translation=np.zeros((1, 3))), PKL, "either transl"),
     "a scale of 0": (pkl(FIT, scale=lambda x: 0 * x), PKL, "scale", "positive"),
     "two scales": (pkl(FIT, scale=lambda x: np.ones(2)), PKL, "scale", "(2,)"),
-    "hands of 6 numbers": (pkl(FIT, left_hand_pose=lambda x: x[:, :6]), "left_hand_pose", "45", "6"),
-    "hands of two kinds": (pkl(OTHER_FIT, right_hand_pose=np.zeros((1, 45), np.float32)), "right_hand_pose", "12 or 45"),
+    "hands of 6 numbers": (
+        pkl(FIT, left_hand_pose=lambda x: x[:, :6]),
+        "left_hand_pose",
+        "45",
+        "6",
+    ),
+    "hands of two kinds": (
+        pkl(OTHER_FIT, right_hand_pose=np.zeros((1, 45), np.float32)),
+        "right_hand_pose",
+        "12 or 45",
+    ),
     "no leading axis": (pkl(FIT, body_pose=lambda x: x[0]), PKL, "body_pose", "(63,)"),
-    "degrees": (pkl(FIT, global_orient=lambda x: np.rad2deg(x) + 90), "global_orient", "another unit?"),
+    "degrees": (
+        pkl(FIT, global_orient=lambda x: np.rad2deg(x) + 90),
+        "global_orient",
+        "another unit?",
+    ),
     "millimetres": (pkl(FIT, transl=lambda x: 1000 * x + 500), "transl", "another unit?"),
-    "jaw exchanged with the root": (swapped(FIT, "jaw_pose", "global_orient"), OBJ, "mm from this mesh"),
-    "hands exchanged": (swapped(FIT, "left_hand_pose", "right_hand_pose"), OBJ, "mm from this mesh"),
+    "jaw exchanged with the root": (
+        swapped(FIT, "jaw_pose", "global_orient"),
+        OBJ,
+        "mm from this mesh",
+    ),
+    "hands exchanged": (
+        swapped(FIT, "left_hand_pose", "right_hand_pose"),
+        OBJ,
+        "mm from this mesh",
+    ),
     "no fitted mesh": (removed(MESH), OBJ, "no such file"),
     "a mesh of another model": (text(MESH, "v ", "v 0 0 0\nv "), OBJ, "81 vertices"),
     "a mesh in other units": (scaled_obj(MESH, 1000), OBJ, "mm from this mesh"),
     "text in a vertex": (text(MESH, "v ", "v x y z\nv "), OBJ, "could not convert"),
-    "a short vertex": (text(MESH, "v ", "v 0 0\nv "), OBJ, "line 1: expected three coordinates of a vertex, got 2"),
-    "a quad": (text(MESH, "f ", "f 1 2 3 4\nf "), OBJ, "line 81: expected three corners of a triangle, got 4"),
+    "a short vertex": (
+        text(MESH, "v ", "v 0 0\nv "),
+        OBJ,
+        "line 1: expected three coordinates of a vertex, got 2",
+    ),
+    "a quad": (
+        text(MESH, "f ", "f 1 2 3 4\nf "),
+        OBJ,
+        "line 81: expected three corners of a triangle, got 4",
+    ),
     "a NaN in a vertex": (text(MESH, "v ", "v nan 0 0\nv "), OBJ, "finite"),
-    "a face without its vertices": (text(MESH, "f ", "f 1 2 900\nf "), OBJ, "f: expected integers in [0, 80)"),
+    "a face without its vertices": (
+        text(MESH, "f ", "f 1 2 900\nf "),
+        OBJ,
+        "f: expected integers in [0, 80)",
+    ),
     "no texture": (removed("model/0001/material0.jpeg"), "0001.obj", "texture"),
     "no material": (removed(TEXTURE), "0001.obj", "texture"),
     "a texture outside": (text(TEXTURE, "material0.jpeg", "../0000/material0.jpeg"), "0001.obj"),
@@ -186,27 +274,62 @@ LIST, ARRAYS = "train.json", "smpl/0.npz"
 frame = lambda change: jsn(LIST, lambda c: change(c[0]["frames"][1]))
 mirrored = lambda f: f["w2c"][0].__setitem__(slice(0, 3), [-v for v in f["w2c"][0][:3]])
 SCENES = {
-    "no image_path": (frame(lambda f: f.pop("image_path")), LIST, "s0.frames[1]", "image_path", "missing"),
+    "no image_path": (
+        frame(lambda f: f.pop("image_path")),
+        LIST,
+        "s0.frames[1]",
+        "image_path",
+        "missing",
+    ),
     "no views": (jsn(LIST, lambda c: c[0].update(frames=[])), LIST, "s0.frames"),
     "no name": (jsn(LIST, lambda c: c[0].pop("scene_name")), LIST, "scene_name"),
     "two scenes of one name": (jsn(LIST, lambda c: c.append(c[0])), LIST, "[1].scene_name"),
-    "a number for a path": (frame(lambda f: f.update(image_path=3)), LIST, "image_path", "name or path"),
+    "a number for a path": (
+        frame(lambda f: f.update(image_path=3)),
+        LIST,
+        "image_path",
+        "name or path",
+    ),
     "a path that leads out": (frame(lambda f: f.update(image_path="../../x.png")), LIST, "outside"),
     "arrays that lead out": (frame(lambda f: f.update(smpl_path="/etc/hostname")), LIST, "outside"),
     "w2c of 3 rows": (frame(lambda f: f.update(w2c=f["w2c"][:3])), LIST, "w2c", "(3, 4)"),
     "ragged w2c": (frame(lambda f: f["w2c"][1].pop()), LIST, "w2c", "numbers"),
     "a mirrored w2c": (frame(mirrored), LIST, "frames[1]", "mirrored"),
     "another last row": (frame(lambda f: f["w2c"].__setitem__(3, [0, 0, 0, 2])), LIST, "last row"),
-    "three intrinsics": (frame(lambda f: f.update(fxfycxcy=f["fxfycxcy"][:3])), LIST, "fxfycxcy", "(3,)"),
+    "three intrinsics": (
+        frame(lambda f: f.update(fxfycxcy=f["fxfycxcy"][:3])),
+        LIST,
+        "fxfycxcy",
+        "(3,)",
+    ),
     "a negative focal length": (frame(lambda f: f["fxfycxcy"].__setitem__(0, -20)), LIST, "focal"),
     "an object, no list": (written(LIST, "{}"), LIST, "list of scenes"),
     "a scene that is text": (written(LIST, '["a"]'), LIST, "[0]"),
     "no v_cano": (npz(ARRAYS, v_cano=None), "0.npz", "v_cano", "missing"),
-    "v_cano of another model": (npz(ARRAYS, v_cano=lambda x: x[:-1]), "0.npz", "v_cano", "79 vertices"),
-    "v_cano of somebody else": (npz(ARRAYS, v_cano=lambda x: x[::-1]), "0.npz", "v_cano", "mm from body"),
+    "v_cano of another model": (
+        npz(ARRAYS, v_cano=lambda x: x[:-1]),
+        "0.npz",
+        "v_cano",
+        "79 vertices",
+    ),
+    "v_cano of somebody else": (
+        npz(ARRAYS, v_cano=lambda x: x[::-1]),
+        "0.npz",
+        "v_cano",
+        "mm from body",
+    ),
     "v_posed for v_cano": (swapped(ARRAYS, "v_cano", "v_posed"), "0.npz", "v_cano", "mm from body"),
-    "joints that are no rotation": (npz(ARRAYS, joint_transforms=lambda x: 2 * x), "joint_transforms", "expected rotations"),
-    "54 joints": (npz(ARRAYS, joint_transforms=lambda x: x[1:]), "0.npz", "joint_transforms", "(54, 4, 4)"),
+    "joints that are no rotation": (
+        npz(ARRAYS, joint_transforms=lambda x: 2 * x),
+        "joint_transforms",
+        "expected rotations",
+    ),
+    "54 joints": (
+        npz(ARRAYS, joint_transforms=lambda x: x[1:]),
+        "0.npz",
+        "joint_transforms",
+        "(54, 4, 4)",
+    ),
 }
 
 # DNA-Rendering ----------------------------------------------------------------------------------------------------------
@@ -253,7 +376,11 @@ DNA = {
     "degrees": (h5_set(FULL, lambda x: np.rad2deg(x) + 90), FULL, "another unit?"),
     "fewer translations": (h5_set(TRANSL, lambda x: x[:2]), TRANSL, "(2, 3)"),
     "text": (h5_set(TRANSL, lambda x: b"text"), TRANSL, "numbers"),
-    "a group for numbers": (h5(NOTES, lambda f: (f.__delitem__(TRANSL), f.create_group(TRANSL))), TRANSL, "numbers"),
+    "a group for numbers": (
+        h5(NOTES, lambda f: (f.__delitem__(TRANSL), f.create_group(TRANSL))),
+        TRANSL,
+        "numbers",
+    ),
     "a link into another file": (h5(NOTES, h5_link), TRANSL, "refused a link"),
     "numbers of 10^15 bytes": (h5(NOTES, h5_endless), TRANSL, "array_bytes"),
     "K of 2 rows": (h5_set(K, lambda x: x[:2]), K, "(2, 3)"),
@@ -264,9 +391,20 @@ DNA = {
     "a photo cut off": (h5_set(SHOWN, lambda x: x[: len(x) // 2], MAIN), SHOWN, "image"),
     "a photo of floats": (h5_set(SHOWN, lambda x: x.astype(float), MAIN), SHOWN, "encoded bytes"),
     "a mask cut off": (h5_set(COVER, lambda x: x[: len(x) // 2]), COVER, "image"),
-    "no photo": (h5(MAIN, lambda f: [f[f"Camera_5mp/{c}/color"].clear() for c in (0, 1)]), "0001_01.smc", "no photo"),
+    "no photo": (
+        h5(MAIN, lambda f: [f[f"Camera_5mp/{c}/color"].clear() for c in (0, 1)]),
+        "0001_01.smc",
+        "no photo",
+    ),
 }
-CASES = {"avatarrex": AVATARREX, "thuman4": THUMAN4, "actorshq": ACTORSHQ, "thuman": THUMAN, "scenes": SCENES, "dna": DNA}
+CASES = {
+    "avatarrex": AVATARREX,
+    "thuman4": THUMAN4,
+    "actorshq": ACTORSHQ,
+    "thuman": THUMAN,
+    "scenes": SCENES,
+    "dna": DNA,
+}
 
 
 @pytest.fixture(scope="module")
@@ -282,7 +420,9 @@ def honest(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("layout", "name"), [(layout, name) for layout, cases in CASES.items() for name in cases])
+@pytest.mark.parametrize(
+    ("layout", "name"), [(layout, name) for layout, cases in CASES.items() for name in cases]
+)
 def test_damage_is_one_line_that_names_file_and_key(layout, name, honest, body, tmp_path):
     damage, *words = CASES[layout][name]
     folder = tmp_path / "set"
@@ -297,7 +437,9 @@ def test_damage_is_one_line_that_names_file_and_key(layout, name, honest, body, 
 
 @pytest.mark.parametrize("layout", WRITE)
 def test_honest_sets_are_read(layout, honest, body):
-    assert read(layout, honest(layout), body) == ({"listed as missing": 1} if layout == "thuman4" else {})
+    assert read(layout, honest(layout), body) == (
+        {"listed as missing": 1} if layout == "thuman4" else {}
+    )
 
 
 def test_preprocessing_names_all_damage_and_makes_the_rest(honest, body, tmp_path):
@@ -306,10 +448,23 @@ def test_preprocessing_names_all_damage_and_makes_the_rest(honest, body, tmp_pat
     for name, (damage, *_) in AVATARREX.items():
         shutil.copytree(honest("avatarrex"), tmp_path / "in" / name)
         damage(tmp_path / "in" / name)
-    report = preprocess(tmp_path / "in", tmp_path / "out", body.file, Settings("avatarrex", size=SIZE), progress=False)
+    report = preprocess(
+        tmp_path / "in",
+        tmp_path / "out",
+        body.file,
+        Settings("avatarrex", size=SIZE),
+        progress=False,
+    )
     scenes = json.loads((tmp_path / "out" / "manifest.json").read_text())["scenes"]
     assert not scenes["honest"]["unreadable"]
-    of_photos = {"a mask of another size", "a photo of 65,536 pixels a side", "a photo of another size", "the sizes exchanged"}
-    assert set(report.skipped) == set(AVATARREX) - of_photos - {"calibration missing"}  # without one it is no subject
+    of_photos = {
+        "a mask of another size",
+        "a photo of 65,536 pixels a side",
+        "a photo of another size",
+        "the sizes exchanged",
+    }
+    assert set(report.skipped) == set(AVATARREX) - of_photos - {
+        "calibration missing"
+    }  # without one it is no subject
     for name, line in report.skipped.items():
         assert name in line and all(word in line for word in AVATARREX[name][1:])

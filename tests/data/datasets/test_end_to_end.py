@@ -30,7 +30,9 @@ TIGHT_IOU = 0.9
 """Least mean overlap of the posed body and the silhouette of a person in tight clothes."""
 SIZE = 256
 SETTINGS = {
-    "thuman": Settings("thuman", size=SIZE, views=6, factors=(1.75, 1.75), supersample=2, train=1, test=0),
+    "thuman": Settings(
+        "thuman", size=SIZE, views=6, factors=(1.75, 1.75), supersample=2, train=1, test=0
+    ),
     "avatarrex": Settings("avatarrex", size=SIZE),
     "thuman4": Settings("thuman4", size=SIZE, every=1),
 }
@@ -54,14 +56,18 @@ def test_a_person_goes_all_the_way(layout, tmp_path):
     capture = subject.capture(range(len(subject)), body, SIZE)
     checked = check_capture(capture, tmp_path / "check.png")
     overlap = [view.iou for view in checked.views]
-    assert np.mean(overlap) > TIGHT_IOU and max(view.outside for view in checked.views) < 0.01, overlap
+    assert np.mean(overlap) > TIGHT_IOU and max(view.outside for view in checked.views) < 0.01, (
+        overlap
+    )
     config = tiny().with_runtime(token_capacity=64)
     avatar = reconstruct(init_humangs(jax.random.key(0), config), config, capture.select([0, 1]))
     last = capture.pose(capture.frame_count - 1)
     moved = animate(avatar, last)
     middle = np.asarray(moved.means).mean(axis=0)
     assert np.isfinite(np.asarray(moved.means)).all()
-    assert np.linalg.norm(middle - np.asarray(last.translation)) < 1  # an untrained network, in its place
+    assert (
+        np.linalg.norm(middle - np.asarray(last.translation)) < 1
+    )  # an untrained network, in its place
 
 
 FIT_ERROR = 0.015
@@ -76,14 +82,25 @@ def test_videos_and_keypoints_become_a_capture_of_several_frames(tmp_path):
     poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in video.cameras])
     video.R, video.T = poses[:, :3, :3], poses[:, :3, 3]  # of the world of the people, y up
     (tmp_path / "rig.json").write_text(json.dumps(calibration(names, video)))
-    views = [[render_view(posed, camera, made_up.BACKGROUND) for camera in video.cameras] for posed in video.posed]
+    views = [
+        [render_view(posed, camera, made_up.BACKGROUND) for camera in video.cameras]
+        for posed in video.posed
+    ]
     for part, kind in enumerate(("photos", "masks")):
         (tmp_path / kind).mkdir()
         for c, name in enumerate(names):
             shown = [np.broadcast_to(np.atleast_3d(of[c][part]), (*size[::-1], 3)) for of in views]
             write_video(tmp_path / kind / f"{name}.mp4", shown, 30)
     me, k = tmp_path / "me", tmp_path / "keypoints.npz"
-    options = ["--images", tmp_path / "photos", "--masks", tmp_path / "masks", "--up=+y", "--out", me]
+    options = [
+        "--images",
+        tmp_path / "photos",
+        "--masks",
+        tmp_path / "masks",
+        "--up=+y",
+        "--out",
+        me,
+    ]
     assert cli.execute(["import", "cameras", str(tmp_path / "rig.json"), *map(str, options)]) == 0
     photos = load_photos(me)
     assert photos.frames.tolist() == np.repeat(np.arange(frames), len(names)).tolist()
@@ -105,13 +122,17 @@ def test_videos_and_keypoints_become_a_capture_of_several_frames(tmp_path):
     known = np.isfinite(points).all(-1)
     confidences = np.where(known, 0.9, 0.0)
     points = np.where(known[..., None], points, 0)
-    np.savez(k, set=COCO_WHOLEBODY_133.name, names=photos.names, points=points, confidences=confidences)
+    np.savez(
+        k, set=COCO_WHOLEBODY_133.name, names=photos.names, points=points, confidences=confidences
+    )
     assert cli.execute(["fit", str(me), "--keypoints", str(k)]) == 0
 
     fitted = load_capture(me)
     assert fitted.frame_count == frames and fitted.frames.tolist() == photos.frames.tolist()
     vertices = [
-        np.asarray(pose_body(body, shape_body(body, jnp.asarray(each.betas)), each.pose(f)).vertices)
+        np.asarray(
+            pose_body(body, shape_body(body, jnp.asarray(each.betas)), each.pose(f)).vertices
+        )
         for each in (fitted, truth)
         for f in range(frames)
     ]

@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run as in_process
-from dataset_files import CAMERAS, FRAMES, model_arrays, write_actorshq, write_avatarrex, write_model, write_thuman, write_thuman4
+from dataset_files import (
+    CAMERAS,
+    FRAMES,
+    model_arrays,
+    write_actorshq,
+    write_avatarrex,
+    write_model,
+    write_thuman,
+    write_thuman4,
+)
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.cli import training
@@ -63,7 +72,11 @@ def run(source, out, body, asked, **options):
 def test_a_video_becomes_a_scene_in_an_upright_world(videos, tmp_path, body):
     report = run(videos, tmp_path / "out", body, settings())
     views = FRAMES * CAMERAS
-    assert (report.made, report.scenes, report.views) == (2, 2, 2 * views - 1) and not report.skipped
+    assert (report.made, report.scenes, report.views) == (
+        2,
+        2,
+        2 * views - 1,
+    ) and not report.skipped
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert manifest["counts"]["unreadable_photos"] == 1
     (problem,) = manifest["scenes"]["avatarrex_b"]["unreadable"].values()
@@ -77,18 +90,24 @@ def test_a_video_becomes_a_scene_in_an_upright_world(videos, tmp_path, body):
     posed = next(posed_people(body.model, found.parameters([0])))
     spine = posed.joints[12] - posed.joints[0]
     assert spine[1] / np.linalg.norm(spine) > 1 - 1e-6
-    np.testing.assert_allclose((posed.vertices.min(0) + posed.vertices.max(0)) / 2, 0, atol=MILLIMETRE)
+    np.testing.assert_allclose(
+        (posed.vertices.min(0) + posed.vertices.max(0)) / 2, 0, atol=MILLIMETRE
+    )
     before = next(posed_people(body.model, raw.parameters([1]))).vertices
     after = next(posed_people(body.model, found.parameters([1]))).vertices
     with np.load(tmp_path / "out" / "avatarrex_a" / "smpl" / "000001.npz") as arrays:
         np.testing.assert_allclose(arrays["v_posed"], after, atol=MILLIMETRE)
     for view, other in ((2, 2), (3, 3)):
         seen = [
-            (subject.cam_from_world[i] @ np.concatenate([points, np.ones((len(points), 1))], 1).T)[:3]
+            (subject.cam_from_world[i] @ np.concatenate([points, np.ones((len(points), 1))], 1).T)[
+                :3
+            ]
             for subject, points, i in ((raw, before, view), (found, after, other))
         ]
         np.testing.assert_allclose(*seen, atol=MILLIMETRE)
-        np.testing.assert_allclose(found.squared_K([other], SIZE), raw.squared_K([view], SIZE), atol=1e-4)
+        np.testing.assert_allclose(
+            found.squared_K([other], SIZE), raw.squared_K([view], SIZE), atol=1e-4
+        )
     np.testing.assert_array_equal(found.photo(1, SIZE)[0], raw.photo(1, SIZE)[0])
     np.testing.assert_array_equal(found.photo(1, SIZE)[1], raw.photo(1, SIZE)[1])
 
@@ -103,7 +122,9 @@ def test_the_other_layout_is_capture_folders(videos, tmp_path, body):
     raw = open_people(videos, body, SIZE)[0].subject
     K = np.asarray(capture.cameras.K)
     np.testing.assert_allclose(K, raw.squared_K(np.arange(len(raw)), SIZE), atol=1e-4)
-    np.testing.assert_allclose(np.asarray(capture.betas)[:10], raw.parameters([]).betas[:10], atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(capture.betas)[:10], raw.parameters([]).betas[:10], atol=1e-5
+    )
 
 
 def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path, body):
@@ -114,7 +135,9 @@ def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path,
     assert (report.made, report.scenes) == (1, 2) and len(read_scene_list(out)) == 2
     assert run(videos, out, body, settings()).made == 0
     assert (out / "avatarrex_a" / "scene.json").stat().st_mtime_ns == kept
-    with pytest.raises(ValueError, match=r"manifest.json: settings: .*size 16 -> 32.*another folder"):
+    with pytest.raises(
+        ValueError, match=r"manifest.json: settings: .*size 16 -> 32.*another folder"
+    ):
         run(videos, out, body, Settings("avatarrex", "scenes", 32, every=1))
     other = tmp_path / "other.npz"
     other.write_bytes(Path(body.file).read_bytes())
@@ -123,10 +146,14 @@ def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path,
         archive.comment = b"another model"
     with pytest.raises(ValueError, match=r"manifest.json: settings: .*\(body '\w+' -> '\w+'\)"):
         preprocess(videos, out, other, settings(), progress=False)
-    with pytest.raises(ValueError, match=r"manifest.json: settings: .*\(source '\w+' -> 'avatarrex_a'\)"):
+    with pytest.raises(
+        ValueError, match=r"manifest.json: settings: .*\(source '\w+' -> 'avatarrex_a'\)"
+    ):
         run(videos / "avatarrex_a", out, body, settings())
     (out / "avatarrex_a" / "scene.json").write_text('{"known": {"views": true}}')
-    with pytest.raises(ValueError, match=r"avatarrex_a/scene.json: known.views: expected an integer, got True"):
+    with pytest.raises(
+        ValueError, match=r"avatarrex_a/scene.json: known.views: expected an integer, got True"
+    ):
         run(videos, out, body, settings())
     with pytest.raises(ValueError, match="lies in the data set"):
         run(videos, videos / "out", body, settings())
@@ -150,7 +177,9 @@ def test_a_kill_leaves_nothing_half_written(videos, tmp_path, body, monkeypatch)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(set_run, "write_png", die)
         run(videos, tmp_path / "out", body, settings())
-    assert not list((tmp_path / "out").glob("*/scene.json")) and not list((tmp_path / "out").glob(".*"))
+    assert not list((tmp_path / "out").glob("*/scene.json")) and not list(
+        (tmp_path / "out").glob(".*")
+    )
     # a process that is killed at once leaves a temporary folder, which the next one removes
     abandoned = tmp_path / "out" / f".avatarrex_a.new-{atomic.MACHINE}-999999999-01234567"
     (abandoned / "images").mkdir(parents=True)
@@ -165,7 +194,10 @@ def test_a_subject_that_cannot_be_read_is_skipped_with_the_reason(videos, tmp_pa
     good = (source / "avatarrex_a" / "smpl_params.npz").read_bytes()
     (source / "avatarrex_a" / "smpl_params.npz").write_bytes(good[:100])
     report = run(source, out, body, settings())
-    assert report.scenes == 1 and "smpl_params.npz: not a readable npz archive" in report.skipped["avatarrex_a"]
+    assert (
+        report.scenes == 1
+        and "smpl_params.npz: not a readable npz archive" in report.skipped["avatarrex_a"]
+    )
     assert "skipped avatarrex_a" in str(report)
     (source / "avatarrex_a" / "smpl_params.npz").write_bytes(good)  # mended: tried again
     report = run(source, out, body, settings())
@@ -180,32 +212,55 @@ def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
     source = write_thuman(tmp_path / "thuman", model_arrays())
     (source / "smplx" / "0002" / "mesh_smplx.obj").unlink()
     views = ScanViews(views=2, near=True, train=1, test=1)
-    command = Preprocess("thuman", source, views, tmp_path / "out", Path(body.file), size=SIZE, workers=1)
+    command = Preprocess(
+        "thuman", source, views, tmp_path / "out", Path(body.file), size=SIZE, workers=1
+    )
     command.run()
     assert "2 scenes, 4 views" in capsys.readouterr().out
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert "mesh_smplx.obj: no such file" in manifest["skipped"]["0002"]
-    assert manifest["settings"]["factors"] == [2.0, 2.0] and manifest["scenes"]["0001"]["fit_kind"] == "B"
+    assert (
+        manifest["settings"]["factors"] == [2.0, 2.0]
+        and manifest["scenes"]["0001"]["fit_kind"] == "B"
+    )
     people = {}
     for part in ("train", "test"):
         if (tmp_path / "out" / f"{part}.json").is_file():
-            people |= {p.name.rsplit(" ", 1)[1]: p.subject for p in open_people(tmp_path / "out" / f"{part}.json", body)}
+            people |= {
+                p.name.rsplit(" ", 1)[1]: p.subject
+                for p in open_people(tmp_path / "out" / f"{part}.json", body)
+            }
     for name, subject in people.items():
         known = manifest["scenes"][name]
         distance = subject.cam_from_world[:, 2, 3] * known["units_per_metre"]
         np.testing.assert_allclose(distance, 2 * known["radius"], rtol=1e-4)
         image, mask = subject.photo(0, SIZE)
         assert 0.05 < (mask > 0).mean() < 0.6 and (image[mask == 0] == 255).all()
-    captures = Preprocess("thuman", source, views, tmp_path / "captures", Path(body.file), size=SIZE, workers=1, layout="capture")
+    captures = Preprocess(
+        "thuman",
+        source,
+        views,
+        tmp_path / "captures",
+        Path(body.file),
+        size=SIZE,
+        workers=1,
+        layout="capture",
+    )
     captures.run()
     name, wanted = next(iter(people.items()))
     capture = load_capture(tmp_path / "captures" / name)
-    np.testing.assert_allclose(np.asarray(capture.cameras.cam_from_world), wanted.cam_from_world, atol=MILLIMETRE)
+    np.testing.assert_allclose(
+        np.asarray(capture.cameras.cam_from_world), wanted.cam_from_world, atol=MILLIMETRE
+    )
     # as matrices: a turn by more than half a circle is also one the other way round
-    matrices = lambda rotations: Rotation.from_rotvec(np.asarray(rotations, float).reshape(-1, 3)).as_matrix()
+    matrices = lambda rotations: Rotation.from_rotvec(
+        np.asarray(rotations, float).reshape(-1, 3)
+    ).as_matrix()
     found = matrices(capture.poses.rotations)
     np.testing.assert_allclose(found, matrices(wanted.parameters([0]).rotations), atol=1e-4)
-    np.testing.assert_allclose(np.asarray(capture.poses.translation), wanted.parameters([0]).translations, atol=MILLIMETRE)
+    np.testing.assert_allclose(
+        np.asarray(capture.poses.translation), wanted.parameters([0]).translations, atol=MILLIMETRE
+    )
 
 
 def test_the_split_is_that_of_all_scans_also_where_one_lacks_a_file(tmp_path, body):
@@ -229,18 +284,38 @@ def test_a_data_set_is_one_line_of_the_table(tmp_path, body, monkeypatch, capsys
     (tmp_path / "raw" / "a.toy").touch()
     monkeypatch.setattr(training, "Preprocess", training.Preprocess)  # reloading replaces it
     importlib.reload(training)
-    said = " ".join(in_process(monkeypatch, capsys, "preprocess", "--help")[1].replace("│", " ").split())
+    said = " ".join(
+        in_process(monkeypatch, capsys, "preprocess", "--help")[1].replace("│", " ").split()
+    )
     assert ",toy}" in said and "; toy: made up" in said
-    words = ("preprocess", "toy", tmp_path / "raw", "--out", tmp_path / "out", "--body", body.file, "--size", SIZE)
+    words = (
+        "preprocess",
+        "toy",
+        tmp_path / "raw",
+        "--out",
+        tmp_path / "out",
+        "--body",
+        body.file,
+        "--size",
+        SIZE,
+    )
     code, out, error = in_process(monkeypatch, capsys, *words)
     assert code == 0 and "1 scenes, 2 views" in out, error
-    assert [person.name for person in open_people(tmp_path / "raw", body)] == [str(tmp_path / "raw" / "a.toy")]
+    assert [person.name for person in open_people(tmp_path / "raw", body)] == [
+        str(tmp_path / "raw" / "a.toy")
+    ]
 
 
 def test_sequences_of_several_actors_have_names_of_their_own(tmp_path, body):
     for actor in ("Actor01", "Actor02"):
         write_actorshq(tmp_path / "raw" / actor / "Sequence1")
-    report = preprocess(tmp_path / "raw", tmp_path / "out", body.file, Settings("actorshq", size=SIZE), progress=False)
+    report = preprocess(
+        tmp_path / "raw",
+        tmp_path / "out",
+        body.file,
+        Settings("actorshq", size=SIZE),
+        progress=False,
+    )
     assert report.scenes == 2
     assert list(read_scene_list(tmp_path / "out")) == ["Actor01_Sequence1", "Actor02_Sequence1"]
 
@@ -273,20 +348,33 @@ def test_a_face_before_the_camera_has_the_color_of_its_texture():
     texture = np.zeros((64, 64, 3), np.uint8)
     texture[::2] = 200  # finer than the samples: on average 100
     scan = Scan(corners, faces, ((corners[:, :2] + 5) / 10).astype(np.float32), texture)
-    np.testing.assert_allclose(smooth_normals(corners, faces), np.tile([0, 0, 1], (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        smooth_normals(corners, faces), np.tile([0, 0, 1], (4, 1)), atol=1e-12
+    )
     pose = np.diag([1.0, -1, -1, 1])
     pose[2, 3] = 8
     image, mask = ScanRenderer.of(scan, corners).render(pose, SIZE, 1)
     assert (mask == 255).all()
-    across = np.hypot(*np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE / 2) * np.tan(np.pi / 6)] * 2))
+    across = np.hypot(
+        *np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE / 2) * np.tan(np.pi / 6)] * 2)
+    )
     light = AMBIENT + HEADLIGHT / np.sqrt(1 + across**2)
     np.testing.assert_allclose(image, np.repeat(np.rint(100 * light)[..., None], 3, -1), atol=1)
 
 
 def test_listed_missing_photos_are_in_the_manifest(tmp_path, body):
     write_thuman4(tmp_path / "subject00")
-    preprocess(tmp_path, tmp_path.parent / "out4", body.file, Settings("thuman4", size=SIZE, every=2), progress=False)
+    preprocess(
+        tmp_path,
+        tmp_path.parent / "out4",
+        body.file,
+        Settings("thuman4", size=SIZE, every=2),
+        progress=False,
+    )
     manifest = json.loads((tmp_path.parent / "out4" / "manifest.json").read_text())
-    assert manifest["counts"]["missing_photos"] == 1 and manifest["scenes"]["subject00"]["views"] == 2 * CAMERAS
+    assert (
+        manifest["counts"]["missing_photos"] == 1
+        and manifest["scenes"]["subject00"]["views"] == 2 * CAMERAS
+    )
     image, _ = read_image(tmp_path.parent / "out4" / "subject00" / "images" / "cam00_00000002.png")
     assert image.shape == (SIZE, SIZE, 3)

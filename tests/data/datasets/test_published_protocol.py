@@ -4,7 +4,14 @@ import random
 
 import numpy as np
 import pytest
-from dataset_files import VERTICES, fit_values, model_arrays, scan_vertices, write_model, write_thuman
+from dataset_files import (
+    VERTICES,
+    fit_values,
+    model_arrays,
+    scan_vertices,
+    write_model,
+    write_thuman,
+)
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -15,7 +22,11 @@ from humangs_jax.data.preprocess.run import Settings, scan_content
 PUBLISHED = 2e-4
 """Of the body's size, the bound that the arrays have to keep."""
 UP = np.asarray([0.0, 1.0, 0.0])
-vectors = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.asarray).filter(lambda v: np.linalg.norm(v) > 1e-3)
+vectors = (
+    st.lists(st.floats(-1, 1), min_size=3, max_size=3)
+    .map(np.asarray)
+    .filter(lambda v: np.linalg.norm(v) > 1e-3)
+)
 
 
 @given(vectors, vectors)
@@ -27,13 +38,17 @@ def test_the_smallest_rotation_turns_one_direction_into_the_other(start, end):
     a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
     np.testing.assert_allclose(R @ a, b, atol=1e-7)
     # smallest: its angle is that between the two
-    assert np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(np.arccos(np.clip(a @ b, -1, 1)), abs=1e-5)
+    assert np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(
+        np.arccos(np.clip(a @ b, -1, 1)), abs=1e-5
+    )
 
 
 def test_cameras_look_at_the_origin_from_the_protocols_ranges():
     cameras = protocol.scan_cameras(7, 2.0, 400, (1.0, 1.75))
     R, t = cameras[:, :3, :3], cameras[:, :3, 3]
-    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (400, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (400, 1, 1)), atol=1e-12
+    )
     assert (np.linalg.det(R) > 0).all() and (R[:, 1, 1] < 0).all()  # rows of the image go down
     np.testing.assert_allclose(t[:, :2], 0, atol=1e-12)
     assert 2.0 <= t[:, 2].min() < 2.05 and 3.45 < t[:, 2].max() <= 3.5
@@ -84,7 +99,9 @@ def test_preprocessing_reproduces_the_published_arrays(tmp_path):
         # T: the middle of the raw scan's bounding box, here that of the mesh; R: pelvis -> neck upright
         T, R = np.eye(4), np.eye(4)
         T[:3, 3] = -(mesh.min(0) + mesh.max(0)) / 2
-        posed_joints = np.stack([(transforms[j] @ [*rest[j], 1])[:3] for j in (0, 12)])  # joint j is vertex j here
+        posed_joints = np.stack(
+            [(transforms[j] @ [*rest[j], 1])[:3] for j in (0, 12)]
+        )  # joint j is vertex j here
         spine = posed_joints[1] - posed_joints[0]
         axis, angle = np.cross(spine, UP), np.arccos(spine[1] / np.linalg.norm(spine))
         x, y, z = axis / np.linalg.norm(axis)
@@ -99,7 +116,9 @@ def test_preprocessing_reproduces_the_published_arrays(tmp_path):
         assert len(found) == VERTICES
         np.testing.assert_allclose(found, v_posed, atol=bound)
         np.testing.assert_allclose(posed.rest, rest, atol=bound)
-        np.testing.assert_allclose(content.transform @ posed.joint_transforms, mesh_transform @ transforms, atol=bound)
+        np.testing.assert_allclose(
+            content.transform @ posed.joint_transforms, mesh_transform @ transforms, atol=bound
+        )
         radius = np.linalg.norm(mesh @ R[:3, :3].T + mesh_transform[:3, 3], axis=1).max()
         assert content.known["radius"] >= radius - bound  # of the scan: a box around the body
 
@@ -109,7 +128,10 @@ def test_another_body_or_another_kind_of_fit_is_noticed_by_its_mesh(tmp_path):
     folder = write_thuman(tmp_path / "thuman", arrays)
     (tmp_path / "other").mkdir()
     other = write_model(tmp_path / "other", seed=1)
-    with pytest.raises(ValueError, match=r"mesh_smplx.obj: the fit \(kind A\) is .* mm from this mesh on average.*male"):
+    with pytest.raises(
+        ValueError,
+        match=r"mesh_smplx.obj: the fit \(kind A\) is .* mm from this mesh on average.*male",
+    ):
         scan_content(folder, "0000", other, Settings("thuman"))
     with pytest.raises(ValueError, match=r"kind C.*neutral"):
         scan_content(folder, "0002", other, Settings("thuman"))

@@ -24,7 +24,13 @@ from dataset_files import (
 
 from humangs_jax.data.datasets import multiview
 from humangs_jax.data.datasets.scene_list import read_evaluation, read_scene_list
-from humangs_jax.data.datasets.subject import BodyParameters, FileBody, open_people, posed_people, turned
+from humangs_jax.data.datasets.subject import (
+    BodyParameters,
+    FileBody,
+    open_people,
+    posed_people,
+    turned,
+)
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.loading import CaptureSource, Loader, PeopleCache, Source, ViewSampling
 from humangs_jax.evaluation.run import evaluate
@@ -58,28 +64,42 @@ def test_a_video_is_read_as_it_was_written(layout, tmp_path, body):
         assert subject.missing == {"listed as missing": 1}
     else:
         assert not subject.missing
-    assert subject.frames.tolist() == [frame for frame, _ in shown] and subject.frame_count == FRAMES
+    assert (
+        subject.frames.tolist() == [frame for frame, _ in shown] and subject.frame_count == FRAMES
+    )
     made = recording()
     for view, (_, camera) in enumerate(shown):
-        np.testing.assert_allclose(subject.cam_from_world[view, :3, :3], made.R[camera], atol=FLOAT32)
-        np.testing.assert_allclose(subject.cam_from_world[view, :3, 3], made.T[camera], atol=FLOAT32)
+        np.testing.assert_allclose(
+            subject.cam_from_world[view, :3, :3], made.R[camera], atol=FLOAT32
+        )
+        np.testing.assert_allclose(
+            subject.cam_from_world[view, :3, 3], made.T[camera], atol=FLOAT32
+        )
         # pixel centres at +0.5; padded by 2 columns on each side
         np.testing.assert_allclose(subject.K[view, :2, 2], made.K[:2, 2] + 0.5)
-        np.testing.assert_allclose(subject.squared_K([view], SIZE)[0, :2, 2], made.K[:2, 2] + 0.5 + [2, 0])
+        np.testing.assert_allclose(
+            subject.squared_K([view], SIZE)[0, :2, 2], made.K[:2, 2] + 0.5 + [2, 0]
+        )
     values = made.parameters
     betas, rotations, translations = subject.parameters([2, 0])
     np.testing.assert_allclose(betas[:10], values["betas"][0], atol=FLOAT32)
     np.testing.assert_allclose(translations, values["transl"][[2, 0]], atol=FLOAT32)
-    np.testing.assert_allclose(rotations[:, :22].reshape(2, -1)[:, 3:], values["body_pose"][[2, 0]], atol=FLOAT32)
+    np.testing.assert_allclose(
+        rotations[:, :22].reshape(2, -1)[:, 3:], values["body_pose"][[2, 0]], atol=FLOAT32
+    )
     np.testing.assert_array_equal(rotations[:, 23:25], 0)  # no poses of the eyes
     # flat_hand_mean is True: the numbers are whole rotations
-    np.testing.assert_allclose(rotations[:, 40:].reshape(2, -1), values["right_hand_pose"][[2, 0]], atol=FLOAT32)
+    np.testing.assert_allclose(
+        rotations[:, 40:].reshape(2, -1), values["right_hand_pose"][[2, 0]], atol=FLOAT32
+    )
     image, mask = subject.photo(0, SIZE)
     assert image.shape == (SIZE, SIZE, 3) and set(np.unique(mask)) == {0, 255}
     person_box = np.zeros((SIZE, SIZE), bool)
     person_box[4:12, 5:11] = True
     np.testing.assert_array_equal(mask > 0, person_box)
-    assert (image[~person_box] == 255).all() and np.abs(image[person_box].astype(int) - 100).max() <= JPEG
+    assert (image[~person_box] == 255).all() and np.abs(
+        image[person_box].astype(int) - 100
+    ).max() <= JPEG
     capture = subject.capture([0, 2], body, SIZE)
     assert capture.view_count == 2 and capture.names[0].endswith("00000000")
 
@@ -89,7 +109,9 @@ def test_photos_without_mask_or_pose_and_missing_ones_are_counted(tmp_path, body
     (folder / "22010708" / "00000000.jpg").unlink()
     (folder / "22010710" / "mask" / "pha" / "00000002.jpg").unlink()
     camera = folder / "22010710"
-    write_photo(camera / "00000009.jpg", camera / "mask" / "pha" / "00000009.jpg", recording().shot(1, 9))
+    write_photo(
+        camera / "00000009.jpg", camera / "mask" / "pha" / "00000009.jpg", recording().shot(1, 9)
+    )
     (folder / "22010710" / "notes.txt").write_text("not a photo")
     (person,) = open_people(folder, body)
     assert person.subject.missing == {"no photo": 1, "no mask": 1, "no pose": 1}
@@ -104,7 +126,9 @@ def test_hdf5_is_read_as_it_was_written(tmp_path, body):
     np.testing.assert_allclose(subject.cam_from_world[1, :3, 3], made.T[1], atol=FLOAT32)
     np.testing.assert_allclose(subject.K[0, :2, 2], made.K[:2, 2] + 0.5)
     _, rotations, translations = subject.parameters([1])
-    hands = made.parameters["right_hand_pose"][1] + model_arrays()["hands_meanr"]  # flat_hand_mean is False
+    hands = (
+        made.parameters["right_hand_pose"][1] + model_arrays()["hands_meanr"]
+    )  # flat_hand_mean is False
     np.testing.assert_allclose(rotations[0, 40:].reshape(-1), hands, atol=FLOAT32)
     np.testing.assert_allclose(translations[0], made.parameters["transl"][1], atol=FLOAT32)
     image, mask = subject.photo(3, SIZE)
@@ -173,17 +197,23 @@ def test_scans_without_a_fit_are_skipped_with_the_reason(tmp_path):
     with pytest.raises(ValueError, match="preprocess thuman"):
         open_people(folder, FileBody.load())
     (person,) = open_people(write_avatarrex(tmp_path / "a"), FileBody.load())
-    with pytest.raises(ValueError, match=r"smpl_params.npz: betas: of SMPL-X, and body 'makehuman'"):
+    with pytest.raises(
+        ValueError, match=r"smpl_params.npz: betas: of SMPL-X, and body 'makehuman'"
+    ):
         person.summary()
 
 
 def test_a_turned_world_moves_the_posed_body_along(body):
     rng = np.random.default_rng(3)
-    parameters = BodyParameters(0.3 * rng.normal(size=20), 0.4 * rng.normal(size=(1, 55, 3)), rng.normal(size=(1, 3)))
+    parameters = BodyParameters(
+        0.3 * rng.normal(size=20), 0.4 * rng.normal(size=(1, 55, 3)), rng.normal(size=(1, 3))
+    )
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.3, -2, 1]
     before = next(posed_people(body.model, parameters)).vertices
-    after = next(posed_people(body.model, turned(parameters, matrix, body.rest_joints(parameters.betas)[0]))).vertices
+    after = next(
+        posed_people(body.model, turned(parameters, matrix, body.rest_joints(parameters.betas)[0]))
+    ).vertices
     np.testing.assert_allclose(after, before @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5)
 
 
@@ -192,7 +222,9 @@ def test_opening_people_reads_no_photo(tmp_path, body, monkeypatch):
     read = []
     for name in ("read_image", "read_grey"):
         reader = getattr(multiview, name)
-        monkeypatch.setattr(multiview, name, lambda path, reader=reader: read.append(path) or reader(path))
+        monkeypatch.setattr(
+            multiview, name, lambda path, reader=reader: read.append(path) or reader(path)
+        )
     (person,) = open_people(folder, body, SIZE)
     assert len(person.summary().frames) == FRAMES * CAMERAS and not read
     assert person.subject.photo(0, SIZE)[0].shape == (SIZE, SIZE, 3) and len(read) == 2
@@ -203,13 +235,22 @@ def test_every_data_set_is_a_source_of_the_loader(tmp_path, body):
     folders["scenes"] = write_scenes(tmp_path / "scenes", model_arrays())[0]
     people = [person for folder in folders.values() for person in open_people(folder, body, SIZE)]
     (tmp_path / "avatarrex" / "22010708" / "00000001.jpg").write_bytes(b"\xff\xd8 not a photo")
-    source = CaptureSource(PeopleCache(people), ViewSampling(input_counts=(2,), target_count=2), SIZE // 2, SIZE)
+    source = CaptureSource(
+        PeopleCache(people), ViewSampling(input_counts=(2,), target_count=2), SIZE // 2, SIZE
+    )
     assert isinstance(source, Source) and len(source) == 4
     loader = Loader(source, batch_size=4, seed=1)
     batch = loader.batch_at(0)
     assert batch.inputs.images.shape == (4, 2, SIZE // 2, SIZE // 2, 3)
-    assert batch.targets.images.shape == (4, 2, SIZE, SIZE, 3) and batch.inputs.rotations.shape == (4, 2, 55, 3)
-    again = Loader(CaptureSource(PeopleCache(people), source.sampling, SIZE // 2, SIZE), batch_size=4, seed=1).batch_at(0)
+    assert batch.targets.images.shape == (4, 2, SIZE, SIZE, 3) and batch.inputs.rotations.shape == (
+        4,
+        2,
+        55,
+        3,
+    )
+    again = Loader(
+        CaptureSource(PeopleCache(people), source.sampling, SIZE // 2, SIZE), batch_size=4, seed=1
+    ).batch_at(0)
     np.testing.assert_array_equal(batch.targets.images, again.targets.images)
     for step in range(1, 5):
         loader.batch_at(step)
@@ -226,10 +267,17 @@ def test_training_takes_a_scene_list_and_a_data_set(tmp_path, body):
     for data in (write_scenes(tmp_path / "scenes", model_arrays())[0], tmp_path / "videos"):
         make = training_people(data, 0, tmp_path / "run", body.model, body.file)
         example = make(config).example(0, 0, 2)
-        assert example.inputs.rotations.shape == (2, 55, 3) and example.inputs.images.shape == (2, SIZE, SIZE, 3)
+        assert example.inputs.rotations.shape == (2, 55, 3) and example.inputs.images.shape == (
+            2,
+            SIZE,
+            SIZE,
+            3,
+        )
         (example,) = validation_examples(people_on_disk(data, body, split=None), config, 8)
         assert example.targets.images.shape == (2, SIZE, SIZE, 3)
-    with pytest.raises(ValueError, match="synthetic people have the body that comes with the package"):
+    with pytest.raises(
+        ValueError, match="synthetic people have the body that comes with the package"
+    ):
         training_people(None, 5, tmp_path / "run", body.model, body.file)
     with pytest.raises(ValueError, match=r"no captures, scene list or data set"):
         training_people(tmp_path / "run", 0, tmp_path / "run", body.model, body.file)
@@ -245,6 +293,8 @@ def test_the_evaluator_compares_views_of_a_scene_list(tmp_path, body):
     (tmp_path / "theirs").mkdir()
     for image, view in zip(capture.images, capture.names, strict=True):
         write_png(tmp_path / "theirs" / f"{view}.png", image)
-    found = evaluate(file, predictions=tmp_path / "theirs", indices=tmp_path / "views.json", body=body.file)
+    found = evaluate(
+        file, predictions=tmp_path / "theirs", indices=tmp_path / "views.json", body=body.file
+    )
     assert [row.view for row in found.rows] == ["00002", "00001"] and found.rows[0].person == name
     assert all(row.scores["psnr"] == 100 for row in found.rows)
