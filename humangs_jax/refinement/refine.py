@@ -19,10 +19,16 @@ from humangs_jax.data.body_and_masks import unusable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import equal_exposure
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.head import head_crops, sharpened, shows_heads
+from humangs_jax.refinement.head import Crops, head_crops, sharpened, shows_heads
 from humangs_jax.refinement.objective import avatar_of
 from humangs_jax.refinement.photos import crop_to_person
-from humangs_jax.refinement.search import Clock, comparison, prepare, search
+from humangs_jax.refinement.search import (
+    Clock,
+    avatar_comparison,
+    comparison,
+    prepare,
+    search,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,11 +45,11 @@ class Refinement:
     """Of the run, without compilation."""
     compile_seconds: float
     loss: tuple[float, float]
-    """Before and after, over the photos that were fitted."""
+    """Of the avatar that came and of the one that is returned, over the photos that were fitted."""
     psnr: tuple[float, float]
-    """Likewise, dB over the crops."""
+    """The same in dB over the crops."""
     kept: bool
-    """Whether the avatar has become better; if not, it is unchanged."""
+    """Whether the avatar has become better by that loss; if not, it is unchanged."""
     interrupted: bool = False
     """Whether Ctrl-C ended the run."""
     planned: int | None = None
@@ -51,7 +57,7 @@ class Refinement:
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
     head_steps: int = 0
-    """Of the optimizer, on the head alone."""
+    """Of the optimizer, on the head alone; 0 if they were not kept."""
 
     def summary(self) -> str:
         """One line."""
@@ -135,18 +141,12 @@ def refine_with_report(
     clock = Clock(config, progress)
     with clock.compiling():
         task, best, each = prepare(avatar, views, config, clock)
-    unlimited = config.seconds is None or config.steps == 0
-    heads, interrupted = (
-        bool(config.head_steps) and unlimited and shows_heads(capture, config),
-        False,
-    )
-    compiler, crops = ThreadPoolExecutor(1), None
-    if heads:
-        with clock.compiling():
-            crops = head_crops(task.avatar, capture.select(_usable(capture)), config)
-        if crops is not None:  # beside the programs of the search
-            own = dataclasses.replace(config, head_steps=0, iterations=1)
-            compiler.submit(sharpened, task.avatar, best.state.trust, crops, own, Clock(own))
+        crops = _crops(task.avatar, capture, config)
+    compiler = ThreadPoolExecutor(1)
+    if crops is not None:  # compiled beside the programs of the search
+        own = dataclasses.replace(config, head_steps=0, iterations=1)
+        compiler.submit(sharpened, task.avatar, best.state.trust, crops, own, Clock(own))
+    interrupted = False
     try:
         for found in search(task, best, each):
             best = found if found.kept else best
@@ -154,39 +154,60 @@ def refine_with_report(
                 watch(avatar_of(found.state.parameters, task.avatar))
     except KeyboardInterrupt:
         interrupted = True
-    fitted = [task.photos[i] for i in best.used]
+
+    # what the search found is returned only if it is better on the photos that were fitted
     before = jax.tree.map(lambda x: x[best.used], each).together()
-    after = comparison(task, best.state.parameters, fitted, best.state.splat).together()
-    kept = bool(after.loss < before.loss)
-    after = after if kept else before
-    result, sharp = avatar_of(best.state.parameters, task.avatar) if kept else avatar, None
+    fitted = [task.photos[i] for i in best.used]
+    found_there = comparison(task, best.state.parameters, fitted, best.state.splat).together()
+    result, after, head_steps = avatar, before, 0
+    if found_there.loss < before.loss:
+        result, after = avatar_of(best.state.parameters, task.avatar), found_there
+
+    # and so are the steps on the head, by the whole photos, too
     if crops is not None and not interrupted:
         try:
             with clock.compiling():
                 compiler.shutdown()
                 begin = with_low_pass_of(result, views)
                 if len(best.used) < len(task.photos):
-                    crops = head_crops(begin, capture.select(_usable(capture)[best.used]), config)
-            sharp = (
-                None if crops is None else sharpened(begin, best.state.trust, crops, config, clock)
-            )
+                    crops = _crops(begin, capture, config, best.used)
+            if crops is not None:
+                sharp = sharpened(begin, best.state.trust, crops, config, clock)
+                drawn = with_low_pass_of(sharp, views)
+                sharp_there = avatar_comparison(task, drawn, fitted, best.state.splat).together()
+                if sharp_there.loss < after.loss:
+                    result, after, head_steps = sharp, sharp_there, config.head_steps
         except KeyboardInterrupt:
             interrupted = True
     seconds = clock.stopped()
     return Refinement(
-        result if sharp is None else sharp,
+        result,
         best.iterations,
         clock.done,
         seconds,
         clock.compile_seconds,
         loss=(float(before.loss), float(after.loss)),
         psnr=(float(before.psnr), float(after.psnr)),
-        kept=kept or sharp is not None,
+        kept=result is not avatar,
         interrupted=interrupted,
         planned=None if interrupted or clock.late else clock.planned,
         left_out=_without(capture, best.used) if len(best.used) < len(task.photos) else (),
-        head_steps=0 if sharp is None else config.head_steps,
+        head_steps=head_steps,
     )
+
+
+def _crops(
+    avatar: Avatar,
+    capture: Capture,
+    config: RefineConfig,
+    used: Int[np.ndarray, " n"] | None = None,
+) -> Crops | None:
+    """Crops of the heads in some of the usable views (None: in all); None where no steps on the head are to be made."""
+    unlimited = config.seconds is None or config.steps == 0
+    if not (config.head_steps and unlimited and shows_heads(capture, config)):
+        return None
+    usable = _usable(capture)
+    return head_crops(avatar, capture.select(usable if used is None else usable[used]), config)
 
 
 def _check(avatar: Avatar, capture: Capture) -> None:

@@ -220,19 +220,22 @@ def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
 
 
 def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
-    """The held-out pixels choose the best state; the last one is kept where there are none. losses: of the photos, at first."""
+    """The held-out pixels choose the best state. Where there are none, the loss on all pixels decides on the iterations, and the
+    last state of the steps is kept. losses: of the photos, at first.
+    """
     hidden = [
         replace(all, counted=all.counted & ~seen.counted)
         for all, seen in zip(task.photos, task.seen, strict=True)
     ]
-    any_hidden = any(
-        photo.counted.any() for photo in hidden
-    )  # a small crop may have no block to hold out
+    # a small crop may have no block to hold out
+    any_hidden = any(photo.counted.any() for photo in hidden)
     best, highest = start, psnr_of(task, start, hidden)
     if task.config.iterations:
         found, loss = iterated(task, start, start.used)
-        if loss < np.mean(losses):
-            best, highest = found, psnr_of(task, found, hidden)
+        psnr = psnr_of(task, found, hidden)
+        better = psnr > highest if any_hidden else loss < np.mean(losses)
+        if better:
+            best, highest = found, psnr
         yield best
     total = task.clock.plan(lambda: stepped(task, best.state, best.used[0]))
     for found in steps(task, best, best.used, total, total, (0.0, 1.0)):
@@ -354,6 +357,14 @@ def comparison(
         return each, jnp.sum(each.overflow)
 
     return task.clock.with_room(compared, splat)
+
+
+def avatar_comparison(
+    task: Task, avatar: Avatar, photos: Sequence[Photo], splat: SplatConfig
+) -> Comparison:
+    """`comparison` of an avatar with each of the photos, drawn with the low-pass that it has."""
+    parameters = _parameters_of(avatar.gaussians)
+    return comparison(task._replace(avatar=avatar), parameters, photos, splat)
 
 
 def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:

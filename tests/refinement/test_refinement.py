@@ -1,6 +1,7 @@
 """Refinement on a toy person: a body whose Gaussians differ in color from its photos."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import jax
@@ -297,7 +298,9 @@ def clock(monkeypatch):
 
 
 @pytest.mark.parametrize("views", [3, pytest.param(4, marks=pytest.mark.slow)])
-def test_a_run_by_the_clock_is_repeated_by_its_steps(views, body, clock):
+def test_a_run_by_the_clock_is_repeated_by_its_steps(views, body, clock, monkeypatch):
+    better = itertools.count()
+    monkeypatch.setattr(search, "psnr_of", lambda *of: float(next(better)))
     avatar, capture = toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), views=views)
     config = dataclasses.replace(STEPS, iterations=1, steps=None, seconds=2.0, held_out=0.05)
     timed = refinement.refine_with_report(avatar, capture, config)
@@ -438,6 +441,33 @@ def test_the_state_with_the_highest_psnr_on_held_out_pixels_is_returned(person, 
     )
     assert report.kept and len(so_far) == STEPS.checks
     jax.tree.map(np.testing.assert_array_equal, report.avatar.gaussians, so_far[1].gaussians)
+
+
+@pytest.mark.parametrize(
+    ("held_out", "psnrs", "loss", "kept"),
+    [
+        (
+            0.3,
+            (30.0, 25.0),
+            0.0,
+            0,
+        ),  # the photos that are seen are fitted, the held-out pixels get worse
+        (0.3, (30.0, 31.0), 9.0, 2),
+        (0.0, (100.0, 100.0), 0.0, 2),  # nothing is held out: all pixels decide
+        (0.0, (100.0, 100.0), 9.0, 0),
+    ],
+)
+def test_held_out_pixels_decide_on_the_iterations_of_few_photos(
+    held_out, psnrs, loss, kept, person, monkeypatch
+):
+    values = iter(psnrs)
+    monkeypatch.setattr(search, "psnr_of", lambda *of: next(values))
+    monkeypatch.setattr(search, "updated", lambda *of: None)
+    monkeypatch.setattr(
+        search, "iterated", lambda task, start, used: (start._replace(iterations=2), loss)
+    )
+    settings = dataclasses.replace(STEPS, iterations=2, steps=0, held_out=held_out)
+    assert refinement.refine_with_report(*person, settings).iterations == kept
 
 
 def test_what_makes_the_photos_worse_is_not_returned(person, monkeypatch):
