@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from attacks_binary import as_format, chunk, png, zlib_zeros
 from honest_files import pixels, written
-from hostile_cases import capture_with, case
+from hostile_cases import FIRST_SEED, capture_with, case
 from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[1] / "io"))
@@ -38,7 +38,7 @@ def at(data, place, new):
 
 def noise(data, seed):
     """Some bytes behind the head are others."""
-    changed, rng = bytearray(data), np.random.default_rng(seed)
+    changed, rng = bytearray(data), np.random.default_rng(FIRST_SEED + seed)
     for place in rng.integers(128, len(data), 12):
         changed[place] = rng.integers(256)
     return bytes(changed)
@@ -216,7 +216,7 @@ for kind, (data, item) in WEB.items():
         case(kind, reader, written("a.jpg", data), item=item)
 for seed in range(40):
     for form, data in (("WebP", EXTENDED), ("AVIF", AVIF)):
-        changed, rng = bytearray(data), np.random.default_rng(seed)
+        changed, rng = bytearray(data), np.random.default_rng(FIRST_SEED + seed)
         for place in rng.integers(12, len(data), 6):
             changed[place] = rng.integers(256)
         case(f"noise {seed} of {form}", "image", written("a", bytes(changed)), "either", 6)

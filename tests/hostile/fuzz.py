@@ -34,6 +34,7 @@ worker.prepare()  # before JAX and the readers are imported
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import readers  # noqa: E402
+from hostile_cases import FIRST_SEED  # noqa: E402
 from hypothesis import HealthCheck, Phase, given, seed, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
@@ -343,7 +344,7 @@ def fuzz(name, folder, inputs, number, watch):
     file = readers.FORMATS[name].damaged(path)
     honest, counts = file.read_bytes(), {"read": 0, "refused": 0}
 
-    @seed(number)
+    @seed(FIRST_SEED + number)
     @settings(
         max_examples=inputs, deadline=None, database=None, phases=(Phase.generate, Phase.shrink), print_blob=False,
         suppress_health_check=list(HealthCheck), report_multiple_bugs=False,

@@ -15,6 +15,10 @@ from honest_files import written as written
 from readers import FORMATS
 
 
+FIRST_SEED = int(os.environ.get("HUMANGS_HOSTILE_SEED", "0"))
+"""Added to the seeds of random damage: another number makes other files."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """reader: of `readers.FORMATS`. make: writes the file into a folder, returns its path. item: of test_hostile.ITEMS."""
@@ -126,7 +130,7 @@ def replaced(name, place):
 
 def flipped(seed):
     def change(data):
-        data, random = bytearray(data), np.random.default_rng(seed)
+        data, random = bytearray(data), np.random.default_rng(FIRST_SEED + seed)
         for position in random.integers(len(data), size=1 + seed % 3):
             data[position] ^= 1 << int(random.integers(8))
         return bytes(data)
@@ -143,7 +147,7 @@ NONSENSE = {
     "empty": lambda data: b"",
     "one byte": lambda data: b"\0",
     "zeros": lambda data: bytes(4096),
-    "noise": lambda data: np.random.default_rng(7).bytes(4096),
+    "noise": lambda data: np.random.default_rng(FIRST_SEED + 7).bytes(4096),
     "a web page": lambda data: b"<!DOCTYPE html><html><body>404 Not Found</body></html>\n",
 }
 PLACES = {

@@ -2,7 +2,7 @@
 
 Some files of each item are read here, all of them in a process of their own (`worker`), by the slow tests. So are the commands:
 killed, and on full and read-only disks (`writers`). `python tests/hostile/test_hostile.py FOLDER` reads all files and
-prints the figures of docs/benchmarks/security.md.
+prints the figures of docs/security.md. HUMANGS_HOSTILE_SEED=N makes the randomly damaged files from other seeds.
 """
 
 import json
