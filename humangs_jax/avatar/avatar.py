@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -236,8 +236,10 @@ class Avatar(Batchable):
             self, gaussians=gaussians, skinning_weights=self.skinning_weights[index], light=light
         )
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, made_from: str | None = None) -> None:
         """Write one compressed `.npz` (no pickle); it appears whole or not at all.
+
+        Arguments: made_from: a checksum of what the avatar was made from, for `recorded_source`.
 
         Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the Gaussians are deformed, as
         those of a pose are: avatars are in the T-pose; FileError if
@@ -262,6 +264,8 @@ class Avatar(Batchable):
             "skinning": self.skinning,
             "rendering": self.rendering,
         }
+        if made_from is not None:
+            header["made_from"] = made_from
         values = {name: getattr(self.gaussians, name) for name in _ARRAYS[:5]}
         values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
         if self.light is not None:
@@ -289,9 +293,23 @@ class Avatar(Batchable):
             return _load(cls, path)
 
 
-def _load(cls: type[Avatar], path: Any) -> Avatar:
+def recorded_source(path: str | os.PathLike[str]) -> str | None:
+    """The checksum of what an avatar file was made from, as `Avatar.save` was given it; None for a file without one.
+
+    Raises: FileNotFoundError if there is no such file; FileError if it is no avatar of this version.
+    """
+    with reading(path, "avatar file"):
+        _, header = _read(path, lambda name: name == "header")
+        found = header.get("made_from")
+        return found if isinstance(found, str) else None
+
+
+def _read(
+    path: Any, wanted: Callable[[str], bool] | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays of an avatar file, not checked yet, and its header. wanted: which arrays to read; None: all."""
     try:
-        arrays, _ = read_npz(path)
+        arrays, _ = read_npz(path, wanted)
         header = parse_json(str(arrays["header"]))
     except (FileError, KeyError) as error:
         if is_unread(error):
@@ -306,6 +324,11 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
         raise Refused(
             f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}"
         )
+    return arrays, header
+
+
+def _load(cls: type[Avatar], path: Any) -> Avatar:
+    arrays, header = _read(path)
     with_light = any(f"light_{name}" in arrays for name in _LIGHT)
     wanted = _ARRAYS + tuple(f"light_{name}" for name in _LIGHT if with_light)
     wanted += tuple(name for name in _OPTIONAL if name in arrays)

@@ -83,8 +83,8 @@ class Reconstruct:
     """Reconstruct avatars from capture folders.
 
     A capture is photos, cameras and body poses. Several captures, or a folder of them, become OUT/NAME.npz. Those that are
-    there are kept, so that the same command goes on after an interruption; a capture that fails does not stop the others.
-    docs: capture_format.
+    there are kept, so that the same command goes on after an interruption. One whose capture has other contents now is
+    named, and nothing is made. A capture that fails does not stop the others. docs: capture_format.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -139,6 +139,7 @@ class Reconstruct:
         require_place(out, "--out", Place() if several else AVATAR)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct_many
+            from humangs_jax.data.capture import capture_checksum
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 
@@ -151,15 +152,19 @@ class Reconstruct:
             done = {name for name in captures if (out / f"{name}.npz").exists()}
             if done:
                 tell(f"{out}: {len(done)} of {len(captures)} avatars are there")
-            captures = {
-                name: folder
-                for name, folder in list(captures.items())[part::parts]
-                if name not in done
-            }
+            captures = dict(list(captures.items())[part::parts])
+            for name in done & captures.keys():
+                _check_source(out / f"{name}.npz", captures.pop(name))
         views = settings.views if settings is not None and self.views is None else self.views
+        sources: dict[str, str] = {}
+
+        def photos_of(name: str, folder: Path) -> "Capture":
+            if several:
+                sources[name] = capture_checksum(folder)
+            return self._photos(folder, views)
+
         load = {
-            name: functools.partial(self._photos, folder, views)
-            for name, folder in captures.items()
+            name: functools.partial(photos_of, name, folder) for name, folder in captures.items()
         }
         if not several:  # what is wrong with it is said before the network is read
             (name, read), *_ = load.items()
@@ -194,6 +199,7 @@ class Reconstruct:
                     file,
                     how if photos.masks is not None else None,
                     unfinished=not several,
+                    made_from=sources.get(name),
                 )
         if not several:
             suggest("humangs view", out)
@@ -202,11 +208,16 @@ class Reconstruct:
 
     def _begin_set(self, out: Path) -> None:
         """Avatars that were made in other ways are not mixed. Raises: CaptureError."""
+        from humangs_jax import __version__
         from humangs_jax.data.sets import AVATARS, SETTINGS, begin_set
         from humangs_jax.io.arrays import SHORT, file_checksum
+        from humangs_jax.network.weights import shipped_checksum
 
         apart = ("captures", "out", "batch", "shard", "check")
         said = {name: str(value) for name, value in vars(self).items() if name not in apart}
+        said["version"] = __version__
+        if self.weights is None:
+            said["weights"] += f" ({shipped_checksum()[:SHORT]})"
         for name in ("weights", "config"):  # other contents under the same name are other settings
             if (file := getattr(self, name)) is not None and file.is_file():
                 said[name] += f" ({file_checksum(file)[:SHORT]})"
@@ -294,6 +305,17 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
     return named
 
 
+def _check_source(avatar: Path, capture: Path) -> None:
+    """An avatar of a set that is kept was made from what the capture holds now. Raises: CaptureError, naming both."""
+    from humangs_jax.avatar.avatar import recorded_source
+    from humangs_jax.data.capture import capture_checksum
+    from humangs_jax.data.capture_checks import CaptureError
+
+    if recorded_source(avatar) != capture_checksum(capture):
+        problem = f"made from other contents than {capture} has now: move it away, or choose another --out"
+        raise CaptureError(avatar, "made_from", problem)
+
+
 def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
     """The views of a capture that show the person, after warnings about what looks wrong in them. Raises: ValueError for none."""
     with stage("reading the capture"):
@@ -327,14 +349,15 @@ def _refine_and_save(
     how: "RefineConfig | None",
     live: bool = False,
     unfinished: bool = True,
+    made_from: str | None = None,
 ) -> None:
     """Refine with a progress bar if asked, write the result (now and then, if live), say what it took.
 
-    unfinished: whether an avatar is written whose refinement was interrupted.
+    unfinished: whether an avatar is written whose refinement was interrupted. made_from: a checksum to write with it.
     Raises: KeyboardInterrupt, after that, if one ended it.
     """
     if how is None:
-        _save(avatar, out, f"from {photos.view_count} photos")
+        _save(avatar, out, f"from {photos.view_count} photos", made_from)
         return
     with stage("refining"):
         from humangs_jax.refinement.refine import refine_with_report
@@ -344,14 +367,15 @@ def _refine_and_save(
     if refinement.interrupted and not unfinished:
         tell(f"{out}: not written, its refinement was interrupted: the same command makes it again")
         raise KeyboardInterrupt
-    _save(refinement.avatar, out, f"from {photos.view_count} photos, {refinement.summary()}")
+    done = f"from {photos.view_count} photos, {refinement.summary()}"
+    _save(refinement.avatar, out, done, made_from)
     if refinement.interrupted:
         raise KeyboardInterrupt
 
 
-def _save(avatar: "Avatar", out: Path, how: str) -> None:
+def _save(avatar: "Avatar", out: Path, how: str, made_from: str | None) -> None:
     with stage("writing"):
-        avatar.save(out)
+        avatar.save(out, made_from=made_from)
     wrote(out, f"{len(avatar.gaussians.means):,} Gaussians {how}")
 
 

@@ -45,7 +45,7 @@ from humangs_jax.data.photos import (
     write_description,
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.io.arrays import read_npz, write_npz
+from humangs_jax.io.arrays import checksum, file_checksum, read_npz, write_npz
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import image_row, png_bytes, resized, write_png
 from humangs_jax.io.reading import FileError, check_limit, reading
@@ -263,6 +263,26 @@ def load_capture(
         if body_file != DEFAULT_BODY:
             body_file = str(folder / body_file)
         return _assemble(photos, body, body_file, *checked)
+
+
+def capture_checksum(path: str | Path) -> str:
+    """SHA-256, in hexadecimal, of all files that a capture is read from: capture.json, body.npz, the model, photos and masks.
+
+    Captures of the same name with other contents have other checksums.
+
+    Raises: CaptureError, as `load_capture` does; OSError for a file that cannot be read.
+    """
+    folder = capture_folder(path)
+    with reading(folder / "capture.json", "capture", CaptureError):
+        description = read_description(folder / "capture.json")
+        parameter_file = folder / description["body"]
+        body_file, _ = read_parameters(parameter_file)
+        files = [folder / "capture.json", parameter_file]
+        if body_file != DEFAULT_BODY:
+            files.append(folder / body_file)
+        for view in description["views"]:
+            files += [folder / view[kind] for kind in ("image", "mask") if kind in view]
+        return checksum({}, *(file_checksum(file) for file in files))
 
 
 @checked_arguments

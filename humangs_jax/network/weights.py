@@ -17,7 +17,7 @@ import numpy as np
 from humangs_jax.core.array_types import PyTree
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import config_from_json, config_to_json
-from humangs_jax.io.arrays import check_checksum, checksum
+from humangs_jax.io.arrays import check_checksum, checksum, file_checksum
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.reading import reading
 from humangs_jax.io.tensors import read_safetensors
@@ -75,6 +75,12 @@ def save_weights(
     stored = {key: np.ascontiguousarray(x, np.dtype(dtype)) for key, x in tensors.items()}
     metadata = {"format": FORMAT, "version": VERSION, **recorded}
     write_bytes(path, save(stored, metadata | {"checksum": checksum(stored, *recorded.values())}))
+
+
+def shipped_checksum() -> str:
+    """SHA-256, in hexadecimal, of the shipped weights file; "none" where the installation has none."""
+    with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
+        return file_checksum(shipped) if shipped.exists() else "none"
 
 
 @checked_arguments

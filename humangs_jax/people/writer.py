@@ -35,6 +35,7 @@ from humangs_jax.data.sets import (
     read_manifest,
     write_manifest,
 )
+from humangs_jax.evaluation.kept import body_key
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.people.bank import export_scan
@@ -202,6 +203,7 @@ def write_set(
         "generator_version": GENERATOR_VERSION,
         "split": split,
         "settings": dataclasses.asdict(layout),
+        "body": body_key(body),
     }
     check_writable(out)
     begin_set(out, SYNTHETIC, made_with)

@@ -101,6 +101,37 @@ def test_a_folder_of_captures_goes_on_after_failures_and_interruptions(people, t
     assert code == cli.BAD_DATA and "views 'None' -> '2'" in err
 
 
+def test_an_avatar_that_is_kept_was_made_from_what_its_capture_holds_now(people, tmp_path, humangs):
+    shutil.copy("people/a/body.npz", "people/b/body.npz")
+    line = ("reconstruct", "people", "--refine", "0", "--no-check", "--out", "avatars")
+    assert humangs(*line)[0] == 0
+    kept = (tmp_path / "avatars/c.npz").read_bytes()
+    photos = sorted((tmp_path / "people/c/images").iterdir())
+    shutil.copy(photos[0], photos[1])  # another person under the same name
+    people.clear()
+    code, _, err = humangs(*line)
+    assert code == cli.BAD_DATA and not people
+    assert "c.npz: made_from: made from other contents than people/c has now" in err
+    assert (tmp_path / "avatars/c.npz").read_bytes() == kept
+    (tmp_path / "avatars/c.npz").unlink()
+    assert humangs(*line)[0] == 0 and people == ["c"]
+    save_tiny_avatar(tmp_path / "avatars/d.npz")  # which does not say what it was made from
+    assert "d.npz: made_from" in humangs(*line)[2]
+
+
+def test_a_set_of_avatars_of_another_release_or_of_other_shipped_weights_is_refused(
+    people, monkeypatch, humangs
+):
+    shutil.copy("people/a/body.npz", "people/b/body.npz")
+    line = ("reconstruct", "people", "--refine", "0", "--no-check", "--out", "avatars")
+    assert humangs(*line)[0] == 0
+    monkeypatch.setattr("humangs_jax.network.weights.shipped_checksum", lambda: "0" * 64)
+    monkeypatch.setattr("humangs_jax.__version__", "9.9")
+    code, _, err = humangs(*line)
+    assert code == cli.BAD_DATA
+    assert "-> '9.9'" in err and "-> 'None (0000" in err
+
+
 def test_an_avatar_of_a_set_whose_refinement_is_interrupted_is_made_again(
     people, tmp_path, monkeypatch, capsys
 ):

@@ -14,7 +14,6 @@ from changes import edit_bytes, edit_text
 from honest_files import written as written
 from readers import FORMATS
 
-
 FIRST_SEED = int(os.environ.get("HUMANGS_HOSTILE_SEED", "0"))
 """Added to the seeds of random damage: another number makes other files."""
 

@@ -155,6 +155,8 @@ def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
         write(4, layout=writer.Layout(64, views=2))
     with pytest.raises(ValueError, match="split 'demo' -> 'train'"):
         write(4, split="train")
+    with pytest.raises(ValueError, match=r"body '\w+' -> None"):
+        write(4, body=None)
     monkeypatch.setattr("humangs_jax.people.writer.GENERATOR_VERSION", GENERATOR_VERSION + 1)
     with pytest.raises(
         ValueError, match=f"generator_version {GENERATOR_VERSION} -> {GENERATOR_VERSION + 1}"

@@ -67,7 +67,7 @@ from humangs_jax.data.preprocess.protocol import (
     split_ids,
     video_alignment,
 )
-from humangs_jax.data.sets import DATA_SET, begin_set, finished, made, write_manifest
+from humangs_jax.data.sets import DATA_SET, begin_set, files_key, finished, made, write_manifest
 from humangs_jax.io.arrays import SHORT, file_checksum, write_npz
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import write_png
@@ -153,11 +153,12 @@ def preprocess(
     begin_set(out, DATA_SET, made_with, alone=True)
     for name, reason in absent.items():
         _skip(out, name, reason)
-    due = {
-        name: path
-        for name, path in list(names.items())[index::count]
-        if not (out / name / settings.mark).is_file()
-    }
+    due = {}
+    for name, path in list(names.items())[index::count]:
+        if (out / name / settings.mark).is_file():
+            _check_source(out / name / SCENE, name, path, settings)
+        else:
+            due[name] = path
     tasks = {name: (out / name, name, path, settings, progress) for name, path in due.items()}
     load = functools.partial(FileBody.load, None if body.file == DEFAULT_BODY else body.file)
     scans, done = DATASETS[settings.kind].scans, 0  # photos of videos are decoded by threads
@@ -210,6 +211,25 @@ def _made_with(source: Path, body: FileBody, settings: Settings) -> dict[str, An
         "body": body.file if shipped else file_checksum(Path(body.file))[:SHORT],
     }
     return {"settings": dataclasses.asdict(settings) | {"factors": list(settings.factors)} | known}
+
+
+def _source_key(name: str, source: Path, settings: Settings) -> str:
+    """A checksum of the files that a scene is made from, see `sets.files_key`."""
+    if DATASETS[settings.kind].scans:
+        scan, fit = scan_files(source, name)
+        return files_key(source, (*scan.parent.iterdir(), *fit.parent.iterdir()))
+    files = [source] if source.is_file() else source.rglob("*")
+    return files_key(source.parent, files)
+
+
+def _check_source(file: Path, name: str, source: Path, settings: Settings) -> None:
+    """A finished scene was made from what the data set holds now, if its scene.json says from what. Raises: CaptureError."""
+    if not file.is_file():
+        return
+    recorded = _read_scene(file, settings).get("made_from")
+    if recorded not in (None, _source_key(name, source, settings)):
+        problem = f"made from other files than {source} has now: move the folder away, or choose another --out"
+        raise CaptureError(file, "made_from", problem)
 
 
 def _skip(out: Path, name: str, reason: str) -> None:
@@ -318,7 +338,8 @@ class Content:
 def _make_scan(
     body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool
 ) -> None:
-    _write(folder, scan_content(source, name, body, settings), body, settings)
+    content = scan_content(source, name, body, settings)
+    _write(folder, content, body, settings, _source_key(name, source, settings))
 
 
 def scan_content(source: Path, name: str, body: FileBody, settings: Settings) -> Content:
@@ -385,11 +406,13 @@ def _make_video(
     content = Content(
         transform, posed, np.asarray(body.model.faces), parameters, 1.0, views(), known
     )
-    _write(folder, content, body, settings)
+    _write(folder, content, body, settings, _source_key(name, source, settings))
 
 
-def _write(folder: Path, content: Content, body: FileBody, settings: Settings) -> None:
-    """Photos and masks, then what the layout says of them."""
+def _write(
+    folder: Path, content: Content, body: FileBody, settings: Settings, made_from: str
+) -> None:
+    """Photos and masks, then what the layout says of them. made_from: `_source_key`."""
 
     def write(temporary: Path) -> None:
         for kind in ("images", "masks"):
@@ -404,7 +427,7 @@ def _write(folder: Path, content: Content, body: FileBody, settings: Settings) -
                 f"{folder.name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}"
             )
         known = {"views": len(views), "frames": len(content.parameters.rotations), **content.known}
-        described: dict[str, Any] = {"known": known}
+        described: dict[str, Any] = {"known": known, "made_from": made_from}
         if settings.layout == "scenes":
             described = {"entry": _write_scene(temporary, folder.name, content, views)} | described
         write_json(temporary / SCENE, described, indent=None)

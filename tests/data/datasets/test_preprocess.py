@@ -127,6 +127,16 @@ def test_the_other_layout_is_capture_folders(videos, tmp_path, body):
     )
 
 
+def test_a_finished_scene_is_kept_only_of_the_same_files(videos, tmp_path, body):
+    source, out = shutil.copytree(videos, tmp_path / "data"), tmp_path / "out"
+    run(source, out, body, settings())
+    assert run(source, out, body, settings()).made == 0
+    photo = source / "avatarrex_a" / "22010708" / "00000001.jpg"
+    photo.write_bytes(photo.read_bytes() + b" of somebody else")
+    with pytest.raises(ValueError, match=r"avatarrex_a/scene.json: made_from: made from other"):
+        run(source, out, body, settings())
+
+
 def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path, body):
     out = tmp_path / "out"
     assert run(videos, out, body, settings(), shard=(0, 2)).scenes == 1
