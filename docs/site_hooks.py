@@ -1,4 +1,6 @@
-"""What mkdocs does with our pages: help texts of the commands, and links to files that are not on the site."""
+"""What mkdocs does with our pages: help texts of the commands, and links to files that are not on
+the site.
+"""
 
 import os
 import re

@@ -54,14 +54,15 @@ def accelerator(
 
     What fails is noted, the next one begins, and the exit status is 1.
 
-    check: the same numbers on CPU and device: the shipped network, splatting by the schedule of each with gradients. splatting:
-    forward and with gradients. people: rendered on the fly. reconstruct: the demo's photos. Training: `train_by_clock`.
+    check: the same numbers on CPU and device: the shipped network, splatting by the schedule of
+    each with gradients. splatting: forward and with gradients. people: rendered on the fly.
+    reconstruct: the demo's photos. Training: `train_by_clock`.
 
     Options:
     stage: which
     small: sizes that a CPU rehearses in minutes
-    earlier: files of --json of runs on an accelerator, and run.json of `train_by_clock`: their rows are published together, and
-        nothing is measured
+    earlier: files of --json of runs on an accelerator, and run.json of `train_by_clock`: their rows
+        are published together, and nothing is measured
     """
     if earlier:
         records = [json.loads(path.read_text()) for path in earlier]
@@ -97,7 +98,10 @@ def table_of(device: str, found: dict[str, dict[str, Any]]) -> str:
         for key, value in numbers.items()
         if not isinstance(value, dict | list)
     ]
-    return f"{device}. Milliseconds, unless said otherwise.\n\n{markdown_table(['measurement', 'number', 'value'], rows, 'llr')}"
+    return (
+        f"{device}. Milliseconds, unless said"
+        f" otherwise.\n\n{markdown_table(['measurement', 'number', 'value'], rows, 'llr')}"
+    )
 
 
 def _tried(measure):

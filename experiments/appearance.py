@@ -1,4 +1,6 @@
-"""What eyes see of an avatar: LPIPS of the whole person and of the head, errors in the foreground, what is drawn beside it."""
+"""What eyes see of an avatar: LPIPS of the whole person and of the head, errors in the foreground,
+what is drawn beside it.
+"""
 
 import functools
 import itertools
@@ -26,7 +28,9 @@ from humangs_jax.refinement.refine import refine
 VIEWS = 4
 NETS = ("alex", "vgg")
 LOOSEST, WORST = 10, 5
-"""Of the people, those whose clothes are farthest from the body, and those whose foreground is worst, are listed apart."""
+"""Of the people, those whose clothes are farthest from the body, and those whose foreground is
+worst, are listed apart.
+"""
 SHOWN = {
     "psnr": ("PSNR", 2),
     "psnr_fg": ("foreground", 2),
@@ -49,10 +53,11 @@ def appearance(
     off: tuple[float, ...] = (0.0,),
     details_sheet: Path | None = None,
 ) -> None:
-    """What eyes see of avatars of four photos, as `humangs reconstruct` makes them, from other cameras.
+    """What eyes see of avatars of four photos, as `humangs reconstruct` makes them, from other
+    cameras.
 
-    Needs the extra `lpips`. "iterations alone": no displacement of the body, no steps on the head. Alpha outside: of the area of
-    the true mask.
+    Needs the extra `lpips`. "iterations alone": no displacement of the body, no steps on the head.
+    Alpha outside: of the area of the true mask.
 
     Options:
     sizes: sides of the photos in pixels (--size is not used)
@@ -114,7 +119,10 @@ def appearance(
         "avatar",
         *(heading for heading, _ in SHOWN.values()),
     ]
-    about = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other cameras."
+    about = (
+        f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other"
+        " cameras."
+    )
     text = f"{about}\n\n{markdown_table(header, table, 'lllll' + 'r' * len(SHOWN))}"
     run.show(text, {"settings": start.settings | settings, "means": numbers, "people": len(rows)})
     if details_sheet:

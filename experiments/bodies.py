@@ -1,4 +1,6 @@
-"""The same weights, people and photos on other bodies: the default one, a made-up one in SMPL-X's format, and decimated ones."""
+"""The same weights, people and photos on other bodies: the default one, a made-up one in SMPL-X's
+format, and decimated ones.
+"""
 
 import dataclasses
 import tempfile
@@ -23,7 +25,9 @@ from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_
 from humangs_jax.network.config import HumanGSConfig
 
 SMPLX_SEED_VERTICES = 3493
-"""Vertices of the decimated body that the made-up one grows from: with a vertex for each of its faces about SMPL-X's 10,475."""
+"""Vertices of the decimated body that the made-up one grows from: with a vertex for each of its
+faces about SMPL-X's 10,475.
+"""
 FRACTIONS = {"1/4": 4, "1/16": 16}
 POSE_FEATURES = 9 * (len(JOINT_NAMES) - 1)
 PAINTED = "painted default body"
@@ -31,11 +35,13 @@ PAINTED = "painted default body"
 
 @entry
 def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> None:
-    """The same weights, people and photos on other bodies: another topology in SMPL-X's format, and fewer vertices.
+    """The same weights, people and photos on other bodies: another topology in SMPL-X's format, and
+    fewer vertices.
 
-    "SMPL-X format": a made-up body of another topology, written as an SMPL-X file and read by its loader; the poses go to its
-    joints by name. "1/4" and "1/16" of the default body's vertices, as they are and with long edges split as the weights want
-    it. About 10 s of CPU time a person, and some minutes of compiling.
+    "SMPL-X format": a made-up body of another topology, written as an SMPL-X file and read by its
+    loader; the poses go to its joints by name. "1/4" and "1/16" of the default body's vertices, as
+    they are and with long edges split as the weights want it. About 10 s of CPU time a person, and
+    some minutes of compiling.
 
     Options:
     views: photos that the network sees
@@ -96,9 +102,11 @@ class BodyCase:
 
 
 def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
-    """By name: the body, the made-up one in SMPL-X's format, and the body with a fraction of its vertices.
+    """By name: the body, the made-up one in SMPL-X's format, and the body with a fraction of its
+    vertices.
 
-    Decimated bodies are included unchanged and, if the weights want long edges split, also with split edges.
+    Decimated bodies are included unchanged and, if the weights want long edges split, also with
+    split edges.
     """
     wanted = {"default": body, "SMPL-X format": smplx_body(body)}
     cases = {name: BodyCase(model, gaussian_body(model, config)) for name, model in wanted.items()}
@@ -127,10 +135,12 @@ def smplx_body(body: BodyModel) -> BodyModel:
 
 
 def turned_subdivision(body: BodyModel) -> BodyModel:
-    """Another mesh of the same body: a vertex in the middle of each face, and each edge turned to join two of them.
+    """Another mesh of the same body: a vertex in the middle of each face, and each edge turned to
+    join two of them.
 
-    That is a step of sqrt(3)-subdivision (Kobbelt, 2000) without its smoothing; no inner edge of the old mesh is left, and the
-    old vertices have their numbers. Joints stay those of the old vertices in every shape. Texture coordinates are dropped.
+    That is a step of sqrt(3)-subdivision (Kobbelt, 2000) without its smoothing; no inner edge of
+    the old mesh is left, and the old vertices have their numbers. Joints stay those of the old
+    vertices in every shape. Texture coordinates are dropped.
     """
     faces = np.asarray(body.faces, np.int64)
     n = len(body.template)
@@ -164,10 +174,12 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
 def write_smplx(
     path: Path, body: BodyModel, directions: np.ndarray | None = None, **more: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """A body with SMPL-X's joints as an SMPL-X model file, no correctives if it has none; its arrays.
+    """A body with SMPL-X's joints as an SMPL-X model file, no correctives if it has none; its
+    arrays.
 
-    directions: (n, 3, columns) of shapes and expressions; by default those of the body, and no expressions. more: arrays
-    beside these. Raises: ValueError if it has other joints, or more shape directions than the format holds.
+    directions: (n, 3, columns) of shapes and expressions; by default those of the body, and no
+    expressions. more: arrays beside these. Raises: ValueError if it has other joints, or more shape
+    directions than the format holds.
     """
     count, n = body.shape_directions.shape[-1], len(body.template)
     if body.joint_names != JOINT_NAMES:
@@ -175,7 +187,8 @@ def write_smplx(
     if directions is None:
         if count > SHAPE_COLUMNS:
             raise ValueError(
-                f"body '{body.name}' has {count} shape directions, SMPL-X's format holds {SHAPE_COLUMNS}"
+                f"body '{body.name}' has {count} shape directions, SMPL-X's format holds"
+                f" {SHAPE_COLUMNS}"
             )
         directions = np.zeros((n, 3, SHAPE_COLUMNS + EXPRESSION_COLUMNS), np.float32)
         directions[..., :count] = body.shape_directions

@@ -1,4 +1,6 @@
-"""Files that ship with the package: the networks of `humangs detect`, the demo capture, the walk."""
+"""Files that ship with the package: the networks of `humangs detect`, the demo capture, the
+walk.
+"""
 
 import hashlib
 import subprocess
@@ -52,7 +54,8 @@ def checked(package: Path) -> dict[str, bytes]:
 def build_blazepose(
     run: Run, out: Path = ASSETS / "blazepose", package: Path | None = None
 ) -> None:
-    """Fetches the networks that find people in photos, from the public npm package @mediapipe/pose, and checks them.
+    """Fetches the networks that find people in photos, from the public npm package @mediapipe/pose,
+    and checks them.
 
     The files are written unchanged; nothing is written if a sum differs.
 
@@ -75,7 +78,8 @@ def build_blazepose(
 def build_demo_capture(
     run: Run, seed: int = 3_000_002, out: Path = ASSETS / "demo_capture"
 ) -> None:
-    """Makes the capture folder that ships with the package: a synthetic person, four photos and held-out views.
+    """Makes the capture folder that ships with the package: a synthetic person, four photos and
+    held-out views.
 
     The person's seed lies outside of every range that training draws from.
 
@@ -148,8 +152,9 @@ def build():
 def frame_rotations(frame: int) -> dict:
     """Rotation matrices of the joints that move, by name.
 
-    The T-pose faces +z with its left at +x: a leg or a hanging arm swings forward about -x, a foot lifts about -x, the left
-    arm sinks about -z and its elbow bends forward about -y; the right side is the mirror image.
+    The T-pose faces +z with its left at +x: a leg or a hanging arm swings forward about -x, a foot
+    lifts about -x, the left arm sinks about -z and its elbow bends forward about -y; the right side
+    is the mirror image.
     """
     phase = STRIDES * frame / FRAMES
     turn = 2 * np.pi * phase
@@ -160,7 +165,8 @@ def frame_rotations(frame: int) -> dict:
     heading = 9 * np.sin(once)
     pelvis_turn, pelvis_list = -5 * np.cos(turn), 3.5 * np.sin(turn + 0.5)
     joints["pelvis"] = _y(heading + pelvis_turn) @ _z(pelvis_list) @ _x(2.5)
-    # the spine turns the shoulders against the pelvis and keeps them level; neck and head look ahead
+    # the spine turns the shoulders against the pelvis and keeps them level; neck and head look
+    # ahead
     for name, share in (("spine1", 0.3), ("spine2", 0.4), ("spine3", 0.3)):
         joints[name] = (
             _y(share * 11 * np.cos(turn - 0.2)) @ _z(-share * 1.25 * pelvis_list) @ _x(share * 2)

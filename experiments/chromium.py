@@ -1,4 +1,5 @@
-"""Chromium without a screen, drawing WebGL in software: for tests and measurements of the page that shows avatars.
+"""Chromium without a screen, drawing WebGL in software: for tests and measurements of the page that
+shows avatars.
 
 Debian: `apt-get install chromium chromium-driver`; the Python side is selenium (extra `dev`).
 """
@@ -84,16 +85,25 @@ class Chromium:
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
 
     def open(self, page: Path | str) -> None:
-        """Load a file or an address and wait for the first image. Raises: RuntimeError with the page's own words."""
+        """Load a file or an address and wait for the first image.
+
+        Raises: RuntimeError with the page's own words.
+        """
         self.driver.get(page.resolve().as_uri() if isinstance(page, Path) else page)
         problem = self.run("return humangs.ready.then(() => null, (error) => String(error))")
         if problem is not None:
             raise RuntimeError(problem)
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """Run the body of an async function in the page; its value, promises awaited. Raises: RuntimeError if it throws."""
+        """Run the body of an async function in the page; its value, promises awaited.
+
+        Raises: RuntimeError if it throws.
+        """
         code = "const done = arguments[arguments.length - 1], given = [...arguments].slice(0, -1);"
-        code += f"(async () => {{ {script} }})().then((v) => done([v, null]), (e) => done([null, String(e.stack || e)]))"
+        code += (
+            f"(async () => {{ {script} }})().then((v) => done([v, null]), (e) => done([null,"
+            " String(e.stack || e)]))"
+        )
         value, error = self.driver.execute_async_script(code, *arguments)
         if error is not None:
             raise RuntimeError(error)
@@ -107,7 +117,9 @@ class Chromium:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float32) / 255
 
     def problems(self) -> list[str]:
-        """Errors and warnings on the console since the last call, but for notes on speed (tests read pixels back)."""
+        """Errors and warnings on the console since the last call, but for notes on speed (tests
+        read pixels back).
+        """
         entries = self.driver.get_log("browser")
         return [
             entry["message"]

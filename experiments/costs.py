@@ -1,12 +1,15 @@
-"""What a traced JAX program costs: multiplications and additions of its matrix products and convolutions, and what it sends.
+"""What a traced JAX program costs: multiplications and additions of its matrix products and
+convolutions, and what it sends.
 
     costs = costs_of(jax.jit(f).trace(*arguments))
 
-XLA's own `cost_analysis()` counts the body of a loop once; here it counts as often as it runs. The program is counted as it is
-written: what nothing reads is left out, what XLA fuses makes no difference. Conditionals cost what their dearest branch does. A
-loop whose length depends on data counts once, and `unknown_trips` says how many there are. Zeros between the inputs of a
-transposed convolution do not count, so that the gradients of a convolution cost what it costs itself; padding does. Operations
-and messages inside of `shard_map` are those of one device.
+XLA's own `cost_analysis()` counts the body of a loop once; here it counts as often as it runs. The
+program is counted as it is
+written: what nothing reads is left out, what XLA fuses makes no difference. Conditionals cost what
+their dearest branch does. A loop whose length depends on data counts once, and `unknown_trips` says
+how many there are. Zeros between the inputs of a transposed convolution do not count, so that the
+gradients of a convolution cost what it costs itself; padding does. Operations and messages inside
+of `shard_map` are those of one device.
 """
 
 import dataclasses
@@ -29,7 +32,9 @@ MEBI = 1 / 2**20
 
 @dataclasses.dataclass(frozen=True)
 class Costs:
-    """dots, convolutions: operations. messages: calls by kind. sent: bytes that one device sends, by kind."""
+    """dots, convolutions: operations. messages: calls by kind. sent: bytes that one device sends,
+    by kind.
+    """
 
     dots: int = 0
     convolutions: int = 0
@@ -115,7 +120,9 @@ def _of_equation(equation, devices) -> Costs:
 
 
 def _inner(given):
-    """The programs that an equation calls; of a function with a gradient of its own, the function."""
+    """The programs that an equation calls; of a function with a gradient of its own, the
+    function.
+    """
     for key in ("jaxpr", "call_jaxpr", "call"):
         if key in given:
             return [given[key]]

@@ -24,17 +24,21 @@ GENERATED = ("docs/benchmarks/", "docs/knobs.md", "docs/api/")
 
 @entry
 def count(run: Run, before: Path | None = None, details: bool = False, walks: bool = False) -> None:
-    """Lines, modules, words, annotations, importers and circles of imports of package, tests, experiments and docs.
+    """Lines, modules, words, annotations, importers and circles of imports of package, tests,
+    experiments and docs.
 
-    Only files that git knows. "Annotated": all arguments and the result; functions in functions, lambdas and __methods__ do not
-    count. "One importer": modules that a single other module imports, also inside of functions; tables of names are not read.
+    Only files that git knows. "Annotated": all arguments and the result; functions in functions,
+    lambdas and __methods__ do not count. "One importer": modules that a single other module
+    imports, also inside of functions; tables of names are not read.
 
     Tables: size
 
     Options:
     before: another checkout of the project, whose numbers stand beside these
-    details: names of long modules, of those with one importer, of circles, and of the functions of walks
-    walks: also how many functions a datum enters, see `walked`; a minute, and of this checkout alone
+    details: names of long modules, of those with one importer, of circles, and of the functions of
+    walks
+    walks: also how many functions a datum enters, see `walked`; a minute, and of this checkout
+    alone
     """
     columns = {"before": measure(before)} if before else {}
     columns["now"] = measure(REPOSITORY) | (all_walks() if walks else {})
@@ -158,7 +162,9 @@ def helps(root: Path) -> dict[str, Any]:
 
 
 def documented(root: Path) -> str:
-    """Public functions whose docstring has a section for all that they take, return and raise, and an example."""
+    """Public functions whose docstring has a section for all that they take, return and raise, and
+    an example.
+    """
     complete = every = 0
     tree = ast.parse((root / PACKAGE / "__init__.pyi").read_text())
     for node in (node for node in tree.body if isinstance(node, ast.ImportFrom)):
@@ -214,7 +220,9 @@ def annotated(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
 
 
 def imports(package: dict[str, str], at_import: bool) -> dict[str, set[str]]:
-    """Module -> modules of the package that it imports. at_import: without those inside of functions and for types alone."""
+    """Module -> modules of the package that it imports. at_import: without those inside of
+    functions and for types alone.
+    """
     name_of = lambda path: path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
     modules = {name_of(path): text for path, text in package.items()}
 
@@ -277,10 +285,12 @@ def public_names(root: Path) -> list[str]:
 
 
 def walked(call: Callable[[], object], *datum: type) -> list[str]:
-    """Functions of the package that a datum enters while `call` runs and JAX traces: each counts once, wherever it is called.
+    """Functions of the package that a datum enters while `call` runs and JAX traces: each counts
+    once, wherever it is called.
 
-    A function counts that gets an object of one of the classes as an argument, also in a tuple, list or dict. Methods of the
-    datum itself do not, nor lambdas, nor what only JAX calls, to take pytrees apart.
+    A function counts that gets an object of one of the classes as an argument, also in a tuple,
+    list or dict. Methods of the datum itself do not, nor lambdas, nor what only JAX calls, to take
+    pytrees apart.
     """
     root, found = str(REPOSITORY / PACKAGE), {}
     holds = lambda value: (
@@ -321,7 +331,9 @@ def walked(call: Callable[[], object], *datum: type) -> list[str]:
 
 
 def all_walks() -> dict[str, list[str]]:
-    """The walks of photos to an avatar, of Gaussians to an image, and of a training example to the loss."""
+    """The walks of photos to an avatar, of Gaussians to an image, and of a training example to the
+    loss.
+    """
     import jax
 
     import humangs_jax as hg

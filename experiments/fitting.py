@@ -1,5 +1,5 @@
-"""How exactly bodies are found from 2D keypoints: synthetic people whose keypoints are known, detections with errors; and where a
-detector puts its landmarks.
+"""How exactly bodies are found from 2D keypoints: synthetic people whose keypoints are known,
+detections with errors; and where a detector puts its landmarks.
 """
 
 import dataclasses
@@ -36,8 +36,9 @@ SIZE = 512
 
 @dataclasses.dataclass(frozen=True)
 class FitCase:
-    """One person in m frames seen by c cameras. betas (s,), rotations (m, j, 3), translations (m, 3), joints (m, j, 3),
-    landmarks (m, k, 3) are true; K (m, c, 3, 3) and cam_from_world (m, c, 4, 4).
+    """One person in m frames seen by c cameras. betas (s,), rotations (m, j, 3), translations (m,
+    3), joints (m, j, 3), landmarks (m, k, 3) are true; K (m, c, 3, 3) and cam_from_world (m, c, 4,
+    4).
     """
 
     betas: np.ndarray
@@ -50,7 +51,9 @@ class FitCase:
 
 
 def make_case(seed, body, model, frames, views) -> FitCase:
-    """The person of a seed in random poses, each with cameras of its own, as of the published protocol."""
+    """The person of a seed in random poses, each with cameras of its own, as of the published
+    protocol.
+    """
     subject = make_subject(seed, body)
     rotations, translations, extrinsics, intrinsics = [], [], [], []
     for frame in range(frames):
@@ -82,7 +85,9 @@ def make_case(seed, body, model, frames, views) -> FitCase:
 
 
 def walking(model, seed) -> FitCase:
-    """The person of a seed in the first frames of the shipped walk; cameras stand still all around."""
+    """The person of a seed in the first frames of the shipped walk; cameras stand still all
+    around.
+    """
     motion, rng = load_motion(), np.random.default_rng([seed, POSE_STREAM])
     rotations, translations = (
         np.asarray(x)[:FRAMES] for x in (motion.rotations, motion.translations)
@@ -118,7 +123,9 @@ def _posed(model, betas, rotations, translations):
 
 
 def detect(case, seed, noise_px, outliers, outlier_px=100.0):
-    """Keypoints (m, c, k, 2) as a detector with errors would give them: noise everywhere, a share displaced by up to so far."""
+    """Keypoints (m, c, k, 2) as a detector with errors would give them: noise everywhere, a share
+    displaced by up to so far.
+    """
     rng = np.random.default_rng([seed, ERROR_STREAM])
     seen = (
         np.einsum("mcab,mkb->mcka", case.cam_from_world[..., :3, :3], case.landmarks)
@@ -155,11 +162,13 @@ FIRST = 4_000_000
 
 @entry
 def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = True) -> None:
-    """How exactly a body is found from 2D keypoints: synthetic people of the fitting seeds, random poses, errors of a detector.
+    """How exactly a body is found from 2D keypoints: synthetic people of the fitting seeds, random
+    poses, errors of a detector.
 
-    Errors over views, over noise and over keypoint sets: of all 55 joints in the world, of the body's 22 and of the hands',
-    beside plain and robust triangulation of the same keypoints; seconds per frame of all people and frames in one batch,
-    compilation apart. 8 minutes on two cores.
+    Errors over views, over noise and over keypoint sets: of all 55 joints in the world, of the
+    body's 22 and of the hands', beside plain and robust triangulation of the same keypoints;
+    seconds per frame of all people and frames in one batch, compilation apart. 8 minutes on two
+    cores.
 
     Options:
     people: of the fitting seeds
@@ -190,8 +199,8 @@ def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = Tr
         table.append([kind, views, f"{noise:g}", f"{share:.0%}", *shown])
     four = rows[settings[(ALL, 4, 2.0, 0.2)]]
     said = (
-        f"{people} people of {frames} frames each in one batch: {four['seconds_per_frame']:.2f} s a frame with four views, "
-        f"after a first call of {four['first_call_s']:.0f} s that compiles."
+        f"{people} people of {frames} frames each in one batch: {four['seconds_per_frame']:.2f} s a"
+        f" frame with four views, after a first call of {four['first_call_s']:.0f} s that compiles."
     )
     if curves:
         alone = rows[settings[(ALL, 1, 2.0, 0.0)]]["root_aligned_mean_joint_error_mm"]
@@ -242,7 +251,9 @@ def _errors(count, frames, setting):
 
 
 def landmark_errors(model, people, seen, fit) -> dict:
-    """Millimetres between true landmarks and fitted or triangulated ones; None of triangulation from one view."""
+    """Millimetres between true landmarks and fitted or triangulated ones; None of triangulation
+    from one view.
+    """
     truth, known = np.stack([case.landmarks for case in people]), np.asarray(model.known)
     off = lambda points: float(
         1000 * np.linalg.norm(np.asarray(points) - truth, axis=-1)[..., known].mean()
@@ -294,11 +305,12 @@ def fit_sequences(
     people: int = 3,
     cases: tuple[str, ...] = (),
 ) -> None:
-    """What `humangs fit --smoothness` makes of sequences with frames that are badly seen: the shipped walk with known keypoints.
+    """What `humangs fit --smoothness` makes of sequences with frames that are badly seen: the
+    shipped walk with known keypoints.
 
-    Mean error over all 55 joints of the frames that the case leaves alone and of those that it spoils, and of the joints'
-    accelerations where no frame is spoilt (how much they tremble), with frames fitted one by one and with smooth motion. 15
-    minutes.
+    Mean error over all 55 joints of the frames that the case leaves alone and of those that it
+    spoils, and of the joints' accelerations where no frame is spoilt (how much they tremble), with
+    frames fitted one by one and with smooth motion. 15 minutes.
 
     Options:
     smoothness: expected acceleration, metres per frame squared
@@ -326,14 +338,16 @@ def fit_sequences(
     for what in keys.values():
         header += [f"{what}: one by one", *(f"{s:g}" for s in smoothness)]
     said = (
-        f"{people} people, {FRAMES} frames, {ALL}, one by one and with these values of `--smoothness`; mean "
-        f"errors in millimetres, and millimetres per frame squared."
+        f"{people} people, {FRAMES} frames, {ALL}, one by one and with these values of"
+        " `--smoothness`; mean errors in millimetres, and millimetres per frame squared."
     )
     run.show(f"{markdown_table(header, table)}\n\n{said}", rows)
 
 
 def measure(model, people, name: str, smoothness: float) -> dict:
-    """Mean errors of the frames left alone, of the spoilt ones and of accelerations, millimetres; the acceleration held to."""
+    """Mean errors of the frames left alone, of the spoilt ones and of accelerations, millimetres;
+    the acceleration held to.
+    """
     _, _, spoilt = CASES[name]
     seen = spoiled(model, people, name)
     fit = jax.vmap(lambda own: fit_landmarks(model, own, smoothness))(seen)
@@ -390,18 +404,25 @@ def moved(case, by):
 
 
 CLEAR, SCALE, ITERATIONS, STEP = 0.5, 0.02, 15, 0.01
-"""Least visibility; scale of the robust weights and step of the derivatives, metres; iterations of reweighting."""
+"""Least visibility; scale of the robust weights and step of the derivatives, metres; iterations of
+reweighting.
+"""
 RIDGE, WRONG = 1e-3, 0.05
-"""Keeps offsets near 0 along directions that no view shows. Median error, a share of the person's height, of views left out."""
+"""Keeps offsets near 0 along directions that no view shows.
+
+Median error, a share of the person's height, of views left out.
+"""
 
 
 @entry
 def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
-    """Where a detector puts its landmarks on bodies that are known: the places of `KeypointSet.places`, measured.
+    """Where a detector puts its landmarks on bodies that are known: the places of
+    `KeypointSet.places`, measured.
 
-    Every landmark is looked for in every view of the captures, whose bodies and cameras are taken for the truth. The offset from
-    the base of its place, in the axes of the bones that carry it, is the one that explains all pixels best (robust least squares
-    over all people; left and right are one landmark and its mirror image). `humangs synth` makes captures.
+    Every landmark is looked for in every view of the captures, whose bodies and cameras are taken
+    for the truth. The offset from the base of its place, in the axes of the bones that carry it, is
+    the one that explains all pixels best (robust least squares over all people; left and right are
+    one landmark and its mirror image). `humangs synth` makes captures.
 
     Options:
     captures: capture folders, or folders of them
@@ -431,7 +452,9 @@ def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
 
 
 def landmark_rows(networks, folder):
-    """(name, (change of the image with the offset (2, 3), error (2,))) of a capture's clear landmarks, metres at the person."""
+    """(name, (change of the image with the offset (2, 3), error (2,))) of a capture's clear
+    landmarks, metres at the person.
+    """
     capture, kind = load_capture(folder), MEDIAPIPE_33
     plain = tuple(place._replace(offset=(0.0, 0.0, 0.0)) for place in kind.places)
     model = landmark_model(capture.body, kind.names, plain)
@@ -460,7 +483,9 @@ def landmark_rows(networks, folder):
 
 
 def solved_offset(rows):
-    """The offset that explains the errors best, and the median length of what is left, millimetres."""
+    """The offset that explains the errors best, and the median length of what is left,
+    millimetres.
+    """
     changes, errors = (np.stack(each) for each in zip(*rows, strict=True))
     weights, offset = np.ones(len(rows)), np.zeros(3)
     for _ in range(ITERATIONS):

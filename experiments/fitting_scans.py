@@ -1,4 +1,6 @@
-"""How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints given and without any."""
+"""How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints
+given and without any.
+"""
 
 import functools
 import itertools
@@ -39,13 +41,15 @@ def fit_scans(
     kinds: tuple[Literal["bare", "clothed"], ...] = ("bare", "clothed"),
     without_joints: bool = False,
 ) -> None:
-    """How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints given and without any.
+    """How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints
+    given and without any.
 
-    People of the fitting seeds in random poses. A scan is the posed mesh of the dressed person, or of the bare body, turned by a
-    random rotation, scaled by 0.1 to 100 and moved. The fitted body is put back into the scan's coordinates, from there by the
-    true similarity into metres, and compared with the true body. Two distances: of equal vertices, and of the fitted vertices
-    from the true surface. A fit has succeeded if its vertices are within 50 mm on average. 3 s a scan, without joints four times
-    as long.
+    People of the fitting seeds in random poses. A scan is the posed mesh of the dressed person, or
+    of the bare body, turned by a random rotation, scaled by 0.1 to 100 and moved. The fitted body
+    is put back into the scan's coordinates, from there by the true similarity into metres, and
+    compared with the true body. Two distances: of equal vertices, and of the fitted vertices from
+    the true surface. A fit has succeeded if its vertices are within 50 mm on average. 3 s a scan,
+    without joints four times as long.
 
     Options:
     without_joints: search for the pose (name the table fit_scans_without_joints)
@@ -67,7 +71,9 @@ def fit_scans(
 
 
 def scans_table(numbers: dict[str, Any], without_joints: bool) -> str:
-    """One row for each kind: of all scans if joints were given, else of those whose pose was found."""
+    """One row for each kind: of all scans if joints were given, else of those whose pose was
+    found.
+    """
     if without_joints:
         header = [
             "scans, no joints",
@@ -116,7 +122,9 @@ def fit_one(seed, kind, body, without_joints):
 
 
 def person(seed, kind, body):
-    """True vertices (n, 3) of the body and landmarks (k, 3), and the scan's vertices and faces, metres."""
+    """True vertices (n, 3) of the body and landmarks (k, 3), and the scan's vertices and faces,
+    metres.
+    """
     subject = make_subject(seed, body)
     rotations = sample_rotations(np.random.default_rng([seed, POSE_STREAM]), subject.build).astype(
         np.float32
@@ -141,7 +149,9 @@ def person(seed, kind, body):
 
 
 def random_place(seed):
-    """A random similarity: any rotation, scale 0.1 to 100 by its logarithm, centre up to ten metres off before the scaling."""
+    """A random similarity: any rotation, scale 0.1 to 100 by its logarithm, centre up to ten metres
+    off before the scaling.
+    """
     rng = np.random.default_rng([seed, PLACE_STREAM])
     w, x, y, z = rng.normal(size=4)
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix()

@@ -18,14 +18,22 @@ from humangs_jax.people.writer import sample_motion, sample_pose
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
-"""Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be."""
+"""Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be.
+"""
 FAULTS = {
-    "poking": "skin inside of a hem (deeper than 0) is seen although the outer side of cloth is at most 6 cm behind it on the "
-    "ray",
+    "poking": (
+        "skin inside of a hem (deeper than 0) is seen although the outer side of cloth is at most 6"
+        " cm behind it on the ray"
+    ),
     "poking_deep": "of it, skin more than 1 cm inside of the hem",
-    "inside": "all skin more than 1 cm inside of a hem that is seen at all, rightly (up a sleeve, under a skirt) or not: an "
-    "upper bound of what pokes",
-    "hollow": "the inner side of cloth is seen where the naked body would be at least 1 cm nearer: one looks into empty clothes",
+    "inside": (
+        "all skin more than 1 cm inside of a hem that is seen at all, rightly (up a sleeve, under a"
+        " skirt) or not: an upper bound of what pokes"
+    ),
+    "hollow": (
+        "the inner side of cloth is seen where the naked body would be at least 1 cm nearer: one"
+        " looks into empty clothes"
+    ),
     "gaps": "the background is seen where the naked body would be",
 }
 DEEP = 0.01
@@ -34,10 +42,12 @@ DEEP = 0.01
 
 @entry
 def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
-    """Faults of synthetic people: counted in images of random poses from random cameras, as shares of the person's pixels.
+    """Faults of synthetic people: counted in images of random poses from random cameras, as shares
+    of the person's pixels.
 
-    Skin seen up a sleeve or under a skirt has the inner side of cloth behind it: no fault; skin that cloth covers well is not in
-    the mesh at all and cannot poke: see hollow. A second a person. Expected: poking below 0.1 %.
+    Skin seen up a sleeve or under a skirt has the inner side of cloth behind it: no fault; skin
+    that cloth covers well is not in the mesh at all and cannot poke: see hollow. A second a person.
+    Expected: poking below 0.1 %.
 
     Options:
     subjects: people of the training seeds that are built, posed and rendered
@@ -106,7 +116,8 @@ def _faces_the_eye(vertices, faces, eye):
     return np.sum(np.cross(b - a, c - a) * (eye - a), -1) > 0
 
 
-# Contact sheets ------------------------------------------------------------------------------------------------------
+# Contact sheets
+# --------------------------------------------------------------------------------------------------
 
 FRONT_BACK_SIZE, MOTION_SIZE, CLOSE_SIZE = (184, 228), (148, 176), (256, 256)
 """Width and height of one image, pixels."""
@@ -119,9 +130,11 @@ TELE = 0.42
 
 @entry
 def people_sheets(run: Run, out: Path = Path("docs/images")) -> None:
-    """Contact sheets of synthetic people: front and back, 8 heads and hands, 8 sequences of 8 frames.
+    """Contact sheets of synthetic people: front and back, 8 heads and hands, 8 sequences of 8
+    frames.
 
-    All three take a minute of one CPU core. The same command gives the same images bit for bit on the same machine.
+    All three take a minute of one CPU core. The same command gives the same images bit for bit on
+    the same machine.
 
     Options:
     out: folder to write into
@@ -170,7 +183,9 @@ def close_ups(body, seeds):
 
 
 def motions(body, seeds):
-    """One row a sequence, eight frames over two and a half seconds, the camera beside the walker; two sequences side by side."""
+    """One row a sequence, eight frames over two and a half seconds, the camera beside the walker;
+    two sequences side by side.
+    """
     rows = []
     for seed in seeds:
         subject = make_subject(seed, body)
@@ -202,7 +217,9 @@ def _seen(posed, target, distance, azimuth, elevation, fov, size):
 
 
 def _whole(posed, azimuth, size):
-    """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the image's height."""
+    """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the
+    image's height.
+    """
     low, high = posed.vertices.min(0), posed.vertices.max(0)
     reach = max(2.25, 1.1 * (high[1] - low[1]))
     target = [0.5 * (low[0] + high[0]), low[1] + 0.455 * reach, 0.5 * (low[2] + high[2])]

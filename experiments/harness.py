@@ -1,13 +1,15 @@
-"""`python -m experiments NAME [options]`: one way to run all measurements. `python -m experiments` lists them.
+"""`python -m experiments NAME [options]`: one way to run all measurements. `python -m experiments`
+lists them.
 
-An experiment is a function with `@entry`. Its first argument is a `Run`, the others are its options: those without a default are
-positional, annotations are numbers, paths, flags, `Literal` choices and tuples of these. A dataclass as default stands for its
-fields. Lines `name: text` below `Options:` in a docstring are the help.
+An experiment is a function with `@entry`. Its first argument is a `Run`, the others are its
+options: those without a default are positional, annotations are numbers, paths, flags, `Literal`
+choices and tuples of these. A dataclass as default stands for its fields. Lines `name: text` below
+`Options:` in a docstring are the help.
 
 Its table has its name, unless a line `Tables: NAMES` of the docstring says otherwise.
 
-Every experiment has --json OUT (rows, numbers, date, machine, versions; finished rows of the same settings are kept) and
---publish (docs/results/TABLE.json, and the page that shows the table).
+Every experiment has --json OUT (rows, numbers, date, machine, versions; finished rows of the same
+settings are kept) and --publish (docs/results/TABLE.json, and the page that shows the table).
 """
 
 import argparse
@@ -37,8 +39,14 @@ def entry(function: FunctionType) -> FunctionType:
     return function
 
 
+def summary(docstring: str | None) -> str:
+    """The first paragraph of a docstring, on one line."""
+    paragraph, _, _ = (docstring or "").partition("\n\n")
+    return " ".join(paragraph.split())
+
+
 def listed() -> dict[str, tuple[str, str]]:
-    """Name -> (module, first line of the docstring), without importing anything."""
+    """Name -> (module, first paragraph of the docstring), without importing anything."""
     found = {}
     for path in sorted(FOLDER.rglob("*.py")):
         for node in ast.parse(path.read_text()).body:
@@ -46,16 +54,14 @@ def listed() -> dict[str, tuple[str, str]]:
                 ast.unparse(d) == "entry" for d in node.decorator_list
             ):
                 module = ".".join(("experiments", *path.relative_to(FOLDER).with_suffix("").parts))
-                found[node.name] = module, (ast.get_docstring(node) or "").split("\n")[0]
+                found[node.name] = module, summary(ast.get_docstring(node))
     return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; the exit status."""
     known = listed()
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments", description=__doc__.split("\n")[0]
-    )
+    parser = argparse.ArgumentParser(prog="python -m experiments", description=summary(__doc__))
     parser.add_argument("name", nargs="?", help="without one, all are listed")
     parser.add_argument("options", nargs=argparse.REMAINDER)
     asked = parser.parse_args(arguments)
@@ -72,7 +78,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def call(function: FunctionType, options: Sequence[str]) -> int:
-    """Runs an experiment; what it returns is the exit status (None: 0). Wrong options and files: one line, and status 2."""
+    """Runs an experiment; what it returns is the exit status (None: 0).
+
+    Wrong options and files: one line, and status 2.
+    """
     parser, given = parser_of(function)
     asked = parser.parse_args(options)
     run = Run(function.__name__, asked.table, asked.json, asked.publish, list(options))
@@ -181,9 +190,11 @@ class Run:
         settings: Mapping[str, Any] | None = None,
         again: bool = False,
     ) -> dict[str, Row]:
-        """Rows of all cases. Those that --json OUT has with the same settings are not measured again; it is written after each.
+        """Rows of all cases. Those that --json OUT has with the same settings are not measured
+        again; it is written after each.
 
-        A case may give (row, pictures); these go to `pictures`. again: all cases are measured, for the pictures.
+        A case may give (row, pictures); these go to `pictures`. again: all cases are measured, for
+        the pictures.
         Raises: ValueError if OUT is no file of this harness.
         """
         from humangs_jax.core.progress import bar
@@ -234,7 +245,10 @@ class Run:
 
 
 def means(rows: Sequence[Row]) -> Row:
-    """Of dicts of dicts of numbers: the same with means, None where one is None. Keys: those that all have."""
+    """Of dicts of dicts of numbers: the same with means, None where one is None.
+
+    Keys: those that all have.
+    """
     first = rows[0]
     if isinstance(first, dict):
         keys = [key for key in first if all(key in row for row in rows)]
@@ -248,7 +262,9 @@ def means(rows: Sequence[Row]) -> Row:
 def figure(
     path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0
 ) -> Generator[Any]:
-    """Axes of plots side by side, written when the block ends. legend: share of the height for one legend below all."""
+    """Axes of plots side by side, written when the block ends. legend: share of the height for one
+    legend below all.
+    """
     import matplotlib
 
     matplotlib.use("Agg")

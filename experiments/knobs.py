@@ -27,9 +27,10 @@ from humangs_jax.training.config import TrainConfig
 PAGE = REPOSITORY / "docs" / "knobs.md"
 HEAD = """# Knobs
 
-Every setting of the network, the renderer, the training step and the people on the fly that trades accuracy or memory for speed.
-`python -m experiments knobs` writes this page. Decibels compare with the exact image; times are shares of the default's.
-The linked page has the measurement and its conditions.
+Every setting of the network, the renderer, the training step and the people on the fly that trades
+accuracy or memory for speed. `python -m experiments knobs` writes this page. Decibels compare with
+the exact image; times are shares of the default's. The linked page has the measurement and its
+conditions.
 
 | knob | default | costs | buys | measured in |
 |---|---|---|---|---|
@@ -37,8 +38,9 @@ The linked page has the measurement and its conditions.
 FIELDS_HEAD = """
 ## Field paths
 
-What `hg.vary` and the `config.json` of a run name: all fields of a `TrainConfig`, with the values of the preset `tiny`. Without
-`model.` they are those of a `HumanGSConfig`, which `hg.load_weights` returns. A part of another kind has other fields.
+What `hg.vary` and the `config.json` of a run name: all fields of a `TrainConfig`, with the values
+of the preset `tiny`. Without `model.` they are those of a `HumanGSConfig`, which `hg.load_weights`
+returns. A part of another kind has other fields.
 
 | path | may be | `tiny` has | what |
 |---|---|---|---|
@@ -46,7 +48,8 @@ What `hg.vary` and the `config.json` of a run name: all fields of a `TrainConfig
 PRESETS_HEAD = """
 ## Presets
 
-`hg.PRESETS`, `--preset` of `reconstruct`, `animate`, `render`, `demo`; measured in [tradeoff.md](tradeoff.md).
+`hg.PRESETS`, `--preset` of `reconstruct`, `animate`, `render`, `demo`; measured in
+[tradeoff.md](tradeoff.md).
 
 | preset | settings | `Settings.runtime` |
 |---|---|---|
@@ -138,12 +141,15 @@ def knob_rows(cls: Any) -> list[str]:
             cost, gain, measured = (field.metadata[name] for name in ("cost", "gain", "measured"))
             default = field.default if not dataclasses.is_dataclass(field.default) else "on"
             rows.append(
-                f"| [`{cls.__name__}`]({source})`.{field.name}` | {default} | {cost} | {gain} | [{measured}]({measured}) |"
+                f"| [`{cls.__name__}`]({source})`.{field.name}` | {default} | {cost} | {gain} |"
+                f" [{measured}]({measured}) |"
             )
     return rows
 
 
 @entry
 def knobs(run: Run) -> None:
-    """Writes docs/knobs.md: every setting that trades accuracy or memory for speed, from the code itself."""
+    """Writes docs/knobs.md: every setting that trades accuracy or memory for speed, from the code
+    itself.
+    """
     PAGE.write_text(page())

@@ -50,12 +50,14 @@ SHOWN = (
 
 @entry
 def page(run: Run, size: int = 512, frames: int = 20) -> None:
-    """The page that shows avatars (`humangs export --html`) against `hg.render`, in Chromium with software WebGL.
+    """The page that shows avatars (`humangs export --html`) against `hg.render`, in Chromium with
+    software WebGL.
 
-    Needs Debian's chromium and chromium-driver. Exact views: three cameras times three poses, screenshots against `hg.render` of
-    the same camera and pose. "Motion": the page plays 100 frames on its own and is paused; its image is compared with
-    `hg.render` from the camera and in the pose that it reports. Frames per second: a turning camera, posed, sorted and drawn
-    without waiting for the screen, of the avatar and of one with about 60,000 Gaussians (a body of shorter edges).
+    Needs Debian's chromium and chromium-driver. Exact views: three cameras times three poses,
+    screenshots against `hg.render` of the same camera and pose. "Motion": the page plays 100 frames
+    on its own and is paused; its image is compared with `hg.render` from the camera and in the pose
+    that it reports. Frames per second: a turning camera, posed, sorted and drawn without waiting
+    for the screen, of the avatar and of one with about 60,000 Gaussians (a body of shorter edges).
 
     Options:
     size: side of the images in pixels
@@ -112,7 +114,8 @@ def test_views(avatar: Avatar, size: int) -> tuple[list[Camera], dict[str, BodyP
         intrinsics_from_fov(VERTICAL_FOV, size, size),
     )
     cameras = orbit(middle, distance, jnp.asarray(AZIMUTHS), jnp.asarray(ELEVATIONS), K, size, size)
-    # the root moves from pose to pose: the cameras look at the T-pose's middle, so it is taken back there
+    # the root moves from pose to pose: the cameras look at the T-pose's middle, so it is taken back
+    # there
     return [cameras[i] for i in range(len(AZIMUTHS))], {
         name: BodyPose(x, jnp.zeros(3)) for name, x in rotations.items()
     }
@@ -152,7 +155,9 @@ def compare(image: Any, avatar: Avatar, camera: Camera, pose: BodyPose) -> tuple
 
 
 def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float, float]:
-    """The page plays by itself, sorted by its worker; then its image as `hg.render` draws it, person and floor apart."""
+    """The page plays by itself, sorted by its worker; then its image as `hg.render` draws it,
+    person and floor apart.
+    """
     browser.resize(*MOTION_WINDOW)
     browser.run(
         """document.getElementById("ground").checked && document.getElementById("ground").click();
@@ -179,7 +184,8 @@ def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float
 
 @entry
 def viewer_picture(run: Run, avatar: Path, out: Path = Path("docs/images/viewer.png")) -> None:
-    """A picture of the page that shows an avatar, a moment after it was opened. Needs Debian's chromium and chromium-driver.
+    """A picture of the page that shows an avatar, a moment after it was opened. Needs Debian's
+    chromium and chromium-driver.
 
     Options:
     avatar: file written by humangs reconstruct

@@ -1,4 +1,6 @@
-"""Images of an evaluation: the same views of many people, their faces, hands, hems and shoes; README's pictures."""
+"""Images of an evaluation: the same views of many people, their faces, hands, hems and shoes;
+README's pictures.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -24,9 +26,15 @@ from humangs_jax.io.images import to_uint8
 from humangs_jax.rendering.splatting import render
 
 CROP = 0.75
-"""Share of the image's width that is shown: cameras keep the whole height of a person in a square frame."""
-DETAILS = {"face": (("left_eye", "right_eye"), 0.3), "hand": (("left_middle1", "left_index1"), 0.3),
-           "hem": (("left_hip", "left_knee"), 0.5), "shoe": (("left_ankle", "left_foot"), 0.36)}  # fmt: skip
+"""Share of the image's width that is shown: cameras keep the whole height of a person in a square
+frame.
+"""
+DETAILS = {
+    "face": (("left_eye", "right_eye"), 0.3),
+    "hand": (("left_middle1", "left_index1"), 0.3),
+    "hem": (("left_hip", "left_knee"), 0.5),
+    "shoe": (("left_ankle", "left_foot"), 0.36),
+}
 """What is looked at closely: joints in whose middle it is, and the side of the square in metres."""
 DETAIL_PIXELS = 96
 
@@ -44,7 +52,9 @@ def frontal_view(photos: Capture, held_out: Capture, views: Sequence[int]) -> in
 
 
 def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
-    """Squares of an image of this view, (details, `DETAIL_PIXELS`, `DETAIL_PIXELS`, 3); white beyond its border."""
+    """Squares of an image of this view, (details, `DETAIL_PIXELS`, `DETAIL_PIXELS`, 3); white
+    beyond its border.
+    """
     body, camera = capture.body, capture.cameras[view]
     pose = capture.pose(int(np.asarray(capture.frames)[view]))
     joints = pose_body(body, shape_body(body, jnp.asarray(capture.betas)), pose).joints
@@ -75,11 +85,27 @@ def write_triples(
 
 
 POSES: dict[str, dict[str, tuple[float, float, float]]] = {
-    "wave": {"left_shoulder": (0, 0, -68), "right_shoulder": (0, 0, -35), "right_elbow": (0, 0, -55), "neck": (0, -15, 8)},
-    "step": {"left_shoulder": (0, 35, -55), "right_shoulder": (0, 35, 60), "left_hip": (-55, 0, 0), "left_knee": (75, 0, 0),
-             "left_elbow": (0, -50, 0), "spine1": (8, 0, 0)},
-    "stretch": {"left_shoulder": (0, 0, 62), "right_shoulder": (0, 0, -62), "left_hip": (0, 0, 14), "right_hip": (0, 0, -14)},
-}  # fmt: skip
+    "wave": {
+        "left_shoulder": (0, 0, -68),
+        "right_shoulder": (0, 0, -35),
+        "right_elbow": (0, 0, -55),
+        "neck": (0, -15, 8),
+    },
+    "step": {
+        "left_shoulder": (0, 35, -55),
+        "right_shoulder": (0, 35, 60),
+        "left_hip": (-55, 0, 0),
+        "left_knee": (75, 0, 0),
+        "left_elbow": (0, -50, 0),
+        "spine1": (8, 0, 0),
+    },
+    "stretch": {
+        "left_shoulder": (0, 0, 62),
+        "right_shoulder": (0, 0, -62),
+        "left_hip": (0, 0, 14),
+        "right_hip": (0, 0, -14),
+    },
+}
 """Poses that no photo shows: degrees of axis-angle by joint."""
 
 
@@ -87,7 +113,8 @@ POSES: dict[str, dict[str, tuple[float, float, float]]] = {
 def readme_pictures(
     run: Run, avatar: Path, out: Path = Path("docs/images"), size: int = 512
 ) -> None:
-    """README's row of pictures and its animation: the demo's photos, its avatar from two sides, in new poses, and its face.
+    """README's row of pictures and its animation: the demo's photos, its avatar from two sides, in
+    new poses, and its face.
 
     Options:
     avatar: avatar.npz of `humangs demo`

@@ -33,10 +33,11 @@ def evaluation_views(
     views: tuple[int, ...] = (1, 2, 4, 6),
     plot: Path | None = None,
 ) -> None:
-    """Unseen people from 1 to 6 photos against held-out views, in the pose of the photos and in others.
+    """Unseen people from 1 to 6 photos against held-out views, in the pose of the photos and in
+    others.
 
-    The baseline is the body's mesh, each vertex painted with the mean color of the photos that see it (grey where none does).
-    About 10 s of CPU time a person, and a minute or two of compiling.
+    The baseline is the body's mesh, each vertex painted with the mean color of the photos that see
+    it (grey where none does). About 10 s of CPU time a person, and a minute or two of compiling.
 
     Options:
     views: numbers of photos that the network sees; they divide 12
@@ -86,7 +87,8 @@ def evaluation_views(
 def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) -> str:
     """Scores by number of photos and task, whether more photos help.
 
-    by_views: scores by number of photos and seed. chosen: the number of photos of what is said of single people.
+    by_views: scores by number of photos and seed. chosen: the number of photos of what is said of
+    single people.
     """
     mean = {n: means(list(rows.values())) for n, rows in by_views.items()}
     tasks = [task for task in TASKS if task in mean[chosen]]
@@ -126,13 +128,15 @@ def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
         sum(row[key] > row[f"baseline_{key}"] for row in rows) for key in ("psnr", "psnr_fg")
     )
     return (
-        f"{TASKS[task].capitalize()}: {said}; with {chosen}, {whole} of {len(rows)} people have a higher PSNR than "
-        f"their vertex-color baseline, {person} in the foreground alone."
+        f"{TASKS[task].capitalize()}: {said}; with {chosen}, {whole} of {len(rows)} people have a"
+        f" higher PSNR than their vertex-color baseline, {person} in the foreground alone."
     )
 
 
 def plot_views(path: Path, mean: dict[int, Any]) -> None:
-    """PSNR of the whole image and of the foreground against the number of photos, ours and the vertex-color baseline."""
+    """PSNR of the whole image and of the foreground against the number of photos, ours and the
+    vertex-color baseline.
+    """
     with figure(path, 2, legend=0.15) as axes:
         for axis, key, title in zip(
             axes, ("psnr", "psnr_fg"), ("whole picture", "foreground PSNR"), strict=True

@@ -1,8 +1,10 @@
-"""A real capture, made ready: four synchronised videos of a man on a treadmill, from the demo of PyPI `pose2sim` (BSD-3).
+"""A real capture, made ready: four synchronised videos of a man on a treadmill, from the demo of
+PyPI `pose2sim` (BSD-3).
 
-Of each chosen frame four photos without lens distortion, 512 pixels a side around the man, with his cameras, BlazePose's
-keypoints and masks, and careful masks to score by: where a photo differs from the background, the median over frames of what he
-does not cover. No photo is written but into the folder that the user names.
+Of each chosen frame four photos without lens distortion, 512 pixels a side around the man, with his
+cameras, BlazePose's keypoints and masks, and careful masks to score by: where a photo differs from
+the background, the median over frames of what he does not cover. No photo is written but into the
+folder that the user names.
 """
 
 import dataclasses
@@ -57,14 +59,19 @@ EVERY = 5
 """The background is the median over every fifth frame."""
 Y_UP_FROM_Z_UP = np.asarray([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 SPREAD, DIFFERENT = 25, 0.07
-"""Pixels of a video by which BlazePose's mask is dilated for the background; difference of colors from which on one is his."""
+"""Pixels of a video by which BlazePose's mask is dilated for the background; difference of colors
+from which on one is his.
+"""
 SHADOW, TINT = (0.5, 1.02), 0.04
-"""A shadow multiplies the background by so much, in all channels alike but for the second number."""
+"""A shadow multiplies the background by so much, in all channels alike but for the second number.
+"""
 SAME, BRIGHT, SPECK = 0.03, 0.3, 800
-"""Difference below which a pixel is the background's, if that is brighter than the second; pixels of a part that is kept."""
+"""Difference below which a pixel is the background's, if that is brighter than the second; pixels
+of a part that is kept.
+"""
 NEAR, DEEP = 14, 7
-"""Pixels of a video: he is nowhere further outside of BlazePose's mask than the first, and everywhere further inside than the
-second."""
+"""Pixels of a video: he is nowhere further outside of BlazePose's mask than the first, and
+everywhere further inside than the second."""
 RIM = 3
 """Pixels of a photo: colors of the truth's rim are those from so far inside."""
 
@@ -72,10 +79,12 @@ RIM = 3
 class RealFrame(NamedTuple):
     """One moment in v views.
 
-    images: (v, s, s, 3), with the room. detected, careful: (v, s, s) masks of the detector, and of what differs from the room.
-    cameras: as published. keypoints: MediaPipe's 33. world: (v, 33, 3) landmarks in metres. crop: (v, 3, 3), pixels of the photos
-    from pixels of the video (homogeneous). names: of the views. moments: whether
-    each view has a pose of its own, where the cameras are from the person; None: they are published.
+    images: (v, s, s, 3), with the room. detected, careful: (v, s, s) masks of the detector, and of
+    what differs from the room.
+    cameras: as published. keypoints: MediaPipe's 33. world: (v, 33, 3) landmarks in metres. crop:
+    (v, 3, 3), pixels of the photos from pixels of the video (homogeneous). names: of the views.
+    moments: whether each view has a pose of its own, where the cameras are from the person; None:
+    they are published.
     """
 
     images: Float[np.ndarray, "v s s 3"]
@@ -91,7 +100,9 @@ class RealFrame(NamedTuple):
     def save(
         self, folder: Path, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None
     ) -> None:
-        """A capture folder of the photos, with the room, and these masks. cameras: not the published ones."""
+        """A capture folder of the photos, with the room, and these masks. cameras: not the
+        published ones.
+        """
         views, cameras = [], cameras or self.cameras
         for i, name in enumerate(self.names):
             paths = {"image": f"images/{name}.png", "mask": f"masks/{name}.png"}
@@ -126,7 +137,9 @@ class RealFrame(NamedTuple):
 
 
 class VideoCamera(NamedTuple):
-    """K (3, 3), the centre of the first pixel at (0.5, 0.5); cam_from_world (4, 4), y up; distortion: k1 k2 p1 p2 of OpenCV."""
+    """K (3, 3), the centre of the first pixel at (0.5, 0.5); cam_from_world (4, 4), y up;
+    distortion: k1 k2 p1 p2 of OpenCV.
+    """
 
     K: Float[np.ndarray, "3 3"]
     cam_from_world: Float[np.ndarray, "4 4"]
@@ -146,7 +159,10 @@ class VideoCamera(NamedTuple):
 
 
 def unpacked(folder: Path) -> Path:
-    """The demo's folder in `folder`, downloaded and unpacked if it is not there. Nothing is installed."""
+    """The demo's folder in `folder`, downloaded and unpacked if it is not there.
+
+    Nothing is installed.
+    """
     if not (folder / DEMO).is_dir():
         folder.mkdir(parents=True, exist_ok=True)
         command = [
@@ -166,7 +182,9 @@ def unpacked(folder: Path) -> Path:
 
 
 def read_cameras(file: Path) -> dict[str, VideoCamera]:
-    """Qualisys's calibration by camera: intrinsics in 64ths of a pixel, rotations in axes of their own, millimetres."""
+    """Qualisys's calibration by camera: intrinsics in 64ths of a pixel, rotations in axes of their
+    own, millimetres.
+    """
     found = {}
     for camera in ElementTree.parse(file).getroot().iter("camera"):
         lens, place, view = (
@@ -205,7 +223,8 @@ def read_frames(video: Path, wanted: Collection[int]) -> dict[int, UInt8[np.ndar
 def prepare(
     folder: Path, frames: Sequence[int] = FRAMES, *, straight: bool = True
 ) -> dict[int, RealFrame]:
-    """The frames of the capture, from `folder`/prepared where they are there. straight: without the lenses' distortion.
+    """The frames of the capture, from `folder`/prepared where they are there. straight: without the
+    lenses' distortion.
 
     The empty room, as each camera sees it, is in room_NAME.png there.
     """
@@ -298,7 +317,9 @@ def largest_person(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> Det
 def background(
     photos: Sequence[UInt8[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The median of what the person does not cover, and where there is anything of that in three photos or more."""
+    """The median of what the person does not cover, and where there is anything of that in three
+    photos or more.
+    """
     ball = ndimage.generate_binary_structure(2, 1)
     free = np.stack(
         [~ndimage.binary_dilation(mask > 0.3, ball, iterations=SPREAD) for mask in masks]
@@ -315,7 +336,9 @@ def careful_mask(
     known: Bool[np.ndarray, "h w"],
     detected: Float[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w"]:
-    """Where a photo differs from the background, and is no shadow, near BlazePose's mask; that mask where nothing is known."""
+    """Where a photo differs from the background, and is no shadow, near BlazePose's mask; that mask
+    where nothing is known.
+    """
     smooth = lambda image: ndimage.gaussian_filter(image, (1.0, 1.0, 0))
     ours, theirs = smooth(photo), smooth(room)
     different = np.abs(ours - theirs).max(-1) > DIFFERENT
@@ -324,7 +347,8 @@ def careful_mask(
     shadow = (middle > SHADOW[0]) & (middle < SHADOW[1]) & (np.ptp(ratio, axis=-1) < TINT)
     person = detected > 0.5
     far, deep = (ndimage.distance_transform_edt(~person), ndimage.distance_transform_edt(person))
-    # dark shorts before the dark belt differ from it by nothing; a bright wall that is as it was is no person
+    # dark shorts before the dark belt differ from it by nothing; a bright wall that is as it was is
+    # no person
     wall = known & (np.abs(ours - theirs).max(-1) < SAME) & (theirs.max(-1) > BRIGHT)
     found = np.where(known, different & ~shadow, person)
     found = (found & (far < NEAR)) | ((deep > DEEP) & ~ndimage.binary_opening(wall, iterations=2))
@@ -340,15 +364,18 @@ def _without_small(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return (areas >= SPECK)[parts] & inside
 
 
-# Scores --------------------------------------------------------------------------------------------------------------
+# Scores
+# --------------------------------------------------------------------------------------------------
 
 
 def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]) -> list[Scores]:
-    """Of each view the PSNRs (dB) and LPIPS of the avatar of the others, against the man on white as he was photographed.
+    """Of each view the PSNRs (dB) and LPIPS of the avatar of the others, against the man on white
+    as he was photographed.
 
     Renderings are brought to the exposure of the view's camera, which is found from all photos.
 
-    Arguments: body: what the package makes of the photos, with masks, cameras, shape and pose. make: an avatar from a part of it.
+    Arguments: body: what the package makes of the photos, with masks, cameras, shape and pose.
+    make: an avatar from a part of it.
     """
     found, views, gains = [], range(body.view_count), camera_gains(body)
     for view in views:
@@ -366,7 +393,9 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
 
 
 def drawn_psnrs(avatar: Avatar, truth: Capture) -> Scores:
-    """psnr and psnr_fg (dB), and LPIPS, of an avatar against the photos of these views, means over them."""
+    """psnr and psnr_fg (dB), and LPIPS, of an avatar against the photos of these views, means over
+    them.
+    """
     return _scores(draw_views(avatar, truth).images, truth)
 
 

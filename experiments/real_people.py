@@ -1,4 +1,6 @@
-"""Photos that come with nothing, for `real_person.py`: cameras from the person, people in rooms, and `humangs start`."""
+"""Photos that come with nothing, for `real_person.py`: cameras from the person, people in rooms,
+and `humangs start`.
+"""
 
 import dataclasses
 import os
@@ -57,7 +59,8 @@ PIXELS = 12e6
 def without_calibration(
     frame: RealFrame, sizes: list[tuple[int, int]], focal: Float[np.ndarray, " v"] | None = None
 ) -> RealFrame:
-    """The frame with cameras from the person, and with left and right as they see them. sizes: of the whole photos, pixels.
+    """The frame with cameras from the person, and with left and right as they see them. sizes: of
+    the whole photos, pixels.
     focal: lengths in their pixels, as EXIF tells them; None: unknown.
 
     Raises: ValueError where no cameras are found.
@@ -120,11 +123,14 @@ def video_sizes(data: Path) -> list[tuple[int, int]]:
     return [image_size(data / "prepared" / f"room_{name}.png") for name in CAMERAS]
 
 
-# Synthetic people ----------------------------------------------------------------------------------------------------
+# Synthetic people
+# --------------------------------------------------------------------------------------------------
 
 
 def person_in_rooms(seed: int, data: Path) -> tuple[RealFrame, Capture, Capture]:
-    """A synthetic person in the rooms of the real capture, as detected; the true capture of the photos; views held out."""
+    """A synthetic person in the rooms of the real capture, as detected; the true capture of the
+    photos; views held out.
+    """
     subject = make_evaluation_subject(seed, load_body(), [PHOTOS], SIZE, HeldOut(NOVEL, 0, 0))
     true, networks = subject.inputs(PHOTOS), Networks()
     assert true.masks is not None
@@ -156,8 +162,8 @@ def person_in_rooms(seed: int, data: Path) -> tuple[RealFrame, Capture, Capture]
 
 
 def as_fitted(held_out: Capture, true: Capture, body: Capture, same_world: bool) -> Capture:
-    """The held-out views with the found body. Unless it was found in the same world, a similarity that brings the true body to it
-    places them.
+    """The held-out views with the found body. Unless it was found in the same world, a similarity
+    that brings the true body to it places them.
     """
     cameras = held_out.cameras
     if not same_world:
@@ -179,12 +185,13 @@ def as_fitted(held_out: Capture, true: Capture, body: Capture, same_world: bool)
     )
 
 
-# The command ---------------------------------------------------------------------------------------------------------
+# The command
+# --------------------------------------------------------------------------------------------------
 
 
 def started(data: Path, frame: int) -> dict[str, float]:
-    """Seconds of `humangs start` on four photos of 12 megapixels, with an empty compile cache and again; those of the processors,
-    too, since the machine may be busy (load: processes at the end).
+    """Seconds of `humangs start` on four photos of 12 megapixels, with an empty compile cache and
+    again; those of the processors, too, since the machine may be busy (load: processes at the end).
     """
     with tempfile.TemporaryDirectory() as place:
         photos = Path(place) / "photos"
@@ -226,7 +233,8 @@ def _processor_time():
     return times.children_user + times.children_system
 
 
-# Pictures ------------------------------------------------------------------------------------------------------------
+# Pictures
+# --------------------------------------------------------------------------------------------------
 
 
 def draw_sheet(avatar: Avatar, body: Capture, path: Path) -> None:
@@ -278,7 +286,9 @@ def reference_cameras(folder: Path) -> Reference:
 
 
 def _found(frames):
-    """From all frames, each camera in one square that holds its squares of all: equal cameras count as one."""
+    """From all frames, each camera in one square that holds its squares of all: equal cameras count
+    as one.
+    """
     views, back = range(len(CAMERAS)), np.linalg.inv(np.stack([frame.crop for frame in frames]))
     corners = np.einsum("fvab,kb->fvka", back, [[0, 0, 1], [SIZE, SIZE, 1]])[..., :2]
     least, most = corners[:, :, 0].min(0), corners[:, :, 1].max(0)
@@ -334,7 +344,9 @@ def _square(least, most):
 
 
 def to_reference(own: Camera, reference: Camera) -> Similarity:
-    """From the world of cameras (a batch) to that of the same cameras elsewhere: by their axes, then by their places."""
+    """From the world of cameras (a batch) to that of the same cameras elsewhere: by their axes,
+    then by their places.
+    """
     (rotations, centers), (targets, places) = (_axes(each) for each in (own, reference))
     u, _, vt = np.linalg.svd(np.einsum("vba,vbc->ac", targets, rotations))
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
@@ -357,7 +369,9 @@ def camera_errors(
 
 
 def seen_from(own: Camera, used: Sequence[int], reference: Camera, view: int) -> Camera:
-    """A camera of the reference, a batch of one, in the world of own cameras, which are those of the used views."""
+    """A camera of the reference, a batch of one, in the world of own cameras, which are those of
+    the used views.
+    """
     at = np.asarray(used)
     move = to_reference(own, jax.tree.map(lambda leaf: leaf[at], reference))
     matrix = np.asarray(reference.cam_from_world[view], float) @ move.matrix()

@@ -1,4 +1,6 @@
-"""A real man from four photos of a moment: how well the body fills his masks, how like him the avatar is where no photo was."""
+"""A real man from four photos of a moment: how well the body fills his masks, how like him the
+avatar is where no photo was.
+"""
 
 import dataclasses
 import functools
@@ -76,13 +78,16 @@ Cases = Iterator[tuple[str, str, Callable[[], dict[str, Any]]]]
 """(row, case, what measures its scores)."""
 
 
-# The package's way ---------------------------------------------------------------------------------------------------
+# The package's way
+# --------------------------------------------------------------------------------------------------
 
 ALL, MASKS = (0, 1, 2, 3), ("detected", "careful")
 
 
 class Man:
-    """What the package makes of the capture; each thing once. frames: by number, and what else is to be looked at by name."""
+    """What the package makes of the capture; each thing once. frames: by number, and what else is
+    to be looked at by name.
+    """
 
     def __init__(self, data: Path, frames: Sequence[int]) -> None:
         self.data, self.numbers = data, list(frames)
@@ -140,7 +145,8 @@ def avatar_of(capture: Capture) -> Avatar:
     )
 
 
-# Rows ----------------------------------------------------------------------------------------------------------------
+# Rows
+# --------------------------------------------------------------------------------------------------
 
 
 def calibrated(man: Man) -> Cases:
@@ -240,7 +246,9 @@ def _moments(man, frames, first):
 
 
 def rooms(man: Man) -> Cases:
-    """Synthetic people in rooms: what true cameras, masks and poses give, and what photos alone give."""
+    """Synthetic people in rooms: what true cameras, masks and poses give, and what photos alone
+    give.
+    """
     for seed in SEEDS:
         person = functools.cache(functools.partial(person_in_rooms, seed, man.data))
         for way in ("true", "true cameras", "photos alone"):
@@ -273,7 +281,9 @@ ROWS = (calibrated, poses, uncalibrated, moments, rooms, start)
 
 
 def section(rows: dict[str, dict[str, Any]]) -> str:
-    """The tables of the page: the man, people in rooms, seconds; means over the cases of each row."""
+    """The tables of the page: the man, people in rooms, seconds; means over the cases of each
+    row.
+    """
     return "\n\n".join(filter(None, (_table(rows, kinds, columns) for kinds, columns in TABLES)))
 
 
@@ -300,13 +310,16 @@ def real_person(
     frames: tuple[int, ...] = FRAMES,
     pictures: Path | None = None,
 ) -> None:
-    """A real man from four photos of a moment: how well the body fills his masks, how like him the avatar is where no photo was.
+    """A real man from four photos of a moment: how well the body fills his masks, how like him the
+    avatar is where no photo was.
 
-    Needs the extra `photos` and `imageio-ffmpeg`. Everything is scored by careful masks, in squares of 512 pixels. Rows:
-    calibrated, the published calibration: held out, cameras and body know all four photos, the avatar three; unseen, nothing
-    knows the fourth photo; where its camera stands is told by cameras that all frames have refined together. poses: the avatar
-    of one frame in the poses of the others. uncalibrated: cameras from the person. moments: the same, of photos that each show
-    another moment. rooms: synthetic people in photographed rooms. start: seconds of `humangs start` on photos of 12 megapixels.
+    Needs the extra `photos` and `imageio-ffmpeg`. Everything is scored by careful masks, in squares
+    of 512 pixels. Rows: calibrated, the published calibration: held out, cameras and body know all
+    four photos, the avatar three; unseen, nothing knows the fourth photo; where its camera stands
+    is told by cameras that all frames have refined together. poses: the avatar of one frame in the
+    poses of the others. uncalibrated: cameras from the person. moments: the same, of photos that
+    each show another moment. rooms: synthetic people in photographed rooms. start: seconds of
+    `humangs start` on photos of 12 megapixels.
 
     Options:
     data: where `pose2sim` is downloaded to and what is made of it stays

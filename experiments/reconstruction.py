@@ -1,8 +1,8 @@
 """Time, arithmetic and memory of one reconstruction: photos and body in, canonical Gaussians out.
 
-The subject is the person of the demo, seen by cameras of the published protocol. What the photos show changes no cost but one:
-how many patches the person touches. Random weights cost what trained ones cost. Operations are counted from the traced programs,
-loops included (`costs.py`).
+The subject is the person of the demo, seen by cameras of the published protocol. What the photos
+show changes no cost but one: how many patches the person touches. Random weights cost what trained
+ones cost. Operations are counted from the traced programs, loops included (`costs.py`).
 """
 
 import functools
@@ -34,11 +34,15 @@ MATMUL_SHAPE = (4096, 768, 3072)
 """A product of the published network's MLP at 256 x 256: what "matrix-product peak" means here."""
 TOKENS = ("all", "foreground")
 LOG_SCALE, HEAD_SCALE = -4.6, 0.05
-"""Bias of the scales before their softplus, and how much weaker random geometry heads are than other random layers."""
+"""Bias of the scales before their softplus, and how much weaker random geometry heads are than
+other random layers.
+"""
 
 
 def benchmark_inputs(config: Any, views: int, size: int) -> Any:
-    """`HumanGSInputs` of the demo's photos, in turns until there are that many, as a network of this configuration wants them."""
+    """`HumanGSInputs` of the demo's photos, in turns until there are that many, as a network of
+    this configuration wants them.
+    """
     capture = load_capture(DEMO_CAPTURE)
     photos = standardize(capture.select([i % capture.view_count for i in range(views)]), size)
     prepare = jax.jit(prepare_inputs, static_argnames="config")
@@ -46,7 +50,9 @@ def benchmark_inputs(config: Any, views: int, size: int) -> Any:
 
 
 def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
-    """(configuration for foreground tokens with room for these photos, tokens that the person touches, their share)."""
+    """(configuration for foreground tokens with room for these photos, tokens that the person
+    touches, their share).
+    """
     patch = config.architecture.encoder.patch_size
     touched = int(needed_tokens(inputs.foreground, inputs.view_count, patch))
     patches = int(np.prod(inputs.images.shape[:3])) // patch**2
@@ -94,7 +100,10 @@ def matmul_program(dtype: str) -> tuple[Callable[[], Any], float]:
 
 
 def configured(preset: str, size: int) -> HumanGSConfig:
-    """A preset for photos of that size, in the dtype that suits the machine. Raises ValueError for an unknown preset."""
+    """A preset for photos of that size, in the dtype that suits the machine.
+
+    Raises ValueError for an unknown preset.
+    """
     if preset not in PRESETS:
         raise ValueError(f"--preset {preset}: expected one of {', '.join(PRESETS)}")
     dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
@@ -116,11 +125,12 @@ def reconstruction_benchmark(
     memory: tuple[int, ...] = (1, 4, 8, 16),
     memory_size: int = 512,
 ) -> None:
-    """Time, arithmetic and memory of a reconstruction, with all tokens and with those of the foreground.
+    """Time, arithmetic and memory of a reconstruction, with all tokens and with those of the
+    foreground.
 
-    In turns with a plain matrix product, which gives the peak of this run. Operations are counted from traced programs. Memory
-    is XLA's analysis of programs that are not run (table reconstruction_memory). Published at 256 with 4 views takes 3 minutes on
-    2 cores.
+    In turns with a plain matrix product, which gives the peak of this run. Operations are counted
+    from traced programs. Memory is XLA's analysis of programs that are not run (table
+    reconstruction_memory). Published at 256 with 4 views takes 3 minutes on 2 cores.
 
     Options:
     preset: published, paper, small or tiny
@@ -184,7 +194,9 @@ def reconstruction_benchmark(
 
 
 def benchmark(config: HumanGSConfig, views: int, size: int, repeats: int) -> dict[str, Any]:
-    """Of all tokens and those of the foreground: ms, operations, MiB, and the time over that of as many plain products."""
+    """Of all tokens and those of the foreground: ms, operations, MiB, and the time over that of as
+    many plain products.
+    """
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are of a first run
     inputs, variables = benchmark_inputs(config, views, size), random_variables(config)
     packed, touched, share = foreground(inputs, config)
@@ -217,7 +229,9 @@ def benchmark(config: HumanGSConfig, views: int, size: int, repeats: int) -> dic
 
 
 def _memory(config: HumanGSConfig, views: int, size: int) -> dict[str, float]:
-    """MiB that a program for that number of photos of that size needs besides its arguments and results; its operations."""
+    """MiB that a program for that number of photos of that size needs besides its arguments and
+    results; its operations.
+    """
     subject = benchmark_inputs(config.with_runtime(tokens="all"), views, size)
     if config.tokens == "foreground":
         config = foreground(subject, config)[0]
@@ -230,7 +244,8 @@ def _memory(config: HumanGSConfig, views: int, size: int) -> dict[str, float]:
 def reconstruction_batches(
     run: Run, sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 32), runs: int = 3
 ) -> None:
-    """Subjects a second of `hg.reconstruct_views` under `vmap`, by the size of the batch: four photos, shipped weights.
+    """Subjects a second of `hg.reconstruct_views` under `vmap`, by the size of the batch: four
+    photos, shipped weights.
 
     Options:
         sizes: of the batches

@@ -23,7 +23,9 @@ from humangs_jax.refinement.learned import SHIPPED
 from humangs_jax.refinement.refine import refine_with_report
 
 DEGREES, SHAPES = 0.2, 0.02
-"""Of --off: turn of a joint and change of a shape coefficient (standard deviations) for each millimetre."""
+"""Of --off: turn of a joint and change of a shape coefficient (standard deviations) for each
+millimetre.
+"""
 SHOWN = {
     "psnr": ("PSNR", 2),
     "psnr_fg": ("foreground PSNR", 2),
@@ -50,15 +52,16 @@ def refinement(
 ) -> None:
     """What refinement gains on held-out views, against its seconds.
 
-    0 seconds are the start; seconds do not count compilation. One device: one core of a CPU. With --off, held-out views show the
-    pose of the photos and are drawn with the same wrong body.
+    0 seconds are the start; seconds do not count compilation. One device: one core of a CPU. With
+    --off, held-out views show the pose of the photos and are drawn with the same wrong body.
 
     Options:
     seconds: lengths of the runs
     sizes: sides of the photos in pixels (--size is not used)
     views: numbers of photos
     iterations: of the learned update; 0: Adam alone
-    off: standard deviations of the body's translation, millimetres; for each, joints turn by 0.2 degrees, shapes change by 0.02
+    off: standard deviations of the body's translation, millimetres; for each, joints turn by 0.2
+    degrees, shapes change by 0.02
     plot: PSNR against seconds
     sheet: truth, feed-forward and the longest run of every person, largest size
     details_sheet: the same of faces, hands, hems and shoes
@@ -136,7 +139,9 @@ def body_off(poses: Any, betas: Any, millimetres: float, seed: int) -> tuple[Any
 
 
 def _refined(start, subject, count, how, seconds):
-    """Scores by seconds and task; truth, feed-forward and refined of a held-out view from the front, whole and in details."""
+    """Scores by seconds and task; truth, feed-forward and refined of a held-out view from the
+    front, whole and in details.
+    """
     inputs = subject.inputs(count)
     avatar = reconstruct(start.variables, start.config, inputs)
     view = frontal_view(
@@ -163,7 +168,9 @@ def _refined(start, subject, count, how, seconds):
 def score_all(
     avatar: Any, held_out: Any, lpips: Lpips | None = None, view: int = 0
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """Scores by task, also the semi-transparent foreground of the true images, and the image of a view."""
+    """Scores by task, also the semi-transparent foreground of the true images, and the image of a
+    view.
+    """
     drawn = draw_views(avatar, held_out)
     scores = score_tasks(drawn.images, held_out, lpips, drawn.alpha)
     for task, views in task_views(held_out).items():
@@ -223,7 +230,8 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
     about = (
         f"Means over {people} people of the {settings['split']} seeds; PSNR in dB"
         + (f"; LPIPS {settings['lpips_net']}" if settings.get("lpips_net") else "")
-        + "; seconds: of the whole run on one core, without compilation; silhouette: PSNR within 3 pixels (of 256) of the true "
+        + "; seconds: of the whole run on one core, without compilation; silhouette: PSNR within 3"
+        " pixels (of 256) of the true "
         + "one; worst-subject gain: the least of any person in novel views."
     )
     true = {
@@ -259,15 +267,18 @@ def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
             axis.set_xscale("symlog", linthresh=1)
 
 
-# README --------------------------------------------------------------------------------------------------------------
+# README
+# --------------------------------------------------------------------------------------------------
 
 
 @entry
 def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
-    """README's tables of quality and of the demo's times, from two runs of the demo and from tables of the docs.
+    """README's tables of quality and of the demo's times, from two runs of the demo and from tables
+    of the docs.
 
-    HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --out b; readme b/report.json --timed a/report.json
-    Times are those of an idle machine, from an empty compile cache.
+    HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --out b; readme
+    b/report.json --timed a/report.json Times are those of an idle machine, from an empty compile
+    cache.
 
     Tables: readme_quality
 
@@ -288,11 +299,13 @@ def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
 def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any]) -> str:
     """The demo person and the test people.
 
-    Raises: ValueError if the demo was not refined, or the weights of the two tables are not the same.
+    Raises: ValueError if the demo was not refined, or the weights of the two tables are not the
+    same.
     """
     if "refined" not in demo:
         raise ValueError(
-            "the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0"
+            "the report of the refined demo has no refined scores: expected `humangs demo` without"
+            " --refine 0"
         )
     if people["settings"]["weights"] != refined["settings"]["weights"]:
         raise ValueError(
@@ -324,8 +337,9 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
 
 def readme_times(demo: dict[str, Any]) -> str:
     spent, views = demo["timings"], demo["views"]
+    photos = f"{views['input']} photos of {demo['image_size'][0]} px"
     stages = {
-        f"reconstruct: {views['input']} photos of {demo['image_size'][0]} px -> {demo['gaussians']:,} Gaussians": "reconstruct",
+        f"reconstruct: {photos} -> {demo['gaussians']:,} Gaussians": "reconstruct",
         "animate: one pose": "animate",
         f"render {views['held_out']} views": "render_held_out",
     }

@@ -2,9 +2,10 @@
 
     python experiments/render_tables.py [--check]
 
-Every section `<!-- table: NAME -->` ... `<!-- end -->` becomes what docs/results/NAME.json holds (format:
-`experiments/results.py`). --check writes nothing; exit status 1 if a page differs from its JSON files, if a section has
-no file, or if a file is shown nowhere. `<!-- formats: NAME -->` ... `<!-- end -->` becomes the formats that the package reads.
+Every section `<!-- table: NAME -->` ... `<!-- end -->` becomes what docs/results/NAME.json holds
+(format: `experiments/results.py`). --check writes nothing; exit status 1 if a page differs from its
+JSON files, if a section has no file, or if a file is shown nowhere. `<!-- formats: NAME -->` ...
+`<!-- end -->` becomes the formats that the package reads.
 """
 
 import argparse

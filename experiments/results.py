@@ -5,10 +5,12 @@
     script, arguments   what made it
     source              where the rows come from, if not from that script's own run
     date, machine, versions   of the run; null if unknown
-    blocks              the section as data: paragraphs (text) and tables ({"header", "rows", "align"})
+    blocks              the section as data: paragraphs (text) and tables ({"header", "rows",
+                        "align"})
     numbers             the unrounded numbers, as the script wrote them; null if unknown
 
-A page shows it between `<!-- table: NAME -->` and `<!-- end -->`. `publish` writes both, `render_tables.py` all pages again.
+A page shows it between `<!-- table: NAME -->` and `<!-- end -->`. `publish` writes both,
+`render_tables.py` all pages again.
 """
 
 import datetime
@@ -72,7 +74,9 @@ def json_text(value: Any, indent: str = "") -> str:
 def markdown_table(
     header: Sequence[str], rows: Sequence[Sequence[object]], align: str | None = None
 ) -> str:
-    """A table. align holds "l" or "r" for each column; by default the first is aligned to the left, others to the right."""
+    """A table. align holds "l" or "r" for each column; by default the first is aligned to the left,
+    others to the right.
+    """
     rule = [ALIGNMENTS[side] for side in align or default_alignment(header)]
     return "\n".join(
         "| " + " | ".join(str(cell) for cell in row) + " |" for row in (header, rule, *rows)
@@ -144,7 +148,8 @@ def page_of(name: str) -> Path:
     ]
     if len(found) != 1:
         raise ValueError(
-            f"needs <!-- table: {name} --> and <!-- end --> once in README.md, experiments/README.md or docs/, found {len(found)}"
+            f"needs <!-- table: {name} --> and <!-- end --> once in README.md,"
+            f" experiments/README.md or docs/, found {len(found)}"
         )
     return found[0]
 
@@ -164,7 +169,8 @@ def publish(
 
 
 def rendered(page: str, results: Path, names: Sequence[str] | None = None) -> str:
-    """A page's text with its sections (of these names, or all) as the JSON files of a folder have them.
+    """A page's text with its sections (of these names, or all) as the JSON files of a folder have
+    them.
 
     Raises: FileNotFoundError for a section without a JSON file.
     """
@@ -182,8 +188,8 @@ def rendered(page: str, results: Path, names: Sequence[str] | None = None) -> st
 
 
 def run_record(name: str | None = None, options: Sequence[str] | None = None) -> dict[str, Any]:
-    """What made a result: an experiment (by default this process's script) and its options (absolute paths without their folders,
-    also after NAME=), date, machine, versions.
+    """What made a result: an experiment (by default this process's script) and its options
+    (absolute paths without their folders, also after NAME=), date, machine, versions.
     """
     script = Path(sys.argv[0]).resolve()
     made_by = (
@@ -197,8 +203,9 @@ def run_record(name: str | None = None, options: Sequence[str] | None = None) ->
         "arguments": shlex.join(re.sub(r"(^|=)/.*/", r"\1", each) for each in given),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": {"cpu": cpu_model(), "cores": cores()},
-        "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in PACKAGES},
+        "versions": (
+            {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+        ),
     }
 
 

@@ -1,4 +1,6 @@
-"""How far inputs and number types may go: extremes of each quantity, ranges of use, errors of every stage."""
+"""How far inputs and number types may go: extremes of each quantity, ranges of use, errors of every
+stage.
+"""
 
 import dataclasses
 import functools
@@ -29,13 +31,15 @@ from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.diagnose import Recorder, observe_subject
 from humangs_jax.training.forward import draw_targets, white_backgrounds
 
-# Extremes ------------------------------------------------------------------------------------------------------------
+# Extremes
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """photos, held_out: changes of the captures that the avatar is made of and compared with. photographed: the person is
-    photographed anew, by the changed cameras. network: (variables, configuration) -> others.
+    """photos, held_out: changes of the captures that the avatar is made of and compared with.
+    photographed: the person is photographed anew, by the changed cameras. network: (variables,
+    configuration) -> others.
     """
 
     photos: changes.Change = lambda capture: capture
@@ -117,11 +121,13 @@ CASES: dict[str, Case] = {
 
 @entry
 def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
-    """What `reconstruct` makes of inputs at the extremes: an error, a warning or an avatar, and how good that is.
+    """What `reconstruct` makes of inputs at the extremes: an error, a warning or an avatar, and how
+    good that is.
 
-    One person of the validation seeds, four photos of 256 pixels; each case changes one thing. "warned": the quick check, which
-    `humangs reconstruct` runs first, says something. "reach": largest distance of a Gaussian from its vertex, in body heights;
-    all numbers have to be finite. PSNR: held-out views of the same pose, by the true cameras and pose. "error": a line names the
+    One person of the validation seeds, four photos of 256 pixels; each case changes one thing.
+    "warned": the quick check, which `humangs reconstruct` runs first, says something. "reach":
+    largest distance of a Gaussian from its vertex, in body heights; all numbers have to be finite.
+    PSNR: held-out views of the same pose, by the true cameras and pose. "error": a line names the
     array.
 
     Options:
@@ -151,7 +157,8 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
     run.show(markdown_table(header, rows, "llrrrl"), numbers)
 
 
-# Ranges of use -------------------------------------------------------------------------------------------------------
+# Ranges of use
+# --------------------------------------------------------------------------------------------------
 
 BOUND = 1.0
 """Decibels of PSNR."""
@@ -215,7 +222,10 @@ LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
         },
     ),
 }
-"""{quantity: (unit, the value at which nothing is changed, {value: change})}. None: it is somewhere among the values."""
+"""{quantity: (unit, the value at which nothing is changed, {value: change})}.
+
+None: it is somewhere among the values.
+"""
 
 
 @entry
@@ -265,7 +275,9 @@ def limits(run: Run, people: int = 2) -> None:
 
 
 def interval(name: str, losses: dict[float, float]) -> dict[str, Any]:
-    """The range around the best value in which the loss stays below `BOUND`; None for an end that was not reached."""
+    """The range around the best value in which the loss stays below `BOUND`; None for an end that
+    was not reached.
+    """
     unit, zero, _ = LIMITS[name]
     points = sorted((losses | ({} if zero is None else {zero: 0.0})).items())
     middle = min(range(len(points)), key=lambda i: points[i][1])
@@ -286,7 +298,8 @@ def interval(name: str, losses: dict[float, float]) -> dict[str, Any]:
     return {"unit": unit, "low": low, "high": high}
 
 
-# Number types --------------------------------------------------------------------------------------------------------
+# Number types
+# --------------------------------------------------------------------------------------------------
 
 Types = Literal["float32", "tf32", "bfloat16", "float16"]
 COLUMNS = {
@@ -301,11 +314,13 @@ TARGETS = 2
 def stability(
     run: Run, types: tuple[Types, ...] = ("float32", "tf32", "bfloat16", "float16"), seeds: int = 3
 ) -> None:
-    """Error of every stage, from photos to images and back to gradients, by number type, against float64 from the same numbers.
+    """Error of every stage, from photos to images and back to gradients, by number type, against
+    float64 from the same numbers.
 
-    The shipped weights on people of the validation seeds. An error is a relative L2 norm, the largest over the arrays of a stage
-    and over the people: of what the stage gives, of the gradients that it sends back, and of those of its parameters. float16
-    runs forward only. tf32: float32 with products as the device's matrix units compute them; left out where it has none.
+    The shipped weights on people of the validation seeds. An error is a relative L2 norm, the
+    largest over the arrays of a stage and over the people: of what the stage gives, of the
+    gradients that it sends back, and of those of its parameters. float16 runs forward only. tf32:
+    float32 with products as the device's matrix units compute them; left out where it has none.
 
     Tables: stability_shipped
 
@@ -353,7 +368,9 @@ def _worst(cases, types):
 
 
 def shipped_cases(count):
-    """(variables, config, body, example) of people of the validation seeds, with one token capacity: a program serves all."""
+    """(variables, config, body, example) of people of the validation seeds, with one token
+    capacity: a program serves all.
+    """
     whole, (variables, config) = load_body(), load_weights()
     body, size, examples = gaussian_body(whole, config), config.conventions.image_size, []
     for seed in seeds_of("validation", 0, count):
@@ -370,7 +387,9 @@ def shipped_cases(count):
 
 
 def observe(case, name):
-    """{stage: {column: {leaf: array}}} of one training step's forward and backward pass in a number type."""
+    """{stage: {column: {leaf: array}}} of one training step's forward and backward pass in a number
+    type.
+    """
     variables, config, body, example = case
     run = TrainConfig(
         model=config,
@@ -413,7 +432,9 @@ def observe(case, name):
 
 @functools.cache
 def observer(model, run):
-    """The stages of a forward pass, a compiled function of parameters, batch statistics, body and example."""
+    """The stages of a forward pass, a compiled function of parameters, batch statistics, body and
+    example.
+    """
 
     def forward(params, batch_stats, body, example):
         recorder = Recorder()

@@ -1,4 +1,6 @@
-"""Time and error of the splatting renderer on the shipped person: image sizes, presets, every knob; finite differences."""
+"""Time and error of the splatting renderer on the shipped person: image sizes, presets, every knob;
+finite differences.
+"""
 
 import dataclasses
 import functools
@@ -47,8 +49,8 @@ class Scene(NamedTuple):
 
 
 def demo_scene(size: int, count: int | None = None) -> Scene:
-    """The shipped person in the pose and before the camera of her first photo. count: of Gaussians drawn from her own, moved
-    within their extent and smaller in proportion to their spacing.
+    """The shipped person in the pose and before the camera of her first photo. count: of Gaussians
+    drawn from her own, moved within their extent and smaller in proportion to their spacing.
     """
     avatar, capture = shipped_person(), load_capture(DEMO_CAPTURE)
     own = animate(avatar, capture.pose(int(capture.frames[0])))
@@ -69,7 +71,8 @@ def demo_scene(size: int, count: int | None = None) -> Scene:
 def compiled(scene: Scene, config: SplatConfig) -> tuple[Programs, dict[str, float]]:
     """Two programs bound to the scene, and the MiB that each holds while it runs.
 
-    forward() -> Rendering. forward_backward() -> (mean squared error against noise, its gradients as Gaussians).
+    forward() -> Rendering. forward_backward() -> (mean squared error against noise, its gradients
+    as Gaussians).
     """
     gaussians, camera = scene
     dtype = gaussians.means.dtype
@@ -123,10 +126,12 @@ def differences(found: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> d
 
 @entry
 def splatting(run: Run, sizes: tuple[int, ...] = (256, 512, 1024), repeats: int = 9) -> None:
-    """Time, memory and error of the splatting renderer by the size of the image: the shipped person, float32, black background.
+    """Time, memory and error of the splatting renderer by the size of the image: the shipped
+    person, float32, black background.
 
-    Errors are those to float64: where float32 decides otherwise, an alpha at 1/255, a pixel at its stop, two equal depths.
-    The loss is the mean squared error against noise; of gradients the worst of the five parameters'. A minute.
+    Errors are those to float64: where float32 decides otherwise, an alpha at 1/255, a pixel at its
+    stop, two equal depths. The loss is the mean squared error against noise; of gradients the worst
+    of the five parameters'. A minute.
 
     Options:
     sizes: sides of the images, pixels
@@ -159,7 +164,8 @@ def splatting(run: Run, sizes: tuple[int, ...] = (256, 512, 1024), repeats: int 
     run.show(markdown_table(header, table), rows)
 
 
-# Knobs ---------------------------------------------------------------------------------------------------------------
+# Knobs
+# --------------------------------------------------------------------------------------------------
 
 KNOBS: dict[str, tuple[Any, ...]] = {
     "tile_size": (4, 16),
@@ -186,7 +192,10 @@ COMBINED: tuple[dict[str, Any], ...] = (
 
 
 class Setting(NamedTuple):
-    """A point of the trade-off. knob: of which it is a value, "preset" or "combined". dropped: (g,) left out, or None."""
+    """A point of the trade-off. knob: of which it is a value, "preset" or "combined".
+
+    dropped: (g,) left out, or None.
+    """
 
     knob: str
     label: str
@@ -229,7 +238,9 @@ def short(value: Any) -> str:
 
 
 def largest_weights(scene: Scene) -> np.ndarray:
-    """(g,) the largest weight of each Gaussian on any pixel of any of the cameras around the scene, and of its own."""
+    """(g,) the largest weight of each Gaussian on any pixel of any of the cameras around the scene,
+    and of its own.
+    """
     (gaussians, own), config = scene, SplatConfig(visibility=True)
     middle = jnp.median(gaussians.means, axis=0)
     angles = (
@@ -252,11 +263,13 @@ def splatting_tradeoff(
     only: tuple[str, ...] = (),
     image: Path | None = None,
 ) -> None:
-    """What each knob of the splatting renderer gains in time and costs in accuracy, on the shipped person.
+    """What each knob of the splatting renderer gains in time and costs in accuracy, on the shipped
+    person.
 
-    Every setting takes turns with the exact one, call by call, in one process; its time is the median of the quotients. Its error
-    is that to float64, as in `splatting`. Dropping the hidden: the Gaussians that weigh less than a threshold on every pixel of
-    24 cameras around are left out. 4 minutes.
+    Every setting takes turns with the exact one, call by call, in one process; its time is the
+    median of the quotients. Its error is that to float64, as in `splatting`. Dropping the hidden:
+    the Gaussians that weigh less than a threshold on every pixel of 24 cameras around are left out.
+    4 minutes.
 
     Options:
     size: side of the image, pixels
@@ -340,7 +353,9 @@ def knobs_table(result: dict[str, Any]) -> str:
 
 
 def plot(path: Path, result: dict[str, Any]) -> None:
-    """Time relative to exact against PSNR: a line for each knob, the presets, and the front of all settings."""
+    """Time relative to exact against PSNR: a line for each knob, the presets, and the front of all
+    settings.
+    """
     exact, *others = result["settings"]
     rows = [exact | {"knob": "preset", "forward": 1.0}]
     rows += [row for row in others if row["knob"] not in SCHEDULE and row["label"] != "inria"]
@@ -371,7 +386,8 @@ def plot(path: Path, result: dict[str, Any]) -> None:
         axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
-# Finite differences --------------------------------------------------------------------------------------------------
+# Finite differences
+# --------------------------------------------------------------------------------------------------
 
 STEPS = (1e-3, 1e-4)
 AWAY = (0.02, -0.03, 0.01, 0.02, 0.01, -0.03)
@@ -385,10 +401,12 @@ CUTS = {
 
 @entry
 def splatting_finite_differences(run: Run, size: int = 128) -> None:
-    """Finite differences of an image's error against the gradient of the camera: what the cuts of splatting leave out.
+    """Finite differences of an image's error against the gradient of the camera: what the cuts of
+    splatting leave out.
 
-    The shipped person in the pose and before the camera of its first photo, float64; the loss is the mean squared error to the
-    image of a camera that is a little off. Central differences for the six numbers of a camera twist, radians and metres.
+    The shipped person in the pose and before the camera of its first photo, float64; the loss is
+    the mean squared error to the image of a camera that is a little off. Central differences for
+    the six numbers of a camera twist, radians and metres.
 
     Options:
     size: side of the image, pixels

@@ -1,12 +1,15 @@
-"""The extremes that splatting has to survive, as small scenes: is everything finite, and how far is float32 from float64?
+"""The extremes that splatting has to survive, as small scenes: is everything finite, and how far is
+float32 from float64?
 
-A case is a scene in float32 (or narrower), and bounds on how far its image and gradients may be from those of the same
-numbers in float64. Most scenes are 32 Gaussians in 24 x 16 pixels, so that one compilation serves nearly all of them.
+A case is a scene in float32 (or narrower), and bounds on how far its image and gradients may be
+from those of the same numbers in float64. Most scenes are 32 Gaussians in 24 x 16 pixels, so that
+one compilation serves nearly all of them.
 
-Gradients are compared in natural units, so that no Gaussian counts for nothing because it is large or far: with respect
-to mean / depth, log scale and direction of the quaternion; the others as they are. Errors are relative to the norm of the
-same gradient; that of the quaternions, which vanishes for spheres, to that of the log scales if it is larger. The loss is
-a random linear function of rgb, alpha and depth.
+Gradients are compared in natural units, so that no Gaussian counts for nothing because it is large
+or far: with respect to mean / depth, log scale and direction of the quaternion; the others as they
+are. Errors are relative to the norm of the same gradient; that of the quaternions, which vanishes
+for spheres, to that of the log scales if it is larger. The loss is a random linear function of rgb,
+alpha and depth.
 """
 
 import dataclasses
@@ -31,25 +34,30 @@ WIDTH, HEIGHT, COUNT = 24, 16, 32
 FOCAL, UNTURNED = 24.0, np.eye(4, dtype=np.float32)
 
 IMAGE, GRADIENT = 1e-5, 1e-4
-"""Bounds of a case that is nothing special to float32: largest error of a color or of alpha, and the largest relative
-L2 error among the eight gradients. Roundings of 6e-8, through a few hundred operations."""
+"""Bounds of a case that is nothing special to float32: largest error of a color or of alpha, and
+the largest relative L2 error among the eight gradients. Roundings of 6e-8, through a few hundred
+operations."""
 
 FAR, FARTHER = (2e-4, 1e-3), (3e-2, 2e-1)
-"""The same for a scene 1e3 and 1e5 m from the world's origin: a position is known to 6e-8 of its distance, 6e-5 and 6e-3
-m, where the small Gaussians here are 3e-2 m wide."""
+"""The same for a scene 1e3 and 1e5 m from the world's origin: a position is known to 6e-8 of its
+distance, 6e-5 and 6e-3 m, where the small Gaussians here are 3e-2 m wide."""
 
 NEEDLE_GRADIENT = 2e-3
-"""Scales far below a pixel across and far above the image along: what they matter, in log scale, is 1e-4 of what a
-visible scale would, and rounding is relative to that."""
+"""Scales far below a pixel across and far above the image along: what they matter, in log scale, is
+1e-4 of what a visible scale would, and rounding is relative to that."""
 
 CROWD_GRADIENT = 5e-4
-"""50,000 alphas at one place: the gradients of all but the first few are sums that cancel to nearly nothing."""
+"""50,000 alphas at one place: the gradients of all but the first few are sums that cancel to nearly
+nothing.
+"""
 
 BFLOAT16_GRADIENT, FLOAT16_GRADIENT = 4e-3, 5e-4
 """The gradient is returned in the input's dtype, which rounds it by 2^-9 or 2^-11."""
 
 FLOAT64 = 1e-9
-"""The tiled renderer in float64 against the reference, images absolute and gradients relative: every case."""
+"""The tiled renderer in float64 against the reference, images absolute and gradients relative:
+every case.
+"""
 
 
 class Arrays(NamedTuple):
@@ -64,7 +72,9 @@ class Arrays(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What is drawn; its dtypes are the input's dtypes. unit: the loss sees depths in it, metres."""
+    """What is drawn; its dtypes are the input's dtypes. unit: the loss sees depths in it,
+    metres.
+    """
 
     gaussians: Arrays
     K: np.ndarray
@@ -85,7 +95,9 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """image, gradient: bounds (see `IMAGE`). drawn: whether anything is to be seen. slow: takes seconds."""
+    """image, gradient: bounds (see `IMAGE`). drawn: whether anything is to be seen. slow: takes
+    seconds.
+    """
 
     group: str
     name: str
@@ -98,9 +110,11 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """One case, measured. image: largest error of rgb and alpha. gradient: largest relative L2 error, that of `worst`.
+    """One case, measured. image: largest error of rgb and alpha. gradient: largest relative L2
+    error, that of `worst`.
 
-    depth: relative L2 error of the depth image. coverage: fraction of the pixels with anything on them.
+    depth: relative L2 error of the depth image. coverage: fraction of the pixels with anything on
+    them.
     """
 
     finite: bool
@@ -112,13 +126,17 @@ class Outcome:
     overflow: int
 
     def passes(self, case: Case) -> bool:
-        """Whether everything is finite, within the case's bounds, complete, and there to be seen (or not)."""
+        """Whether everything is finite, within the case's bounds, complete, and there to be seen
+        (or not).
+        """
         within = self.image <= case.image and self.gradient <= case.gradient
         return self.finite and within and (self.coverage > 0) == case.drawn and self.overflow == 0
 
 
 def ordinary(seed: int = 0, count: int = COUNT, width: int = WIDTH, height: int = HEIGHT) -> Scene:
-    """Gaussians 2 to 4 m before a camera that is slightly turned: the scene that every extreme starts from."""
+    """Gaussians 2 to 4 m before a camera that is slightly turned: the scene that every extreme
+    starts from.
+    """
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 4, count)
     means = np.stack(
@@ -185,7 +203,9 @@ def at_depth(z: float, size: float, offset: float = 0.0) -> Scene:
 
 
 def across_near_plane() -> Scene:
-    """Large Gaussians whose centres lie within a few centimetres before and behind the near plane."""
+    """Large Gaussians whose centres lie within a few centimetres before and behind the near
+    plane.
+    """
     z = NEAR + np.linspace(-0.03, 0.08, COUNT)
     means = np.concatenate([ordinary().gaussians.means[:, :2] * 0.02, z[:, None]], axis=1)
     scene = changed(ordinary(), means=means, scales=0.2 * ordinary().gaussians.scales)
@@ -193,7 +213,9 @@ def across_near_plane() -> Scene:
 
 
 def seen_through(focal: float, zoomed: bool) -> Scene:
-    """Another focal length. zoomed: the scene shrinks with the field of view, so the image stays about the same."""
+    """Another focal length. zoomed: the scene shrinks with the field of view, so the image stays
+    about the same.
+    """
     scene = ordinary()
     K = scene.K.copy()
     K[:2, :2] *= focal / FOCAL
@@ -217,7 +239,8 @@ def far_from_origin(distance: float) -> Scene:
 
 
 def crowd(count: int, opacity: tuple[float, float], spread: float) -> Scene:
-    """`count` Gaussians on one pixel of an 8 x 8 image (a single tile, so a single list), thinner than a pixel.
+    """`count` Gaussians on one pixel of an 8 x 8 image (a single tile, so a single list), thinner
+    than a pixel.
 
     opacity: range. spread: of their centres, pixels.
     """
@@ -248,7 +271,9 @@ def behind() -> Scene:
 
 
 def coincident(reverse: bool = False) -> Scene:
-    """All at one depth, overlapping: the image depends on their order, which is that of their index."""
+    """All at one depth, overlapping: the image depends on their order, which is that of their
+    index.
+    """
     scene = at_depth(3.0, 3.0)
     order = np.arange(COUNT)[::-1] if reverse else np.arange(COUNT)
     return dataclasses.replace(scene, gaussians=jax.tree.map(lambda a: a[order], scene.gaussians))
@@ -370,7 +395,9 @@ NAMES = ("means", "quats", "scales", "opacities", "colors", "K", "cam_from_world
 
 @functools.partial(jax.jit, static_argnames=("draw", "width", "height"))
 def evaluate(draw, gaussians, K, pose, background, unit, width, height):
-    """Rendering, and the gradients of a random linear function of its rgb, alpha and depth with respect to everything."""
+    """Rendering, and the gradients of a random linear function of its rgb, alpha and depth with
+    respect to everything.
+    """
     rng = np.random.default_rng(7)
     weights = [
         rng.normal(size=shape) for shape in ((height, width, 3), (height, width), (height, width))
@@ -407,7 +434,9 @@ reference_in_float64 = functools.partial(tiled_in_float64, draw=render_reference
 
 
 def relative_l2(found: np.ndarray, expected: np.ndarray) -> float:
-    """|found - expected| / |expected|; 0 if both are 0, infinite if only the second is or the first is not finite."""
+    """|found - expected| / |expected|; 0 if both are 0, infinite if only the second is or the first
+    is not finite.
+    """
     found, expected = (np.asarray(a, np.float64).ravel() for a in (found, expected))
     if not np.isfinite(found).all():
         return np.inf
@@ -468,10 +497,10 @@ def measure(case: Case, in_float64: bool = False) -> Outcome:
 def splatting_numerics(run: Run, only: str = "") -> int:
     """The extremes of splatting: is everything finite, and how far is float32 from float64?
 
-    Every case is rendered, with the gradients of a random loss with respect to everything, by the tiled renderer in float32 and
-    by the reference in float64 from the same numbers; and by the tiled renderer in float64, which shows that only rounding
-    remains. Exit status 1 if a number is not finite, a bound is exceeded, or something is visible that should not be. Three
-    minutes.
+    Every case is rendered, with the gradients of a random loss with respect to everything, by the
+    tiled renderer in float32 and by the reference in float64 from the same numbers; and by the
+    tiled renderer in float64, which shows that only rounding remains. Exit status 1 if a number is
+    not finite, a bound is exceeded, or something is visible that should not be. Three minutes.
 
     Options:
     only: cases whose names contain this

@@ -1,11 +1,13 @@
-"""People to evaluate on: who they are, their photos and held-out views, the network, and what their rows depend on.
+"""People to evaluate on: who they are, their photos and held-out views, the network, and what their
+rows depend on.
 
-Photos are from a ring of `RING` cameras of the published protocol, evenly spaced but for the generator's jitter, number 0 the
-most frontal one. N photos are every (RING / N)-th camera, so each person is rendered once for all numbers of photos. Held-out
-cameras and novel poses are those of `humangs_jax.people.writer.write_person` for the same seed; images have 8 bits as on disk.
+Photos are from a ring of `RING` cameras of the published protocol, evenly spaced but for the
+generator's jitter, number 0 the most frontal one. N photos are every (RING / N)-th camera, so each
+person is rendered once for all numbers of photos. Held-out cameras and novel poses are those of
+`humangs_jax.people.writer.write_person` for the same seed; images have 8 bits as on disk.
 
-A row of scores is {"novel": scores, "animation": scores}: held-out views in the pose of the photos, and in poses that no photo
-shows; means over views, under the protocol "humangs".
+A row of scores is {"novel": scores, "animation": scores}: held-out views in the pose of the photos,
+and in poses that no photo shows; means over views, under the protocol "humangs".
 """
 
 import dataclasses
@@ -83,7 +85,8 @@ class People:
             or min(self.first, self.poses) < 0
         ):
             raise ValueError(
-                "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0"
+                "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at"
+                " least 0"
             )
         backbone = installed_lpips().get(self.lpips_net)
         lpips = load_lpips(self.lpips_net) if backbone else None
@@ -121,7 +124,9 @@ class Start(NamedTuple):
     def subject(
         self, seed: int, counts: Sequence[int], size: int | None = None
     ) -> "EvaluationSubject":
-        """The person of a seed, with photos for these numbers of views: see `make_evaluation_subject`."""
+        """The person of a seed, with photos for these numbers of views: see
+        `make_evaluation_subject`.
+        """
         return make_evaluation_subject(seed, self.body, counts, size or self.size, self.held_out)
 
     def rows(
@@ -138,9 +143,9 @@ class Start(NamedTuple):
     def about(self) -> str:
         s = self.settings
         return (
-            f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels, white; {s['held_out']} "
-            f"held-out views in the pose of the photos, {s['poses']} x {s['pose_views']} in novel poses; "
-            f"weights {s['weights'][:12]}, tokens: {s['tokens']}"
+            f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels,"
+            f" white; {s['held_out']} held-out views in the pose of the photos, {s['poses']} x"
+            f" {s['pose_views']} in novel poses; weights {s['weights'][:12]}, tokens: {s['tokens']}"
             + (f"; LPIPS {s['lpips_net']}." if s["lpips_net"] else ".")
         )
 
@@ -165,7 +170,9 @@ def file_digest(path: Path) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class HeldOut:
-    """What a reconstruction is compared with: `views` of the pose of the photos, `pose_views` of each of `poses` others."""
+    """What a reconstruction is compared with: `views` of the pose of the photos, `pose_views` of
+    each of `poses` others.
+    """
 
     views: int = 8
     poses: int = 2
@@ -174,7 +181,9 @@ class HeldOut:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EvaluationSubject:
-    """A person. photos: of pose 0, by position on the ring. held_out: frame 0 is that pose, frames 1, ... are others."""
+    """A person. photos: of pose 0, by position on the ring. held_out: frame 0 is that pose, frames
+    1, ... are others.
+    """
 
     seed: int
     photos: Capture
@@ -182,7 +191,10 @@ class EvaluationSubject:
     held_out: Capture
 
     def inputs(self, count: int) -> Capture:
-        """Evenly spaced photos of the ring, the frontal one first. Raises ValueError if they were not rendered."""
+        """Evenly spaced photos of the ring, the frontal one first.
+
+        Raises ValueError if they were not rendered.
+        """
         wanted = ring_positions(count)
         if missing := set(wanted) - set(self.positions):
             raise ValueError(
@@ -191,8 +203,8 @@ class EvaluationSubject:
         return self.photos.select([self.positions.index(position) for position in wanted])
 
     def with_body(self, body: BodyModel) -> "EvaluationSubject":
-        """The same images with the parameters of another body, which has the same directions of shape; the poses go to its
-        joints by name, and joints that have none of that name rest.
+        """The same images with the parameters of another body, which has the same directions of
+        shape; the poses go to its joints by name, and joints that have none of that name rest.
         """
         captures = {name: with_body(getattr(self, name), body) for name in ("photos", "held_out")}
         return dataclasses.replace(self, **captures)
@@ -211,7 +223,10 @@ def with_body(capture: Capture, body: BodyModel) -> Capture:
 
 
 def ring_positions(count: int) -> tuple[int, ...]:
-    """Which cameras of the ring take `count` photos. Raises ValueError unless the count divides `RING`."""
+    """Which cameras of the ring take `count` photos.
+
+    Raises ValueError unless the count divides `RING`.
+    """
     if count < 1 or RING % count:
         raise ValueError(f"{count} photos are not evenly spaced among {RING} cameras")
     return tuple(range(0, RING, RING // count))
@@ -224,7 +239,9 @@ def make_evaluation_subject(
     image_size: int = 256,
     held_out: HeldOut | None = None,
 ) -> EvaluationSubject:
-    """The person of a seed, rendered from every camera that one of the numbers of photos asks for."""
+    """The person of a seed, rendered from every camera that one of the numbers of photos asks
+    for.
+    """
     held_out = held_out or HeldOut()
     subject = make_subject(seed, body)
     posed = [sample_pose(subject, i) for i in range(1 + held_out.poses)]
@@ -267,7 +284,9 @@ def _as_stored(capture):
 
 
 def task_views(held_out: Capture) -> dict[str, np.ndarray]:
-    """Indices of the held-out views by task: those in the pose of the photos, which is frame 0, and the others."""
+    """Indices of the held-out views by task: those in the pose of the photos, which is frame 0, and
+    the others.
+    """
     still = np.asarray(held_out.frames) == 0
     return dict(zip(TASKS, (np.flatnonzero(still), np.flatnonzero(~still)), strict=True))
 
@@ -278,7 +297,8 @@ def score_tasks(
     lpips: Lpips | None = None,
     alpha: np.ndarray | None = None,
 ) -> dict[str, Scores]:
-    """Mean scores of drawn held-out views (v, h, w, 3) by task, under the protocol "humangs"; tasks without views are left out.
+    """Mean scores of drawn held-out views (v, h, w, 3) by task, under the protocol "humangs"; tasks
+    without views are left out.
 
     alpha: their coverage (v, h, w), for semi-transparent foreground and silhouettes.
     """

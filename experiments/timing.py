@@ -1,7 +1,9 @@
-"""Timing on a machine that others use too: competitors take turns in one process, so that all see the same load.
+"""Timing on a machine that others use too: competitors take turns in one process, so that all see
+the same load.
 
-Process CPU time counts what all threads worked; wall time is what a user waits. Other programs stretch wall time by
-several times, and CPU time (caches, clock) by a third: compare ratios of CPU times first.
+Process CPU time counts what all threads worked; wall time is what a user waits. Other programs
+stretch wall time by several times, and CPU time (caches, clock) by a third: compare ratios of CPU
+times first.
 """
 
 import os
@@ -12,7 +14,9 @@ import numpy as np
 
 
 def prepare_process() -> None:
-    """What has to be set before JAX starts: sleeping OpenMP threads, and an allocator that keeps what it has."""
+    """What has to be set before JAX starts: sleeping OpenMP threads, and an allocator that keeps
+    what it has.
+    """
     os.environ.setdefault(
         "OMP_WAIT_POLICY", "passive"
     )  # spinning ones would be counted as CPU time
@@ -32,7 +36,9 @@ def timed(function: Callable[[], object]) -> tuple[float, float]:
 def medians(
     runs: Mapping[str, Callable[[], object]], repeats: int, warm_up: int = 1
 ) -> dict[str, np.ndarray]:
-    """(wall ms, CPU ms) of every run: medians over `repeats` iterations in which each has one turn."""
+    """(wall ms, CPU ms) of every run: medians over `repeats` iterations in which each has one
+    turn.
+    """
     for _ in range(warm_up):
         for run in runs.values():
             run()

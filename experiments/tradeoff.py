@@ -1,10 +1,12 @@
-"""Speed against accuracy of the whole path: what each knob costs in decibels and takes in time, memory and bytes.
+"""Speed against accuracy of the whole path: what each knob costs in decibels and takes in time,
+memory and bytes.
 
-Quality is the mean over people of the split "tradeoff", whom nothing else has seen: new views in the pose of the photos and in
-novel poses. Photos and true images have 512 pixels; frames of another size are brought to 512 before they are compared. Times
-are CPU times of all threads, of the first person, in turns with the default point's, and kept as ratios of medians: other
-programs stretch wall times by far more. Refinement is counted in steps. Compilation does not count. Memory: what making the
-avatar or refining it adds.
+Quality is the mean over people of the split "tradeoff", whom nothing else has seen: new views in
+the pose of the photos and in novel poses. Photos and true images have 512 pixels; frames of another
+size are brought to 512 before they are compared. Times are CPU times of all threads, of the first
+person, in turns with the default point's, and kept as ratios of medians: other programs stretch
+wall times by far more. Refinement is counted in steps. Compilation does not count. Memory: what
+making the avatar or refining it adds.
 """
 
 import dataclasses
@@ -66,7 +68,8 @@ def tradeoff(
     image: Path | None = None,
     front: bool = False,
 ) -> None:
-    """Speed against accuracy of the whole path: some 60 settings, their front, and presets. Half an hour on one core.
+    """Speed against accuracy of the whole path: some 60 settings, their front, and presets. Half an
+    hour on one core.
 
     Tables: tradeoff, tradeoff_presets
 
@@ -96,7 +99,8 @@ def tradeoff(
         # all of one person, then the next: times are of the first
         for done, (i, each) in enumerate(bar(missing, desc="points", unit="point")):
             if done % 20 == 19:
-                jax.clear_caches()  # compiled programs hold memory maps, of which Linux gives a process 65,530
+                # compiled programs hold memory maps, of which Linux gives a process 65,530
+                jax.clear_caches()
                 bench.default_make_ms()  # compiles
             bench.measure(each, i, rows[each.name])
             write_json(out, result)
@@ -115,7 +119,9 @@ def settings_of() -> dict[str, Any]:
 
 
 def described(point) -> dict[str, Any]:
-    """A point as data; what it says of weights decides whether an earlier measurement still counts."""
+    """A point as data; what it says of weights decides whether an earlier measurement still
+    counts.
+    """
     learned = (
         {"refiner": shipped_digest(SHIPPED_REFINER)} if point.settings.refine_iterations else {}
     )
@@ -175,7 +181,8 @@ class Bench:
             )
         row["people"].append({task: {key: scores[task][key] for key in QUALITY} for task in TASKS})
 
-    # Avatars and their images ----------------------------------------------------------------------------------------
+    # Avatars and their images
+    # ----------------------------------------------------------------------------------------
 
     def photos(self, settings, i=0):
         """As many photos of a person as settings take, or all."""
@@ -227,7 +234,8 @@ class Bench:
     def how(point, avatar):
         return splatting_of(point.settings.shot(Shot()), avatar)
 
-    # Times and memory ------------------------------------------------------------------------------------------------
+    # Times and memory
+    # ----------------------------------------------------------------------------------------------
 
     def make(self, settings):
         """One reconstruction of the first person, without refinement."""
@@ -240,7 +248,9 @@ class Bench:
         return timed(lambda: self.make(self.default.settings))[1]
 
     def make_times(self, point) -> dict[str, Any]:
-        """Time of making the avatar over the default's, with refinement; the default's ms; peak memory, MiB."""
+        """Time of making the avatar over the default's, with refinement; the default's ms; peak
+        memory, MiB.
+        """
         settings, usual = point.settings, self.default.settings
         same = (settings.views, settings.runtime) == (usual.views, usual.runtime)
         pairs = []
@@ -264,7 +274,9 @@ class Bench:
         return times | ({"reconstruct_ms": float(own)} if point is self.default else {})
 
     def refining(self, settings) -> tuple[float, float | None]:
-        """Time of a refinement over the default's reconstruction, without compilation, and its MiB."""
+        """Time of a refinement over the default's reconstruction, without compilation, and its
+        MiB.
+        """
         photos, avatar = self.photos(settings), self.make(settings)
         run = lambda config: refine_with_report(avatar, photos, config)
         run(

@@ -15,7 +15,9 @@ SIZE = 512
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A way to make an avatar and draw it. size: side of the frames, pixels. start: "network", or of `NAIVE`, to compare with."""
+    """A way to make an avatar and draw it. size: side of the frames, pixels. start: "network", or
+    of `NAIVE`, to compare with.
+    """
 
     name: str
     knob: str
@@ -34,7 +36,9 @@ def point(name: str, knob: str, size: int = SIZE, start: str = "network", **chan
 
 
 DEFAULT = point("default", "default")
-"""4 photos of 256 pixels, as the weights were trained, float32, no refinement; frames of 512 pixels, exact."""
+"""4 photos of 256 pixels, as the weights were trained, float32, no refinement; frames of 512
+pixels, exact.
+"""
 
 
 def points() -> list[Point]:
@@ -138,7 +142,8 @@ def combined(**fields: Any) -> Point:
 
 FRONT = REPOSITORY / "humangs_jax" / "assets" / "front.json"
 EQUAL = 1.05
-"""Times of points that differ by less are taken for equal: they are measured beside other programs."""
+"""Times of points that differ by less are taken for equal: they are measured beside other programs.
+"""
 TASKS = {"novel": "same pose", "animation": "novel poses"}
 SCORES = {
     "psnr": ("PSNR", 2),
@@ -217,7 +222,9 @@ def compared(rows: list[Row]) -> list[Row]:
 
 
 def front_of(rows: list[Row]) -> list[Row]:
-    """The points of ours than which no other one is better and takes no longer, cheapest reconstruction first."""
+    """The points of ours than which no other one is better and takes no longer, cheapest
+    reconstruction first.
+    """
     ours = [row for row in compared(rows) if row["start"] == "network"]
     no_longer = lambda a, b: all(a[key] <= EQUAL * b[key] for key in ("reconstruct", "frame"))
     beaten = lambda row: any(
@@ -246,7 +253,8 @@ def front_file(rows: list[Row], result: dict[str, Any]) -> dict[str, Any]:
     return {"weights": result["settings"]["weights"], "points": points}
 
 
-# Tables ------------------------------------------------------------------------------------------------------------------
+# Tables
+# --------------------------------------------------------------------------------------------------
 
 
 def _count(people):
@@ -257,9 +265,12 @@ def about(result: dict[str, Any]) -> str:
     default = result["points"]["default"]
     people, took = _count(default["people"]), f"{default['reconstruct_ms']:.0f} ms a reconstruction"
     return (
-        f"Weights with SHA-256 {result['settings']['weights'][:16]}...; {people} of the people kept for this "
-        f'(split "tradeoff"). CPU times of all threads are shares of the default point\'s, in turns with it: {took} and '
-        f"{default['frame_ms']:.0f} ms a frame of {SIZE} pixels. LPIPS: {result['settings'].get('lpips_net')}."
+        f"Weights with SHA-256 {result['settings']['weights'][:16]}...; {people} of the people kept"
+        " for this "
+        '(split "tradeoff"). CPU times of all threads are shares of the default point\'s, in turns'
+        f" with it: {took} and "
+        f"{default['frame_ms']:.0f} ms a frame of {SIZE} pixels. LPIPS:"
+        f" {result['settings'].get('lpips_net')}."
     )
 
 
@@ -321,7 +332,8 @@ def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
     return f"{about(result)}\n\n{markdown_table(header, table)}"
 
 
-# Images ------------------------------------------------------------------------------------------------------------------
+# Images
+# --------------------------------------------------------------------------------------------------
 
 
 def draw(rows: list[Row], key: str, path: Path) -> None:

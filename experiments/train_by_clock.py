@@ -1,4 +1,6 @@
-"""Train the shipped network further on an accelerator that is at hand for minutes: the learning rate falls with the clock."""
+"""Train the shipped network further on an accelerator that is at hand for minutes: the learning
+rate falls with the clock.
+"""
 
 import concurrent.futures
 import dataclasses
@@ -33,13 +35,14 @@ from humangs_jax.training.step import seed_numbers, update
 FOR_EVER = 100_000_000
 """Steps of a run whose learning rate does not fall by itself."""
 WARM_UP, EMA, LOGGED, SAVED, RESERVE = 40, 0.998, 20, 90.0, 6.0
-"""Steps until the full learning rate; decay of the average; steps between lines of the log; seconds between weights on disk;
-seconds that the last ones may take."""
+"""Steps until the full learning rate; decay of the average; steps between lines of the log; seconds
+between weights on disk; seconds that the last ones may take."""
 FIRST, SEED = 1000, 0
 """Of the training seeds; of order and views."""
 LPIPS, DISPLACED, START_SHARE = 0.1, 0.5, 0.5
-"""Weight of LPIPS (AlexNet) in the loss; share of the examples whose body is displaced to the silhouettes of the clothes; share
-of the first weights in OUT/mean.safetensors, the rest are the trained ones (`train_shipped.py`)."""
+"""Weight of LPIPS (AlexNet) in the loss; share of the examples whose body is displaced to the
+silhouettes of the clothes; share of the first weights in OUT/mean.safetensors, the rest are the
+trained ones (`train_shipped.py`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +66,11 @@ class Clock:
 
 @entry
 def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
-    """Train the shipped network further, for minutes, on people rendered on the fly; writes OUT/weights.safetensors, averaged.
+    """Train the shipped network further, for minutes, on people rendered on the fly; writes
+    OUT/weights.safetensors, averaged.
 
-    The step compiles while other processes make the people. One program serves all numbers of photos.
+    The step compiles while other processes make the people. One program serves all numbers of
+    photos.
     Raises: ValueError if no time is left to train.
     """
     began, body, (variables, model) = monotonic(), load_body(), load_weights(how.init_weights)
@@ -116,7 +121,8 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
                 )
     if not done:
         raise ValueError(
-            f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left for training"
+            f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left"
+            " for training"
         )
     trained = state_variables(average, state)
     mean = jax.tree.map(lambda a, b: START_SHARE * a + (1 - START_SHARE) * b, variables, trained)
@@ -177,7 +183,9 @@ def examples_of(config: TrainConfig, how: Clock) -> Callable[..., Any]:
 
 
 def stepper(config: TrainConfig) -> Any:
-    """A step of `training.step.update` at a share of the learning rate, to which an update is proportional."""
+    """A step of `training.step.update` at a share of the learning rate, to which an update is
+    proportional.
+    """
 
     def step(state, average, batch, body, networks, seed, rate):
         new, metrics = update(state, batch, body, networks, seed, config)

@@ -1,9 +1,11 @@
-"""Trains the learned update of refinement (`humangs_jax/refinement/learned.py`) on avatars of the shipped network.
+"""Trains the learned update of refinement (`humangs_jax/refinement/learned.py`) on avatars of the
+shipped network.
 
-Makes the samples first: people of training seeds that the shipped network has not seen, its avatar of each from four photos, and
-ten views, four of them those photos. A step draws samples and a number of photos for each, runs the iterations, and compares the
-result of each iteration with views that are not among the photos. Gradients pass through the iterations, but not through the
-errors that an iteration sees. Validation is on other people.
+Makes the samples first: people of training seeds that the shipped network has not seen, its avatar
+of each from four photos, and ten views, four of them those photos. A step draws samples and a
+number of photos for each, runs the iterations, and compares the result of each iteration with views
+that are not among the photos. Gradients pass through the iterations, but not through the errors
+that an iteration sees. Validation is on other people.
 """
 
 import dataclasses
@@ -81,8 +83,10 @@ class Refining:
     people: of the samples
     samples: to train on
     size: side of the views in pixels
-    off: millimetres that the bodies of half of the samples are off, see `refinement`; they are displaced to the masks
-    start: weights to start from, of all layers or some; default: a network that changes nothing; "shipped": the package's own
+    off: millimetres that the bodies of half of the samples are off, see `refinement`; they are
+    displaced to the masks
+    start: weights to start from, of all layers or some; default: a network that changes nothing;
+    "shipped": the package's own
     lpips: weight of LPIPS (AlexNet) in the loss; needs the extra `lpips`
     batch: samples in a step, a thread each
     """
@@ -103,7 +107,8 @@ class Refining:
 def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
     """Trains the learned update of refinement; the same command continues the run, Ctrl-C saves.
 
-    On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and three iterations.
+    On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and
+    three iterations.
 
     Options:
     out: folder of the samples, the state and the weights (refiner.safetensors)
@@ -126,11 +131,14 @@ def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
     train(folders, validation, out, options)
 
 
-# Samples ------------------------------------------------------------------------------------------------------------------
+# Samples
+# --------------------------------------------------------------------------------------------------
 
 
 def make_samples(out: Path, first: int, people: int, count: int, options: Refining) -> list[Path]:
-    """Folders with avatar.npz and views.npz, of the training seeds from `first` on; those that are there are kept."""
+    """Folders with avatar.npz and views.npz, of the training seeds from `first` on; those that are
+    there are kept.
+    """
     folders = [out / f"{i:05d}" for i in range(count)]
     missing = [folder for folder in folders if not (folder / "views.npz").is_file()]
     if not missing:
@@ -197,7 +205,8 @@ def read_sample(folder: Path) -> Sample:
     return Sample(avatar, start, views, graph_of(np.asarray(avatar.gaussians.means)))
 
 
-# Training -----------------------------------------------------------------------------------------------------------------
+# Training
+# --------------------------------------------------------------------------------------------------
 
 
 @functools.cache
@@ -230,7 +239,9 @@ def run_iterations(
 def through_iterations(
     variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any
 ) -> Any:
-    """Gradient with respect to the variables, from those with respect to the parameters after each iteration."""
+    """Gradient with respect to the variables, from those with respect to the parameters after each
+    iteration.
+    """
 
     def iterations(variables):
         values, hidden, after = start, jnp.zeros((len(start), Refiner.width)), []
@@ -277,7 +288,9 @@ def view_gradient() -> Any:
 def validate(
     variables: Any, folders: list[Path], iterations: int, perceptual: Any, splat: Any
 ) -> list[list[float]]:
-    """[PSNR, LPIPS] of views that are not among the photos, mean over samples, before and after each iteration."""
+    """[PSNR, LPIPS] of views that are not among the photos, mean over samples, before and after
+    each iteration.
+    """
     rows = []
     for folder in folders:
         sample = read_sample(folder)
@@ -305,7 +318,9 @@ def step_gradient(
     splat: Any,
     seed: tuple[int, int],
 ) -> Any:
-    """Gradient of one sample, which the seed chooses: a new view for each iteration, two for the last one."""
+    """Gradient of one sample, which the seed chooses: a new view for each iteration, two for the
+    last one.
+    """
     rng = np.random.default_rng(seed)
     sample = read_sample(folders[rng.integers(len(folders))])
     photos = int(rng.choice(COUNTS))

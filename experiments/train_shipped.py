@@ -1,16 +1,19 @@
-"""Train the network that comes with the package on synthetic people, from nothing to weights, in as many calls as it takes.
+"""Train the network that comes with the package on synthetic people, from nothing to weights, in as
+many calls as it takes.
 
-    python experiments/train_shipped.py --out runs/shipped --hours 2
-    python experiments/train_shipped.py --out runs/more --init-weights shipped --people 480 --start-share 0.5
+    python experiments/train_shipped.py --out runs/shipped --hours 2 python
+    experiments/train_shipped.py --out runs/more --init-weights shipped --people 480 --start-share
+    0.5
 
-The run is the preset `small` of training/config.py. Every setting is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
-Makes the people first: `--people` of the training seeds, rendered anew for every step, and 8 of the validation seeds. The same
-command continues the run in `--out`; Ctrl-C, SIGTERM and the end of `--hours` save. `--loss.lpips 0.1` adds LPIPS (AlexNet), with
-the extra `lpips`. The mean of the first and the trained weights is often better than both (Wortsman et al. 2022,
-https://arxiv.org/abs/2109.01903): `--start-share` writes it.
+The run is the preset `small` of training/config.py. Every setting is an option: `--steps 4000
+--optimizer.learning-rate 2e-4`. Makes the people first: `--people` of the training seeds, rendered
+anew for every step, and 8 of the validation seeds. The same command continues the run in `--out`;
+Ctrl-C, SIGTERM and the end of `--hours` save. `--loss.lpips 0.1` adds LPIPS (AlexNet), with the
+extra `lpips`. The mean of the first and the trained weights is often better than both (Wortsman et
+al. 2022, https://arxiv.org/abs/2109.01903): `--start-share` writes it.
 
-On 2 CPU cores: 2.6 s a person, then 1.2 s a step on an otherwise quiet machine. How the shipped weights came about is in
-humangs_jax/assets/weights.md.
+On 2 CPU cores: 2.6 s a person, then 1.2 s a step on an otherwise quiet machine. How the shipped
+weights came about is in humangs_jax/assets/weights.md.
 """
 
 import logging
@@ -49,9 +52,9 @@ def main(
     bank: Path | None = None,
     validation: Path | None = None,
     hours: float | None = None,
-    init_weights: Literal["shipped"]
-    | Path
-    | None = None,  # the word first: tyro takes the first type that fits
+    init_weights: (
+        Literal["shipped"] | Path | None
+    ) = None,  # the word first: tyro takes the first type that fits
     start_share: float = 0.0,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = small(),  # noqa: B008
 ) -> None:
@@ -61,19 +64,22 @@ def main(
         out: checkpoints, log, images and weights of the run.
         people: how many people of the training seeds; kept in out/people.npz.
         bank: people.npz of another run instead.
-        validation: folder of captures of other people, for validation; made in out/validation by default.
+        validation: folder of captures of other people, for validation; made in out/validation by
+            default.
         hours: save and end after so long; the same command goes on. Default: until the last step.
-        init_weights: start from these weights instead of fresh ones, of a network with the tensors of that of `config`;
-            "shipped": the package's own.
-        start_share: when the last step is done, also write out/mean.safetensors: this share of the first weights and the
-            rest of the trained ones.
+        init_weights: start from these weights instead of fresh ones, of a network with the tensors
+            of that of `config`; "shipped": the package's own.
+        start_share: when the last step is done, also write out/mean.safetensors: this share of the
+            first weights and the rest of the trained ones.
         config: the run.
 
-    Raises: ValueError for a share that is not in [0, 1), or without `init_weights`, and for weights of another network.
+    Raises: ValueError for a share that is not in [0, 1), or without `init_weights`, and for weights
+    of another network.
     """
     if not 0 <= start_share < 1 or (start_share and init_weights is None):
         raise ValueError(
-            f"start_share {start_share}: expected a number in [0, 1), and init_weights if it is not 0"
+            f"start_share {start_share}: expected a number in [0, 1), and init_weights if it is"
+            " not 0"
         )
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     if hours is not None:

@@ -1,4 +1,6 @@
-"""One step of training: settings, arguments, program, time, arithmetic and memory; and the curve of a run."""
+"""One step of training: settings, arguments, program, time, arithmetic and memory; and the curve of
+a run.
+"""
 
 import dataclasses
 import functools
@@ -41,7 +43,9 @@ from humangs_jax.training.step import seed_numbers, update
 
 
 def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -> Any:
-    """The `TrainConfig` of a preset for photos and targets of `size` pixels, numbers of views as given."""
+    """The `TrainConfig` of a preset for photos and targets of `size` pixels, numbers of views as
+    given.
+    """
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset}: expected one of {', '.join(PRESETS)}")
     config = PRESETS[preset]()
@@ -73,7 +77,9 @@ def random_weights(key: Any, slices: Any) -> Any:
 
 
 def random_networks(config: Any) -> Any:
-    """`LossNetworks` with made-up weights for the losses that need some: they cost what the real ones cost."""
+    """`LossNetworks` with made-up weights for the losses that need some: they cost what the real
+    ones cost.
+    """
     key = jax.random.key(0)
     perceptual = Vgg19(random_weights(key, VGG19)) if config.loss.perceptual else None
     lpips = None
@@ -85,7 +91,9 @@ def random_networks(config: Any) -> Any:
 
 
 def written_subject(folder: Path, config: Any, body: Any) -> Path:
-    """Writes the capture of a synthetic person with as many views as an example takes; its folder in `folder`."""
+    """Writes the capture of a synthetic person with as many views as an example takes; its folder
+    in `folder`.
+    """
     views = config.views.input_counts[0] + config.views.target_count
     write_person(
         folder / "person", 0, body, Layout(config.model.conventions.image_size, views=views)
@@ -104,11 +112,13 @@ CASES = {
 
 @entry
 def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: int = 3) -> None:
-    """Time, arithmetic and memory of one step of training, in turns with plain matrix products, which give the floor.
+    """Time, arithmetic and memory of one step of training, in turns with plain matrix products,
+    which give the floor.
 
-    A synthetic person is made and read by the loader; all weights are random, also those of loss networks. Operations are counted
-    from the traced step, loops included. The floor is the time that these operations take as plain products in the same turns.
-    `small` takes two minutes on 2 cores, `published` half an hour.
+    A synthetic person is made and read by the loader; all weights are random, also those of loss
+    networks. Operations are counted from the traced step, loops included. The floor is the time
+    that these operations take as plain products in the same turns. `small` takes two minutes on 2
+    cores, `published` half an hour.
 
     Options:
     only: of "small 256", "published 256", "published 512", "tiny 32"
@@ -210,7 +220,8 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     }
 
 
-# Many chips ----------------------------------------------------------------------------------------------------------
+# Many chips
+# --------------------------------------------------------------------------------------------------
 
 VARIANTS = {
     "kept": {},
@@ -220,7 +231,9 @@ VARIANTS = {
 }
 """What the backward pass finds of the blocks, and which patches become tokens."""
 FOREGROUND_SHARE = 0.22
-"""Room for foreground tokens: a person by the published protocol touches a fifth (docs/performance.md)."""
+"""Room for foreground tokens: a person by the published protocol touches a fifth
+(docs/performance.md).
+"""
 XLA_TOKENS = 8192
 PEAKS = {
     "TPU v5e: 197 TFLOP/s, 200 GB/s to other chips": (197, 200),
@@ -237,11 +250,13 @@ def training_cost(
     sizes: tuple[int, ...] = (256, 512),
     variants: tuple[str, ...] = ("kept", "recomputed", "foreground"),
 ) -> None:
-    """What a step of training costs on a mesh of many chips, one subject each, counted from the traced program.
+    """What a step of training costs on a mesh of many chips, one subject each, counted from the
+    traced program.
 
-    Counts what one chip does in one step, without the chips and without running anything: operations and what it sends, from the
-    step as it is written (XLA removes next to nothing of either). A minute each. Loss networks have made-up weights. The last
-    columns are these counts over numbers of data sheets.
+    Counts what one chip does in one step, without the chips and without running anything:
+    operations and what it sends, from the step as it is written (XLA removes next to nothing of
+    either). A minute each. Loss networks have made-up weights. The last columns are these counts
+    over numbers of data sheets.
 
     Options:
     sizes: of photos and targets, pixels
@@ -344,7 +359,8 @@ def as_variant(config: Any, variant: str) -> Any:
     return dataclasses.replace(with_model(config, **fields), microbatch_size=1)
 
 
-# The curve of a run --------------------------------------------------------------------------------------------------
+# The curve of a run
+# --------------------------------------------------------------------------------------------------
 
 SMOOTHING = 20
 """Log lines that a point of the smooth curves averages, at most a quarter of all."""
@@ -352,7 +368,8 @@ SMOOTHING = 20
 
 @entry
 def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.png")) -> None:
-    """Draws the curve of a training run from its log: loss, and PSNR of training views and of validation people.
+    """Draws the curve of a training run from its log: loss, and PSNR of training views and of
+    validation people.
 
     Options:
     logs: log.jsonl of a run, and of runs that continue it: their steps are added up
@@ -389,6 +406,12 @@ def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.
         for axis in (left, right):
             for number, begin in enumerate(begins, start=1):
                 axis.axvline(begin, color="black", lw=0.8, ls=":")
-                axis.annotate(f"run {number}", (begin, 1), (3, -10), fontsize=7, xycoords=("data", "axes fraction"),
-                              textcoords="offset points")  # fmt: skip
+                axis.annotate(
+                    f"run {number}",
+                    (begin, 1),
+                    (3, -10),
+                    fontsize=7,
+                    xycoords=("data", "axes fraction"),
+                    textcoords="offset points",
+                )
     run.show(f"{out}: {len(trained)} points, {len(validated)} validations")

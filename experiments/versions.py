@@ -1,4 +1,6 @@
-"""Speed of the package with several versions of Python and JAX, and with flags of XLA, on this machine."""
+"""Speed of the package with several versions of Python and JAX, and with flags of XLA, on this
+machine.
+"""
 
 import functools
 import json
@@ -14,7 +16,10 @@ FLAGS = {
     "": "",
     "matrix products by YNN": "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_DOT",
 }
-"""Name -> XLA_FLAGS that are compared. The default of jax 0.11 and 0.12 leaves the library YNNPACK out."""
+"""Name -> XLA_FLAGS that are compared.
+
+The default of jax 0.11 and 0.12 leaves the library YNNPACK out.
+"""
 MEASURED = {
     "render_ms": "image, CPU ms",
     "gradient_ms": "with gradients, CPU ms",
@@ -74,7 +79,10 @@ def versions(
 
 def _versions_of(python: str) -> str:
     """The versions of an interpreter and of its JAX, in words."""
-    code = "import platform, importlib.metadata as m; print(platform.python_version(), m.version('jax'))"
+    code = (
+        "import platform, importlib.metadata as m; print(platform.python_version(),"
+        " m.version('jax'))"
+    )
     done = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True)
     of_python, of_jax = done.stdout.split()
     return f"Python {of_python}, jax {of_jax}"

@@ -36,7 +36,8 @@ FIRST = 10
 
 @entry
 def video(run: Run, image: Path) -> None:
-    """A sheet of what options of `humangs animate` and `humangs render` give: the shipped person and walk, 2.5 m forward.
+    """A sheet of what options of `humangs animate` and `humangs render` give: the shipped person
+    and walk, 2.5 m forward.
 
     A row each: the camera follows, it stands still, its angles, backgrounds and poses, layers.
 

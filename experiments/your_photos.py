@@ -29,9 +29,11 @@ WIDTH = 1200
 
 @entry
 def your_photos(run: Run, out: Path, docs: bool = False) -> int:
-    """The figures of docs/your_photos.md: OUT/photos as a photographer has it, and what `humangs start` makes of it, OUT/me.
+    """The figures of docs/your_photos.md: OUT/photos as a photographer has it, and what `humangs
+    start` makes of it, OUT/me.
 
-    Images in a room, calibration.json of OpenCV, masks, keypoints as MMPose writes them (with 2 pixels of noise). Two minutes.
+    Images in a room, calibration.json of OpenCV, masks, keypoints as MMPose writes them (with 2
+    pixels of noise). Two minutes.
 
     Options:
     out: a new folder
@@ -50,7 +52,9 @@ def your_photos(run: Run, out: Path, docs: bool = False) -> int:
 
 
 def write_material(folder: Path, capture, points: np.ndarray) -> None:
-    """Photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs write them."""
+    """Photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs write
+    them.
+    """
     for name in ("images", "masks", "keypoints"):
         (folder / name).mkdir(parents=True)
     calibration = {}
@@ -78,7 +82,10 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
 
 
 def landmarks_in(capture, names: tuple[str, ...] | None = None) -> np.ndarray:
-    """Where points are in each photo, (v, k, 2) pixels; NaN for those that the body does not have. Default: COCO-WholeBody's."""
+    """Where points are in each photo, (v, k, 2) pixels; NaN for those that the body does not have.
+
+    Default: COCO-WholeBody's.
+    """
     model, betas = (
         landmark_model(capture.body, names or COCO_WHOLEBODY_133.names),
         jnp.asarray(capture.betas),

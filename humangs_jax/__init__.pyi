@@ -1,5 +1,8 @@
 # ruff: noqa: I001
-"""The public interface, in the order photos -> avatar -> image. This file is its only list: `__init__.py` imports from it."""
+"""The public interface, in the order photos -> avatar -> image.
+
+This file is its only list: `__init__.py` imports from it.
+"""
 
 # captures: photos, cameras, poses of one person
 from .data.capture import Capture as Capture

@@ -55,7 +55,9 @@ BONES = [
 
 
 def rest_frames(arms_down=0.0, turned=0.0):
-    """Our rest frame -> the file's, by joint: arms lowered, the world turned about y, both in degrees."""
+    """Our rest frame -> the file's, by joint: arms lowered, the world turned about y, both in
+    degrees.
+    """
     around, frames = Rotation.from_euler("y", turned, degrees=True), {}
     for name in JOINT_NAMES:
         arm = any(part in name for part in ("shoulder", "elbow", "wrist", *FINGERS))
@@ -65,7 +67,9 @@ def rest_frames(arms_down=0.0, turned=0.0):
 
 
 def frames_along_bones(rest, seed=0):
-    """LaFAN's: every bone lies along +x of its joint, twisted as it likes; joints without a bone are as their parents."""
+    """LaFAN's: every bone lies along +x of its joint, twisted as it likes; joints without a bone
+    are as their parents.
+    """
     rng, frames = np.random.default_rng(seed), {}
     children = dict(BONES)
     for name in JOINT_NAMES:
@@ -117,9 +121,10 @@ def write_bvh(
 ):
     """The text of a BVH file of a body with the joints `rest` (55, 3) in T-pose, in centimetres.
 
-    poses: (m, 55, 3). names: ours -> the file's; other joints are left out. frames_of: see above. moves: (m, 3), where the
-    pelvis is. up: a rotation of the whole world. pelvis: (m) rotations by which the pelvis's joint is turned as well; joints
-    at its place turn back: its children there, and for the others Carrier0 and so on.
+    poses: (m, 55, 3). names: ours -> the file's; other joints are left out. frames_of: see above.
+    moves: (m, 3), where the pelvis is. up: a rotation of the whole world. pelvis: (m) rotations by
+    which the pelvis's joint is turned as well; joints at its place turn back: its children there,
+    and for the others Carrier0 and so on.
     """
     frames_of = frames_of or rest_frames()
     moves = np.tile([0.1, 0.9, -0.2], (len(poses), 1)) if moves is None else moves

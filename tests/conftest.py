@@ -1,11 +1,14 @@
-"""Settings that every test shares: the compile cache, the switches of `.ci/run isa`, the shipped body.
+"""Settings that every test shares: the compile cache, the switches of `.ci/run isa`, the shipped
+body.
 
 Environment variables:
 
 JAX_COMPILATION_CACHE_DIR: where compiled programs are kept; default `cache_folder()`.
 HUMANGS_TOLERANCE_SCALE: factor on all float32 bounds, see rounding.py.
-JAX_DISABLE_MOST_OPTIMIZATIONS: default 1: most of the time of a run is compilation; 0: as users compile.
-HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `processes.CPU_COMPILER_OPTIONS` (wide vectors).
+JAX_DISABLE_MOST_OPTIMIZATIONS: default 1: most of the time of a run is compilation; 0: as users
+compile.
+HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `processes.CPU_COMPILER_OPTIONS` (wide
+vectors).
 """
 
 import contextlib
@@ -22,8 +25,9 @@ os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and importlib.metadata.version(
     "jaxlib"
 ).startswith("0.10."):
-    # the emitters make faster programs, but took more than a third of the CPU time of a run with an empty cache. XLA aborts at
-    # flags that it does not know, and other versions of jaxlib may not have this one
+    # the emitters make faster programs, but took more than a third of the CPU time of a run with an
+    # empty cache. XLA aborts at flags that it does not know, and other versions of jaxlib may not
+    # have this one
     os.environ["XLA_FLAGS"] = (
         f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
     )
@@ -47,7 +51,9 @@ settings.register_profile(
 settings.load_profile("humangs")
 
 MOST_MAPPINGS = 35_000
-"""Every compiled program maps memory, and Linux ends a process that has 65,530 mappings: XLA then aborts in mid-compilation."""
+"""Every compiled program maps memory, and Linux ends a process that has 65,530 mappings: XLA then
+aborts in mid-compilation.
+"""
 MAPPINGS = Path("/proc/self/maps")
 
 CACHE_BYTES = 1 << 30
@@ -55,7 +61,9 @@ CACHE_BYTES = 1 << 30
 
 
 def cache_folder() -> Path:
-    """Compiled programs of this jaxlib on this kind of processor, which JAX's own keys leave out."""
+    """Compiled programs of this jaxlib on this kind of processor, which JAX's own keys leave
+    out.
+    """
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     cpu = Path("/proc/cpuinfo")
     flags = (
@@ -85,12 +93,14 @@ def prune(folder: Path, size: int) -> None:
 
 
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    # workers, and the programs that tests start, inherit it: what one has compiled the others need not
+    # workers, and the programs that tests start, inherit it: what one has compiled the others need
+    # not
     folder = cache_folder()
     folder.mkdir(parents=True, exist_ok=True)
     prune(folder, CACHE_BYTES)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-    # of every program (default: those that took a second): measured, one operation is read in 15 ms and compiled in 68
+    # of every program (default: those that took a second): measured, one operation is read in 15 ms
+    # and compiled in 68
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 jax.config.update(
@@ -109,7 +119,10 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Keeps one slice of the tests. A test's slice hangs on its name alone, so that N runs see all."""
+    """Keeps one slice of the tests.
+
+    A test's slice hangs on its name alone, so that N runs see all.
+    """
     wish = config.getoption("--slice")
     if wish is None:
         return
@@ -137,7 +150,9 @@ def _forget_programs():
 
 @pytest.fixture(scope="session")
 def body():
-    """The body that comes with the package; modules that need another one have a fixture of this name."""
+    """The body that comes with the package; modules that need another one have a fixture of this
+    name.
+    """
     from humangs_jax.body.library import load_body
 
     return load_body()
@@ -160,7 +175,9 @@ def float64():
 
 @pytest.fixture(scope="session")
 def capture_folder(demo, tmp_path_factory):
-    """A copy of the shipped capture: with its four photos, so that the demo's programs are compiled once for both."""
+    """A copy of the shipped capture: with its four photos, so that the demo's programs are compiled
+    once for both.
+    """
     from humangs_jax.data.capture import save_capture
 
     path = tmp_path_factory.mktemp("captures") / "someone"

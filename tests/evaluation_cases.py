@@ -55,7 +55,9 @@ def capture_from(images, masks=None, frames=None, names=None) -> Capture:
 
 
 def random_views(seed, count, height=96, width=80):
-    """(predicted, truth, masks): a person of blocks on white, and the same with noise and shifted by a pixel."""
+    """(predicted, truth, masks): a person of blocks on white, and the same with noise and shifted
+    by a pixel.
+    """
     rng = np.random.default_rng(seed)
     mask = ellipse(height, width)
     blocks = np.kron(rng.random((count, height // 8, width // 8, 3)), np.ones((8, 8, 1)))

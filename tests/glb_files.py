@@ -22,7 +22,9 @@ def write_glb(
     titles=(),
     **more_of_file,
 ):
-    """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres and z up write it."""
+    """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres
+    and z up write it.
+    """
     writer, joints = GlbWriter(), [name for name in JOINT_NAMES if name in names]
     place = {name: i for i, name in enumerate(joints)}
     nodes, channels, samplers = [], [], []

@@ -6,7 +6,9 @@ CENTRE = "Hips Spine Chest UpperChest Neck Head"
 
 
 def renamed(limbs, form="{side}{limb}", **middle):
-    """Names of CMU's joints: of limbs by their part, whose sides are put into a form; others as given."""
+    """Names of CMU's joints: of limbs by their part, whose sides are put into a form; others as
+    given.
+    """
     parts = dict(
         zip(
             ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot"),

@@ -1,4 +1,6 @@
-"""Made-up motions of people on the floor and on their feet, y up, with contacts: what is on the floor stays where it is."""
+"""Made-up motions of people on the floor and on their feet, y up, with contacts: what is on the
+floor stays where it is.
+"""
 
 import functools
 
@@ -28,7 +30,9 @@ def _poses(root, **joints):
 
 
 def _on_the_floor(rotations):
-    """Translations with which the lowest joint is at 0 and stays where it is while it is the lowest."""
+    """Translations with which the lowest joint is at 0 and stays where it is while it is the
+    lowest.
+    """
     joints, moves = shipped_joints(), np.zeros((FRAMES, 3))
     places = joint_places(joints, rotations, moves)
     lowest = places[..., 1].argmin(axis=1)

@@ -55,7 +55,10 @@ def small(name: str) -> HumanGSConfig:
 
 
 def mapped_tube(config: HumanGSConfig):
-    """The tube, with some map of its surface; half of the texels show nothing. A real one takes seconds to compile."""
+    """The tube, with some map of its surface; half of the texels show nothing.
+
+    A real one takes seconds to compile.
+    """
     body, wanted = tube(), config.architecture.surface_map
     if wanted is None:
         return body

@@ -50,7 +50,9 @@ def test_every_command_explains_itself(command, humangs):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_a_switch_that_is_on_says_what_typing_it_does(command, humangs):
-    """`--no-x` is what can be typed: its line says what it does, and the field itself what the switch does."""
+    """`--no-x` is what can be typed: its line says what it does, and the field itself what the
+    switch does.
+    """
     _, out, _ = humangs(command, "--help")
     shown = " ".join(re.sub("[\u2500-\u257f]", " ", out).split())
     source = inspect.getsource(cli._command(command))
@@ -59,7 +61,8 @@ def test_the_help_of_a_switch_that_is_on_says_what_typing_it_does(command, human
             continue
         (off,) = [each.help for each in hint.__metadata__ if getattr(each, "help", None)]
         assert off.startswith("Do not ") and f"--no-{field.name.replace('_', '-')} {off}" in shown
-        (about,) = re.findall(rf'^    {field.name}: .*\n    """(.*)"""', source, re.MULTILINE)
+        written = rf'^    {field.name}: .*?\n    """(.*?)"""'
+        about = re.findall(written, source, re.MULTILINE | re.DOTALL)[0]
         assert not re.match(
             r"(do not|no|not|without|skip|take|leave|print)\b", about, re.IGNORECASE
         ), about
@@ -105,7 +108,9 @@ def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatc
 
 @pytest.mark.parametrize(("done", "code"), [(3, cli.INTERRUPTED), (5, 0)])
 def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, monkeypatch, capsys):
-    """Ctrl-C: `train` saves and raises, and the exit code tells that it was interrupted, unless all steps were done."""
+    """Ctrl-C: `train` saves and raises, and the exit code tells that it was interrupted, unless all
+    steps were done.
+    """
     from humangs_jax.training import loop, sources
 
     def interrupted(*arguments, **options):
@@ -134,7 +139,8 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
     assert (f"--weights {tmp_path / 'weights.safetensors'}" in out) == (code == 0)
 
 
-# What a command shows -------------------------------------------------------------------------------------------------
+# What a command shows
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -341,15 +347,16 @@ def test_a_reader_that_has_gone_ends_a_command_quietly():
 
 @pytest.mark.parametrize("verbose", [False, True])
 def test_what_libraries_say_stays_off_the_screen(verbose):
-    """Orbax's warnings go through absl's logger; errors in TensorStore's threads have nobody to report to. Ours are shown."""
+    """Orbax's warnings go through absl's logger; errors in TensorStore's threads have nobody to
+    report to. Ours are shown.
+    """
     code = (
-        f"from humangs_jax.cli.screen import silence; import logging, threading, warnings; silence({verbose})\n"
-        "logging.getLogger('absl').warning('theirs'); warnings.warn('theirs')\n"
-        "logging.getLogger('humangs_jax.training').warning('ours')\n"
-        "class Broken:\n"
-        "    def __init__(self, name): self.name = name\n"
-        "    def __del__(self): raise RuntimeError(self.name)\n"
-        "thread = threading.Thread(target=Broken, args=('theirs',)); thread.start(); thread.join(); Broken('ours')"
+        "from humangs_jax.cli.screen import silence; import logging, threading, warnings;"
+        f" silence({verbose})\nlogging.getLogger('absl').warning('theirs');"
+        " warnings.warn('theirs')\nlogging.getLogger('humangs_jax.training').warning('ours')\nclass"
+        " Broken:\n    def __init__(self, name): self.name = name\n    def __del__(self): raise"
+        " RuntimeError(self.name)\nthread = threading.Thread(target=Broken, args=('theirs',));"
+        " thread.start(); thread.join(); Broken('ours')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ("theirs" in done.stderr) == verbose and "RuntimeError: ours" in done.stderr, done.stderr
@@ -358,15 +365,14 @@ def test_what_libraries_say_stays_off_the_screen(verbose):
 
 def test_help_and_checks_of_places_import_nothing_heavy(tmp_path):
     code = (
-        "import sys; from humangs_jax import cli; print(cli.overview())\n"
-        "for words in (['reconstruct', 'x', '--out', 'a.zip'], ['refine', 'x', 'y', '--out', 'a.zip'],"
-        " ['check', 'x', '--out', 'a.npz'], ['convert', 'x', '--out', 'a.npz'], ['demo', '--size', '0'],"
-        " ['synth', '--workers', '0'],"
-        " ['fit', 'x', '--keypoints', 'k', '--out', '.'], ['import', 'cameras', 'c', '--images', 'i', '--out', '.'],"
-        " ['start', 'p', '--out', '.'], ['train', '--on-the-fly', '-1'], ['animate', 'x', '--out', 'a.txt'],"
-        " ['render', 'x', '--size', '0'], ['export', 'x', '--out', 'a.zip']):\n"
-        "    assert cli.execute(words) == cli.BAD_USAGE, words\n"
-        "assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
+        "import sys; from humangs_jax import cli; print(cli.overview())\nfor words in"
+        " (['reconstruct', 'x', '--out', 'a.zip'], ['refine', 'x', 'y', '--out', 'a.zip'],"
+        " ['check', 'x', '--out', 'a.npz'], ['convert', 'x', '--out', 'a.npz'], ['demo', '--size',"
+        " '0'], ['synth', '--workers', '0'], ['fit', 'x', '--keypoints', 'k', '--out', '.'],"
+        " ['import', 'cameras', 'c', '--images', 'i', '--out', '.'], ['start', 'p', '--out', '.'],"
+        " ['train', '--on-the-fly', '-1'], ['animate', 'x', '--out', 'a.txt'], ['render', 'x',"
+        " '--size', '0'], ['export', 'x', '--out', 'a.zip']):\n    assert cli.execute(words) =="
+        " cli.BAD_USAGE, words\nassert 'jax' not in sys.modules and 'numpy' not in sys.modules"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False

@@ -1,4 +1,6 @@
-"""Command lines that are refused: one line that names file and key, or the option, the exit code, and nothing is written."""
+"""Command lines that are refused: one line that names file and key, or the option, the exit code,
+and nothing is written.
+"""
 
 import dataclasses
 import json
@@ -86,7 +88,9 @@ BAD_DATA = {
     "animate three.npz": "rotations: expected 3 joints, got 55",
     "animate three.npz --motion steps.npz --loop 250000000": "steps.npz: 1,000,000,000 frames",
     "render me.npz --views 1000000000": "the limit frames is 250,000",
-    "render three.npz --capture demo_capture": "the capture's poses have 55 joints, the avatar has 3",
+    "render three.npz --capture demo_capture": (
+        "the capture's poses have 55 joints, the avatar has 3"
+    ),
     "render file.ksplat": "file.ksplat: no such file",
     "animate me.npz --camera no.json": "no.json: no such file",
     "render me.npz --camera no.json": "no.json: no such file",
@@ -128,10 +132,18 @@ BAD_USAGE = {
     "render me.npz --capture demo_capture --views 3": "--views: not with --capture",
     "render me.npz --capture demo_capture --pose a": "--pose: not with --capture",
     "render me.npz --capture demo_capture --out b.mp4": "--out b.mp4: expected a folder",
-    "render me.npz --camera c.json --capture someone": "--camera: not with --capture, which has cameras and poses of its own",
-    "render me.npz --camera c.json --views 3": "--views: not with --camera, which has cameras of its own",
-    "render splats.ply --camera c.json --azimuth 3": "--azimuth: not with --camera, which has cameras of its own",
-    "animate me.npz --camera c.json --fov 40": "--fov: not with --camera, which has cameras of its own",
+    "render me.npz --camera c.json --capture someone": (
+        "--camera: not with --capture, which has cameras and poses of its own"
+    ),
+    "render me.npz --camera c.json --views 3": (
+        "--views: not with --camera, which has cameras of its own"
+    ),
+    "render splats.ply --camera c.json --azimuth 3": (
+        "--azimuth: not with --camera, which has cameras of its own"
+    ),
+    "animate me.npz --camera c.json --fov 40": (
+        "--fov: not with --camera, which has cameras of its own"
+    ),
     "animate me.npz --camera c.json --turn 40": "--turn: not with --camera",
     "animate me.npz --camera c.json --no-follow": "--no-follow: not with --camera",
     "render me.npz --capture demo_capture --height 64": "--height: not with --capture",
@@ -140,35 +152,58 @@ BAD_USAGE = {
     "render me.npz --preset best --config x.json": "does not go with --preset best",
     "animate": "AVATAR is missing, as in `humangs animate avatar.npz",
     "start": "PHOTOS and --out PATH are missing, as in `humangs start photos --out me",
-    "import cameras": "SOURCE, --images PATH and --out PATH are missing, as in `humangs import cameras ",
+    "import cameras": (
+        "SOURCE, --images PATH and --out PATH are missing, as in `humangs import cameras "
+    ),
     "animate me.npz three.npz": "three.npz: not expected here, as in `humangs animate avatar.npz",
     "animate me.npz --size abc": "--size abc: expected a whole number, such as --size 512",
     "animate me.npz --size": "--size: expected a whole number after it",
     "animate me.npz --turn=much": "--turn much: expected a number, such as --turn 0.0",
     "render me.npz --views 2.5": "--views 2.5: expected a whole number",
     "reconstruct someone --views some": "--views some: expected a whole number or auto",
-    "demo --preset qualty": "--preset qualty: expected one of realtime, balanced, quality or best: did you mean quality?",
+    "demo --preset qualty": (
+        "--preset qualty: expected one of realtime, balanced, quality or best: did you mean"
+        " quality?"
+    ),
     "export me.npz --up x": "--up x: expected one of y, -y or z",
-    "import cameras c --images i --out new --up -y": "--up: expected a value after it, as in --up=-y",
-    "preprocess thumam in --out x --body b.npz": "KIND thumam: expected one of thuman, thuman4, avatarrex,",
+    "import cameras c --images i --out new --up -y": (
+        "--up: expected a value after it, as in --up=-y"
+    ),
+    "preprocess thumam in --out x --body b.npz": (
+        "KIND thumam: expected one of thuman, thuman4, avatarrex,"
+    ),
     "tune someone": "--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them",
     "tune someone --frame-ms -1": "--frame-ms -1.0: expected a positive number",
     "tune someone --frame-ms 9 --out tuned.txt": "--out tuned.txt: expected a name ending in .json",
     "convert file --out w.npz": "--out w.npz: expected a name ending in .safetensors",
-    "convert file --losses weights.safetensors": "--losses weights.safetensors: the same file as --out",
-    "evaluate someone --predictions someone/images --latex a.html": "--latex a.html: expected a name ending in .tex",
-    "evaluate someone --predictions someone/images --lpips-alex a b c": "--lpips-alex: expected a backbone",
+    "convert file --losses weights.safetensors": (
+        "--losses weights.safetensors: the same file as --out"
+    ),
+    "evaluate someone --predictions someone/images --latex a.html": (
+        "--latex a.html: expected a name ending in .tex"
+    ),
+    "evaluate someone --predictions someone/images --lpips-alex a b c": (
+        "--lpips-alex: expected a backbone"
+    ),
     "view me.npz --port 99999": "--port 99999",
     "view me.npz --capture demo_capture": "--capture: only with --live",
     "export me.npz --out x.ply --frame 1": "--frame 1: expected --motion and --out",
-    "export me.npz --html x.html --motion jump.npz --frames :": "--frames :: expected --motion and --out",
-    "export me.npz --out x.ply --motion jump.npz --frame 1 --frames :": "--frame 1: does not go with --frames",
-    "export me.npz --out x.glb --mesh --motion jump.npz --frame 1": "a file that holds the whole motion",
+    "export me.npz --html x.html --motion jump.npz --frames :": (
+        "--frames :: expected --motion and --out"
+    ),
+    "export me.npz --out x.ply --motion jump.npz --frame 1 --frames :": (
+        "--frame 1: does not go with --frames"
+    ),
+    "export me.npz --out x.glb --mesh --motion jump.npz --frame 1": (
+        "a file that holds the whole motion"
+    ),
     "export me.npz --out x.ply --mesh": "expected a name ending in .glb or .obj",
     "export me.npz --out x.sog": "expected a name ending in .ply, .splat, .spz, .glb or .obj",
     "export me.npz --out x.ply --motion jump.npz --frame 9": "--frame 9: jump.npz has 4 frames",
     "export me.npz --out x.spz --rest": "--rest: x.spz has no such fields",
-    "export me.npz --out x.ply --spz-version 4": "--spz-version 4: expected a name of --out that ends in .spz",
+    "export me.npz --out x.ply --spz-version 4": (
+        "--spz-version 4: expected a name of --out that ends in .spz"
+    ),
     "preprocess thuman in --out x --body b.npz --views 0": "--views 0",
     "demo --refine inf": "--refine 'inf': expected how long",
     "synth --workers 0": "--workers 0: expected at least 1",
@@ -196,10 +231,14 @@ BAD_USAGE = {
             ),
         )
     },
-    "fit --scan broken/me.obj --out broken --overwrite": "broken/me.obj lies in it and would be deleted",
+    "fit --scan broken/me.obj --out broken --overwrite": (
+        "broken/me.obj lies in it and would be deleted"
+    ),
     "fit --scan me.obj --out someone --overwrite": "the folder holds no scan_fit.json",
     f"{FIT} --out some --overwrite": "the folder holds no capture.json",
-    "fit someone --keypoints k --body broken/b.npz --out broken --overwrite": "broken/b.npz lies in it and would be deleted",
+    "fit someone --keypoints k --body broken/b.npz --out broken --overwrite": (
+        "broken/b.npz lies in it and would be deleted"
+    ),
     "fit": "give either a CAPTURE folder or --scan MESH",
     "fit someone --scan scan.obj": "give either a CAPTURE folder or --scan MESH",
     "fit someone": "body.npz exists: --overwrite replaces it",

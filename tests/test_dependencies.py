@@ -1,4 +1,6 @@
-"""pyproject.toml declares what the package and its tests import, and no dependency that the package does not import."""
+"""pyproject.toml declares what the package and its tests import, and no dependency that the package
+does not import.
+"""
 
 import re
 import sys

@@ -1,4 +1,6 @@
-"""Every `humangs` and `python` line of README, docs and notebooks is one that the real parser takes; quick ones are run."""
+"""Every `humangs` and `python` line of README, docs and notebooks is one that the real parser
+takes; quick ones are run.
+"""
 
 import contextlib
 import importlib
@@ -42,8 +44,8 @@ PROGRAM = re.compile(r"(?:.*/)?(humangs|python3?)$")
 
 
 class Command(NamedTuple):
-    """words: without prompt and program before it, placeholders as they stand. whole: of a block, or the beginning of an item of
-    a list; others may lack arguments.
+    """words: without prompt and program before it, placeholders as they stand. whole: of a block,
+    or the beginning of an item of a list; others may lack arguments.
     """
 
     page: str
@@ -88,8 +90,9 @@ def commands_in(text, page):
 
 
 def split_shell(text):
-    """The commands of `humangs` and `python` in lines of a shell: continued lines, comments, prompts, `a && b`, `X=1 a`, what a
-    launcher (srun) starts, and what stands in quotes after one (ssh --command "a").
+    """The commands of `humangs` and `python` in lines of a shell: continued lines, comments,
+    prompts, `a && b`, `X=1 a`, what a launcher (srun) starts, and what stands in quotes after one
+    (ssh --command "a").
     """
     text = re.sub(r"\\\n[ \t]*", " ", text)
     found = []
@@ -111,7 +114,9 @@ def split_shell(text):
 
 
 def of_one(words):
-    """The command among the words of one line of a shell: none, one, or those in a quoted argument."""
+    """The command among the words of one line of a shell: none, one, or those in a quoted
+    argument.
+    """
     for i, word in enumerate(words):
         if match := PROGRAM.fullmatch(word):
             return [(match[1].replace("python3", "python"), *words[i + 1 :])]
@@ -121,12 +126,15 @@ def of_one(words):
 
 
 def filled(words):
-    """Optional parts as if they were given, the first of several values, and 1 for what is in capitals or is a variable."""
+    """Optional parts as if they were given, the first of several values, and 1 for what is in
+    capitals or is a variable.
+    """
     words = [word.strip("[]").split("|")[0] for word in words if word not in ("...", "…")]
     return [re.sub(r"\$\{?\w+\}?|(?<![\w.])[A-Z][A-Z_]*(?![\w.])", "1", word) for word in words]
 
 
-# The tests ----------------------------------------------------------------------------------------------------------------
+# The tests
+# --------------------------------------------------------------------------------------------------
 
 
 COMMANDS = [command for page in PAGES for command in commands_of(page)]
@@ -154,7 +162,9 @@ SLOW = (
 
 
 def refused(command):
-    """None, or why a line of a page cannot be typed: what the parser says; of a span, a name or an option that does not exist."""
+    """None, or why a line of a page cannot be typed: what the parser says; of a span, a name or an
+    option that does not exist.
+    """
     name, *words = filled(command.words[1:])
     if not command.whole:
         if name not in cli.COMMANDS:
@@ -239,7 +249,10 @@ def test_lines_of_a_shell_are_read_as_a_shell_reads_them(text, expected):
 
 
 def test_blocks_and_beginnings_of_items_are_whole_and_other_spans_are_not():
-    text = "See `humangs fit\nme --scan S`.\n```sh\nhumangs fit me\n```\n```python\nhumangs = 1\n```\n~~~\nhumangs view x\n~~~\n"
+    text = (
+        "See `humangs fit\nme --scan S`.\n```sh\nhumangs fit me\n```\n```python\nhumangs ="
+        " 1\n```\n~~~\nhumangs view x\n~~~\n"
+    )
     found = commands_in(text + "- `humangs check me`, `humangs tune`\n", "page")
     assert found == [
         Command("page", ("humangs", "fit", "me"), True),

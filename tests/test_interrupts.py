@@ -1,6 +1,7 @@
 """Ctrl-C: exit code 130, one line, and nothing half-written, whatever the process is doing.
 
-Random moments of every command that writes are tried by tests/hostile/kills.py. `train` has its own handler (tests/training).
+Random moments of every command that writes are tried by tests/hostile/kills.py. `train` has its own
+handler (tests/training).
 """
 
 import os
@@ -21,8 +22,8 @@ pytestmark = pytest.mark.skipif(
     not hasattr(signal, "setitimer"), reason="needs Linux's or macOS's signals"
 )
 START = (
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL); "
-    "from humangs_jax import cli; "
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+    " signal.signal(signal.SIGHUP, signal.SIG_DFL); from humangs_jax import cli; "
 )
 """Shells start what runs in the background without the usual handlers."""
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
@@ -55,7 +56,10 @@ def interrupted(program, number=signal.SIGINT):
 
 @pytest.mark.slow
 def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
-    """As in a compilation: a long call into C, which gives Python no turn. What it was writing goes, too."""
+    """As in a compilation: a long call into C, which gives Python no turn.
+
+    What it was writing goes, too.
+    """
     writing = """
         import hashlib
         from humangs_jax.io import atomic
@@ -147,9 +151,9 @@ def test_an_interrupt_after_the_work_is_done_changes_nothing(code):
 def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
     """Extensions that are interrupted while they begin crash or raise ImportError."""
     (tmp_path / "slow_to_import.py").write_text(
-        "import signal, time; signal.raise_signal(signal.SIGINT)\n"
-        "try:\n    time.sleep(0.2)\nexcept BaseException as error:\n    raise ImportError('half-imported') from error\n"
-        "print('imported', flush=True)\n"
+        "import signal, time; signal.raise_signal(signal.SIGINT)\ntry:\n    time.sleep(0.2)\nexcept"
+        " BaseException as error:\n    raise ImportError('half-imported') from"
+        " error\nprint('imported', flush=True)\n"
     )
     path = os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])
     program = process(
@@ -160,7 +164,8 @@ def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
     assert (program.returncode, out) == (cli.INTERRUPTED, "imported\n"), error
 
 
-# Real commands, at moments of a run ----------------------------------------------------------------------------------
+# Real commands, at moments of a run
+# ----------------------------------------------------------------------------------
 
 
 WORKS = {

@@ -2,10 +2,13 @@
 
 What a notebook keeps to, so that these tests can look:
 
-- A number in digits in the prose stands in an output of the notebook or in its code. With a unit it is a result: it
-  stands with that unit in an output. "Some", "about" allow zeros at its end. Results are not written in words ("two fifths").
-- The first cell ends with how long the notebook takes, a key of `DURATIONS`; the last output has the seconds.
-- Pictures of people are drawn by `pictures`, which frames each in `FRAME`: the whole person lies inside of the frame.
+- A number in digits in the prose stands in an output of the notebook or in its code. With a unit it
+  is a result: it stands with that unit in an output. "Some", "about" allow zeros at its end.
+  Results are not written in words ("two fifths").
+- The first cell ends with how long the notebook takes, a key of `DURATIONS`; the last output has
+  the seconds.
+- Pictures of people are drawn by `pictures`, which frames each in `FRAME`: the whole person lies
+  inside of the frame.
 - What it reads of docs/ is part of the package.
 """
 
@@ -29,19 +32,23 @@ MOST_BYTES = 1_500_000
 UNITS = ("dB", "%", "MiB", "MB", "ms", "s", "mm", "m", "times")
 NUMBER = r"\d{1,3}(?:,\d{3})+|\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 STATED = re.compile(
-    rf"(?:\b(some|about) +)?(?<![\w.,/^])({NUMBER})(?![\w/]|[.,]\d)(?: ?({'|'.join(UNITS)})(?![\w^]))?",
+    rf"(?:\b(some|about) +)?(?<![\w.,/^])({NUMBER})(?![\w/]|[.,]\d)(?:"
+    rf" ?({'|'.join(UNITS)})(?![\w^]))?",
     re.I,
 )
 IN_WORDS = re.compile(
     r"\b(halves|thirds|quarters?|fifths|sixths|eighths|tenths|twice|thrice|percent|half (?:of|as)|"
-    r"a (?:half|third|fifth|tenth) of|(?:two|three|four|five|six|seven|eight|nine|ten|twenty|hundred|thousand) times)\b",
+    r"a (?:half|third|fifth|tenth)"
+    r" of|(?:two|three|four|five|six|seven|eight|nine|ten|twenty|hundred|thousand) times)\b",
     re.IGNORECASE,
 )
 DURATIONS = {
     "About a minute on a CPU with two cores.": (20, 140),
     "A few minutes on a CPU with two cores.": (60, 600),
 }
-"""Seconds of CPU time, between which the committed run lies: two cores take between one and half of them."""
+"""Seconds of CPU time, between which the committed run lies: two cores take between one and half of
+them.
+"""
 
 PICTURES = {
     "ablations": 3,
@@ -60,7 +67,9 @@ PICTURES = {
 FRAME, SMALLEST = 204, 40
 """Grey level of a frame; its least side, pixels."""
 BACKGROUND, BORDER = 24, 60
-"""Grey levels by which a person differs from the background at least; at the border more, where filters may blur a foot."""
+"""Grey levels by which a person differs from the background at least; at the border more, where
+filters may blur a foot.
+"""
 LEAST, MOST = 0.01, 0.7
 """Share of a picture that a person covers."""
 

@@ -8,13 +8,18 @@ from pathlib import Path
 from experiments.count import GENERATED, written
 from experiments.results import REPOSITORY
 
-TERMS = "rounds of the learned|on the person(?!')|fog|painted body|yardstick|unseen poses|new views|psnr_mask|psnr_foreground"
+TERMS = (
+    "rounds of the learned|on the person(?!')|fog|painted body|yardstick|unseen poses|new"
+    " views|psnr_mask|psnr_foreground"
+)
 DIALECT = re.compile(rf"\b({TERMS}|colour\w*)\b")
 """Words that the field does not use."""
 
 
 def broken_links(root: Path, name: str) -> list[str]:
-    """Links of a page or notebook to files and headings that are not there; addresses are not looked up."""
+    """Links of a page or notebook to files and headings that are not there; addresses are not
+    looked up.
+    """
     text = (root / name).read_text()
     if name.endswith(".ipynb"):
         text = "\n\n".join(
@@ -50,7 +55,10 @@ def headings(text: str) -> set[str]:
 
 def test_broken_links_are_found(tmp_path):
     (tmp_path / "b.md").write_text("# B\n## One, two: `three`\n```\n# no heading\n```\n")
-    page = "[a](b.md) [b](b.md#one-two-three) [c](#here) [d](https://x.y/z) `[e](no.md)`\n```\n[f](no.md)\n```\n# Here\n"
+    page = (
+        "[a](b.md) [b](b.md#one-two-three) [c](#here) [d](https://x.y/z)"
+        " `[e](no.md)`\n```\n[f](no.md)\n```\n# Here\n"
+    )
     wrong = ["gone.md", "b.md#no-heading", "#there"]
     (tmp_path / "a.md").write_text(page + " ".join(f"[x]({target})" for target in wrong))
     cell = {"cell_type": "markdown", "source": ["[a](b.md) [b](gone.png)"]}

@@ -67,7 +67,9 @@ def pointers(path: Path) -> list[str]:
 
 @functools.cache
 def namespaces() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
-    """Names in each module or package, by the last parts of its path; attributes of each class, by its name."""
+    """Names in each module or package, by the last parts of its path; attributes of each class, by
+    its name.
+    """
     modules: dict[str, set[str]] = {}
     classes: dict[str, set[str]] = {}
     bases: dict[str, set[str]] = {}
@@ -143,7 +145,8 @@ def of_others() -> set[str]:
 
 
 def points_nowhere(name: str) -> bool:
-    """Whether a dotted name begins with a module or class of ours and goes on with what that does not have.
+    """Whether a dotted name begins with a module or class of ours and goes on with what that does
+    not have.
 
     Or with a module that is gone, and goes on with what another one has.
     """
@@ -157,7 +160,8 @@ def points_nowhere(name: str) -> bool:
         return False
     if first in classes:
         return not {rest[0], "*"} & classes[first]
-    # a word may also stand for an object of a class of that name: camera.K, capture.poses, config.max_pairs
+    # a word may also stand for an object of a class of that name: camera.K, capture.poses,
+    # config.max_pairs
     if any(
         rest[0] in attributes
         for owner, attributes in classes.items()

@@ -21,7 +21,10 @@ def test_other_names_are_refused():
 
 
 def test_importing_the_package_imports_nothing_heavy():
-    code = "import sys, humangs_jax; print([name for name in ('jax', 'numpy', 'flax') if name in sys.modules])"
+    code = (
+        "import sys, humangs_jax; print([name for name in ('jax', 'numpy', 'flax') if name in"
+        " sys.modules])"
+    )
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True

@@ -1,14 +1,17 @@
-"""What the experiments of the paper share: the variants that are trained, how a run goes and is scored, printed numbers.
+"""What the experiments of the paper share: the variants that are trained, how a run goes and is
+scored, printed numbers.
 
-The reference is the paper's own network, narrower and with fewer layers. Every variant differs from it in what its name says,
-sees the same people, views and targets in the same order, has the same losses and learning rate, and is compared on the same
-views of the same unseen people.
+The reference is the paper's own network, narrower and with fewer layers. Every variant differs from
+it in what its name says, sees the same people, views and targets in the same order, has the same
+losses and learning rate, and is compared on the same views of the same unseen people.
 
-A run goes in rounds of `ROUND` steps with the squared error and the tightness of the paper, each with a learning rate that ends
-at 0, until it is `MARGIN` above the vertex-color baseline in the foreground of the validation people; or above it, and a round
-has gained less than `FLAT`; or `MOST_ROUNDS` are done, and it is not trained. Then comes a quarter of a round with the perceptual
-loss, too: what falls below the vertex colors there is not trained either. So all that learn fast have the same number of steps.
-People are plain (`people.py`): on richer ones the systems that attend to photos show grey bodies after as many steps.
+A run goes in rounds of `ROUND` steps with the squared error and the tightness of the paper, each
+with a learning rate that ends at 0, until it is `MARGIN` above the vertex-color baseline in the
+foreground of the validation people; or above it, and a round has gained less than `FLAT`; or
+`MOST_ROUNDS` are done, and it is not trained. Then comes a quarter of a round with the perceptual
+loss, too: what falls below the vertex colors there is not trained either. So all that learn fast
+have the same number of steps. People are plain (`people.py`): on richer ones the systems that
+attend to photos show grey bodies after as many steps.
 """
 
 import dataclasses
@@ -81,7 +84,9 @@ NOT_TRAINED = "not trained"
 
 
 class Variant(NamedTuple):
-    """photos: that it is trained with. about: what it tests; "": a system. fields: of its `TrainConfig`."""
+    """photos: that it is trained with. about: what it tests; "": a system. fields: of its
+    `TrainConfig`.
+    """
 
     model: HumanGSConfig
     photos: int = PHOTOS
@@ -151,7 +156,9 @@ def configuration(variant: Variant, seed: int, steps: int, perceptual: bool = Fa
 
 
 def tests_of(name: str, variant: Variant) -> tuple[str, ...]:
-    """What a variant is scored with: numbers of photos, "near" those of nearer cameras; several only where claims need them."""
+    """What a variant is scored with: numbers of photos, "near" those of nearer cameras; several
+    only where claims need them.
+    """
     if variant.photos == 1:
         return ("1",)
     several = name in (REFERENCE, "no global token", *SYSTEMS) and name not in ADDED
@@ -163,16 +170,22 @@ def tests_of(name: str, variant: Variant) -> tuple[str, ...]:
     return *(COUNTS if several else (str(PHOTOS),)), *near
 
 
-# One run ------------------------------------------------------------------------------------------------------------------
+# One run
+# --------------------------------------------------------------------------------------------------
 
 
 def enough(curve: list[float], painted: float) -> bool:
-    """Whether a run needs no more rounds. curve: foreground PSNR of the validation people after each; that of vertex colors."""
+    """Whether a run needs no more rounds. curve: foreground PSNR of the validation people after
+    each; that of vertex colors.
+    """
     return len(curve) >= MOST_ROUNDS or meets(curve, painted)
 
 
 def meets(curve: list[float], painted: float) -> bool:
-    """Whether a run is trained: `MARGIN` above the vertex colors, or above them and flat. Below networks stay white for long."""
+    """Whether a run is trained: `MARGIN` above the vertex colors, or above them and flat.
+
+    Below networks stay white for long.
+    """
     flat = len(curve) > 1 and painted < curve[-1] < max(curve[:-1]) + FLAT
     return flat or bool(curve and curve[-1] >= painted + MARGIN)
 
@@ -186,10 +199,11 @@ def train_run(
     painted: float,
     round_steps: int = ROUND,
 ) -> dict[str, Any] | None:
-    """The row of a run after one more round in the folder `out`; None if it was interrupted, and goes on there.
+    """The row of a run after one more round in the folder `out`; None if it was interrupted, and
+    goes on there.
 
-    people: folders `train` and `validation` of `people.write_plain`. row: after the rounds before, {} at first. painted: what
-    the vertex colors reach.
+    people: folders `train` and `validation` of `people.write_plain`. row: after the rounds before,
+    {} at first. painted: what the vertex colors reach.
     """
     curve, body, networks = row.get("curve", []), load_body(), load_loss_networks(installed=True)
     number, perceptual = len(curve), enough(curve, painted)
@@ -252,13 +266,17 @@ def network(variables: Any, model: HumanGSConfig) -> Method:
 
 
 def painted(case: Any, background: float) -> Predicted:
-    """The vertex-color baseline: vertices have the mean colors of the photos that see them, grey where none does."""
+    """The vertex-color baseline: vertices have the mean colors of the photos that see them, grey
+    where none does.
+    """
     images = draw_painted_body(painted_body(case.inputs), case.truth)
     return Predicted(np.clip(images, 0, 1), None, tuple(range(len(images))))
 
 
 def tested(method: Method, people: Path, count: int, moves: bool = True) -> dict[str, Any]:
-    """Task -> score -> a number a person, of the people of a folder with held_out/, from `count` photos."""
+    """Task -> score -> a number a person, of the people of a folder with held_out/, from `count`
+    photos.
+    """
     rows = evaluate(people, method=method, inputs=count, protocol=PROTOCOL).rows
     found = {}
     for task, first in zip(TASKS, (True, False), strict=True):
@@ -271,11 +289,14 @@ def tested(method: Method, people: Path, count: int, moves: bool = True) -> dict
     return found
 
 
-# Differences --------------------------------------------------------------------------------------------------------------
+# Differences
+# --------------------------------------------------------------------------------------------------
 
 
 class Difference(NamedTuple):
-    """mean; half: of the 95 % interval, None where there is no second seed; seeds: of both; people."""
+    """mean; half: of the 95 % interval, None where there is no second seed; seeds: of both;
+    people.
+    """
 
     mean: float
     half: float | None
@@ -299,8 +320,9 @@ def difference(
 ) -> Difference:
     """Of two variants, each (name, photos, see `tests_of`), over the same people.
 
-    Its variance is that over people of the paired differences, and that of seeds, which is pooled over all variants with several;
-    Student's t with the degrees of freedom of Welch and Satterthwaite.
+    Its variance is that over people of the paired differences, and that of seeds, which is pooled
+    over all variants with several; Student's t with the degrees of freedom of Welch and
+    Satterthwaite.
     """
     values = lambda name, photos: np.asarray(
         [x["scores"][str(photos)][task][score] for x in finished(runs, name)]
@@ -344,7 +366,8 @@ def headline(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_trained(row: Mapping[str, Any], painted: float) -> bool:
-    """Whether a run is done, meets the criterion, and is above the vertex colors after its perceptual steps, too.
+    """Whether a run is done, meets the criterion, and is above the vertex colors after its
+    perceptual steps, too.
 
     painted: foreground PSNR of the vertex-color baseline, dB.
     """
@@ -373,7 +396,8 @@ def results(name: str) -> Any:
     return json.loads((PAGE.parent / "results" / f"{name}.json").read_text())["numbers"]
 
 
-# Trained systems --------------------------------------------------------------------------------------------------------
+# Trained systems
+# --------------------------------------------------------------------------------------------------
 
 
 def folder_of(name: str) -> str:
@@ -386,7 +410,9 @@ def last_weights(run: Path) -> Path:
 
 
 def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple[Any, float, float]:
-    """What a system shows of a `Case`, as `Predicted`; seconds to model, 0 if it runs for each target, and to draw all views."""
+    """What a system shows of a `Case`, as `Predicted`; seconds to model, 0 if it runs for each
+    target, and to draw all views.
+    """
     start = modelled = time.perf_counter()
     if (driver := weights[1].architecture.driver) is not None:
         images, alpha = driver.show(*weights, case.inputs, case.truth, background)

@@ -1,7 +1,8 @@
 """A checkpoint of the published network on stored inputs: every stage against the stored numbers.
 
-A blended transform is no rotation, and the quaternion that the release makes of it jumps where two of its four candidates
-tie. Where ours tie to within the bound, the nearer one counts: rounding decides there, in the release as here.
+A blended transform is no rotation, and the quaternion that the release makes of it jumps where two
+of its four candidates tie. Where ours tie to within the bound, the nearer one counts: rounding
+decides there, in the release as here.
 """
 
 from pathlib import Path
@@ -64,7 +65,9 @@ MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
 
 
 def load_arrays(path: Path) -> dict[str, Any]:
-    """The arrays of a file, inputs checked: all there, finite, and of shapes that fit each other."""
+    """The arrays of a file, inputs checked: all there, finite, and of shapes that fit each
+    other.
+    """
     arrays = read_npz(path)[0]
     sizes: dict[str, int] = {}
     for name, axes in INPUTS.items():
@@ -103,7 +106,8 @@ def read_release_config(path: Path) -> dict[str, Any]:
     }
     if found.get("training.use_canonical_maps"):
         raise ValueError(
-            f"{path}: training.use_canonical_maps: the variant with canonical target maps is not supported"
+            f"{path}: training.use_canonical_maps: the variant with canonical target maps is not"
+            " supported"
         )
     if (height := found.get("training.target_height")) not in (None, 1.8):
         raise ValueError(f"{path}: training.target_height must be 1.8, got {height!r}")
@@ -113,7 +117,10 @@ def read_release_config(path: Path) -> dict[str, Any]:
 def complete_config(
     config: HumanGSConfig, release: dict[str, Any], dtype: str, image_size: int
 ) -> HumanGSConfig:
-    """A checkpoint's configuration with what the release's one adds to it. Raises: ValueError where they do not agree."""
+    """A checkpoint's configuration with what the release's one adds to it.
+
+    Raises: ValueError where they do not agree.
+    """
     encoder, _, decoder = paper_parts(config.architecture)
     transformer = encoder.transformer
     found = {
@@ -132,7 +139,8 @@ def complete_config(
     for name, value in found.items():
         if release.get(name) not in (None, value):
             raise ValueError(
-                f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the checkpoint"
+                f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the"
+                " checkpoint"
             )
     tight, free = (
         release.get(f"vertex_decoder.num_{kind}_gaussians") for kind in ("tight", "free")
@@ -140,8 +148,8 @@ def complete_config(
     if tight is not None and free is not None:
         if tight + free != decoder.gaussians_per_vertex:
             raise ValueError(
-                f"model.vertex_decoder: {tight} tight and {free} free Gaussians in the configuration, but "
-                f"{decoder.gaussians_per_vertex} a vertex in the checkpoint"
+                f"model.vertex_decoder: {tight} tight and {free} free Gaussians in the"
+                f" configuration, but {decoder.gaussians_per_vertex} a vertex in the checkpoint"
             )
         decoder = decoder.clone(tight=tight, free=free)
     pool = "visible" if release.get("transformer.project_all_vertices") is False else "all"
@@ -150,7 +158,9 @@ def complete_config(
 
 
 def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
-    """The network's inputs of one subject, and its skinning weights (n, j) and joint transforms (j, 4, 4)."""
+    """The network's inputs of one subject, and its skinning weights (n, j) and joint transforms (j,
+    4, 4).
+    """
     own = lambda name: jnp.asarray(arrays[name][index], dtype)
     images = jnp.moveaxis(own("in_image"), 1, -1)
     height, width = images.shape[1:3]
@@ -177,9 +187,11 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
 def compute_stages(
     variables: Any, inputs: Any, config: Any, skinning_weights: Any, joint_transforms: Any
 ) -> dict:
-    """Every stage of one subject, by its array's name and in its layout; jittable with `config` static.
+    """Every stage of one subject, by its array's name and in its layout; jittable with `config`
+    static.
 
-    And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see `nearest_candidates`.
+    And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see
+    `nearest_candidates`.
     """
     channels_first = lambda x: jnp.moveaxis(x, -1, 1)
     encoder, reader, decoder = paper_parts(config.architecture)
@@ -217,8 +229,8 @@ def compute_stages(
     return {
         "out_ray_d": channels_first(pixels[..., 6:9]),
         "out_pose_feature": channels_first(sample_triplane(texture, pixels[..., 9:])),
-        "mid_tokens": stages["encoder.tokenizer"].reshape(
-            len(inputs.images), -1, encoder.transformer.width
+        "mid_tokens": (
+            stages["encoder.tokenizer"].reshape(len(inputs.images), -1, encoder.transformer.width)
         ),
         "mid_block_0": stages["encoder.transformer.block_0"],
         "mid_encoder_out": stages["encoder.transformer.norm"],
@@ -240,7 +252,9 @@ def compute_stages(
 
 
 def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> Any:
-    """Ours of the posed rotations; where candidates tie to within `bound`, the one nearest to the reference."""
+    """Ours of the posed rotations; where candidates tie to within `bound`, the one nearest to the
+    reference.
+    """
     ours = np.asarray(found["posed_rotations"], np.float64)
     if TIES not in found or ours.shape != reference.shape:
         return ours
@@ -258,7 +272,8 @@ def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> A
 def relative_errors(
     found: dict[str, Any], expected: dict[str, Any], bound: float = 0.0
 ) -> dict[str, float | None]:
-    """Largest error of each expected stage over its largest magnitude; None where none was found in its shape.
+    """Largest error of each expected stage over its largest magnitude; None where none was found in
+    its shape.
 
     bound: within which candidates of posed rotations tie.
     """
@@ -282,7 +297,8 @@ def relative_errors(
 
 
 def check(checkpoint: Path, dtype: str) -> dict[str, Any]:
-    """{"dtype", "bound", "stages": {array: relative error, or None if it was not compared}, "passed"}.
+    """{"dtype", "bound", "stages": {array: relative error, or None if it was not compared},
+    "passed"}.
 
     For float64 `jax_enable_x64` must be set.
     """
@@ -309,8 +325,8 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
     settings = complete_config(converted.config, release, dtype, expected["in_image"].shape[-2])
     if expected["in_lbs_weights"].shape != converted.skinning_weights.shape:
         raise ValueError(
-            f"{arrays}: in_lbs_weights has shape {expected['in_lbs_weights'].shape}, the checkpoint's "
-            f"{converted.skinning_weights.shape}"
+            f"{arrays}: in_lbs_weights has shape {expected['in_lbs_weights'].shape}, the"
+            f" checkpoint's {converted.skinning_weights.shape}"
         )
     working = (
         jnp.float64 if dtype == "float64" else jnp.float32
@@ -341,21 +357,25 @@ def parity(
     checkpoints: tuple[Path, ...],
     dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",),
 ) -> int:
-    """Checkpoints of the published network on stored inputs: the largest error of every stage, relative to its largest magnitude.
+    """Checkpoints of the published network on stored inputs: the largest error of every stage,
+    relative to its largest magnitude.
 
-    Beside a checkpoint STEM.pt, in the released format, or its state dict STEM.safetensors, are STEM.json, the release's
-    configuration, which says what shapes do not tell (pooling, width of a head), and STEM.npz with b subjects of v views:
+    Beside a checkpoint STEM.pt, in the released format, or its state dict STEM.safetensors, are
+    STEM.json, the release's configuration, which says what shapes do not tell (pooling, width of a
+    head), and STEM.npz with b subjects of v views:
 
-        in_image (b,v,3,h,w) in [0,1], in_c2w (b,v,4,4), in_fxfycxcy (b,v,4), in_smpl_canonical_vertices and
-        in_smpl_posed_vertices (b,v,n,3), in_joint_transforms (b,j,4,4), in_lbs_weights (n,j), metric; in_position_map
-        (b,v,h,w,3) and in_depth_map (b,v,1,h,w) in normalised units
-        out_ray_d (b,v,3,h,w), out_pose_feature (b,v,c,h,w), mid_tokens (b*v,p,d), mid_block_0 and mid_encoder_out (b,l,d),
-        mid_feature_map_stride4 (b*v,d,h',w'), mid_decoder_input (b,n,c), mid_raw_geometry (b,n,k,10), mid_raw_appearance
-        (b,n,k,4), asset_{means3D,rotations,scales,colors,opacity} (b,n*k,.), asset_lbs_weights (every fifth of n*k),
-        posed_means3D, posed_rotations (b,n*k,.; the sign of a quaternion is free)
+        in_image (b,v,3,h,w) in [0,1], in_c2w (b,v,4,4), in_fxfycxcy (b,v,4),
+        in_smpl_canonical_vertices and in_smpl_posed_vertices (b,v,n,3), in_joint_transforms
+        (b,j,4,4), in_lbs_weights (n,j), metric; in_position_map (b,v,h,w,3) and in_depth_map
+        (b,v,1,h,w) in normalised units out_ray_d (b,v,3,h,w), out_pose_feature (b,v,c,h,w),
+        mid_tokens (b*v,p,d), mid_block_0 and mid_encoder_out (b,l,d), mid_feature_map_stride4
+        (b*v,d,h',w'), mid_decoder_input (b,n,c), mid_raw_geometry (b,n,k,10), mid_raw_appearance
+        (b,n,k,4), asset_{means3D,rotations,scales,colors,opacity} (b,n*k,.), asset_lbs_weights
+        (every fifth of n*k), posed_means3D, posed_rotations (b,n*k,.; the sign of a quaternion is
+        free)
 
-    Exit status 1 if an error exceeds 2e-5 (float32), 1e-6 (float64) or 5e-2 (bfloat16), or an array of a stage (any that is not
-    in_*) could not be compared. Seconds for small networks.
+    Exit status 1 if an error exceeds 2e-5 (float32), 1e-6 (float64) or 5e-2 (bfloat16), or an array
+    of a stage (any that is not in_*) could not be compared. Seconds for small networks.
 
     Tables: parity_stages
 

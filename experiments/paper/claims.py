@@ -51,7 +51,10 @@ class Pair(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """pairs: what it is about. Without them `measured` is what is known, and the verdict is given."""
+    """pairs: what it is about.
+
+    Without them `measured` is what is known, and the verdict is given.
+    """
 
     claim: str
     paper: str
@@ -64,9 +67,10 @@ class Claim(NamedTuple):
 def paper_claims(run: Run) -> None:
     """The paper's claims beside what docs/results says of them. Measures nothing.
 
-    A verdict is one of three. The 95 % intervals of all differences that a claim is about lie on the paper's side: "reproduced at
-    toy scale"; one lies on the other side: "contradicted at toy scale"; else, or where a variant that it needs is not trained, or
-    has fewer than three seeds: "not tested".
+    A verdict is one of three. The 95 % intervals of all differences that a claim is about lie on
+    the paper's side: "reproduced at toy scale"; one lies on the other side: "contradicted at toy
+    scale"; else, or where a variant that it needs is not trained, or has fewer than three seeds:
+    "not tested".
     """
     report, cost = results("paper"), results("paper_cost")
     rows = sorted(
@@ -89,13 +93,15 @@ def judged(
     """Rows: claim, the paper, ours, verdict, why."""
     return [
         (
-            row.claim,
-            row.paper,
-            "; ".join(filter(None, (said(report, x) for x in row.pairs))) or "-",
-            *judge(report, row.pairs),
+            (
+                row.claim,
+                row.paper,
+                "; ".join(filter(None, (said(report, x) for x in row.pairs))) or "-",
+                *judge(report, row.pairs),
+            )
+            if row.pairs
+            else (row.claim, row.paper, row.measured or "-", *row.verdict)
         )
-        if row.pairs
-        else (row.claim, row.paper, row.measured or "-", *row.verdict)
         for row in listed
     ]
 
@@ -255,15 +261,20 @@ def of_cost(cost: Mapping[str, Any]) -> list[Claim]:
         Claim(
             "reading by back-projection is cheap",
             "replaces attention from vertices to the photos",
-            measured=f"{min(times):.0f} to {max(times):.0f} times less CPU time than attention, {min(counts):.0f} to "
-            f"{max(counts):.0f} times fewer operations (one reader 128 wide, forward, each size once)",
+            measured=(
+                f"{min(times):.0f} to {max(times):.0f} times less CPU time than attention,"
+                f" {min(counts):.0f} to {max(counts):.0f} times fewer operations (one reader 128"
+                " wide, forward, each size once)"
+            ),
             verdict=(REPRODUCED if min(times) > 1 else CONTRADICTED, ""),
         ),
         Claim(
             f"modelling is {FASTER_MODELLING} x faster than LHM's",
             "0.29 s against 4.59 s on a GPU",
-            measured=f"counted operations: LHM's joint attention alone has {lhm:.1f} x those of HumanGS. Attention instead of "
-            f"back-projection adds {whole:.0%} to the whole network",
+            measured=(
+                f"counted operations: LHM's joint attention alone has {lhm:.1f} x those of HumanGS."
+                f" Attention instead of back-projection adds {whole:.0%} to the whole network"
+            ),
             verdict=(NOT_TESTED, "nothing was timed on a GPU, LHM's backbones are not counted"),
         ),
     ]

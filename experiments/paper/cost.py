@@ -1,4 +1,6 @@
-"""The paper's central claim, measured: vertices that are projected into the photos against vertices that attend to all tokens."""
+"""The paper's central claim, measured: vertices that are projected into the photos against vertices
+that attend to all tokens.
+"""
 
 import functools
 import json
@@ -24,7 +26,9 @@ from humangs_jax.network.parts import Encoding, HumanGSInputs
 from humangs_jax.network.weights import expected_variables
 
 PATCH, READ_OPERATIONS = 8, 8
-"""Operations of one bilinear read and its sum over views, per feature: four products, four additions."""
+"""Operations of one bilinear read and its sum over views, per feature: four products, four
+additions.
+"""
 AXES = {"views": (1, 2, 4, 8, 16), "vertices": (1000, 3000, 10000, 40000), "size": (128, 256, 512)}
 MIDDLE = {"views": 4, "vertices": 10000, "size": 256}
 READERS = {"back-projection": "#1f6f8b", "cross-attention": "#c0392b"}
@@ -33,7 +37,10 @@ NETWORKS = {"humangs": 4, "back_projection": 4, "cross_attention": 4, "gst": 1}
 JOINT = {"lhm": 1, "lhm_views": 4, "lhm_plus": 4}
 """Systems of which the joint attention is counted, and their photos."""
 POINTS, TOKENS = 40000, 4096 + 1024
-"""Of LHM: points of the body, tokens of the body's photo and of the head's. LHM++ has its own, which we do not know."""
+"""Of LHM: points of the body, tokens of the body's photo and of the head's.
+
+LHM++ has its own, which we do not know.
+"""
 
 
 @entry
@@ -45,13 +52,16 @@ def paper_cost(
     quick: bool = False,
     image: Path | None = None,
 ) -> None:
-    """The paper's central claim: vertices that are projected into the photos against vertices that attend to all tokens.
+    """The paper's central claim: vertices that are projected into the photos against vertices that
+    attend to all tokens.
 
-    The two readers of `experiments.systems`, alone, on maps of the same width: forward passes over views, vertices and image
-    sizes, in turns. Operations of attention are products of matrices; back-projection has none: its weighted sums of four
-    neighbours count as 8 a vertex, view and feature. All patches are tokens, as in the paper. Then the operations of whole
-    networks in published sizes, counted in programs that are not run. Of LHM and its kin the joint attention of points and
-    tokens alone is counted, without the two pretrained networks that make the tokens and the decoder. 4 CPU minutes.
+    The two readers of `experiments.systems`, alone, on maps of the same width: forward passes over
+    views, vertices and image sizes, in turns. Operations of attention are products of matrices;
+    back-projection has none: its weighted sums of four neighbours count as 8 a vertex, view and
+    feature. All patches are tokens, as in the paper. Then the operations of whole networks in
+    published sizes, counted in programs that are not run. Of LHM and its kin the joint attention of
+    points and tokens alone is counted, without the two pretrained networks that make the tokens and
+    the decoder. 4 CPU minutes.
 
     Options:
     width: features of maps, vertices and attention
@@ -155,7 +165,9 @@ def configurations(width: int, size: int) -> dict[str, Any]:
 
 
 def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]:
-    """(inputs, encoding): points on a cylinder of the size of a person, cameras around it, maps of noise."""
+    """(inputs, encoding): points on a cylinder of the size of a person, cameras around it, maps of
+    noise.
+    """
     rng = np.random.default_rng(0)
     angles, heights = rng.uniform(-np.pi, np.pi, vertices), rng.uniform(-0.9, 0.9, vertices)
     normals = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)
@@ -179,7 +191,9 @@ def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]
 
 
 def network_flops(name: str, photos: int) -> dict[str, float]:
-    """Operations of a whole network in its published size, counted in the program before its compilation."""
+    """Operations of a whole network in its published size, counted in the program before its
+    compilation.
+    """
     config = SYSTEMS[name]("published").with_conventions(tokens="all").with_runtime(dtype="float32")
     vertices = len(gaussian_body(load_body(), config).template)
     inputs = jax.eval_shape(lambda: subject(1, photos, vertices, config.conventions.image_size)[0])
@@ -188,7 +202,9 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
 
 
 def joint_flops(name: str, photos: int) -> dict[str, float]:
-    """Operations of the attention of an LHM-style system in its published size, with LHM's points and tokens."""
+    """Operations of the attention of an LHM-style system in its published size, with LHM's points
+    and tokens.
+    """
     config = SYSTEMS[name]("published")
     reader, grid = config.architecture.reader, jnp.zeros((photos, TOKENS, 1))
     camera = jax.vmap(lambda K, pose: Camera(K, pose, 1, TOKENS))(
@@ -274,9 +290,12 @@ def text_of(result: dict[str, Any]) -> str:
                 ]
             )
         texts += [
-            f"Networks in published sizes, all patches tokens: operations counted, not run. LHM-style: {POINTS:,} points and "
-            f"{TOKENS:,} tokens a photo, without the two networks that make the tokens. The last rows are the paper's modelling "
-            f"times, its {FASTER_MODELLING} x.",
+            (
+                "Networks in published sizes, all patches tokens: operations counted, not run."
+                f" LHM-style: {POINTS:,} points and {TOKENS:,} tokens a photo, without the two"
+                " networks that make the tokens. The last rows are the paper's modelling times,"
+                f" its {FASTER_MODELLING} x."
+            ),
             markdown_table(
                 [
                     "network",

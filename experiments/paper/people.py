@@ -1,4 +1,5 @@
-"""Plain people, whom small networks learn to read on two cores: one cut of clothes in plain dyes, one light, eight poses.
+"""Plain people, whom small networks learn to read on two cores: one cut of clothes in plain dyes,
+one light, eight poses.
 
 Bodies, skin, dyes and cameras differ. Each person is seen in two of the poses.
 """
@@ -32,7 +33,9 @@ SIZE, POSES = 32, 8
 CLOTHES_STREAM, POSE_STREAM, CAMERA_STREAM, COLOR_STREAM = 30, 31, 32, 33
 LIGHT_SEED = 5
 NEARER = 0.6
-"""Distance of the cameras of near people over that of the others: parts of the person leave the frame."""
+"""Distance of the cameras of near people over that of the others: parts of the person leave the
+frame.
+"""
 CLOTHES = {
     "longsleeve": ({"sleeve": 0.6, "bottom": -0.33, "loose": 0.4, "depth": 0.05}, {"crew"}),
     "chinos": (
@@ -72,9 +75,11 @@ def write_plain(
     size: int = SIZE,
     near: bool = False,
 ) -> Path:
-    """People of a split as captures of two poses, `views` photos of each; folders that are there are kept. Returns `out`.
+    """People of a split as captures of two poses, `views` photos of each; folders that are there
+    are kept. Returns `out`.
 
-    held_out: where it is not 0 the capture has the first pose alone, and held_out/ has that many views of either.
+    held_out: where it is not 0 the capture has the first pose alone, and held_out/ has that many
+    views of either.
     """
     body = load_body()
     for seed in bar(seeds_of(split, 0, count), desc=out.name, unit="person"):
@@ -123,7 +128,9 @@ def _closer(cameras: Camera, middle: np.ndarray) -> Camera:
 
 
 class OnePose(CaptureFolder):
-    """A capture of which only the views of the first pose are used, for systems that show no other."""
+    """A capture of which only the views of the first pose are used, for systems that show no
+    other.
+    """
 
     def summary(self) -> StoredSubject:
         found = super().summary()
@@ -137,7 +144,9 @@ class OnePose(CaptureFolder):
 
 
 class Recolored(CaptureSource):
-    """Examples have their color channels exchanged, the same way in all images: six times the dyes."""
+    """Examples have their color channels exchanged, the same way in all images: six times the
+    dyes.
+    """
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
         example = super().example(seed, index, input_count)

@@ -1,4 +1,6 @@
-"""Rows of the paper's tables: the printed ones, and weights measured on the people of a folder or data set."""
+"""Rows of the paper's tables: the printed ones, and weights measured on the people of a folder or
+data set.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,7 +55,8 @@ DOMAINS = {
     "GIGA, on its split": ((20.19, 0.794, 0.070), None),
     "HumanGS, on GIGA's split": ((26.00, 0.945, 0.061), None),
 }
-"""Table 3, reconstruction: in the domain of training (THuman2.1), and in another one (AvatarReX)."""
+"""Table 3, reconstruction: in the domain of training (THuman2.1), and in another one (AvatarReX).
+"""
 VIEWS = {
     HUMANRAM: (
         (25.44, 0.946, 0.052),
@@ -100,7 +103,8 @@ Views = dict[str, dict[str, list[int]]]
 def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Views | None:
     """Inputs and targets of people who have no held_out/; None: they have.
 
-    varying: each input shows another pose and side, and targets poses that no input shows, where there are as many.
+    varying: each input shows another pose and side, and targets poses that no input shows, where
+    there are as many.
     """
     names, found = find_people(people, None, {}, body).names, {}
     if any(people.glob("*/capture.json")) or (people / "capture.json").is_file():
@@ -124,7 +128,9 @@ def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Vie
 
 
 def varied(frames: np.ndarray, photos: int) -> tuple[list[int], list[int]]:
-    """Inputs of as many frames as there are, in turns, each by another camera; targets of all others. Nothing of one frame."""
+    """Inputs of as many frames as there are, in turns, each by another camera; targets of all
+    others. Nothing of one frame.
+    """
     poses = np.unique(frames)
     seen = (
         poses[[i * len(poses) // photos for i in range(photos)]]
@@ -157,7 +163,9 @@ def cases(people: Path, photos: int, body: Path | None, views: Views | None) -> 
 
 
 def trained(runs: Path | None, given: tuple[str, ...] = ()) -> dict[str, tuple[Any, Any]]:
-    """(variables, configuration) by name: the variants that are trained, weights NAME=FILE, and the shipped ones."""
+    """(variables, configuration) by name: the variants that are trained, weights NAME=FILE, and the
+    shipped ones.
+    """
     found = {}
     if runs is not None:
         for name in trained_names(read_json(runs / "results.json")):
@@ -178,10 +186,11 @@ def measured(
     networks: Any,
     views: Views | None = None,
 ) -> dict[str, Any] | None:
-    """Scores of the views in the pose of the photos and in others, and the seconds to model and to draw a frame.
+    """Scores of the views in the pose of the photos and in others, and the seconds to model and to
+    draw a frame.
 
-    None if the system takes no such number of photos. The first person is run twice, and only the second run is timed: the first
-    one compiles.
+    None if the system takes no such number of photos. The first person is run twice, and only the
+    second run is timed: the first one compiles.
     """
     config, rows = weights[1], []
     if takes_one(config) and photos > 1:

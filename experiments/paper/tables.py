@@ -1,8 +1,8 @@
 """The paper's tables with our rows beside the printed ones, on real data or synthetic people.
 
-PSNR / SSIM / LPIPS by the protocol of the paper. Printed rows say so and are of the paper's data and training: they are no
-measure of ours. Rows are weights of any run or checkpoint, variants of the bench that are trained, and the shipped weights; those
-that take one photo get the first.
+PSNR / SSIM / LPIPS by the protocol of the paper. Printed rows say so and are of the paper's data
+and training: they are no measure of ours. Rows are weights of any run or checkpoint, variants of
+the bench that are trained, and the shipped weights; those that take one photo get the first.
 """
 
 import dataclasses
@@ -40,7 +40,9 @@ from humangs_jax.training.sources import people_on_disk
 COUNTS = (1, 2, 4, 6)
 K_VARIANTS = ("1 Gaussian a vertex", REFERENCE)
 Measure = Callable[..., Any]
-"""(name, people, photos, whether these show other poses) -> what `rows.measured` gives, or None; each is measured once."""
+"""(name, people, photos, whether these show other poses) -> what `rows.measured` gives, or None;
+each is measured once.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +50,8 @@ class Compared:
     """Options:
     data: captures with held_out/, or any data set (docs/datasets.md)
     body: body model of a data set
-    indices: JSON file with the views of each person of --data, "context" and "target"; default: evaluation_N.json beside a scene
-        list, else evenly spaced ones
+    indices: JSON file with the views of each person of --data, "context" and "target"; default:
+        evaluation_N.json beside a scene list, else evenly spaced ones
     weights: rows, NAME=FILE: runs of `humangs train`, checkpoints after `humangs convert`
     runs: the OUT of `paper`, whose trained variants are rows, too
     other: people of other kinds
@@ -77,9 +79,10 @@ class Compared:
 def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ()) -> None:
     """The paper's tables with our rows beside the printed ones, on real data or synthetic people.
 
-    animation: table 1, inputs of varying poses, novel poses and views; reconstruction: table 2, views in the pose of the photos,
-    and in others; domains: table 3, people like those of training and of other kinds; views: 1, 2, 4 and 6 photos, cameras at the
-    distance of training and nearer; gaussians: 1 against 1 + 4 Gaussians a vertex, on all of these people.
+    animation: table 1, inputs of varying poses, novel poses and views; reconstruction: table 2,
+    views in the pose of the photos, and in others; domains: table 3, people like those of training
+    and of other kinds; views: 1, 2, 4 and 6 photos, cameras at the distance of training and nearer;
+    gaussians: 1 against 1 + 4 Gaussians a vertex, on all of these people.
 
     Options:
     only: which tables
@@ -116,7 +119,8 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
                 measured, systems[name], people, photos, options.body, networks, views
             )
             numbers.update(run.rows({key: one}, settings))
-            jax.clear_caches()  # programs map memory, and Linux ends a process with too many mappings
+            # programs map memory, and Linux ends a process with too many mappings
+            jax.clear_caches()
         return numbers[key]
 
     left_out = {name for name, variant in variants().items() if variant.about}
@@ -129,13 +133,17 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
 
 
 def train_first(options: Compared) -> tuple[str, ...]:
-    """Train the configuration, or go on there; its row. Raises: ValueError without people or VGG-19 where the loss needs it."""
+    """Train the configuration, or go on there; its row.
+
+    Raises: ValueError without people or VGG-19 where the loss needs it.
+    """
     config, out, people = read_config(options.config), options.train, options.train_on
     if people is None or out is None:
         raise ValueError("--train needs --train-on: the people that the network learns from")
     if config.loss.perceptual and options.vgg19 is None:
         raise ValueError(
-            f"--config {options.config} has the perceptual loss: it needs --vgg19 (docs/loss_networks.md)"
+            f"--config {options.config} has the perceptual loss: it needs --vgg19"
+            " (docs/loss_networks.md)"
         )
     body = FileBody.load(options.body)
     train(
@@ -154,7 +162,10 @@ def title(people: Path) -> str:
 
 
 def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
-    """What decides the numbers: the weights and the people. Raises: ValueError for people of one name, by which rows are kept."""
+    """What decides the numbers: the weights and the people.
+
+    Raises: ValueError for people of one name, by which rows are kept.
+    """
     names = sorted(title(path) for path in {options.data, options.near, *options.other} if path)
     if len(set(names)) < len(names):
         raise ValueError(
@@ -179,7 +190,8 @@ def shown(value: Any) -> Any:
     )
 
 
-# The tables: (names of our rows, measure, options) -> Markdown ---------------------------------------------------------
+# The tables: (names of our rows, measure, options) -> Markdown
+# ---------------------------------------------------------
 
 
 def ours(
@@ -188,9 +200,11 @@ def ours(
     columns: Sequence[tuple[Path | None, int, str]],
     cameras: str = "",
 ) -> list[list[str]]:
-    """Our rows: a name, its number of photos (or cameras), and for each column (people, photos, task) the scores.
+    """Our rows: a name, its number of photos (or cameras), and for each column (people, photos,
+    task) the scores.
 
-    Those without a score for the first people are left out. cameras: then systems that take one photo are shown with one alone.
+    Those without a score for the first people are left out. cameras: then systems that take one
+    photo are shown with one alone.
     """
     rows = []
     for name in names:

@@ -53,11 +53,13 @@ VALIDATED, VIEWS, HELD_OUT_VIEWS, TRAIN_VIEWS = 8, 12, 4, 8
 def paper(
     run: Run, out: Path, only: tuple[str, ...] = (), train: bool = True, quick: bool = False
 ) -> None:
-    """Trains the paper's systems and ablations one after the other at 32 pixels, until each meets its criterion.
+    """Trains the paper's systems and ablations one after the other at 32 pixels, until each meets
+    its criterion.
 
-    What the rounds of a run are, and when it counts as trained: `bench.py`. What is done stays in OUT: the same command goes on
-    there, also after a kill, from the last checkpoint. The reference comes first, then a seed of each system, more seeds of the
-    reference, the ablations, more seeds of all. CPU seconds are of calls that were not killed; operations are of all steps.
+    What the rounds of a run are, and when it counts as trained: `bench.py`. What is done stays in
+    OUT: the same command goes on there, also after a kill, from the last checkpoint. The reference
+    comes first, then a seed of each system, more seeds of the reference, the ablations, more seeds
+    of all. CPU seconds are of calls that were not killed; operations are of all steps.
 
     Options:
     out: folder of the people, the runs and results.json
@@ -102,7 +104,9 @@ def paper(
 
 
 def queue(seeds: int) -> list[tuple[str, int]]:
-    """Runs, the most wanted ones first: of systems a seed before a second one of any; what was added later is last."""
+    """Runs, the most wanted ones first: of systems a seed before a second one of any; what was
+    added later is last.
+    """
     systems = [name for name, variant in variants().items() if not variant.about]
     others = [name for name, variant in variants().items() if variant.about]
     more = [(REFERENCE, seed) for seed in range(1, seeds)]
@@ -117,7 +121,10 @@ def queue(seeds: int) -> list[tuple[str, int]]:
 
 
 def finish(name: str, seed: int, out: Path, report: dict[str, Any]) -> bool:
-    """Bring a run to its end and score it; the report is written after each round. False if it was interrupted."""
+    """Bring a run to its end and score it; the report is written after each round.
+
+    False if it was interrupted.
+    """
     variant, place = variants()[name], out / folder_of(name) / str(seed)
     rows = report["runs"].setdefault(name, {})
     while "scores" not in (row := rows.get(str(seed), {})):
@@ -146,7 +153,10 @@ def finish(name: str, seed: int, out: Path, report: dict[str, Any]) -> bool:
 
 
 def kept(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The report in a file, an empty one without a file. Raises: ValueError if it has other settings."""
+    """The report in a file, an empty one without a file.
+
+    Raises: ValueError if it has other settings.
+    """
     if not path.is_file():
         return {"settings": dict(settings), "painted": {}, "runs": {}}
     report = read_json(path)
@@ -158,7 +168,9 @@ def kept(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """A row a variant, with its difference to the reference; those that have not met the criterion say how far they came."""
+    """A row a variant, with its difference to the reference; those that have not met the criterion
+    say how far they came.
+    """
     runs, least, lines, counted, changes = (
         report["runs"],
         report["painted"]["validation"],
@@ -217,9 +229,12 @@ def table(report: Mapping[str, Any]) -> str:
     header += [f"foreground against `{REFERENCE}`, dB", "steps", "TFLOP", "CPU minutes"]
     settings = report["settings"]
     said = (
-        f"{settings['test_people']} test people. A run has rounds of {settings['round_steps']} steps, then a quarter as many "
-        f"with the perceptual loss. Rounds end {MARGIN:g} dB of foreground PSNR above the {PAINTED}, which has {least:.2f} dB on "
-        f'the validation people, or where a run is flat; "{NOT_TRAINED}": it has not got there, or the perceptual loss has '
+        f"{settings['test_people']} test people. A run has rounds of {settings['round_steps']}"
+        " steps, then a quarter as many "
+        f"with the perceptual loss. Rounds end {MARGIN:g} dB of foreground PSNR above the"
+        f" {PAINTED}, which has {least:.2f} dB on "
+        f'the validation people, or where a run is flat; "{NOT_TRAINED}": it has not got there, or'
+        " the perceptual loss has "
         "taken it below the baseline. Intervals: 95 %, over people and seeds."
     )
     texts = [markdown_table(header, lines), said]
@@ -235,7 +250,9 @@ def table(report: Mapping[str, Any]) -> str:
 
 
 def differences(report: Mapping[str, Any]) -> dict[str, Difference]:
-    """To the reference, of the foreground in the pose of the photos, each trained variant with its own number of photos."""
+    """To the reference, of the foreground in the pose of the photos, each trained variant with its
+    own number of photos.
+    """
     runs, ready = report["runs"], trained_names(report)
     with_photos = {
         name: (name, finished(runs, name)[0]["photos"]) for name in ready if name != REFERENCE
@@ -253,11 +270,14 @@ ABLATIONS = {
     "1 tight + 4 free Gaussians a vertex instead of 1": "1 Gaussian a vertex",
     "Photos, over the number before": REFERENCE,
 }
-"""The paper's, and the variant without the part; that of photos compares the reference with itself."""
+"""The paper's, and the variant without the part; that of photos compares the reference with itself.
+"""
 
 
 def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Heading and rows of each ablation: what a part gains, by cameras, poses and numbers of photos."""
+    """Heading and rows of each ablation: what a part gains, by cameras, poses and numbers of
+    photos.
+    """
     runs, ready, found = report["runs"], trained_names(report), {}
     scored = lambda name, test, task: (
         name in ready and task in finished(runs, name)[0]["scores"].get(test, {})

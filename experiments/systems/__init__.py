@@ -1,10 +1,12 @@
-"""The systems that the paper compares with, and HumanGS itself, as configurations of parts: one bench for all.
+"""The systems that the paper compares with, and HumanGS itself, as configurations of parts: one
+bench for all.
 
     config = SYSTEMS["lhm"]("bench")
 
-"published" has the sizes of their papers where these are known, "bench" trains on two cores at 32 pixels: the same body, width
-and losses for all, so that only the system differs. Sizes and sources: the modules of the parts. Each takes the
-data, the body and the loop of this package, and none of the pretrained networks that some of them have.
+"published" has the sizes of their papers where these are known, "bench" trains on two cores at 32
+pixels: the same body, width and losses for all, so that only the system differs. Sizes and sources:
+the modules of the parts. Each takes the data, the body and the loop of this package, and none of
+the pretrained networks that some of them have.
 """
 
 import dataclasses
@@ -42,7 +44,9 @@ BENCH = {"image_size": 32, "body_vertices": 800, "longest_edge": None}
 
 
 def humangs(size: Size = "published") -> HumanGSConfig:
-    """The paper's network; on the bench narrower and of four layers, for smaller photos of a coarser body, and nothing else."""
+    """The paper's network; on the bench narrower and of four layers, for smaller photos of a
+    coarser body, and nothing else.
+    """
     config = presets.paper()
     if size == "published":
         return config
@@ -57,8 +61,8 @@ def humangs(size: Size = "published") -> HumanGSConfig:
 
 
 def ours(size: Size = "published") -> HumanGSConfig:
-    """The network that we ship, with our additions: shells, photo colors, Gaussians in the frame of the normals, the person's
-    tokens alone; 1 + 2 Gaussians and no upsampler.
+    """The network that we ship, with our additions: shells, photo colors, Gaussians in the frame of
+    the normals, the person's tokens alone; 1 + 2 Gaussians and no upsampler.
     """
     config = presets.small()
     if size == "published":
@@ -85,7 +89,10 @@ def _sized(size: Size, conventions: Conventions, *parts: Any) -> HumanGSConfig:
 
 
 def lvsm(size: Size = "published") -> HumanGSConfig:
-    """LVSM-style (`pixel_queries`), decoder-only, 24 layers. Novel views only: it cannot be animated."""
+    """LVSM-style (`pixel_queries`), decoder-only, 24 layers.
+
+    Novel views only: it cannot be animated.
+    """
     parts = PlainPhotos(patch_size=8), NoReader(), PhotoDecoder()
     if size == "bench":
         return _sized(size, Conventions(image_size=256), *parts, QueryDriver(BENCH_BLOCKS))
@@ -95,7 +102,10 @@ def lvsm(size: Size = "published") -> HumanGSConfig:
 
 
 def lvsm_latents(size: Size = "published") -> HumanGSConfig:
-    """LVSM's encoder-decoder: photos become latents once, and a target attends to these. 12 + 12 layers, 3,072 latents."""
+    """LVSM's encoder-decoder: photos become latents once, and a target attends to these.
+
+    12 + 12 layers, 3,072 latents.
+    """
     config, published = lvsm(size), size == "published"
     blocks = (
         TransformerConfig(layers=12, class_token=False)
@@ -106,7 +116,9 @@ def lvsm_latents(size: Size = "published") -> HumanGSConfig:
 
 
 def humanram(size: Size = "published") -> HumanGSConfig:
-    """HumanRAM-style (`pixel_queries`): LVSM of 12 layers with the neural texture, and a convolutional decoder, at 512 pixels."""
+    """HumanRAM-style (`pixel_queries`): LVSM of 12 layers with the neural texture, and a
+    convolutional decoder, at 512 pixels.
+    """
     config = lvsm(size)
     if size == "published":
         driver = QueryDriver(
@@ -119,7 +131,9 @@ def humanram(size: Size = "published") -> HumanGSConfig:
 
 
 def giga(size: Size = "published") -> HumanGSConfig:
-    """GIGA-style (`surface_gaussians`): a texture of 512 texels, a U-Net for every pose, one Gaussian a texel."""
+    """GIGA-style (`surface_gaussians`): a texture of 512 texels, a U-Net for every pose, one
+    Gaussian a texel.
+    """
     driver = (
         TextureDriver()
         if size == "published"
@@ -137,8 +151,9 @@ def giga(size: Size = "published") -> HumanGSConfig:
 
 
 def animatable(size: Size = "published") -> HumanGSConfig:
-    """Animatable-Gaussians-style (`surface_gaussians`): maps of front and back, fitted to ONE person: train it on that person's
-    photos alone, and anew for the next. Photos that reconstruction or evaluation give are ignored.
+    """Animatable-Gaussians-style (`surface_gaussians`): maps of front and back, fitted to ONE
+    person: train it on that person's photos alone, and anew for the next. Photos that
+    reconstruction or evaluation give are ignored.
     """
     driver = PoseMapDriver() if size == "published" else PoseMapDriver((16, 32, 64))
     surface = SurfaceMap("front_back", 1024 if size == "published" else 96)
@@ -153,15 +168,17 @@ def animatable(size: Size = "published") -> HumanGSConfig:
 
 
 def lca(size: Size = "published") -> HumanGSConfig:
-    """LCA-style: LHM with the tokens of all photos for the canonical Gaussians, and an MLP that corrects them for every driving
-    frame (`correction`). Their sizes are not known.
+    """LCA-style: LHM with the tokens of all photos for the canonical Gaussians, and an MLP that
+    corrects them for every driving frame (`correction`). Their sizes are not known.
     """
     driver = CorrectionMLP() if size == "published" else CorrectionMLP(BENCH_WIDTH, 2)
     return lhm_views(size).with_parts(driver=driver)
 
 
 def back_projection(size: Size = "published") -> HumanGSConfig:
-    """The paper's network without its upsampler: the partner of `cross_attention`, from which it differs in the reader alone."""
+    """The paper's network without its upsampler: the partner of `cross_attention`, from which it
+    differs in the reader alone.
+    """
     config = humangs(size)
     encoder, reader, _ = paper_parts(config.architecture)
     return config.with_parts(
@@ -170,7 +187,9 @@ def back_projection(size: Size = "published") -> HumanGSConfig:
 
 
 def cross_attention(size: Size = "published") -> HumanGSConfig:
-    """The same with vertices that attend to all image tokens: what the paper's second claim is about."""
+    """The same with vertices that attend to all image tokens: what the paper's second claim is
+    about.
+    """
     reader = (
         CrossAttentionReader()
         if size == "published"
@@ -182,8 +201,8 @@ def cross_attention(size: Size = "published") -> HumanGSConfig:
 def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) -> HumanGSConfig:
     """LHM-style (`two_stream`), LHM-500M's sizes: one photo without its camera and pose.
 
-    Tokens have 16 pixels a side as those of Sapiens. A Gaussian a vertex; edges of 1.28 cm give the default body about as many as
-    their 40,000 points.
+    Tokens have 16 pixels a side as those of Sapiens. A Gaussian a vertex; edges of 1.28 cm give the
+    default body about as many as their 40,000 points.
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
@@ -203,8 +222,8 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
 
 
 def lhm_views(size: Size = "published") -> HumanGSConfig:
-    """LHM-style with the tokens of all photos side by side: the multi-view row that the paper cites from LCA
-    (https://arxiv.org/abs/2604.02320), without LCA's correction per driving frame.
+    """LHM-style with the tokens of all photos side by side: the multi-view row that the paper cites
+    from LCA (https://arxiv.org/abs/2604.02320), without LCA's correction per driving frame.
     """
     return lhm(size, most_views=None)
 
@@ -215,7 +234,9 @@ def lhm_plus(size: Size = "published") -> HumanGSConfig:
 
 
 def gst(size: Size = "published") -> HumanGSConfig:
-    """GST-style (`grouped`): one photo of 256 pixels; HMR2's ViT-H in size (1280 wide, 32 layers, patches of 16)."""
+    """GST-style (`grouped`): one photo of 256 pixels; HMR2's ViT-H in size (1280 wide, 32 layers,
+    patches of 16).
+    """
     if size == "published":
         encoder = _photo_encoder(
             TransformerConfig(width=1280, layers=32, class_token=False, head_width=80),
@@ -238,14 +259,19 @@ def ghg(size: Size = "published") -> HumanGSConfig:
 
 
 def gps(size: Size = "published") -> HumanGSConfig:
-    """GPS-Gaussian-style (`stereo`): a Gaussian for every pixel of the two nearest of the photos. Novel views only."""
+    """GPS-Gaussian-style (`stereo`): a Gaussian for every pixel of the two nearest of the photos.
+
+    Novel views only.
+    """
     decoder = StereoDecoder() if size == "published" else StereoDecoder((16, 32, 64), planes=24)
     parts = PlainPhotos(patch_size=8), NoReader(), decoder, NearestPairDriver()
     return _sized(size, Conventions(image_size=1024, pixels="person"), *parts)
 
 
 def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> PatchTransformer:
-    """Of photos without cameras and poses: nothing reads the neural texture, so it is as small as can be."""
+    """Of photos without cameras and poses: nothing reads the neural texture, so it is as small as
+    can be.
+    """
     return PatchTransformer(patch_size, "place", TriplaneConfig(2, 1), transformer, upsampler=None)
 
 

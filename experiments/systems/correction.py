@@ -1,9 +1,11 @@
-"""Corrections of canonical Gaussians for one driving frame, and the LCA-style driver: an MLP that gives them.
+"""Corrections of canonical Gaussians for one driving frame, and the LCA-style driver: an MLP that
+gives them.
 
-LCA (Large-scale Codec Avatars, 2026, https://arxiv.org/abs/2604.02320) has no public code; what is known of it: a transformer
-over image and anchor tokens, an MLP that gives canonical Gaussians, an MLP that corrects them for the driving signal,
-skinning. Our reading of the second MLP: it takes the features of a vertex, which the canonical MLP takes too, and the
-rotations of all joints but the root.
+LCA (Large-scale Codec Avatars, 2026, https://arxiv.org/abs/2604.02320) has no public code; what is
+known of it: a transformer over image and anchor tokens, an MLP that gives canonical Gaussians, an
+MLP that corrects them for the driving signal, skinning. Our reading of the second MLP: it takes the
+features of a vertex, which the canonical MLP takes too, and the rotations of all joints but the
+root.
 """
 
 from typing import NamedTuple
@@ -24,13 +26,18 @@ from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
 CHANNELS = 14
-"""Of a correction: offset 3, quaternion 4, logarithm of the scale 3, logits of opacity 1 and color 3."""
+"""Of a correction: offset 3, quaternion 4, logarithm of the scale 3, logits of opacity 1 and color
+3.
+"""
 SCALING = 2.0
 """Corrections of the logarithm of a scale are bounded to this."""
 
 
 class Corrected(NamedTuple):
-    """gaussians: canonical, of one frame. offsets: (g, 3) of the means, in the unit of `offset_scale`."""
+    """gaussians: canonical, of one frame.
+
+    offsets: (g, 3) of the means, in the unit of `offset_scale`.
+    """
 
     gaussians: Gaussians
     offsets: Float[Array, "g 3"]
@@ -39,8 +46,8 @@ class Corrected(NamedTuple):
 def apply_corrections(
     gaussians: Gaussians, raw: Float[Array, "g 14"], offset_scale: float
 ) -> Corrected:
-    """Gaussians with corrections, `CHANNELS` numbers each: zeros change nothing (but colors closer to 0 or 1 than
-    `COLOR_MARGIN`), and Gaussians of opacity 0 keep it.
+    """Gaussians with corrections, `CHANNELS` numbers each: zeros change nothing (but colors closer
+    to 0 or 1 than `COLOR_MARGIN`), and Gaussians of opacity 0 keep it.
 
     offset_scale: metres to which offsets, in canonical axes, are bounded by tanh.
     """
@@ -72,7 +79,8 @@ def pose_vector(pose: BodyPose, joints: int) -> Float[Array, " q"]:
 
 @part
 class CorrectionMLP(GaussianDriver):
-    """The LCA-style driver, for readers that give `VertexFeatures`, and a decoder with K Gaussians per vertex.
+    """The LCA-style driver, for readers that give `VertexFeatures`, and a decoder with K Gaussians
+    per vertex.
 
     Inputs of vertices -> raw corrections, 14 for each Gaussian; they start near 0.
     """
@@ -89,7 +97,10 @@ class CorrectionMLP(GaussianDriver):
 
     @nn.compact
     def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
-        """See `parts.Driver`. Raises: ValueError for other features or another K; see `pose_vector`."""
+        """See `parts.Driver`.
+
+        Raises: ValueError for other features or another K; see `pose_vector`.
+        """
         if not isinstance(outputs.scene, VertexFeatures):
             raise ValueError(
                 f"a CorrectionMLP needs VertexFeatures, got {type(outputs.scene).__name__}"

@@ -1,7 +1,7 @@
 """A reader that is not pixel-aligned: vertices look at all tokens of all photos by attention.
 
-The paper replaces it by back-projection. Its arithmetic grows with vertices times tokens; back-projection's grows with
-vertices times views. One layer is
+The paper replaces it by back-projection. Its arithmetic grows with vertices times tokens;
+back-projection's grows with vertices times views. One layer is
 
     x += attention(q = norm(x), k, v = tokens);  x += mlp(norm(x))
 
@@ -71,8 +71,9 @@ def image_tokens(
     patch = encoding.patch_size
     if inputs.images.shape[1:3] != (height * patch, width * patch):
         raise ValueError(
-            f"attention to tokens needs maps of one element per {patch} x {patch} patch, got {width} x {height} for photos of "
-            f"{inputs.images.shape[2]} x {inputs.images.shape[1]}: encoder.upsampler must be None"
+            f"attention to tokens needs maps of one element per {patch} x {patch} patch, got"
+            f" {width} x {height} for photos of {inputs.images.shape[2]} x"
+            f" {inputs.images.shape[1]}: encoder.upsampler must be None"
         )
     if packing is not None:
         return tokens.at[packing.indices].get(mode="fill", fill_value=0), packing.count

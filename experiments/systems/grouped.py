@@ -1,14 +1,17 @@
-"""GST-style: tokens of groups of vertices look at one photo, and each makes one attribute of the Gaussians of its group.
+"""GST-style: tokens of groups of vertices look at one photo, and each makes one attribute of the
+Gaussians of its group.
 
-Theirs (Prospero et al. 2024, https://arxiv.org/abs/2409.04196): one photo, a frozen HMR2 ViT, 130 learned tokens (5 attributes
-of 26 groups of 265 vertices of SMPL) that cross-attend to its tokens; a Gaussian a vertex, its mean the posed vertex plus an
-offset; the body's pose and shape and the camera come from the same network.
+Theirs (Prospero et al. 2024, https://arxiv.org/abs/2409.04196): one photo, a frozen HMR2 ViT, 130
+learned tokens (5 attributes of 26 groups of 265 vertices of SMPL) that cross-attend to its tokens;
+a Gaussian a vertex, its mean the posed vertex plus an offset; the body's pose and shape and the
+camera come from the same network.
 
-Our reading: the tokens attend to each other before they look at the photo, as in any decoder of a transformer; the body, its pose
-and the camera are given, as they are to every system here: theirs come from HMR2's pretrained weights, and a network that knows a
-few hundred people would be judged by its wrong poses alone; our patch transformer stands for HMR2's; vertices are grouped in
-their order; offsets are in the canonical frame, so that the person can be posed, which theirs cannot. Behind the reader a token
-changes nothing outside of its group.
+Our reading: the tokens attend to each other before they look at the photo, as in any decoder of a
+transformer; the body, its pose and the camera are given, as they are to every system here: theirs
+come from HMR2's pretrained weights, and a network that knows a few hundred people would be judged
+by its wrong poses alone; our patch transformer stands for HMR2's; vertices are grouped in their
+order; offsets are in the canonical frame, so that the person can be posed, which theirs cannot.
+Behind the reader a token changes nothing outside of its group.
 """
 
 import flax.linen as nn
@@ -60,7 +63,10 @@ class GroupReader(Reader):
     def __call__(
         self, encoding: Encoding, inputs: HumanGSInputs, run: Pass
     ) -> Float[Array, "a r d"]:
-        """Tokens of the 5 attributes of r groups. Raises ValueError for a second photo, or an encoder with an upsampler."""
+        """Tokens of the 5 attributes of r groups.
+
+        Raises ValueError for a second photo, or an encoder with an upsampler.
+        """
         check_views(inputs, 1)
         tokens, count = image_tokens(encoding, inputs)
         x = self.param(
@@ -93,11 +99,14 @@ class GroupDecoder(Decoder):
     def __call__(
         self, features: Float[Array, "a r d"], inputs: HumanGSInputs, run: Pass
     ) -> HumanGSOutputs:
-        """A Gaussian a vertex. Raises ValueError for a body of more vertices than the groups have."""
+        """A Gaussian a vertex. Raises ValueError for a body of more vertices than the groups
+        have.
+        """
         vertices, groups = len(inputs.canonical_vertices), features.shape[1]
         if vertices > (room := groups * self.group_size):
             raise ValueError(
-                f"a body of {vertices} vertices: {groups} groups of decoder.group_size {self.group_size} have {room}"
+                f"a body of {vertices} vertices: {groups} groups of decoder.group_size"
+                f" {self.group_size} have {room}"
             )
         first = {"scales": self.initial_log_scale, "opacities": INITIAL_OPACITY}
         raw = {}

@@ -1,21 +1,24 @@
-"""LVSM-style and HumanRAM-style: one transformer makes the pixels of a target from photos. No Gaussians, no 3D.
+"""LVSM-style and HumanRAM-style: one transformer makes the pixels of a target from photos. No
+Gaussians, no 3D.
 
-LVSM, decoder-only (Jin et al. 2024, https://arxiv.org/abs/2410.17242): patches of the photos (rgb and rays, 9 channels) and
-of the target (rays, 6) are tokens with a linear map each; all attend to all; a linear map turns the target's tokens into
-pixels. Trained with squared error and 0.5 VGG-19. Their encoder-decoder: photos and learned latent tokens attend to each other,
-then target and latents (12 + 12 layers, 3,072 latents). LVSM knows no body: it shows other views of the pose in the photos,
-CANNOT be animated, and the pose of a target changes nothing. HumanRAM (Yu et al. 2025, https://arxiv.org/abs/2506.03118) adds a
-neural texture of the body, read at the position maps of photos and of the target (57 and 54 channels): the target's pose enters
-through its position map alone. A residual convolutional decoder fuses its target tokens of four depths. Trained with squared
+LVSM, decoder-only (Jin et al. 2024, https://arxiv.org/abs/2410.17242): patches of the photos (rgb
+and rays, 9 channels) and of the target (rays, 6) are tokens with a linear map each; all attend to
+all; a linear map turns the target's tokens into pixels. Trained with squared error and 0.5 VGG-19.
+Their encoder-decoder: photos and learned latent tokens attend to each other, then target and
+latents (12 + 12 layers, 3,072 latents). LVSM knows no body: it shows other views of the pose in the
+photos, CANNOT be animated, and the pose of a target changes nothing. HumanRAM (Yu et al. 2025,
+https://arxiv.org/abs/2506.03118) adds a neural texture of the body, read at the position maps of
+photos and of the target (57 and 54 channels): the target's pose enters through its position map
+alone. A residual convolutional decoder fuses its target tokens of four depths. Trained with squared
 error and 1.0 VGG.
 
-Every target is a pass of its own through the whole transformer: photos attend to the target, so nothing of a person can be
-kept from one target to the next, and a frame costs as much as the first one. (The encoder-decoder's latents could be kept; here
-they are made again.)
+Every target is a pass of its own through the whole transformer: photos attend to the target, so
+nothing of a person can be kept from one target to the next, and a frame costs as much as the first
+one. (The encoder-decoder's latents could be kept; here they are made again.)
 
-Our reading: the neural texture and blocks are those of this package. HumanRAM's code is not public: its decoder here adds the
-four depths, from the last to the first, each followed by a residual block, and doubles the sides until a token has its
-pixels.
+Our reading: the neural texture and blocks are those of this package. HumanRAM's code is not public:
+its decoder here adds the four depths, from the last to the first, each followed by a residual
+block, and doubles the sides until a token has its pixels.
 """
 
 from typing import Annotated, Any, NamedTuple, cast
@@ -54,7 +57,9 @@ LEAST_WIDTH = 8
 
 @part
 class NoReader(Reader):
-    """The reader of systems whose decoders read the inputs themselves: its features are the encoding."""
+    """The reader of systems whose decoders read the inputs themselves: its features are the
+    encoding.
+    """
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Encoding:
         return encoding
@@ -90,15 +95,21 @@ class QueryDriver(PixelDriver):
     texture: TriplaneConfig | None = None
     """The neural texture (HumanRAM), None: the body is unknown (LVSM)."""
     fusion: Annotated[int, Range(2, 16_384)] | None = None
-    """Width of the convolutional decoder, which needs a patch size that is a power of 2; None: the linear map."""
+    """Width of the convolutional decoder, which needs a patch size that is a power of 2; None: the
+    linear map.
+    """
     patch_size: Patch = 8
     """Of photos and targets."""
     latents: Vertices | None = None
-    """Learned tokens of LVSM's encoder-decoder, which has two transformers, None: photos and target attend to each other."""
+    """Learned tokens of LVSM's encoder-decoder, which has two transformers, None: photos and target
+    attend to each other.
+    """
 
     @property
     def moves(self) -> bool:
-        """Whether it can show a pose that no photo shows: without the texture the body is unknown."""
+        """Whether it can show a pose that no photo shows: without the texture the body is
+        unknown.
+        """
         return self.texture is not None
 
     def __post_init__(self):
@@ -161,7 +172,9 @@ class QueryDriver(PixelDriver):
 
 
 class FusionHead(nn.Module):
-    """Token maps of four depths, each (1, h, w, d) -> (1, patch h, patch w, 3), before the sigmoid."""
+    """Token maps of four depths, each (1, h, w, d) -> (1, patch h, patch w, 3), before the
+    sigmoid.
+    """
 
     hidden: int
     patch: int

@@ -1,14 +1,18 @@
-"""GHG-style: textures of shells of the body, copied from the photos, and a U-Net that makes a Gaussian of every texel.
+"""GHG-style: textures of shells of the body, copied from the photos, and a U-Net that makes a
+Gaussian of every texel.
 
-Theirs (Kwon et al. 2024, https://arxiv.org/abs/2407.12777): UV maps of 1024 x 1024 texels of the surface of the body and of four
-shells around it, up to 4 cm off along the normals. A texel has the color of the photo that sees it best; a network of gated
-convolutions fills the rest of the innermost one, the outer ones keep what was seen. A convolutional U-Net takes the colors and
-the offsets of the shells and gives rotation, scale (at most 1 cm) and opacity. Means and colors are not predicted.
+Theirs (Kwon et al. 2024, https://arxiv.org/abs/2407.12777): UV maps of 1024 x 1024 texels of the
+surface of the body and of four shells around it, up to 4 cm off along the normals. A texel has the
+color of the photo that sees it best; a network of gated convolutions fills the rest of the
+innermost one, the outer ones keep what was seen. A convolutional U-Net takes the colors and the
+offsets of the shells and gives rotation, scale (at most 1 cm) and opacity. Means and colors are not
+predicted.
 
-Our reading: the best view is the one whose ray meets the posed normal most directly; unseen texels of the innermost shell are
-filled from their neighbours through coarser and coarser maps (pull-push, Gortler et al. 1996), without a network; texels of outer
-shells that no photo shows on the person are transparent. Theirs is of one pose; here texels have the skinning weights of their
-points, so that the person can be animated. The encoder is `PlainPhotos`: none.
+Our reading: the best view is the one whose ray meets the posed normal most directly; unseen texels
+of the innermost shell are filled from their neighbours through coarser and coarser maps (pull-push,
+Gortler et al. 1996), without a network; texels of outer shells that no photo shows on the person
+are transparent. Theirs is of one pose; here texels have the skinning weights of their points, so
+that the person can be animated. The encoder is `PlainPhotos`: none.
 """
 
 import flax.linen as nn
@@ -46,8 +50,9 @@ CHANNELS = (4, 3, 1)
 class ShellTextures:
     """What the photos show of every texel of s shells.
 
-    distances: (s,) from the surface, normalised units. colors: (s, h, w, 3), the innermost filled, others `UNSEEN_COLOR` where
-    nothing was seen. seen: (s, h, w) whether a photo shows the person there.
+    distances: (s,) from the surface, normalised units. colors: (s, h, w, 3), the innermost filled,
+    others `UNSEEN_COLOR` where nothing was seen. seen: (s, h, w) whether a photo shows the person
+    there.
     """
 
     distances: Float[Array, " s"]
@@ -82,7 +87,10 @@ class ShellTextureReader(Reader):
             )
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> ShellTextures:
-        """Textures of the shells. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
+        """Textures of the shells.
+
+        Raises: ValueError if the inputs lack the map of the surface or posed normals.
+        """
         if inputs.texels is None or inputs.posed_normals is None:
             raise ValueError(
                 "shell textures need texels and posed_normals of the inputs, see `prepare_inputs`"
@@ -136,7 +144,9 @@ class ShellTextureReader(Reader):
 
 
 def fill_unseen(colors: Float[Array, "h w 3"], seen: Bool[Array, "h w"]) -> Float[Array, "h w 3"]:
-    """Seen texels as they are, others from the finest coarser map that has seen something; grey if nothing was seen at all."""
+    """Seen texels as they are, others from the finest coarser map that has seen something; grey if
+    nothing was seen at all.
+    """
     weights = seen[None, ..., None].astype(colors.dtype)
     return _filled(colors[None] * weights, weights)[0]
 
@@ -173,7 +183,8 @@ class ShellDecoder(Decoder):
 
     @nn.compact
     def __call__(self, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
-        """A Gaussian a texel of every shell; those that show no point of the body, or were not seen, are transparent.
+        """A Gaussian a texel of every shell; those that show no point of the body, or were not
+        seen, are transparent.
 
         Raises: ValueError if the inputs lack the map of the surface, normals or skinning weights.
         """

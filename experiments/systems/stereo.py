@@ -1,15 +1,19 @@
-"""GPS-Gaussian-style: every pixel of the two photos nearest to a target becomes a Gaussian, at a depth found by stereo.
+"""GPS-Gaussian-style: every pixel of the two photos nearest to a target becomes a Gaussian, at a
+depth found by stereo.
 
-Theirs (Zheng et al. 2024, https://arxiv.org/abs/2312.02155): of cameras around a person the two beside the target are rectified;
-their features are compared along the rows, and a recurrent network of the kind of RAFT-Stereo finds disparities; a U-Net on
-photos, features and depths gives rotation, scale and opacity of a Gaussian a pixel, whose color is the pixel's. Depths are
-supervised by scans first. There is no body: it shows other views of the pose in the photos, and CANNOT be animated.
+Theirs (Zheng et al. 2024, https://arxiv.org/abs/2312.02155): of cameras around a person the two
+beside the target are rectified; their features are compared along the rows, and a recurrent network
+of the kind of RAFT-Stereo finds disparities; a U-Net on photos, features and depths gives rotation,
+scale and opacity of a Gaussian a pixel, whose color is the pixel's. Depths are supervised by scans
+first. There is no body: it shows other views of the pose in the photos, and CANNOT be animated.
 
-Our reading: a photo is compared with the photo whose direction is nearest to its own, whatever the target is, so that a person is
-modelled once; features meet at a fixed number of distances along the ray of each pixel (a plane sweep, Collins 1996), not in
-rectified rows; a U-Net on what they have in common gives scores of these distances, whose mean under a softmax is the depth, in
-one step, and the rest of the Gaussian; depths are learned from images alone. The posed body gives the range of distances and
-nothing else. Photos here are a quarter of a circle apart where there are four; theirs 45 degrees.
+Our reading: a photo is compared with the photo whose direction is nearest to its own, whatever the
+target is, so that a person is modelled once; features meet at a fixed number of distances along the
+ray of each pixel (a plane sweep, Collins 1996), not in rectified rows; a U-Net on what they have in
+common gives scores of these distances, whose mean under a softmax is the depth, in one step, and
+the rest of the Gaussian; depths are learned from images alone. The posed body gives the range of
+distances and nothing else. Photos here are a quarter of a circle apart where there are four; theirs
+45 degrees.
 """
 
 import flax.linen as nn
@@ -45,7 +49,9 @@ from humangs_jax.training.forward import draw_posed
 CHANNELS = 4, 3, 1
 """Of a quaternion, the logarithms of scales, and an opacity."""
 COVERAGE, SCALING = 0.7, 2.0
-"""First standard deviation over the distance between pixels; bound of what the logarithm of a scale may change."""
+"""First standard deviation over the distance between pixels; bound of what the logarithm of a scale
+may change.
+"""
 SHARPNESS = 5.0
 """Of the softmax over what the features of two photos have in common, a cosine."""
 ABSENT = -2.0
@@ -54,8 +60,9 @@ ABSENT = -2.0
 
 @pytree_dataclass
 class PixelGaussians:
-    """gaussians: (v, h w, ...) in the world, a set a photo. directions: (v, 3) unit, from the person to the cameras; middle: (3,)
-    of the person, metres. present: (v,) photos that are no padding.
+    """gaussians: (v, h w, ...) in the world, a set a photo. directions: (v, 3) unit, from the
+    person to the cameras; middle: (3,) of the person, metres. present: (v,) photos that are no
+    padding.
     """
 
     gaussians: Gaussians
@@ -192,7 +199,10 @@ class NearestPairDriver(Driver):
 
 
 def nearest_pair(scene: PixelGaussians, center: Float[Array, "3"]) -> Gaussians:
-    """Of the two photos from which the person is seen most like from a point, metres. Raises: ValueError for a single photo."""
+    """Of the two photos from which the person is seen most like from a point, metres.
+
+    Raises: ValueError for a single photo.
+    """
     if len(scene.present) < 2:
         raise ValueError("1 photo: this system takes at least 2")
     towards = safe_normalize(center - scene.middle, jnp.zeros(3))

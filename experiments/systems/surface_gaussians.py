@@ -1,23 +1,27 @@
-"""GIGA-style and Animatable-Gaussians-style: a Gaussian for every texel of a map of the body, by U-Nets that run for every pose.
+"""GIGA-style and Animatable-Gaussians-style: a Gaussian for every texel of a map of the body, by
+U-Nets that run for every pose.
 
-GIGA (Zubekhin et al. 2025, https://arxiv.org/abs/2504.07144): photos of the CURRENT frame are projected onto a texture of 512
-x 512 texels, the visible views weighted by the softmax of 5 times the cosine at which they see a texel. Encoders for textures
-and for canonical positions (64 x 1, 2, 4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width
-1024), and decoders of 3, 3 and 8 channels give color, offset and the rest of a Gaussian a texel, which skinning poses. SSIM
-0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and scales. Our reading: encoders of 3 + 1 channels
-(color, whether seen) and 3 (position), whose scales are joined, and three decoders; no second, static texture of other frames,
-which half of their steps drop: the photos here show one pose, and for a target in another pose theirs is the static texture; the
-pose is that of the target.
+GIGA (Zubekhin et al. 2025, https://arxiv.org/abs/2504.07144): photos of the CURRENT frame are
+projected onto a texture of 512 x 512 texels, the visible views weighted by the softmax of 5 times
+the cosine at which they see a texel. Encoders for textures and for canonical positions (64 x 1, 2,
+4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width 1024), and
+decoders of 3, 3 and 8 channels give color, offset and the rest of a Gaussian a texel, which
+skinning poses. SSIM 0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and
+scales. Our reading: encoders of 3 + 1 channels (color, whether seen) and 3 (position), whose scales
+are joined, and three decoders; no second, static texture of other frames, which half of their steps
+drop: the photos here show one pose, and for a target in another pose theirs is the static texture;
+the pose is that of the target.
 
-Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person: maps of the front and the
-back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel that shows the body; three StyleUNets turn a map of
-posed positions into colors, offsets (times 0.05) and the rest. L1 + 0.1 LPIPS + 0.005 of squared offsets, Adam 5e-4, 800,000
-steps of one person. It reads no photo: the weights contain the person, and fit nobody else. Our reading: plain U-Nets on maps
-of one size, colors that do not depend on the view, no PCA of novel poses, positions relative to the middle and the root's
-rotation.
+Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person:
+maps of the front and the back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel
+that shows the body; three StyleUNets turn a map of posed positions into colors, offsets (times
+0.05) and the rest. L1 + 0.1 LPIPS + 0.005 of squared offsets, Adam 5e-4, 800,000 steps of one
+person. It reads no photo: the weights contain the person, and fit nobody else. Our reading: plain
+U-Nets on maps of one size, colors that do not depend on the view, no PCA of novel poses, positions
+relative to the middle and the root's rotation.
 
-Both start from the same Gaussians, flat ones on the surface: with zero corrections the body itself. Texels that show nothing
-are transparent.
+Both start from the same Gaussians, flat ones on the surface: with zero corrections the body itself.
+Texels that show nothing are transparent.
 """
 
 import flax.linen as nn
@@ -53,7 +57,9 @@ from humangs_jax.rendering.gaussians import Gaussians
 AREA = 1.9
 """Surface of a body of height 1.8, square metres."""
 COVERAGE, THICKNESS = 0.7, 0.2
-"""Standard deviations of a Gaussian along the surface over the distance between texels, and across over along it."""
+"""Standard deviations of a Gaussian along the surface over the distance between texels, and across
+over along it.
+"""
 OPACITY = 0.9
 """Of Gaussians before corrections."""
 NETS = {"offsets": 3, "shapes": 8, "colors": 3}
@@ -62,7 +68,10 @@ NETS = {"offsets": 3, "shapes": 8, "colors": 3}
 
 @pytree_dataclass
 class SurfaceTexture:
-    """colors: (h, w, 3), grey where unseen. seen: (h, w) 1 where a photo shows the texel, else 0."""
+    """colors: (h, w, 3), grey where unseen.
+
+    seen: (h, w) 1 where a photo shows the texel, else 0.
+    """
 
     colors: Float[Array, "h w 3"]
     seen: Float[Array, "h w"]
@@ -70,7 +79,10 @@ class SurfaceTexture:
 
 @pytree_dataclass
 class Surface:
-    """What drivers work from. texture: or None. positions: (h, w, 3) canonical, normalised units. texels: the map."""
+    """What drivers work from. texture: or None. positions: (h, w, 3) canonical, normalised units.
+
+    texels: the map.
+    """
 
     texture: SurfaceTexture | None
     positions: Float[Array, "h w 3"]
@@ -86,7 +98,9 @@ class TextureReader(Reader):
     """Of the softmax over the cosines of visible views; larger: the best view."""
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> SurfaceTexture:
-        """The texture. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
+        """The texture. Raises: ValueError if the inputs lack the map of the surface or posed
+        normals.
+        """
         texels = _texels(inputs)
         if inputs.posed_normals is None:
             raise ValueError(
@@ -125,7 +139,8 @@ class TextureReader(Reader):
 
 @part
 class SurfaceDecoder(Decoder):
-    """A flat Gaussian on the surface for every texel, row-major, with the texture's color: what drivers correct.
+    """A flat Gaussian on the surface for every texel, row-major, with the texture's color: what
+    drivers correct.
 
     Nothing is learned. Without a texture, features of any other kind, colors are grey.
     """
@@ -133,11 +148,15 @@ class SurfaceDecoder(Decoder):
     surface_map: SurfaceMap = SurfaceMap()
 
     def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
-        """See `parts.Decoder`. Raises: ValueError if the inputs lack the map, the normals or the weights of the body."""
+        """See `parts.Decoder`.
+
+        Raises: ValueError if the inputs lack the map, the normals or the weights of the body.
+        """
         texels = _texels(inputs)
         if inputs.canonical_normals is None or inputs.skinning_weights is None:
             raise ValueError(
-                "a SurfaceDecoder needs canonical_normals and skinning_weights, see `prepare_inputs`"
+                "a SurfaceDecoder needs canonical_normals and skinning_weights, see"
+                " `prepare_inputs`"
             )
         texture = features if isinstance(features, SurfaceTexture) else None
         unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
@@ -150,9 +169,11 @@ class SurfaceDecoder(Decoder):
             quats=normal_frames(safe_normalize(flat(inputs.canonical_normals), up)),
             scales=jnp.broadcast_to(along * jnp.asarray([1.0, 1.0, THICKNESS]), (len(covered), 3)),
             opacities=jnp.where(covered, OPACITY, 0.0),
-            colors=jnp.full((len(covered), 3), UNSEEN_COLOR)
-            if texture is None
-            else texture.colors.reshape(-1, 3),
+            colors=(
+                jnp.full((len(covered), 3), UNSEEN_COLOR)
+                if texture is None
+                else texture.colors.reshape(-1, 3)
+            ),
         )
         weights = jnp.where(covered[:, None], flat(inputs.skinning_weights), root)
         positions = texels.interpolate(inputs.canonical_vertices) / unit
@@ -171,7 +192,9 @@ def _texels(inputs: HumanGSInputs) -> Texels:
 
 @part
 class TextureDriver(GaussianDriver):
-    """GIGA-style: encoders of the texture, seen or not, and of positions; their coarsest maps attend to the pose."""
+    """GIGA-style: encoders of the texture, seen or not, and of positions; their coarsest maps
+    attend to the pose.
+    """
 
     widths: tuple[Width, ...] = (64, 128, 256, 512)
     """Of the U-Net."""
@@ -190,7 +213,10 @@ class TextureDriver(GaussianDriver):
 
     @nn.compact
     def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
-        """See `parts.Driver`. Raises: ValueError for a decoder without a texture; see `correction.pose_vector`."""
+        """See `parts.Driver`.
+
+        Raises: ValueError for a decoder without a texture; see `correction.pose_vector`.
+        """
         surface: Surface = outputs.scene
         if surface.texture is None:
             raise ValueError("a TextureDriver needs a TextureReader")
@@ -208,7 +234,9 @@ class TextureDriver(GaussianDriver):
 
 @part
 class PoseMapDriver(GaussianDriver):
-    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colors."""
+    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes
+    and colors.
+    """
 
     widths: tuple[Width, ...] = (64, 128, 256, 512)
     """Of each U-Net."""
@@ -245,7 +273,9 @@ def _driven(
 
 
 class PoseAttention(nn.Module):
-    """The bottleneck of a U-Net: every texel of its maps (1, h, w, d) attends to tokens that an MLP makes of the pose (q,)."""
+    """The bottleneck of a U-Net: every texel of its maps (1, h, w, d) attends to tokens that an MLP
+    makes of the pose (q,).
+    """
 
     width: int
     tokens: int

@@ -1,7 +1,9 @@
-"""Maps of the body's surface, for networks that work on texels: which point of the body each texel shows.
+"""Maps of the body's surface, for networks that work on texels: which point of the body each texel
+shows.
 
-A part asks for a map by its field `surface_map`. `data.views.gaussian_body` makes it, once per body, and the inputs of the
-network carry it: `HumanGSInputs.texels`. Texels name vertices, so that one map serves every shape and pose of a body.
+A part asks for a map by its field `surface_map`. `data.views.gaussian_body` makes it, once per
+body, and the inputs of the network carry it: `HumanGSInputs.texels`. Texels name vertices, so that
+one map serves every shape and pose of a body.
 """
 
 import dataclasses
@@ -26,8 +28,9 @@ class SurfaceMap:
     """A map of the surface."""
 
     kind: Literal["atlas", "front_back"] = "atlas"
-    """The texture coordinates of the body, or charts cut for it, with every point of the surface once ("atlas"); or the T-pose
-    seen from the front, and beside it, mirrored, from the back, by parallel rays ("front_back")."""
+    """The texture coordinates of the body, or charts cut for it, with every point of the surface
+    once ("atlas"); or the T-pose seen from the front, and beside it, mirrored, from the back, by
+    parallel rays ("front_back")."""
     size: Side = 512
     """Texels a side; "front_back" is twice as wide."""
 
@@ -36,7 +39,10 @@ class SurfaceMap:
         return self.size, self.size * (2 if self.kind == "front_back" else 1)
 
     def texels(self, body: BodyModel) -> Texels:
-        """Of a body, on the host; texels that show nothing have no weights. Equal bodies share them: they take seconds."""
+        """Of a body, on the host; texels that show nothing have no weights.
+
+        Equal bodies share them: they take seconds.
+        """
         plain = lambda x, dtype: None if x is None else np.asarray(x, dtype).tobytes()
         uvs = plain(body.uvs, np.float32), plain(body.uv_faces, np.int32)
         return _texels(plain(body.template, np.float32), plain(body.faces, np.int32), *uvs, self)

@@ -1,7 +1,7 @@
 """Drivers, by what they give for a target: corrected Gaussians, or the image itself.
 
-Avatar files, exports and the viewer know nothing of them: there a person moves by skinning alone, and the avatar of a network
-with a driver is the one before any correction.
+Avatar files, exports and the viewer know nothing of them: there a person moves by skinning alone,
+and the avatar of a network with a driver is the one before any correction.
 """
 
 import functools
@@ -83,7 +83,8 @@ class GaussianDriver(Driver):
 
 
 class PixelDriver(Driver):
-    """Makes the images of targets without Gaussians: on white, the background is not known to it, and there is no alpha.
+    """Makes the images of targets without Gaussians: on white, the background is not known to it,
+    and there is no alpha.
 
     `__call__` gives the image of a target whose sides are multiples of the encoder's patch size.
     """
@@ -99,7 +100,10 @@ class PixelDriver(Driver):
         targets: SubjectViews,
         config: HumanGSConfig,
     ) -> Float[Array, "v h w 3"]:
-        """Of targets, a pass each; their photos and masks are not used. What is too much of a whole patch is cut off."""
+        """Of targets, a pass each; their photos and masks are not used.
+
+        What is too much of a whole patch is cut off.
+        """
         vertices, pixels = target_queries(body, targets, config)
 
         @jax.checkpoint
@@ -124,7 +128,8 @@ class PixelDriver(Driver):
         """See `parts.Driver`. Raises: ValueError for another background than white."""
         if background != 1:
             raise ValueError(
-                f"a network that draws pixels shows people on white; background {background:g} was asked for"
+                f"a network that draws pixels shows people on white; background {background:g} was"
+                " asked for"
             )
         outputs, body, views, config = reconstructed(variables, config, inputs)
         own, images = part_variables(variables, "driver"), []
@@ -138,7 +143,10 @@ class PixelDriver(Driver):
 def target_queries(
     body: BodyModel, targets: SubjectViews, config: HumanGSConfig
 ) -> tuple[Float[Array, "v n 3"], Float[Array, "v h w 9"]]:
-    """`Target.vertices` and `Target.pixels` of targets, whose photos and masks are not used. Sides are whole patches."""
+    """`Target.vertices` and `Target.pixels` of targets, whose photos and masks are not used.
+
+    Sides are whole patches.
+    """
     patch, cameras = config.architecture.encoder.patch_size, targets.cameras
     height, width = -(-cameras.height // patch) * patch, -(-cameras.width // patch) * patch
     blank = jnp.zeros((len(targets.rotations), height, width, 3), targets.images.dtype)
@@ -162,7 +170,9 @@ def drawn(
 def reconstructed(
     variables: Variables, config: HumanGSConfig, inputs: Capture
 ) -> tuple[HumanGSOutputs, BodyModel, SubjectViews, HumanGSConfig]:
-    """What the network makes of a capture; the body and photos that it sees, the configuration with buffers that fit."""
+    """What the network makes of a capture; the body and photos that it sees, the configuration with
+    buffers that fit.
+    """
     body = gaussian_body(inputs.body, config)
     views = standardize(equal_exposure(inputs), config.image_size, config.runtime.crop)
     prepared = _prepare(body, views, config)

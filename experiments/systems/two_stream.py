@@ -1,14 +1,18 @@
-"""LHM-style reading: points of the body and image tokens attend to each other and to themselves, in two streams.
+"""LHM-style reading: points of the body and image tokens attend to each other and to themselves, in
+two streams.
 
-Theirs (Qiu et al. 2025, https://arxiv.org/abs/2503.10625): encoded canonical points of the body meet the tokens of one photo in
-blocks of the kind of Stable Diffusion 3 (Esser et al. 2024, https://arxiv.org/abs/2403.03206): joint attention over both, each
-stream with weights of its own, modulated by the pooled image features; a small MLP makes a Gaussian of every point. There is no
-camera and no pose of the photo. LHM++ (https://arxiv.org/abs/2506.13766): the same on pooled points, for several photos.
+Theirs (Qiu et al. 2025, https://arxiv.org/abs/2503.10625): encoded canonical points of the body
+meet the tokens of one photo in blocks of the kind of Stable Diffusion 3 (Esser et al. 2024,
+https://arxiv.org/abs/2403.03206): joint attention over both, each stream with weights of its own,
+modulated by the pooled image features; a small MLP makes a Gaussian of every point. There is no
+camera and no pose of the photo. LHM++ (https://arxiv.org/abs/2506.13766): the same on pooled
+points, for several photos.
 
-Our reading: the points are the vertices of the body; our patch transformer, trained with the rest, stands for their frozen
-Sapiens and DINOv2; there is no second branch for the head, whose crop our inputs do not have; points are pooled along a Morton
-curve, as Point Transformer V3 does (https://arxiv.org/abs/2312.10035), once and not in a U-Net, and Gaussians are drawn as they
-are, not as features for a second network. The cost grows with (points + tokens)^2.
+Our reading: the points are the vertices of the body; our patch transformer, trained with the rest,
+stands for their frozen Sapiens and DINOv2; there is no second branch for the head, whose crop our
+inputs do not have; points are pooled along a Morton curve, as Point Transformer V3 does
+(https://arxiv.org/abs/2312.10035), once and not in a U-Net, and Gaussians are drawn as they are,
+not as features for a second network. The cost grows with (points + tokens)^2.
 """
 
 import flax.linen as nn
@@ -32,7 +36,9 @@ from humangs_jax.network.transformer import NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
 CURVE_REACH = 1.2
-"""Normalised units: half the side of the curve's cube; canonical bodies are 1.8 high and less than 2 wide."""
+"""Normalised units: half the side of the curve's cube; canonical bodies are 1.8 high and less than
+2 wide.
+"""
 
 
 @part
@@ -56,7 +62,10 @@ class TwoStreamReader(Reader):
 
     @nn.compact
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
-        """Features of the n vertices. Raises ValueError for too many views, or an encoder with an upsampler."""
+        """Features of the n vertices.
+
+        Raises ValueError for too many views, or an encoder with an upsampler.
+        """
         check_views(inputs, self.most_views)
         tokens, count = image_tokens(encoding, inputs)
         positions = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
@@ -95,9 +104,11 @@ def check_views(inputs: HumanGSInputs, most: int | None) -> None:
 
 
 class TwoStreamBlock(nn.Module):
-    """Points (n, d) and tokens (l, d) -> both. The `last` block returns the tokens unchanged, as nothing reads them.
+    """Points (n, d) and tokens (l, d) -> both. The `last` block returns the tokens unchanged, as
+    nothing reads them.
 
-    The modulation starts as the identity, and gates at 0 (Peebles & Xie 2023, https://arxiv.org/abs/2212.09748).
+    The modulation starts as the identity, and gates at 0 (Peebles & Xie 2023,
+    https://arxiv.org/abs/2212.09748).
     """
 
     width: int

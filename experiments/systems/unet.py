@@ -1,7 +1,8 @@
 """A small U-Net over maps, for systems that predict Gaussians texel by texel.
 
-At each scale two 3x3 convolutions with a ReLU; 2x2 means going down, nearest texels going up, joined with the maps of the same
-scale. A last 3x3 convolution gives the output, which starts near 0 (Ronneberger et al. 2015, https://arxiv.org/abs/1505.04597).
+At each scale two 3x3 convolutions with a ReLU; 2x2 means going down, nearest texels going up,
+joined with the maps of the same scale. A last 3x3 convolution gives the output, which starts near 0
+(Ronneberger et al. 2015, https://arxiv.org/abs/1505.04597).
 """
 
 from typing import Any
@@ -20,19 +21,23 @@ MOST_SCALES = 12
 
 
 def check_scales(name: str, widths: tuple[int, ...]) -> None:
-    """Raises ValueError, naming the setting, unless there are 1 to `MOST_SCALES` positive widths."""
+    """Raises ValueError, naming the setting, unless there are 1 to `MOST_SCALES` positive
+    widths.
+    """
     if not 1 <= len(widths) <= MOST_SCALES or min(widths) < 1:
         raise ValueError(
-            f"{name} {widths[:MOST_SCALES]}: expected 1 to {MOST_SCALES} positive numbers, one a scale"
+            f"{name} {widths[:MOST_SCALES]}: expected 1 to {MOST_SCALES} positive numbers, one a"
+            " scale"
         )
 
 
 class UNet(nn.Module):
     """Maps (v, h, w, c) -> (v, h, w, features).
 
-    widths: features at every scale, the finest first; both sides are multiples of 2^(len(widths) - 1), or ValueError. bottleneck:
-    a module that changes the coarsest maps, (v, h', w', c') and what the call gives as `context` -> the same shape. Several maps
-    have an encoder each, whose results are joined at every scale; several numbers of features a decoder each, joined at the end.
+    widths: features at every scale, the finest first; both sides are multiples of 2^(len(widths) -
+    1), or ValueError. bottleneck: a module that changes the coarsest maps, (v, h', w', c') and what
+    the call gives as `context` -> the same shape. Several maps have an encoder each, whose results
+    are joined at every scale; several numbers of features a decoder each, joined at the end.
     """
 
     widths: tuple[int, ...]
@@ -47,7 +52,8 @@ class UNet(nn.Module):
         coarsest, (_, height, width, _) = 2 ** (len(self.widths) - 1), given[0].shape
         if height % coarsest or width % coarsest:
             raise ValueError(
-                f"maps of {width} x {height}: a U-Net of {len(self.widths)} scales needs multiples of {coarsest}"
+                f"maps of {width} x {height}: a U-Net of {len(self.widths)} scales needs multiples"
+                f" of {coarsest}"
             )
 
         def convolved(x, width, name):

@@ -1,11 +1,14 @@
-"""A look at a capture before its use, and at a fit: the posed body over each photo, and numbers that show what is wrong.
+"""A look at a capture before its use, and at a fit: the posed body over each photo, and numbers
+that show what is wrong.
 
-Blue is the person's left side, red the right, the green line the boundary of the body; photo and body should coincide. A yellow
-line is the boundary of the body after the displacement of the capture, or after that to the masks where `reconstruct` makes one,
-with its skirt. What is wrong with a view is said by `apps.quick_check`.
+Blue is the person's left side, red the right, the green line the boundary of the body; photo and
+body should coincide. A yellow line is the boundary of the body after the displacement of the
+capture, or after that to the masks where `reconstruct` makes one, with its skirt. What is wrong
+with a view is said by `apps.quick_check`.
 
-On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An outlier is a ring. A line leads to
-the cross of the body's landmark; where the body fits, disc and cross coincide.
+On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An
+outlier is a ring. A line leads to the cross of the body's landmark; where the body fits, disc and
+cross coincide.
 """
 
 import dataclasses
@@ -56,7 +59,10 @@ OPACITY = 0.55
 
 @pytree_dataclass
 class BodyImage:
-    """The posed body as one camera sees it. shaded: (h, w, 3) lit from the camera, black outside. covered: (h, w)."""
+    """The posed body as one camera sees it. shaded: (h, w, 3) lit from the camera, black outside.
+
+    covered: (h, w).
+    """
 
     shaded: Float[Array, "h w 3"]
     covered: Bool[Array, "h w"]
@@ -78,12 +84,16 @@ class ViewCheck:
 
 @dataclasses.dataclass(frozen=True)
 class CheckReport:
-    """One row per view; `str(report)` is the table that the command line prints. warnings: about the capture as a whole."""
+    """One row per view; `str(report)` is the table that the command line prints. warnings: about
+    the capture as a whole.
+    """
 
     views: tuple[ViewCheck, ...]
     warnings: tuple[str, ...] = ()
     displaced: float = 0.0
-    """Metres that `reconstruct` moves the body at most, so that it fits the masks; 0: it fits already."""
+    """Metres that `reconstruct` moves the body at most, so that it fits the masks; 0: it fits
+    already.
+    """
     registered: bool = False
     """Whether the capture itself says by how much."""
     skirt: bool = False
@@ -107,7 +117,8 @@ class CheckReport:
         if self.displaced:
             how = "as body.npz says" if self.registered else "to the masks"
             lines.append(
-                f"reconstruct will move the body {how}, by up to {100 * self.displaced:.1f} cm (yellow)"
+                f"reconstruct will move the body {how}, by up to {100 * self.displaced:.1f} cm"
+                " (yellow)"
             )
         if self.skirt:
             lines.append(
@@ -117,7 +128,8 @@ class CheckReport:
         lines += [f"warning: {view.name}: {view.warning}" for view in self.views if view.warning]
         if self.ok:
             lines.append(
-                "no warnings; look at the sheet all the same: silhouettes do not show whether left and right are exchanged"
+                "no warnings; look at the sheet all the same: silhouettes do not show whether left"
+                " and right are exchanged"
             )
         return "\n".join(lines)
 
@@ -125,7 +137,8 @@ class CheckReport:
 def check_capture(
     capture: Capture, out: str | Path, keypoints: Keypoints | None = None
 ) -> CheckReport:
-    """Draw the posed body over every photo, write the sheet as a PNG, and report how well they agree.
+    """Draw the posed body over every photo, write the sheet as a PNG, and report how well they
+    agree.
 
     Arguments: keypoints: of the views, if they are known: whether the cameras may be at fault.
     Raises: OSError if the sheet cannot be written.
@@ -183,7 +196,9 @@ def check_capture(
 
 
 def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3"]]) -> Capture:
-    """What a sheet shows of a capture: its photos cut to the person, or `small`, all of them, where that is nearly the same."""
+    """What a sheet shows of a capture: its photos cut to the person, or `small`, all of them, where
+    that is nearly the same.
+    """
     close, _ = around_person(whole, vertices)
     if close is whole:
         return small
@@ -212,7 +227,9 @@ def overlay(photo: Float[np.ndarray, "h w 3"], drawn: BodyImage) -> Float[np.nda
 
 
 def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
-    """Colors of the vertices: left, right, or between, by the names of the joints that move them, else by x in T-pose."""
+    """Colors of the vertices: left, right, or between, by the names of the joints that move them,
+    else by x in T-pose.
+    """
     weights = np.asarray(body.skinning_weights)
     left, right = (
         weights @ np.array([name.startswith(side) for name in body.joint_names])
@@ -257,7 +274,9 @@ def _posed_frames(
 def _agreement(
     covered: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
 ) -> tuple[float, float]:
-    """Intersection over union of body and mask, and the share of the body more than one pixel off the mask."""
+    """Intersection over union of body and mask, and the share of the body more than one pixel off
+    the mask.
+    """
     union = max((covered | mask).sum(), 1)
     return float((covered & mask).sum() / union), float(
         (covered & ~binary_dilation(mask)).sum() / max(covered.sum(), 1)
@@ -274,7 +293,8 @@ def _label(view: ViewCheck) -> str:
     return f"{'! ' if view.warning else ''}{view.name}{iou}"
 
 
-# Fits -----------------------------------------------------------------------------------------------------------------
+# Fits
+# --------------------------------------------------------------------------------------------------
 
 VIEWS = 24
 """Most views on a sheet."""
@@ -290,7 +310,8 @@ def fit_sheet(
 ) -> None:
     """Write a sheet of up to 24 views, evenly chosen, as a PNG.
 
-    Arguments: examination: of this capture by these keypoints. Raises: OSError if the image cannot be written.
+    Arguments: examination: of this capture by these keypoints. Raises: OSError if the image cannot
+    be written.
     """
     count = capture.view_count
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int)).tolist()
@@ -320,7 +341,9 @@ def _with_keypoints(
     examination: Examination,
     view: int,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The image of a view with its keypoints. corner: of the photo of `capture` in the one that keypoints are of, pixels."""
+    """The image of a view with its keypoints. corner: of the photo of `capture` in the one that
+    keypoints are of, pixels.
+    """
     from PIL import Image, ImageDraw
 
     height, width = image.shape[:2]

@@ -22,11 +22,13 @@ def around_person(
     vertices: Mapping[int, Float[Array, "n 3"]],
     marks: Sequence[Float[np.ndarray, "k 2"]] | None = None,
 ) -> tuple[Capture, Int[np.ndarray, "v 2"]]:
-    """The capture with photos, masks and cameras cut to windows of one size around the person, and their upper left corners.
+    """The capture with photos, masks and cameras cut to windows of one size around the person, and
+    their upper left corners.
 
     The capture as it is, and corners of 0, where the largest window is nearly the photo.
 
-    Arguments: vertices: of the posed body, by frame. marks: further pixels of each view that are to be seen.
+    Arguments: vertices: of the posed body, by frame. marks: further pixels of each view that are to
+    be seen.
     """
     height, width = capture.images.shape[1:3]
     photo, count = np.asarray([width, height]), len(capture.images)
@@ -72,7 +74,9 @@ def _box(
     vertices: Float[Array, "n 3"],
     marks: Sequence[Float[np.ndarray, "k 2"]] | None,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
-    """The least and largest x and y of the body, the mask and the marks in a photo; None if nothing is in it."""
+    """The least and largest x and y of the body, the mask and the marks in a photo; None if nothing
+    is in it.
+    """
     K, pose = (
         np.asarray(x[view], float) for x in (capture.cameras.K, capture.cameras.cam_from_world)
     )

@@ -1,4 +1,6 @@
-"""The demonstration: an unseen person, four photos, one forward pass, some seconds of refinement, new views, a walk."""
+"""The demonstration: an unseen person, four photos, one forward pass, some seconds of refinement,
+new views, a walk.
+"""
 
 import contextlib
 import dataclasses
@@ -59,14 +61,16 @@ def run_demo(
     refine: RefineConfig | None = None,
     settings: Settings | None = None,
 ) -> dict[str, Any]:
-    """Make an avatar of the shipped person, and write what is made of it into `out` at the end; returns what report.json holds.
+    """Make an avatar of the shipped person, and write what is made of it into `out` at the end;
+    returns what report.json holds.
 
-    refine: how the avatar is fitted to its photos; None: not at all. settings: which photos are used, how the network runs,
-    how frames are drawn (their refinement is not used); None: all photos, as the weights were trained.
+    refine: how the avatar is fitted to its photos; None: not at all. settings: which photos are
+    used, how the network runs, how frames are drawn (their refinement is not used); None: all
+    photos, as the weights were trained.
 
-    Files: inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr, animation.mp4 and .gif, avatar.npz,
-    avatar.ply, avatar.html (see docs/viewer.md), report.json; with `refine` also refined.png (truth, feed-forward, refined), and
-    the others are of the refined avatar.
+    Files: inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr, animation.mp4
+    and .gif, avatar.npz, avatar.ply, avatar.html (see docs/viewer.md), report.json; with `refine`
+    also refined.png (truth, feed-forward, refined), and the others are of the refined avatar.
     """
     report: dict[str, Any] = {}
     settings = settings or Settings()
@@ -91,8 +95,9 @@ def _check_place(out: Path) -> None:
 def summary(report: dict[str, Any]) -> str:
     """What `run_demo` found, in one line."""
     quality = (
-        f"PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR {report['psnr_fg']:.2f} dB on "
-        f"{report['views']['held_out']} held-out views (vertex-color baseline: {report['baseline_psnr']:.2f} dB)"
+        f"PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR"
+        f" {report['psnr_fg']:.2f} dB on {report['views']['held_out']} held-out views (vertex-color"
+        f" baseline: {report['baseline_psnr']:.2f} dB)"
     )
     refined = report.get("refined")
     if refined is None:
@@ -141,8 +146,10 @@ def _write_demo(
         "gaussians": len(avatar.gaussians.means),
         "views": {"input": inputs.view_count, "held_out": truth.view_count},
         "image_size": [inputs.cameras.width, inputs.cameras.height],
-        "versions": {name: metadata.version(name) for name in VERSIONS}
-        | {"python": platform.python_version()},
+        "versions": (
+            {name: metadata.version(name) for name in VERSIONS}
+            | {"python": platform.python_version()}
+        ),
         "device": f"{jax.devices()[0].platform}: {jax.devices()[0].device_kind}",
         "timings": timings,
     }
@@ -193,7 +200,9 @@ def _scores(images: np.ndarray, truth: Capture) -> dict[str, Any]:
 
 
 def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False) -> Any:
-    """Run a stage and record its seconds; `twice`: separately for compiling (first run less second) and running (second)."""
+    """Run a stage and record its seconds; `twice`: separately for compiling (first run less second)
+    and running (second).
+    """
     start = time.perf_counter()
     with stage(COMPILING) if twice else contextlib.nullcontext():
         result = jax.block_until_ready(run())

@@ -1,4 +1,5 @@
-"""People in photos: found, the same one in all of them chosen, and written as keypoints, masks and a numbered sheet.
+"""People in photos: found, the same one in all of them chosen, and written as keypoints, masks and
+a numbered sheet.
 
     keypoints.json   the chosen person, for `humangs fit`
     people.png       the sheet: everybody, with numbers
@@ -67,13 +68,17 @@ FAINT = 0.45
 BEYOND = 0.03
 """Share of a person's size that a landmark outside of the photo is beyond its border."""
 PLAINLY = 0.5
-"""Masks or keypoints on somebody else have to leave the person less than this share of what they give the other one."""
+"""Masks or keypoints on somebody else have to leave the person less than this share of what they
+give the other one.
+"""
 
 
 def found_in_photos(folder: Path) -> list[PhotoPeople]:
-    """The people in the photos of a folder, or of a capture folder, whose cameras are used; see `same_people`.
+    """The people in the photos of a folder, or of a capture folder, whose cameras are used; see
+    `same_people`.
 
-    Raises: CaptureError without photos; FileError, naming the file, for what is no photo; ValueError without LiteRT.
+    Raises: CaptureError without photos; FileError, naming the file, for what is no photo;
+    ValueError without LiteRT.
     """
     if (folder / "capture.json").is_file():
         return found_in_capture(folder)
@@ -83,12 +88,18 @@ def found_in_photos(folder: Path) -> list[PhotoPeople]:
 
 
 def left_out(folder: Path) -> str | None:
-    """What `found_in_photos` does not use of a folder, in one line; None where it uses all. Raises: as it."""
+    """What `found_in_photos` does not use of a folder, in one line; None where it uses all.
+
+    Raises: as it.
+    """
     return None if (folder / "capture.json").is_file() else unused_line(scan_photos(folder).unused)
 
 
 def found_in_capture(folder: Path) -> list[PhotoPeople]:
-    """The same for the photos of a capture folder; their names are the views'. Raises: see `found_in_photos`."""
+    """The same for the photos of a capture folder; their names are the views'.
+
+    Raises: see `found_in_photos`.
+    """
     photos = load_photos(folder)  # checked; these are on white where there are masks
     if photos.masks is None:
         pictures = iter(photos.images)
@@ -105,10 +116,11 @@ def person_in_capture(
     keypoints: Keypoints | None = None,
     person: int | None = None,
 ) -> tuple[list[PhotoPeople], int]:
-    """The people in the photos of a capture folder, and the number of the one who is meant: by keypoints, if there are any, else
-    by the number asked for, else by masks, else by size.
+    """The people in the photos of a capture folder, and the number of the one who is meant: by
+    keypoints, if there are any, else by the number asked for, else by masks, else by size.
 
-    Raises: see `found_in_photos`, `choose`, `person_of`; ValueError for a photo whose keypoints are of nobody found there.
+    Raises: see `found_in_photos`, `choose`, `person_of`; ValueError for a photo whose keypoints are
+    of nobody found there.
     """
     people, sheet = found_in_capture(folder), folder / SHEET_FILE
     if keypoints is None:
@@ -122,7 +134,10 @@ def person_in_capture(
         if _has_any(keypoints, v) and photo.people[number] is None and any(photo.people)
     ]
     if lost:
-        told = f"{few(lost)}: the keypoints are of nobody who was found there: see {sheet}; give masks, or leave the photo out"
+        told = (
+            f"{few(lost)}: the keypoints are of nobody who was found there: see {sheet}; give"
+            " masks, or leave the photo out"
+        )
         raise _refused(told, people, sheet)
     return people, number
 
@@ -134,10 +149,12 @@ Masks = Sequence[Float[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]]
 def person_of(
     photos: Sequence[PhotoPeople], given: Keypoints | Masks, sheet: Path
 ) -> tuple[list[PhotoPeople], int]:
-    """The photos, and the number of the one whose keypoints or masks these are, which decide in each photo.
+    """The photos, and the number of the one whose keypoints or masks these are, which decide in
+    each photo.
 
     Arguments: sheet: see `choose`.
-    Raises: ValueError for keypoints or masks of nobody, and where it is unclear who of a photo without any is meant.
+    Raises: ValueError for keypoints or masks of nobody, and where it is unclear who of a photo
+    without any is meant.
     """
     kind = "keypoints" if isinstance(given, Keypoints) else "masks"
     scores = [
@@ -161,7 +178,10 @@ def person_of(
         )
     blank = [v for v in range(len(photos)) if not _has_any(given, v)]
     if unclear := [photos[v].name for v in blank if is_unclear(settled, v, number)]:
-        told = f"{few(unclear)}: which of the people of {sheet} is meant? There are no {kind} of the person: add them"
+        told = (
+            f"{few(unclear)}: which of the people of {sheet} is meant? There are no {kind} of the"
+            " person: add them"
+        )
         raise _refused(told, settled, sheet)
     return settled, number
 
@@ -171,7 +191,9 @@ def _has_any(given: Keypoints | Masks, view: int) -> bool:
 
 
 def _agreement(found: Found | None, given: Keypoints | Masks, view: int) -> float:
-    """How much of the keypoints or the mask of a view is on the mask of somebody who was found there."""
+    """How much of the keypoints or the mask of a view is on the mask of somebody who was found
+    there.
+    """
     if found is None:
         return 0.0
     mask, (top, left) = found.mask / np.float32(255), found.corner
@@ -203,7 +225,10 @@ def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
 def detect_photos(
     names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 3"]]
 ) -> list[PhotoPeople]:
-    """The people of each photo with values in [0, 1], those with the most pixels first. Raises: ValueError without LiteRT."""
+    """The people of each photo with values in [0, 1], those with the most pixels first.
+
+    Raises: ValueError without LiteRT.
+    """
     try:
         networks = Networks()
     except ImportError as error:
@@ -225,7 +250,10 @@ def detect_photos(
 
 
 def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"]) -> Found:
-    """The person with a mask whose edges are the photo's. Nothing of the size of the photo is made."""
+    """The person with a mask whose edges are the photo's.
+
+    Nothing of the size of the photo is made.
+    """
     pixel = person.crop.side / LANDMARK_SIZE
     window = mask_window(person, photo.shape[1], photo.shape[0], filter_margin(pixel))
     mask = sharpened(mask_in_window(person, window), photo[window], pixel)
@@ -242,14 +270,17 @@ def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"]) -> Found:
     )
 
 
-# Who is meant -------------------------------------------------------------------------------------------------------
+# Who is meant
+# --------------------------------------------------------------------------------------------------
 
 
 def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
     """The number of the person that is meant: the one asked for, or the only one who is large.
 
-    Arguments: sheet: where the numbers can be looked up; it is written where this cannot be decided.
-    Raises: ValueError if no photo has a person or none has this number, if several may be meant, or if it is unclear who is who.
+    Arguments: sheet: where the numbers can be looked up; it is written where this cannot be
+    decided.
+    Raises: ValueError if no photo has a person or none has this number, if several may be meant, or
+    if it is unclear who is who.
     """
     try:
         return _chosen(photos, person, sheet)
@@ -259,7 +290,10 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
 
 
 def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
-    """Write the sheet that an error speaks of. Raises: ValueError where a picture of others has its name."""
+    """Write the sheet that an error speaks of.
+
+    Raises: ValueError where a picture of others has its name.
+    """
     sheet.parent.mkdir(parents=True, exist_ok=True)
     check_ours(
         [sheet],
@@ -279,7 +313,8 @@ def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> i
     count = len(photos[0].people)
     if not count:
         raise ValueError(
-            f"no person in {few([photo.name for photo in photos])}: expected one who is seen as a whole"
+            f"no person in {few([photo.name for photo in photos])}: expected one who is seen as a"
+            " whole"
         )
     if person is not None:
         if not 0 <= person < count:
@@ -293,8 +328,9 @@ def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> i
     if unclear := [photo for i, photo in enumerate(photos) if is_unclear(photos, i, chosen)]:
         clues = "colors do" if any(photo.unclear for photo in unclear) else "places do"
         raise ValueError(
-            f"{few([photo.name for photo in unclear])}: which of the people of {sheet} is meant? Their {clues} not tell: cut "
-            "these photos down to one person, leave them out, or give masks or keypoints of the one"
+            f"{few([photo.name for photo in unclear])}: which of the people of {sheet} is meant?"
+            f" Their {clues} not tell: cut these photos down to one person, leave them out, or give"
+            " masks or keypoints of the one"
         )
     return chosen
 
@@ -309,7 +345,8 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
     if any(photo.colors for photo in photos):
         told.insert(
             0,
-            f"several people in a photo: number {person} is the same by the colors of upper body and legs alone",
+            f"several people in a photo: number {person} is the same by the colors of upper body"
+            " and legs alone",
         )
     found = [(photo, each) for photo in photos if (each := photo.people[person]) is not None]
     for photo, each in found:
@@ -324,13 +361,15 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
     return told + [f"{photo.name}: {mirrored}" for photo, each in found if each.mirrored]
 
 
-# Writing -------------------------------------------------------------------------------------------------------------
+# Writing
+# --------------------------------------------------------------------------------------------------
 
 
 def check_found_place(
     folder: Path, names: Sequence[str], advice: str = MOVE_AWAY, *, masks: bool = True
 ) -> None:
-    """Whether what is found in photos of these names can be written without replacing files of others.
+    """Whether what is found in photos of these names can be written without replacing files of
+    others.
 
     Raises: ValueError, see `io.atomic.check_ours`.
     """
@@ -352,7 +391,9 @@ def mask_name(photo: str) -> str:
 
 
 def _is_ours(file: Path) -> bool:
-    """Whether a file that is there was written by `write_found`. capture.json is that of the photos, which gets their masks."""
+    """Whether a file that is there was written by `write_found`. capture.json is that of the
+    photos, which gets their masks.
+    """
     if file.name == KEYPOINTS_FILE:
         with contextlib.suppress(OSError, ValueError):
             read_people(file)
@@ -372,9 +413,10 @@ def write_found(
 ) -> None:
     """Keypoints and masks of a person, and the sheet, into a folder; all or nothing.
 
-    Arguments: to_capture: the folder is the capture whose photos these are, which then names the masks. overwrite: replace files
-    that were not written by this function, too.
-    Raises: ValueError if two photos have the same name but for the suffix, or for a file of others, see `check_found_place`.
+    Arguments: to_capture: the folder is the capture whose photos these are, which then names the
+    masks. overwrite: replace files that were not written by this function, too.
+    Raises: ValueError if two photos have the same name but for the suffix, or for a file of others,
+    see `check_found_place`.
     """
     files = [mask_name(photo.name) for photo in photos]
     owners: dict[str, str] = {}
@@ -416,7 +458,9 @@ def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
 
 
 def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
-    """The photos side by side, everybody in a color and with a number. person: the one who was chosen."""
+    """The photos side by side, everybody in a color and with a number. person: the one who was
+    chosen.
+    """
     from humangs_jax.avatar.video import contact_sheet
 
     pictures = [_picture(photo, person) for photo in photos]

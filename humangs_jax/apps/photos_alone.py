@@ -1,7 +1,8 @@
-"""Photos without a calibration -> a capture without a body: the people in them are found, and from the person the cameras.
+"""Photos without a calibration -> a capture without a body: the people in them are found, and from
+the person the cameras.
 
-See `fitting.person_cameras`; who is who in several photos: `apps.detect`. Large photos are reduced first: nothing that comes
-after looks at more than some hundred pixels of a person.
+See `fitting.person_cameras`; who is who in several photos: `apps.detect`. Large photos are reduced
+first: nothing that comes after looks at more than some hundred pixels of a person.
 """
 
 import dataclasses
@@ -36,13 +37,16 @@ from humangs_jax.io.images import (
 )
 
 LONGEST, LEAST_PERSON = 2048, 700
-"""Pixels: longest side to which photos are reduced, and size of the person there below which they stay as they are."""
+"""Pixels: longest side to which photos are reduced, and size of the person there below which they
+stay as they are.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class PhotosImported:
-    """What `import_photos` did, a line each; warnings: what a user should know. people, person: who was found in the photos, and
-    the number of the one who is meant. one_moment: whether several photos share one pose, so that cameras can be refined.
+    """What `import_photos` did, a line each; warnings: what a user should know. people, person: who
+    was found in the photos, and the number of the one who is meant. one_moment: whether several
+    photos share one pose, so that cameras can be refined.
     """
 
     lines: tuple[str, ...]
@@ -64,17 +68,20 @@ def import_photos(
     reduce: bool = False,
     also: Mapping[str, object] | None = None,
 ) -> PhotosImported:
-    """Write the capture folder `out`, with keypoints.json and people.png, from photos alone; what is there is replaced.
+    """Write the capture folder `out`, with keypoints.json and people.png, from photos alone; what
+    is there is replaced.
 
     Arguments:
         person: number on people.png, where several may be meant; with `keypoints`, in their file.
         height: of the person, metres.
         keypoints: of another program. They choose who is meant in each photo.
-        masks: folder of masks of another program. They choose, too, where neither keypoints nor a number is given.
+        masks: folder of masks of another program. They choose, too, where neither keypoints nor a
+            number is given.
         own_masks: whether the detector's masks are written.
         reduce: whether large photos may be reduced.
         also: name and content of JSON files that appear with the capture.
-    Raises: ValueError (one line) if no camera is found or several people may be meant; as `import_cameras`.
+    Raises: ValueError (one line) if no camera is found or several people may be meant; as
+    `import_cameras`.
     """
     images, files = photo_files(folder)
     choice = _Choice(person, keypoints, masks, out)
@@ -90,7 +97,9 @@ def import_photos(
 
 
 def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
-    """The photos, upright and not larger than `LONGEST`, in a folder; none if they are small as they are."""
+    """The photos, upright and not larger than `LONGEST`, in a folder; none if they are small as
+    they are.
+    """
     names = {file.relative_to(images).with_suffix(".png") for file in files}
     if max(max(image_size(file)) for file in files) <= LONGEST or len(names) < len(files):
         return []
@@ -107,7 +116,9 @@ def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
 
 
 class _Looked(NamedTuple):
-    """photos: all of them. shown: those with the person `number`. seen: of these. cropped: a line for photos that were cut."""
+    """photos: all of them. shown: those with the person `number`. seen: of these. cropped: a line
+    for photos that were cut.
+    """
 
     photos: list[PhotoPeople]
     number: int
@@ -155,7 +166,10 @@ def _cropped(files: list[Path]) -> tuple[str, ...]:
         return ()
     named = [f"{file.name} ({_by(image_size(file))}, EXIF {_by(frame)})" for file, frame in found]
     return (
-        f"cropped, as their shape is not that of their EXIF: {few(named)}: their focal length is taken for unknown",
+        (
+            f"cropped, as their shape is not that of their EXIF: {few(named)}: their focal length"
+            " is taken for unknown"
+        ),
     )
 
 
@@ -166,7 +180,10 @@ def _by(size: tuple[int, int]) -> str:
 def _chosen(
     photos: list[PhotoPeople], images: Path, files: list[Path], choice: _Choice
 ) -> tuple[list[PhotoPeople], int]:
-    """The photos, and the number of the person. Raises: see `detect.choose`, `detect.person_of`, `read_keypoints`."""
+    """The photos, and the number of the person.
+
+    Raises: see `detect.choose`, `detect.person_of`, `read_keypoints`.
+    """
     # beside the capture folder, which a refusal leaves as it is
     sheet = choice.out.with_name(f"{choice.out.resolve().name}_{detect.SHEET_FILE}")
     if choice.keypoints is not None:
@@ -245,7 +262,10 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
     elif found.moments == 1:
         which = f"{count} photos of one moment: one pose"
     else:
-        which = f"{count} photos of several moments: the person has a pose of its own in each, and one shape"
+        which = (
+            f"{count} photos of several moments: the person has a pose of its own in each, and one"
+            " shape"
+        )
     focal = np.median(
         [
             float(c.K[0, 0]) / np.hypot(*seen.sizes[view])
@@ -254,7 +274,9 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
     )
     return (
         f"{report.out}: {which}",
-        f"cameras from the person: {distance:.1f} m away, {DIAGONAL_35MM * focal:.0f} mm (35-mm equivalent); "
-        f"landmarks are off by {np.median(found.errors):.1f} px",
+        (
+            f"cameras from the person: {distance:.1f} m away, {DIAGONAL_35MM * focal:.0f} mm (35-mm"
+            f" equivalent); landmarks are off by {np.median(found.errors):.1f} px"
+        ),
         *report.notes,
     )

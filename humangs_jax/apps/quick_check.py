@@ -1,8 +1,10 @@
-"""What is wrong with a capture: whether its photos, masks, cameras and poses belong together, in a fraction of a second.
+"""What is wrong with a capture: whether its photos, masks, cameras and poses belong together, in a
+fraction of a second.
 
-The posed body is drawn as points into coarse silhouettes by numpy: nothing is compiled. Where a silhouette is not on its mask,
-mistakes that people make are undone on trial, and the one that explains it is named. `humangs reconstruct` and `refine` look
-first; `humangs check` and `start` draw a sheet as well (`apps.check`).
+The posed body is drawn as points into coarse silhouettes by numpy: nothing is compiled. Where a
+silhouette is not on its mask, mistakes that people make are undone on trial, and the one that
+explains it is named. `humangs reconstruct` and `refine` look first; `humangs check` and `start`
+draw a sheet as well (`apps.check`).
 """
 
 import math
@@ -23,11 +25,15 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 
 LEAST_IOU = 0.5
-"""Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
+"""Clothes and hair cover about a fifth of a silhouette that the body does not; half means another
+pose or camera.
+"""
 SURELY_IOU = 0.6
 """From here on a mistake that was undone explains a view."""
 LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
-"""Share of the points in the frame: below the first it is a warning, the second is asked of an explanation."""
+"""Share of the points in the frame: below the first it is a warning, the second is asked of an
+explanation.
+"""
 LEAST_HEIGHT = 0.05
 """Share of the image's height: a body smaller than this has its lengths in another unit."""
 GRID = 64
@@ -37,11 +43,15 @@ POINTS = 6000
 VIEWS = 24
 """Most views that are looked at before a reconstruction, evenly chosen."""
 LONGEST_TURN = 2 * math.pi + 0.5
-"""Radians: rotation vectors are at most half a turn, and a whole one where someone counted on; degrees are far beyond."""
+"""Radians: rotation vectors are at most half a turn, and a whole one where someone counted on;
+degrees are far beyond.
+"""
 BETTER = 0.1
 """IoU by which an exchange has to explain each view better than the capture does."""
 DARKEST, BURNT = 0.12, 0.98
-"""A photo is too dark if 98 % of the person's values are below the first, and burnt out if 60 % are above the second."""
+"""A photo is too dark if 98 % of the person's values are below the first, and burnt out if 60 % are
+above the second.
+"""
 
 Matrix = Float[np.ndarray, "4 4"]
 Cells = Bool[np.ndarray, "rows columns"]
@@ -50,23 +60,22 @@ MISTAKES: dict[str, Callable[[Matrix, Float[np.ndarray, "3"]], Matrix]] = {
     "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(
         m
     ),
-    "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": (
-        lambda m, t: OPENGL_FROM_OPENCV @ m
-    ),
-    "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate rows 2 and 3": (
-        lambda m, t: OPENGL_FROM_OPENCV @ np.linalg.inv(m)
-    ),
+    "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of"
+    " cam_from_world": (lambda m, t: OPENGL_FROM_OPENCV @ m),
+    "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate"
+    " rows 2 and 3": (lambda m, t: OPENGL_FROM_OPENCV @ np.linalg.inv(m)),
     "the camera's translation is in millimetres": lambda m, t: pose_matrix(
         m[:3, :3], m[:3, 3] / 1000
     ),
     "the body's translation is in millimetres": lambda m, t: (
         m @ pose_matrix(np.eye(3), t / 1000 - t)
     ),
-    "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y) from the right": (
-        lambda m, t: m @ _TO_Y_UP.T
-    ),
+    "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y)"
+    " from the right": (lambda m, t: m @ _TO_Y_UP.T),
 }
-"""What people do wrong, and the correct cam_from_world from the given one and the body's translation."""
+"""What people do wrong, and the correct cam_from_world from the given one and the body's
+translation.
+"""
 MISTAKES_OF_IMAGES: dict[str, Callable[[Cells, Cells], tuple[Cells, Cells]]] = {
     "the mask is inverted": lambda body, mask: (body, ~mask),
     "the photo is mirrored": lambda body, mask: (body[:, ::-1], mask),
@@ -77,7 +86,8 @@ MISTAKES_OF_IMAGES: dict[str, Callable[[Cells, Cells], tuple[Cells, Cells]]] = {
 class Faults(NamedTuple):
     """What is wrong. whole: with the capture, a line each. views: with each view, a line or None.
 
-    inside: of each view, the share of the body in the frame. explained: views that `whole` explains.
+    inside: of each view, the share of the body in the frame. explained: views that `whole`
+    explains.
     """
 
     whole: tuple[str, ...]
@@ -87,7 +97,9 @@ class Faults(NamedTuple):
 
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:
-    """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it first."""
+    """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it
+    first.
+    """
     some = np.unique(
         np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int)
     )
@@ -123,7 +135,10 @@ def faults(capture: Capture) -> Faults:
 
 
 class _View(NamedTuple):
-    """What is compared, in numpy: JAX would compile each of the small operations. points: (p, 3) on the posed skin."""
+    """What is compared, in numpy: JAX would compile each of the small operations.
+
+    points: (p, 3) on the posed skin.
+    """
 
     name: str
     image: Float[np.ndarray, "h w 3"]
@@ -183,14 +198,19 @@ def _wrong_exposure(view: _View) -> str | None:
         view.image if view.mask is None else view.image[view.mask > 0.99]
     )  # without its blended edge
     if person.size and np.quantile(person, 0.98) < DARKEST:
-        return "the person is nearly black; is the photo underexposed, or were its values divided by 255 twice"
+        return (
+            "the person is nearly black; is the photo underexposed, or were its values divided by"
+            " 255 twice"
+        )
     if person.size and view.mask is not None and np.quantile(person, 0.4) > BURNT:
         return "most of the person is white; is the photo overexposed"
     return None
 
 
 def _cause(view: _View, body: Cells) -> str | None:
-    """The mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in the frame."""
+    """The mistake that, undone, puts the body where the mask is; without a mask the only one that
+    puts it in the frame.
+    """
     tried = {}
     if view.cells is not None:
         tried = {
@@ -210,7 +230,10 @@ def _cause(view: _View, body: Cells) -> str | None:
 
 
 def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
-    """For views that fit the camera of another one: that one. An exchange has to explain all of its views."""
+    """For views that fit the camera of another one: that one.
+
+    An exchange has to explain all of its views.
+    """
     drawn = lambda i, j: _silhouette(views[i]._replace(K=views[j].K, matrix=views[j].matrix))[0]
     masks = {i: view.cells for i, view in enumerate(views) if view.cells is not None}
     own = {i: _overlap(drawn(i, i), mask) for i, mask in masks.items()}
@@ -236,11 +259,14 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
     return {i: j for i, (j, _) in found.items()}
 
 
-# Coarse silhouettes ---------------------------------------------------------------------------------------------------
+# Coarse silhouettes
+# --------------------------------------------------------------------------------------------------
 
 
 def _silhouette(view: _View) -> tuple[Cells, float, float]:
-    """The cells that the body covers; the share of its points in the image; and its height there, of the image's."""
+    """The cells that the body covers; the share of its points in the image; and its height there,
+    of the image's.
+    """
     height, width = view.image.shape[:2]
     pixels = points_in_image(view.points, view.K, view.matrix, width, height)
     (rows, columns), cell = _grid(width, height)

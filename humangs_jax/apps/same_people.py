@@ -1,9 +1,10 @@
 """Who of the people in one photo is who of those in the others.
 
-The person is the only large one of each photo. Where several are large, people of one moment are matched by how well they
-triangulate, over time by where they are, in space or in the photo of one camera. Without calibrated cameras the colors of upper
-body and legs are compared, whatever the exposure. Whoever is matched to nobody may still be the person: only who is in a photo
-together with the person is surely somebody else.
+The person is the only large one of each photo. Where several are large, people of one moment are
+matched by how well they triangulate, over time by where they are, in space or in the photo of one
+camera. Without calibrated cameras the colors of upper body and legs are compared, whatever the
+exposure. Whoever is matched to nobody may still be the person: only who is in a photo together with
+the person is surely somebody else.
 """
 
 import dataclasses
@@ -33,9 +34,11 @@ LARGE_PEOPLE = 5
 
 
 class Found(NamedTuple):
-    """A person in a photo. mask: 8 bits, the part of the photo that begins at corner (row, column). area: pixels of the person.
-    mirrored: left and right were exchanged, as other views show; it is repaired. apart: the landmarks do not meet those of other
-    photos of the moment: the camera is off, or this is somebody else.
+    """A person in a photo. mask: 8 bits, the part of the photo that begins at corner (row, column).
+    area: pixels of the person.
+    mirrored: left and right were exchanged, as other views show; it is repaired. apart: the
+    landmarks do not meet those of other photos of the moment: the camera is off, or this is
+    somebody else.
     """
 
     person: SeenPerson
@@ -48,7 +51,8 @@ class Found(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PhotoPeople:
-    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet. people: None who is not in it.
+    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet.
+    people: None who is not in it.
     colors: several are large, and colors tell who is who. unclear: they do not.
     """
 
@@ -74,8 +78,9 @@ def same_people(
 ) -> list[PhotoPeople]:
     """The photos with people in such an order that the i-th of each is the same person.
 
-    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, or, where several are large, that
-    of colors. frames: the moment of each photo. The person with the most pixels in all photos together is the first.
+    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, or,
+    where several are large, that of colors. frames: the moment of each photo. The person with the
+    most pixels in all photos together is the first.
     """
     if cameras is not None and len(photos) > 1:
         moments = np.asarray([0] * len(photos) if frames is None else frames)
@@ -110,7 +115,9 @@ def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
 
 
 def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
-    """The photos, each with its large people in the order of those in the photo that has the most of them; see `unclear`."""
+    """The photos, each with its large people in the order of those in the photo that has the most
+    of them; see `unclear`.
+    """
     found = [
         [each for each in photo.people if each is not None] for photo in photos
     ]  # the largest first
@@ -135,7 +142,9 @@ def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
 
 
 def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n parts 3"]:
-    """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in the photo."""
+    """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in
+    the photo.
+    """
     height, width = photo.thumbnail.shape[:2]
     u, v = (
         each.reshape(-1, 1)
@@ -184,10 +193,11 @@ def _matched(
 
 
 def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]:
-    """The same where those who are the only large ones of their photos are one person, matched or not.
+    """The same where those who are the only large ones of their photos are one person, matched or
+    not.
 
-    Two of whom one photo shows both stay two. So does everybody where somebody else is large in many photos: whoever is alone
-    in a photo may then be either.
+    Two of whom one photo shows both stay two. So does everybody where somebody else is large in
+    many photos: whoever is alone in a photo may then be either.
     """
     alone = {large[0] for large in map(_large, rows) if len(large) == 1}
     if not alone:
@@ -212,7 +222,8 @@ def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]
 def _with_those_apart(
     rows: list[Row], person: int, source: Int[np.ndarray, " v"], frames: Int[np.ndarray, " v"]
 ) -> list[Row]:
-    """The same where photos of the person that do not meet the others of their moment are marked, see `Found.apart`.
+    """The same where photos of the person that do not meet the others of their moment are marked,
+    see `Found.apart`.
 
     Arguments: source: the number that each photo had by its match.
     """

@@ -1,9 +1,12 @@
-"""Speed against accuracy in one value: how many photos, how the network runs, how long refinement takes, how frames are drawn.
+"""Speed against accuracy in one value: how many photos, how the network runs, how long refinement
+takes, how frames are drawn.
 
-`PRESETS` are points of the front that python -m experiments tradeoff has measured (docs/tradeoff.md). `tune` finds one for a
-machine and a person within a budget. The front (assets/front.json) says which settings are worth trying, how good they are, and
-how their times compare. A few are measured, the cheapest first; times of the others are extrapolated from those. What is chosen
-has been measured itself, twice: other programs come and go. Times are without compilation.
+`PRESETS` are points of the front that python -m experiments tradeoff has measured
+(docs/tradeoff.md). `tune` finds one for a machine and a person within a budget. The front
+(assets/front.json) says which settings are worth trying, how good they are, and how their times
+compare. A few are measured, the cheapest first; times of the others are extrapolated from those.
+What is chosen has been measured itself, twice: other programs come and go. Times are without
+compilation.
 """
 
 import dataclasses
@@ -56,11 +59,14 @@ KIND = "humangs_jax settings"
 
 @configuration
 class Settings:
-    """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the screen.
+    """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the
+    screen.
 
-    views: photos that are used at most, chosen by `select_views`; None: all. runtime: of the network. refine_iterations,
-    refine_steps, head_steps: of refinement, see `RefineConfig`; the first two 0 for none. refine_size: photos whose longer side
-    is larger are reduced to it for refinement, pixels. splat: as `Shot.splat`. prune: as `Shot.prune`.
+    views: photos that are used at most, chosen by `select_views`; None: all. runtime: of the
+    network. refine_iterations,
+    refine_steps, head_steps: of refinement, see `RefineConfig`; the first two 0 for none.
+    refine_size: photos whose longer side is larger are reduced to it for refinement, pixels. splat:
+    as `Shot.splat`. prune: as `Shot.prune`.
     """
 
     views: Few | None = knob(
@@ -197,7 +203,10 @@ def save_settings(path: str | os.PathLike[str], settings: Settings, **about: Any
 
 
 def load_settings(path: str | os.PathLike[str]) -> Settings:
-    """Settings that `save_settings` has written. Raises: FileNotFoundError; FileError naming the file and what is wrong."""
+    """Settings that `save_settings` has written.
+
+    Raises: FileNotFoundError; FileError naming the file and what is wrong.
+    """
     with reading(path, "settings file"):
         content = parse_json(read_text(path))
         if not isinstance(content, dict) or content.get("kind") != KIND:
@@ -208,19 +217,23 @@ def load_settings(path: str | os.PathLike[str]) -> Settings:
             raise Refused(str(error)) from error
 
 
-# Settings for a budget ------------------------------------------------------------------------------------------------
+# Settings for a budget
+# ------------------------------------------------------------------------------------------------
 
 MARGIN = 1.25
 """A busy machine is slower later: what is measured times this has to be within the budget."""
 MAKES, FRAMES, STEPS = 3, 16, 6
-"""Repetitions of a measurement, and steps of refinement that are timed. The slowest counts, of frames the 90th percentile."""
+"""Repetitions of a measurement, and steps of refinement that are timed.
+
+The slowest counts, of frames the 90th percentile.
+"""
 
 
 @configuration
 class FrontPoint:
-    """A point of the front. `make`, `refine` and `frame`: times over those of the sweep's default point, of making the avatar
-    without refinement, of refinement, and of a frame. memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
-    in the pose of the photos and in novel poses.
+    """A point of the front. `make`, `refine` and `frame`: times over those of the sweep's default
+    point, of making the avatar without refinement, of refinement, and of a frame. memory_mb as in
+    `Cost`. psnr, psnr_poses: dB, of new views in the pose of the photos and in novel poses.
     """
 
     name: str
@@ -240,7 +253,9 @@ class FrontPoint:
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """Milliseconds of making an avatar and of a frame; MiB that they add to the process at their peak, None: not known."""
+    """Milliseconds of making an avatar and of a frame; MiB that they add to the process at their
+    peak, None: not known.
+    """
 
     make_ms: float
     refine_ms: float
@@ -268,7 +283,9 @@ class Budget:
     memory_mb: float | None = None
 
     def allows(self, cost: Cost) -> bool:
-        """Whether a cost is within the budget with room to spare (memory needs none: it does not depend on other programs)."""
+        """Whether a cost is within the budget with room to spare (memory needs none: it does not
+        depend on other programs).
+        """
         pairs = (
             (self.reconstruct_ms, MARGIN * cost.reconstruct_ms),
             (self.frame_ms, MARGIN * cost.frame_ms),
@@ -279,8 +296,9 @@ class Budget:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tuned:
-    """What `tune` found. cost: of the point, the worse of two measurements. best: the point of the highest quality, whatever it
-    costs. measured: all costs that were measured, by the name of the point.
+    """What `tune` found. cost: of the point, the worse of two measurements. best: the point of the
+    highest quality, whatever it costs. measured: all costs that were measured, by the name of the
+    point.
     """
 
     point: FrontPoint
@@ -289,8 +307,13 @@ class Tuned:
     measured: dict[str, Cost]
 
     def __str__(self) -> str:
-        """What was chosen, what it takes, and what it gives up against the best point, by the committed sweep."""
-        takes = f"{self.cost.reconstruct_ms:.0f} ms a reconstruction, {self.cost.frame_ms:.1f} ms a frame"
+        """What was chosen, what it takes, and what it gives up against the best point, by the
+        committed sweep.
+        """
+        takes = (
+            f"{self.cost.reconstruct_ms:.0f} ms a reconstruction, {self.cost.frame_ms:.1f} ms a"
+            " frame"
+        )
         takes += "" if self.cost.memory_mb is None else f", {self.cost.memory_mb:.0f} MiB"
         if self.point.name == self.best.name:
             gives = "is the best of all settings"
@@ -299,7 +322,10 @@ class Tuned:
                 self.best.psnr - self.point.psnr,
                 self.best.psnr_poses - self.point.psnr_poses,
             )
-            gives = f"gives up {lost:.1f} dB in the pose of the photos and {in_poses:.1f} dB in novel poses"
+            gives = (
+                f"gives up {lost:.1f} dB in the pose of the photos and {in_poses:.1f} dB in novel"
+                " poses"
+            )
             gives += f" against {self.best.name!r}"
         return f"{self.point.name}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
 
@@ -314,7 +340,8 @@ def load_front() -> list[FrontPoint]:
 
 
 def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[str, Cost]) -> Cost:
-    """The cost of a point that was not measured: for each part, that of the measured point nearest to it, times their ratio.
+    """The cost of a point that was not measured: for each part, that of the measured point nearest
+    to it, times their ratio.
 
     measured: at least one; by name.
     """
@@ -343,8 +370,9 @@ def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[st
 def choose(
     front: Sequence[FrontPoint], measured: Mapping[str, Cost], budget: Budget
 ) -> FrontPoint | None:
-    """The point to go on with: the best whose cost, measured or predicted, the budget allows. It is the answer if it has been
-    measured, and is to be measured next if not. None: no point is within the budget. Pure.
+    """The point to go on with: the best whose cost, measured or predicted, the budget allows. It is
+    the answer if it has been measured, and is to be measured next if not. None: no point is within
+    the budget. Pure.
     """
     if not measured:
         return min(front, key=lambda point: (point.make + point.refine, point.frame))
@@ -375,16 +403,17 @@ def tune(
         frame_ms: the most that a frame may take, milliseconds.
         memory_mb: the most memory that this may add to the process, MiB.
         size: side of the frames, pixels.
-        front: points to choose from; None: those that come with the package. Those that ask for more photos than the capture has
-            are tried with all it has, and without masks those that refine are not.
+        front: points to choose from; None: those that come with the package. Those that ask for
+            more photos than the capture has are tried with all it has, and without masks those that
+            refine are not.
         progress: show a bar.
 
     Returns:
         The settings (`.point.settings`, for `reconstruct_with`) and what they cost.
 
     Raises:
-        ValueError: if no setting is within the budget, saying what the cheapest takes; or if memory is limited where it cannot be
-            measured.
+        ValueError: if no setting is within the budget, saying what the cheapest takes; or if memory
+            is limited where it cannot be measured.
 
     Examples:
         >>> tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
@@ -419,11 +448,14 @@ def tune(
         for name in ("reconstruct_ms", "frame_ms")
     }
     memory = [cost.memory_mb for cost in measured.values() if cost.memory_mb is not None]
-    needs = f"{least['reconstruct_ms']:.0f} ms a reconstruction, {least['frame_ms']:.1f} ms a frame of {size} pixels"
+    needs = (
+        f"{least['reconstruct_ms']:.0f} ms a reconstruction, {least['frame_ms']:.1f} ms a frame of"
+        f" {size} pixels"
+    )
     needs += f", {min(memory):.0f} MiB" if memory else ""
     raise ValueError(
-        f"no setting is within the budget: the least that was measured is {needs}, and {MARGIN - 1:.0%} of room is kept "
-        "for a busy machine; smaller frames are faster"
+        f"no setting is within the budget: the least that was measured is {needs}, and"
+        f" {MARGIN - 1:.0%} of room is kept for a busy machine; smaller frames are faster"
     )
 
 
@@ -461,7 +493,9 @@ def measure(
 
 
 def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
-    """Short runs of refinement, and how often each has to be counted: the iterations, and a few steps for all."""
+    """Short runs of refinement, and how often each has to be counted: the iterations, and a few
+    steps for all.
+    """
     few = min(settings.refine_steps, STEPS)
     iterations = dataclasses.replace(settings, refine_steps=0).refinement
     steps = dataclasses.replace(
@@ -479,7 +513,10 @@ def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
 
 
 def frames_of(avatar: Avatar, settings: Settings, size: int) -> Iterator[Rendering]:
-    """Renderings without end, around the avatar in its T-pose. Nothing is pruned: that is of a motion and its cameras."""
+    """Renderings without end, around the avatar in its T-pose.
+
+    Nothing is pruned: that is of a motion and its cameras.
+    """
     shot = settings.shot(Shot(size=size))
     poses, cameras = turntable_views(avatar, rest_pose_of(avatar), 8, shot)
     turns = [itertools.cycle(range(8)) for _ in range(2)]

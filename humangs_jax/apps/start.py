@@ -1,7 +1,8 @@
-"""From a folder of photos to an avatar: what is there, what is missing, and which well-known tool makes it.
+"""From a folder of photos to an avatar: what is there, what is missing, and which well-known tool
+makes it.
 
-Nothing is asked: the folder is looked at. docs/your_photos.md shows the way. Also the best frames of a video, and how like a
-person an avatar is where no photo was.
+Nothing is asked: the folder is looked at. docs/your_photos.md shows the way. Also the best frames
+of a video, and how like a person an avatar is where no photo was.
 """
 
 import dataclasses
@@ -50,7 +51,8 @@ from humangs_jax.refinement.refine import refine
 
 PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
 CAMERA_PLACES = (".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0")
-"""Names that are looked for in the folder of photos, in this order; those of files: `data.formats`."""
+"""Names that are looked for in the folder of photos, in this order; those of files: `data.formats`.
+"""
 KEYPOINT_FOLDER = "keypoints"
 OWN_DETECTOR = (
     "pip install 'humangs_jax[photos]', and the same command finds them; or with another program:"
@@ -62,8 +64,10 @@ OWN_DETECTOR = (
 class Material:
     """What a folder has.
 
-    folder: that was looked at. images: the folder of its photos. photos: their number. size: of the first one, pixels.
-    cameras, keypoints: file or folder, masks: folder, None where there is none. alpha: whether photos carry their mask.
+    folder: that was looked at. images: the folder of its photos. photos: their number. size: of the
+    first one, pixels.
+    cameras, keypoints: file or folder, masks: folder, None where there is none. alpha: whether
+    photos carry their mask.
     unused: what the folder has besides.
     """
 
@@ -81,7 +85,10 @@ class Material:
         """A line for each kind of thing, and one for what is not used."""
         masks = self.masks or ("in the photos' alpha channel" if self.alpha else None)
         rows = {
-            "photos": f"{self.photos} in {self.images}, the first of {self.size[0]} x {self.size[1]} pixels",
+            "photos": (
+                f"{self.photos} in {self.images}, the first of {self.size[0]} x {self.size[1]}"
+                " pixels"
+            ),
             "cameras": self.cameras,
             "masks": masks,
             "keypoints": self.keypoints,
@@ -96,7 +103,9 @@ class Material:
 
 @dataclasses.dataclass(frozen=True)
 class Missing:
-    """Something that is not there. why: what it is for. how: command lines and advice, a line each."""
+    """Something that is not there. why: what it is for. how: command lines and advice, a line
+    each.
+    """
 
     name: str
     why: str
@@ -116,7 +125,8 @@ def look(
 ) -> Material:
     """What a folder has; what the arguments name is taken from there.
 
-    Raises: CaptureError, one line, if there is no photo, the folder is a capture already, or a named file does not exist.
+    Raises: CaptureError, one line, if there is no photo, the folder is a capture already, or a
+    named file does not exist.
     """
     _expect_folder(folder)
     if (folder / "capture.json").is_file():
@@ -147,13 +157,17 @@ def look(
 
 
 def photo_files(folder: Path) -> tuple[Path, list[Path]]:
-    """The folder that the photos are in, and their files in order. Raises: CaptureError, one line, if there is none."""
+    """The folder that the photos are in, and their files in order.
+
+    Raises: CaptureError, one line, if there is none.
+    """
     scan = scan_photos(folder)
     return scan.folder, list(scan.photos)
 
 
 def scan_photos(folder: Path) -> FolderScan:
-    """The photos in a folder, or in the one in it that is called like one of photos, and what both hold besides.
+    """The photos in a folder, or in the one in it that is called like one of photos, and what both
+    hold besides.
 
     Raises: CaptureError, one line, if there is no photo.
     """
@@ -191,19 +205,31 @@ def _expect_folder(folder: Path) -> None:
 def missing(material: Material, images: Path | None = None) -> tuple[Missing, ...]:
     """What is still to be made, with the commands that make it.
 
-    Arguments: images: where photos without lens distortion are, if they were imported: keypoints have to be of those.
+    Arguments: images: where photos without lens distortion are, if they were imported: keypoints
+    have to be of those.
     """
     folder, found = material.folder, []
     if material.cameras is None:
         workspace = folder / "colmap"
         model = workspace / "sparse" / "0"
         how = (
-            "many overlapping photos of someone who stands still, with COLMAP (https://colmap.github.io):",
-            f"  mkdir {workspace} && colmap automatic_reconstructor --workspace_path {workspace}"
-            f" --image_path {material.images} --single_camera 1 --dense 0",
-            f"  colmap model_converter --input_path {model} --output_path {model} --output_type TXT",
+            (
+                "many overlapping photos of someone who stands still, with COLMAP"
+                " (https://colmap.github.io):"
+            ),
+            (
+                f"  mkdir {workspace} && colmap automatic_reconstructor --workspace_path"
+                f" {workspace} --image_path {material.images} --single_camera 1 --dense 0"
+            ),
+            (
+                f"  colmap model_converter --input_path {model} --output_path {model}"
+                " --output_type TXT"
+            ),
             "  its unit is arbitrary: measure something, and add --scale METRES_PER_UNIT",
-            "few cameras that stand still: calibrate them with a checkerboard, in OpenCV or EasyMocap;",
+            (
+                "few cameras that stand still: calibrate them with a checkerboard, in OpenCV or"
+                " EasyMocap;"
+            ),
             f"  put calibration.json, or intri.yml and extri.yml, into {folder} (docs/cameras.md)",
         )
         found.append(Missing("cameras", "where each photo was taken from, and its lens", how))
@@ -212,7 +238,10 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
             OWN_DETECTOR,
             'rembg: pip install "rembg[cpu,cli]"',
             f"  rembg p -m u2net_human_seg -om {material.images} {folder / 'masks'}",
-            "where it takes something else for the person: SAM 2 (https://github.com/facebookresearch/sam2)",
+            (
+                "where it takes something else for the person: SAM 2"
+                " (https://github.com/facebookresearch/sam2)"
+            ),
             "photos with nothing but white behind the person: --without-masks",
         )
         found.append(Missing("masks", "what of each photo is the person", how))
@@ -223,7 +252,10 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
             "RTMPose, in a checkout of MMPose (https://github.com/open-mmlab/mmpose):",
             f"  python demo/inferencer_demo.py {source} --pose2d wholebody --pred-out-dir {target}",
             "or OpenPose (https://github.com/CMU-Perceptual-Computing-Lab/openpose):",
-            f"  openpose.bin --image_dir {source} --write_json {target} --hand --display 0 --render_pose 0",
+            (
+                f"  openpose.bin --image_dir {source} --write_json {target} --hand --display 0"
+                " --render_pose 0"
+            ),
         )
         found.append(
             Missing("keypoints", "where shoulders, knees and fingers are, for `humangs fit`", how)
@@ -247,7 +279,8 @@ def _scan(folder: Path) -> FolderScan:
     return scan_folder(folder, lambda place: place.name in others)
 
 
-# Photos of a video ----------------------------------------------------------------------------------------------------
+# Photos of a video
+# --------------------------------------------------------------------------------------------------
 
 
 MARK = "video.json"
@@ -275,7 +308,8 @@ def video_of(place: Path) -> Path | None:
 
 
 def photos_of_video(video: Path, folder: Path) -> str:
-    """Write the chosen frames into `folder / "images"`, and say so; a folder that an earlier run wrote of this video stays.
+    """Write the chosen frames into `folder / "images"`, and say so; a folder that an earlier run
+    wrote of this video stays.
 
     Raises: CaptureError naming the video, or the folder if something else is there.
     """
@@ -285,7 +319,10 @@ def photos_of_video(video: Path, folder: Path) -> str:
     if folder.exists() or folder.is_symlink():
         known = read_json(folder / MARK) if (folder / MARK).is_file() else None
         if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
-            problem = f"exists, and is not of {video.name} as it is now: expected another folder, or remove it"
+            problem = (
+                f"exists, and is not of {video.name} as it is now: expected another folder, or"
+                " remove it"
+            )
             raise CaptureError(folder, "", problem)
         return _said(video, folder, known["chosen"], known["frames"])
     sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
@@ -302,12 +339,14 @@ def photos_of_video(video: Path, folder: Path) -> str:
 
 def _said(video: Path, folder: Path, chosen: Sequence[int], count: int) -> str:
     return (
-        f"{video}: {len(chosen)} of {count:,} frames, sharp ones that show different things ({', '.join(map(str, chosen))}), "
-        f"are the photos in {folder / 'images'}; what is to be added goes into {folder}"
+        f"{video}: {len(chosen)} of {count:,} frames, sharp ones that show different things"
+        f" ({', '.join(map(str, chosen))}), are the photos in {folder / 'images'}; what is to be"
+        f" added goes into {folder}"
     )
 
 
-# A held-out photo -----------------------------------------------------------------------------------------------------
+# A held-out photo
+# --------------------------------------------------------------------------------------------------
 
 
 LEAST_PHOTOS, SIZE = 4, 512
@@ -325,15 +364,19 @@ class HeldOut(NamedTuple):
 
     def __str__(self) -> str:
         """One line."""
-        return f"a photo that was held out ({self.name}) is reproduced with {self.psnr:.1f} dB in the foreground"
+        return (
+            f"a photo that was held out ({self.name}) is reproduced with {self.psnr:.1f} dB in the"
+            " foreground"
+        )
 
 
 def held_out_psnr(
     variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None
 ) -> HeldOut | None:
-    """How well the photo that has the nearest other one is reproduced by an avatar of the others, over the person, in a crop of
-    `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos. In its place is a
-    second copy of the nearest photo: the programs for that number of photos are compiled already.
+    """How well the photo that has the nearest other one is reproduced by an avatar of the others,
+    over the person, in a crop of `SIZE` pixels; None for fewer than four photos or without masks.
+    Body and cameras are those of all photos. In its place is a second copy of the nearest photo:
+    the programs for that number of photos are compiled already.
     """
     capture = usable_views(capture)
     if max(capture.images.shape[1:3]) > LONGEST:
@@ -363,9 +406,11 @@ def better_body(
     second: Capture,
     refinement: RefineConfig | None,
 ) -> tuple[Capture, HeldOut | None]:
-    """The capture whose body makes the better avatar, judged by a photo that is held out of it, and what that photo says.
+    """The capture whose body makes the better avatar, judged by a photo that is held out of it, and
+    what that photo says.
 
-    More of the masks is covered by a body that fills clothes; the avatar is not better for it. Without enough photos the first.
+    More of the masks is covered by a body that fills clothes; the avatar is not better for it.
+    Without enough photos the first.
     """
     one = held_out_psnr(variables, config, first, refinement)
     two = None if one is None else held_out_psnr(variables, config, second, refinement)
@@ -377,8 +422,8 @@ def better_body(
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
-    """Between the cameras as the person sees them, in the axes of the pelvis: of somebody who turns before one camera, too. A
-    photo is none of its own neighbours.
+    """Between the cameras as the person sees them, in the axes of the pelvis: of somebody who turns
+    before one camera, too. A photo is none of its own neighbours.
     """
     frames = np.asarray(capture.frames)
     pelvis = capture.poses.rotations[:, 0]

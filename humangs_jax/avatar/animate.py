@@ -1,10 +1,12 @@
-"""Canonical Gaussians -> posed Gaussians, by blend skinning alone: the network is not run again. And the low-pass of images as a
-part of the scales, so that an avatar looks the same in images of every size.
+"""Canonical Gaussians -> posed Gaussians, by blend skinning alone: the network is not run again.
+And the low-pass of images as a part of the scales, so that an avatar looks the same in images of
+every size.
 
-A renderer adds `EPS2D` pixels^2 to the variances of each Gaussian, whatever the size of the image. Gaussians that fit images of
-one size are therefore too wide in smaller images, and too narrow in larger ones. Here all but `MIP_EPS2D` of it goes into the
-scales, for the size of the images that they fit (after Mip-Splatting, https://arxiv.org/abs/2311.16493), and `Gaussians.low_pass`
-tells renderers so.
+A renderer adds `EPS2D` pixels^2 to the variances of each Gaussian, whatever the size of the image.
+Gaussians that fit images of one size are therefore too wide in smaller images, and too narrow in
+larger ones. Here all but `MIP_EPS2D` of it goes into the scales, for the size of the images that
+they fit (after Mip-Splatting, https://arxiv.org/abs/2311.16493), and `Gaussians.low_pass` tells
+renderers so.
 """
 
 import jax
@@ -28,17 +30,20 @@ from humangs_jax.rendering.gaussians import (
 
 @checked_arguments
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """The avatar in a pose, differentiable in avatar and pose; affine skinning leaves its linear part in `deformations`.
+    """The avatar in a pose, differentiable in avatar and pose; affine skinning leaves its linear
+    part in `deformations`.
 
     Args:
         avatar: one person.
         pose: rotations (j, 3), axis-angle; translation (3,), metres.
 
     Returns:
-        Posed Gaussians, metres. Colors stay, or are re-shaded for the pose if the avatar has a light.
+        Posed Gaussians, metres. Colors stay, or are re-shaded for the pose if the avatar has a
+        light.
 
     Examples:
-        >>> loss = lambda pose: jnp.mean((hg.render(hg.skin(avatar, pose), camera, config).rgb - photo) ** 2)
+        >>> image = lambda pose: hg.render(hg.skin(avatar, pose), camera, config).rgb
+        >>> loss = lambda pose: jnp.mean((image(pose) - photo) ** 2)
         >>> gradient = jax.grad(loss)(pose)
     """
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
@@ -54,8 +59,8 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
 def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     """The avatar in a pose, as Gaussians that means, quats and scales describe completely.
 
-    The linear deformation is factored into quaternions and scales. These are not differentiable where two scales coincide:
-    optimise through `skin`.
+    The linear deformation is factored into quaternions and scales. These are not differentiable
+    where two scales coincide: optimise through `skin`.
 
     Args:
         avatar: one person.
@@ -65,8 +70,8 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
         Posed Gaussians, metres.
 
     Raises:
-        ValueError: if the pose has another number of joints than the avatar; outside of transformations, also for values
-            that are not finite or out of range, naming the array.
+        ValueError: if the pose has another number of joints than the avatar; outside of
+            transformations, also for values that are not finite or out of range, naming the array.
 
     Examples:
         >>> image = hg.render(hg.animate(avatar, capture.pose(0)), camera).rgb
@@ -75,7 +80,8 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     if pose.rotations.shape != (joints, 3) or pose.translation.shape != (3,):
         found = f"rotations {pose.rotations.shape}, translation {pose.translation.shape}"
         raise ValueError(
-            f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch of poses"
+            f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch"
+            " of poses"
         )
     moves = {
         "pose.rotations": (pose.rotations, FINITE),
@@ -91,13 +97,15 @@ def _animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     return factored(skin(avatar, pose))
 
 
-# The low-pass -----------------------------------------------------------------------------------------------------------
+# The low-pass
+# --------------------------------------------------------------------------------------------------
 
 
 def with_low_pass(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
     """The avatar whose scales contain the low-pass of images with pixels of this size in metres.
 
-    One that is drawn by other conventions than "exact", or has a low-pass already, is returned as it is.
+    One that is drawn by other conventions than "exact", or has a low-pass already, is returned as
+    it is.
     """
     gaussians = avatar.gaussians
     if avatar.rendering != "exact" or gaussians.low_pass is not None:
@@ -119,9 +127,11 @@ def without_low_pass(avatar: Avatar) -> Avatar:
 
 
 def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """The avatar with the low-pass of the photos that it will be fitted to, unless its own is that of smaller pixels.
+    """The avatar with the low-pass of the photos that it will be fitted to, unless its own is that
+    of smaller pixels.
 
-    It looks as before: the excess of its own low-pass is now an ordinary part of the scales, which a fit can reduce.
+    It looks as before: the excess of its own low-pass is now an ordinary part of the scales, which
+    a fit can reduce.
     """
     gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
     if gaussians.low_pass is None:

@@ -1,4 +1,6 @@
-"""The avatar: canonical Gaussians, their skinning weights and the body that they belong to, as one pytree and one file."""
+"""The avatar: canonical Gaussians, their skinning weights and the body that they belong to, as
+one pytree and one file.
+"""
 
 import json
 import os
@@ -28,17 +30,20 @@ from humangs_jax.io.reading import FileError, Refused, is_unread, parse_json, re
 from humangs_jax.rendering.gaussians import Gaussians, check_count
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
-# The light of the photos: colors contain it, so they are corrected (`relit`) for parts that turn in another pose.
-#
-# The log of the brightness is a polynomial of second order in the surface's unit normal, the same for all colors. A Lambertian
-# surface in distant light has a brightness of that order (Ramamoorthi and Hanrahan 2001, https://doi.org/10.1145/383259.383317).
-# Its coefficients come from the colors of the avatar: vertices near each other mostly have the same albedo, so that light is the
-# cause where normals and brightness differ (Retinex: Land and McCann 1971, https://doi.org/10.1364/JOSA.61.000001). Prints and
-# the edges of clothes are outliers.
+# The light of the photos: colors contain it, so they are corrected (`relit`) for parts that turn in
+# another pose.
+#  The log of the brightness is a polynomial of second order in the surface's unit normal, the same
+# for all colors. A Lambertian surface in distant light has a brightness of that order (Ramamoorthi
+# and Hanrahan 2001, https://doi.org/10.1145/383259.383317). Its coefficients come from the colors
+# of the avatar: vertices near each other mostly have the same albedo, so that light is the cause
+# where normals and brightness differ (Retinex: Land and McCann 1971,
+# https://doi.org/10.1364/JOSA.61.000001). Prints and the edges of clothes are outliers.
 
 TERMS = 8
 LIMIT = 0.7
-"""Of the change of the log: no pose makes a Gaussian more than twice as bright, or less than half, as it is in the photos."""
+"""Of the change of the log: no pose makes a Gaussian more than twice as bright, or less than
+half, as it is in the photos.
+"""
 STEPS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233)
 """Along a curve through all vertices: how far apart those are that are compared."""
 CURVE_REACH = 1.5
@@ -58,9 +63,11 @@ TINY = 1e-24
 
 @pytree_dataclass
 class Light:
-    """coefficients: (8,), of `light_terms`. normals: (g, 3), unit, of the body's surface in the T-pose.
+    """coefficients: (8,), of `light_terms`. normals: (g, 3), unit, of the body's surface in the
+    T-pose.
 
-    shading: (g,) log of the brightness in the photos: the colors of the Gaussians are those under this light.
+    shading: (g,) log of the brightness in the photos: the colors of the Gaussians are those under
+    this light.
     """
 
     coefficients: Float[Array, "8"]
@@ -102,7 +109,10 @@ def turned_normals(
 def relit(
     colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3"]
 ) -> Float[Array, "g 3"]:
-    """Colors where `linear` has turned the surface. They do not exceed 1, except where they do in the photos."""
+    """Colors where `linear` has turned the surface.
+
+    They do not exceed 1, except where they do in the photos.
+    """
     terms = light_terms(turned_normals(light.normals, linear))
     change = jnp.clip(log_brightness(terms, light.coefficients) - light.shading, -LIMIT, LIMIT)
     return jnp.minimum(colors * jnp.exp(change)[:, None], jnp.maximum(colors, 1.0))
@@ -116,9 +126,10 @@ def light_coefficients(
 ) -> Float[Array, "8"]:
     """The light that explains the colors of vertices.
 
-    Arguments: vertices: metres, in the T-pose. colors, weights: of the vertices; those without weight do not count. terms: of
-    the light in the photos. Returns: coefficients with the least absolute deviations of the differences between vertices that
-    are near each other, found by reweighted least squares.
+    Arguments: vertices: metres, in the T-pose. colors, weights: of the vertices; those without
+    weight do not count. terms: of the light in the photos. Returns: coefficients with the least
+    absolute deviations of the differences between vertices that are near each other, found by
+    reweighted least squares.
     """
     middle = (jnp.min(vertices, axis=0) + jnp.max(vertices, axis=0)) / 2
     order = jnp.argsort(along_curve(vertices - middle, CURVE_REACH))
@@ -154,7 +165,8 @@ def surface_normals(
     ]
 
 
-# The avatar -----------------------------------------------------------------------------------------------------------
+# The avatar
+# -----------------------------------------------------------------------------------------------------------
 
 FORMAT = "humangs-avatar"
 VERSION = 1
@@ -180,22 +192,26 @@ _OPTIONAL = ("low_pass", "harmonics")
 class Avatar(Batchable):
     """A person who can be animated: Gaussians in the T-pose (theta = 0).
 
-    Or a batch of people, leading axes on every array: it can be indexed and iterated over, and functions are mapped over it with
-    `jax.vmap`.
+    Or a batch of people, leading axes on every array: it can be indexed and iterated over, and
+    functions are mapped over it with `jax.vmap`.
 
     Examples:
         >>> avatar = hg.Avatar.load("avatar.npz")
         >>> image = hg.render(hg.animate(avatar, pose), camera).rgb
 
-        `faces` are integers, which `jax.grad` refuses. Differentiate a part of an avatar, or all but the integers:
+        `faces` are integers, which `jax.grad` refuses. Differentiate a part of an avatar, or all
+        but the integers:
 
-        >>> gradient = jax.grad(lambda part: loss(hg.replace(avatar, gaussians=part)))(avatar.gaussians)
+        >>> of_gaussians = lambda part: loss(hg.replace(avatar, gaussians=part))
+        >>> gradient = jax.grad(of_gaussians)(avatar.gaussians)
         >>> floats, rest = equinox.partition(avatar, equinox.is_inexact_array)
         >>> gradient = jax.grad(lambda floats: loss(equinox.combine(floats, rest)))(floats)
     """
 
     gaussians: Gaussians
-    """Canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement has added some."""
+    """Canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement
+    has added some.
+    """
     skinning_weights: Float[Array, "g j"]
     """Rows sum to 1."""
     rest_vertices: Float[Array, "n 3"]
@@ -217,12 +233,15 @@ class Avatar(Batchable):
 
     @property
     def gaussians_per_vertex(self) -> int | None:
-        """k, or None where refinement has added Gaussians, which do not stand with those of a vertex."""
+        """k, or None where refinement has added Gaussians, which do not stand with those of a
+        vertex.
+        """
         weights, vertices = np.asarray(self.skinning_weights), len(self.rest_vertices)
         if len(weights) % vertices:
             return None
         own = weights.reshape(vertices, -1, weights.shape[1])
-        # those between the legs may have weights of their own (`body.model.spread_weights`): most of a vertex's agree
+        # those between the legs may have weights of their own (`body.model.spread_weights`): most
+        # of a vertex's agree
         alike = np.isclose(own, own[:, :1], atol=ALIKE).all(axis=(1, 2))
         return own.shape[1] if alike.mean() > 0.5 else None
 
@@ -241,14 +260,15 @@ class Avatar(Batchable):
 
         Arguments: made_from: a checksum of what the avatar was made from, for `recorded_source`.
 
-        Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the Gaussians are deformed, as
-        those of a pose are: avatars are in the T-pose; FileError if
+        Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the
+        Gaussians are deformed, as those of a pose are: avatars are in the T-pose; FileError if
         `load` would refuse the file, as it does numbers that are not finite.
         """
         require_concrete("Avatar.save", "writes a file", self)
         if self.batch_shape:
             raise ValueError(
-                f"expected one avatar, got a batch {self.batch_shape}: save each, avatars[0].save(path)"
+                f"expected one avatar, got a batch {self.batch_shape}: save each,"
+                " avatars[0].save(path)"
             )
         if fault := shape_fault(self):
             raise ValueError(f"avatar{fault}")
@@ -285,18 +305,21 @@ class Avatar(Batchable):
     def load(cls, path: str | os.PathLike[str]) -> "Avatar":
         """Read what `save` wrote.
 
-        Raises: FileNotFoundError if there is no such file; FileError, naming file and key, if it is no avatar of this
-        version, a key is missing, shapes do not fit each other, numbers are not finite or out of range, indices do not
-        exist, or the contents are not those of the checksum in the header (which the first files do not have).
+        Raises: FileNotFoundError if there is no such file; FileError, naming file and key, if it is
+        no avatar of this version, a key is missing, shapes do not fit each other, numbers are not
+        finite or out of range, indices do not exist, or the contents are not those of the checksum
+        in the header (which the first files do not have).
         """
         with reading(path, "avatar file"):
             return _load(cls, path)
 
 
 def recorded_source(path: str | os.PathLike[str]) -> str | None:
-    """The checksum of what an avatar file was made from, as `Avatar.save` was given it; None for a file without one.
+    """The checksum of what an avatar file was made from, as `Avatar.save` was given it; None for a
+    file without one.
 
-    Raises: FileNotFoundError if there is no such file; FileError if it is no avatar of this version.
+    Raises: FileNotFoundError if there is no such file; FileError if it is no avatar of this
+    version.
     """
     with reading(path, "avatar file"):
         _, header = _read(path, lambda name: name == "header")
@@ -307,7 +330,9 @@ def recorded_source(path: str | os.PathLike[str]) -> str | None:
 def _read(
     path: Any, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays of an avatar file, not checked yet, and its header. wanted: which arrays to read; None: all."""
+    """The arrays of an avatar file, not checked yet, and its header. wanted: which arrays to
+    read; None: all.
+    """
     try:
         arrays, _ = read_npz(path, wanted)
         header = parse_json(str(arrays["header"]))
@@ -322,7 +347,8 @@ def _read(
     ):
         found = header if isinstance(header, dict) else {}
         raise Refused(
-            f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}"
+            f"expected {FORMAT} version {VERSION}, got {found.get('format')} version"
+            f" {found.get('version')}"
         )
     return arrays, header
 
@@ -341,7 +367,8 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     )  # the first files do not say
     if skinning not in ("affine", "rotation") or rendering not in ("exact", "inria"):
         raise Refused(
-            f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'"
+            f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation',"
+            " 'exact' or 'inria'"
         )
     arrays = {name: arrays[name] for name in wanted}
     _check_arrays(arrays, len(header["parents"]))
@@ -366,7 +393,8 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
     g, n = (len(arrays[name]) for name in ("means", "rest_vertices"))
     if not g or not n:
         raise Refused(
-            f"{'rest_vertices' if g else 'means'}: expected at least one {'vertex' if g else 'Gaussian'}"
+            f"{'rest_vertices' if g else 'means'}: expected at least one"
+            f" {'vertex' if g else 'Gaussian'}"
         )
     unit, lengths = (-ROUNDING, 1 + ROUNDING), (0.0, LARGEST)
     ranges = {"scales": lengths, "low_pass": lengths, "opacities": unit, "skinning_weights": unit}

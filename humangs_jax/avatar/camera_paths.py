@@ -1,7 +1,7 @@
 """Cameras of a file: as they stand in its world, or as a path along which an avatar is seen.
 
-The person stands on the floor, at the middle of a world with y up and in metres, as in the motions of `motion_views` and in the
-files of `export`. Formats whose world has another axis up are turned.
+The person stands on the floor, at the middle of a world with y up and in metres, as in the motions
+of `motion_views` and in the files of `export`. Formats whose world has another axis up are turned.
 """
 
 import logging
@@ -26,11 +26,14 @@ logger = logging.getLogger(__name__)
 
 
 def file_cameras(path: Path, shot: Shot, upright: bool = False) -> dict[str, Camera]:
-    """The cameras of a calibration, in the order of its file, by unique names; lens distortion is left out, which is logged.
+    """The cameras of a calibration, in the order of its file, by unique names; lens distortion is
+    left out, which is logged.
 
-    Images are as large as the file says. Where it does not say, or the shot has a width or a height, they are those of the shot.
+    Images are as large as the file says. Where it does not say, or the shot has a width or a
+    height, they are those of the shot.
 
-    Arguments: upright: turn the world from the axis that the format has up to y. False: it stays that of the file.
+    Arguments: upright: turn the world from the axis that the format has up to y. False: it stays
+    that of the file.
     Raises: CaptureError, one line that names the file.
     """
     with reading(path, "calibration"):
@@ -68,10 +71,12 @@ def one_size(path: Path, cameras: Mapping[str, Camera]) -> Camera:
 
 
 def camera_path(cameras: Camera, frames: int) -> Camera:
-    """A camera for each frame, from a batch of them: one stands still; several are evenly spread over the frames.
+    """A camera for each frame, from a batch of them: one stands still; several are evenly spread
+    over the frames.
 
-    Between them centres and intrinsics run along a monotone cubic spline (Fritsch and Carlson 1980), which goes through all of
-    them and does not overshoot; rotations turn about one axis at constant speed.
+    Between them centres and intrinsics run along a monotone cubic spline (Fritsch and Carlson
+    1980), which goes through all of them and does not overshoot; rotations turn about one axis at
+    constant speed.
     """
     count = len(cameras)
     if count in (1, frames):

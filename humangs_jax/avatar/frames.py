@@ -1,4 +1,6 @@
-"""Images of an avatar: along a motion, from a circle of cameras, or as a capture's cameras saw the person."""
+"""Images of an avatar: along a motion, from a circle of cameras, or as a capture's cameras saw the
+person.
+"""
 
 import dataclasses
 import functools
@@ -42,14 +44,20 @@ from humangs_jax.rendering.splatting import Background, Rendering, render
 MARGIN = 1.12
 """Room around a person in the frame: the extent is measured at the centres of Gaussians."""
 FOLLOWING = 0.5
-"""Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and swinging arms, of about a second,
-do not reach it; a walk does."""
+"""Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and
+swinging arms, of about a second, do not reach it; a walk does."""
 WIDEST = 2
-"""Of the Gaussian that smooths, over the length of the path: wider ones leave less than 1e-8 of anything but a straight line."""
+"""Of the Gaussian that smooths, over the length of the path: wider ones leave less than 1e-8 of
+anything but a straight line.
+"""
 TRACKED, TRACKED_OPACITY = 1024, 0.5
-"""A person's extent is measured on this number of Gaussians, evenly spread, of at least this opacity."""
+"""A person's extent is measured on this number of Gaussians, evenly spread, of at least this
+opacity.
+"""
 MOST_TRACKED = 1 << 25
-"""In all frames together, 400 MB: a motion of more than 32,768 frames is measured on fewer Gaussians."""
+"""In all frames together, 400 MB: a motion of more than 32,768 frames is measured on fewer
+Gaussians.
+"""
 A_POSE = 48.0
 """Degrees that the arms hang down in the A-pose, as in the page."""
 
@@ -64,8 +72,8 @@ def draw(
     how: SplatConfig | None = None,
     exposures: Float[np.ndarray, "v 3"] | None = None,
 ) -> Iterator[Rendering]:
-    """One rendering per pose and camera. how: None for what the avatar's weights were trained with. exposures: of the
-    cameras, see `data.views`.
+    """One rendering per pose and camera. how: None for what the avatar's weights were trained with.
+    exposures: of the cameras, see `data.views`.
     """
     how = SPLAT_PRESETS[avatar.rendering] if how is None else how
     gaussians = (posed(avatar, pose) for pose in poses)
@@ -85,8 +93,8 @@ def draw_gaussians(
 ) -> Iterator[Rendering]:
     """One rendering per frame of Gaussians and camera.
 
-    Plans for the first frame with room to spare: compiles once per image size, and again only if a frame needs more
-    room than that.
+    Plans for the first frame with room to spare: compiles once per image size, and again only if a
+    frame needs more room than that.
     """
     config = None
     for frame, camera in zip(gaussians, cameras, strict=True):
@@ -100,7 +108,9 @@ def draw_gaussians(
 
 
 def splatting_of(shot: Shot, avatar: Avatar) -> SplatConfig:
-    """The preset of a shot; near_exact and fast keep the conventions that the avatar's weights were trained with."""
+    """The preset of a shot; near_exact and fast keep the conventions that the avatar's weights were
+    trained with.
+    """
     if shot.splat == "as_trained":
         return SPLAT_PRESETS[avatar.rendering]
     config = SPLAT_PRESETS[shot.splat]
@@ -110,7 +120,9 @@ def splatting_of(shot: Shot, avatar: Avatar) -> SplatConfig:
 def image_of(
     rendering: Rendering, color: tuple[float, float, float] | None
 ) -> Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 4"]:
-    """A rendering onto black as an image in [0, 1]: over a color, or with straight alpha for None, as PNG and WebM have it."""
+    """A rendering onto black as an image in [0, 1]: over a color, or with straight alpha for None,
+    as PNG and WebM have it.
+    """
     rgb, alpha = np.asarray(rendering.rgb), np.asarray(rendering.alpha)[..., None]
     if color is not None:
         return np.clip(rgb + (1 - alpha) * np.asarray(color, rgb.dtype), 0, 1)
@@ -124,7 +136,10 @@ def rest_pose_of(avatar: Avatar) -> BodyPose:
 
 
 def a_pose_of(avatar: Avatar) -> BodyPose:
-    """Arms down by 48 degrees. Raises: ValueError for a body without the joints left_shoulder and right_shoulder."""
+    """Arms down by 48 degrees.
+
+    Raises: ValueError for a body without the joints left_shoulder and right_shoulder.
+    """
     names, angle = avatar.joint_names, np.radians(A_POSE)
     if missing := {"left_shoulder", "right_shoulder"} - set(names):
         raise ValueError(f"A-pose: the avatar's body has no joint {' and '.join(sorted(missing))}")
@@ -134,11 +149,14 @@ def a_pose_of(avatar: Avatar) -> BodyPose:
     return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
 
 
-# Cameras -----------------------------------------------------------------------------------------------------------------
+# Cameras
+# --------------------------------------------------------------------------------------------------
 
 
 def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"]:
-    """Where opaque Gaussians of the avatar are in each pose of a batch, metres: what a frame has to show."""
+    """Where opaque Gaussians of the avatar are in each pose of a batch, metres: what a frame has to
+    show.
+    """
     opacities = np.asarray(avatar.gaussians.opacities)
     opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))
     count = min(TRACKED, len(opaque), max(MOST_TRACKED // len(poses.translation), 1))
@@ -153,13 +171,16 @@ def shot_cameras(
     azimuths: Float[np.ndarray, " v"],
     smoothing: float | None,
 ) -> Camera:
-    """A batch of cameras, one per azimuth, that show all points of their frame, all from the same distance.
+    """A batch of cameras, one per azimuth, that show all points of their frame, all from the same
+    distance.
 
-    Arguments: points: of each frame; of one frame: the same for all cameras. azimuths: degrees, added to that of the shot.
-    smoothing: frames, the standard deviation with which the camera follows the middle of the person; None: it stands still,
-    and the image holds everything that happens.
+    Arguments: points: of each frame; of one frame: the same for all cameras. azimuths: degrees,
+    added to that of the shot.
+    smoothing: frames, the standard deviation with which the camera follows the middle of the
+    person; None: it stands still, and the image holds everything that happens.
 
-    Without `shot.distance` it is the smallest for which every point lies in the middle 1 / MARGIN of the image.
+    Without `shot.distance` it is the smallest for which every point lies in the middle 1 / MARGIN
+    of the image.
 
     Raises: ValueError for a shot that is out of range.
     """
@@ -191,7 +212,9 @@ def shot_cameras(
 
 
 def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
-    """A path smoothed by a Gaussian of this standard deviation; at its ends it is taken to go on as it came (point mirrored)."""
+    """A path smoothed by a Gaussian of this standard deviation; at its ends it is taken to go on as
+    it came (point mirrored).
+    """
     frames = min(frames, WIDEST * len(path))
     reach = int(np.ceil(3 * frames))
     if reach == 0 or len(path) == 1:
@@ -206,7 +229,9 @@ def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.nda
 def _fitting_distance(
     shot: Shot, points: np.ndarray, targets: np.ndarray, axes: np.ndarray
 ) -> float:
-    """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z behind the target."""
+    """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z
+    behind the target.
+    """
     needed = 0.0
     for i, target in enumerate(targets):
         x, y, z = axes[i] @ (points[i % len(points)] - target).T
@@ -228,7 +253,8 @@ def _paths(
     return jax.lax.map(one, poses)
 
 
-# Sequences ---------------------------------------------------------------------------------------------------------------
+# Sequences
+# --------------------------------------------------------------------------------------------------
 
 
 def excerpt(
@@ -240,7 +266,8 @@ def excerpt(
 ) -> Motion:
     """A motion from `start` to `stop` (seconds), at another frame rate, `loop` times.
 
-    Every repetition starts where the one before has ended, at the same height. Raises: ValueError naming what is out of range.
+    Every repetition starts where the one before has ended, at the same height. Raises: ValueError
+    naming what is out of range.
     """
     count = len(motion.translations)
     length = count / motion.fps
@@ -248,7 +275,8 @@ def excerpt(
     if not 0 <= start < stop <= length + 0.5 / motion.fps:
         raise ArgumentError(
             "start",
-            f"{start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds",
+            f"{start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's"
+            " seconds",
         )
     if loop < 1:
         raise ArgumentError("loop", f"{loop}: expected at least 1")
@@ -273,7 +301,10 @@ def excerpt(
 
 
 def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
-    """A pose for each frame of a motion, which is put on the floor. Raises: ValueError for another number of joints."""
+    """A pose for each frame of a motion, which is put on the floor.
+
+    Raises: ValueError for another number of joints.
+    """
     joints = motion.rotations.shape[1]
     if joints != len(avatar.parents):
         raise ValueError(f"the motion has {joints} joints, the avatar has {len(avatar.parents)}")
@@ -286,10 +317,12 @@ def motion_views(
 ) -> tuple[BodyPose, Camera]:
     """A pose and a camera for each frame of a motion, which is put on the floor.
 
-    Arguments: turn: degrees that the camera travels around the person. follow: the camera goes along with the person; else it
-    stands still and is so far away that the person stays in the image.
+    Arguments: turn: degrees that the camera travels around the person. follow: the camera goes
+    along with the person; else it stands still and is so far away that the person stays in the
+    image.
 
-    Raises: ValueError if the motion has another number of joints than the avatar, or the shot is out of range.
+    Raises: ValueError if the motion has another number of joints than the avatar, or the shot is
+    out of range.
     """
     poses, count = motion_poses(avatar, motion), len(motion.translations)
     azimuths = turn * np.arange(count) / count
@@ -301,7 +334,10 @@ def motion_views(
 def turntable_views(
     avatar: Avatar, pose: BodyPose, views: int, shot: Shot
 ) -> tuple[BodyPose, Camera]:
-    """One pose, and cameras on a circle that starts at the azimuth of the shot. Raises: ValueError for no view."""
+    """One pose, and cameras on a circle that starts at the azimuth of the shot.
+
+    Raises: ValueError for no view.
+    """
     if views < 1:
         raise ValueError(f"views {views}: expected at least 1")
     check_limit("frames", views, "views")
@@ -311,7 +347,8 @@ def turntable_views(
 
 
 def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
-    """The pose and the camera of each view of a capture, in a world with y up: an avatar's light is that of such a world.
+    """The pose and the camera of each view of a capture, in a world with y up: an avatar's light is
+    that of such a world.
 
     Raises: ValueError if the capture's body has another number of joints than the avatar.
     """
@@ -329,7 +366,10 @@ def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
 def capture_renderings(
     avatar: Avatar, capture: Capture, background: Background = None, how: SplatConfig | None = None
 ) -> tuple[Camera, list[Rendering]]:
-    """The avatar in the poses and from the cameras of a capture. how: as for `draw`. Raises: as `capture_views`."""
+    """The avatar in the poses and from the cameras of a capture. how: as for `draw`.
+
+    Raises: as `capture_views`.
+    """
     poses, cameras = capture_views(avatar, capture)
     return cameras, list(draw(avatar, poses, cameras, background, how))
 
@@ -337,7 +377,8 @@ def capture_renderings(
 def images(
     avatar: Avatar, poses: BodyPose, cameras: Camera, shot: Shot, progress: str | None = None
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """One image per pose and camera, drawn when asked for, (h, w, 3) or with alpha (h, w, 4), see `image_of`.
+    """One image per pose and camera, drawn when asked for, (h, w, 3) or with alpha (h, w, 4), see
+    `image_of`.
 
     progress: what a progress bar says; None: no bar.
     """
@@ -371,9 +412,11 @@ def motion_frames(
 def without_unseen(
     avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatConfig, progress: str | None = None
 ) -> Avatar:
-    """The avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of every one of these images.
+    """The avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of every one
+    of these images.
 
-    Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has the error and the time.
+    Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has
+    the error and the time.
     """
     most = np.zeros(len(avatar.gaussians.means), np.float32)
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))
@@ -389,20 +432,27 @@ def without_unseen(
     return avatar.select(np.flatnonzero(most >= ALPHA_MIN))
 
 
-# Views of any Gaussians, those of other programs too: from a circle of cameras, or from the cameras of a calibration ---
+# Views of any Gaussians, those of other programs too: from a circle of cameras, or from the cameras
+# of a calibration ---
 
 
 SHOWN, NEARLY_ALL = 0.9, 0.999
-"""Of the opaque Gaussians, those that a circle of cameras is made to show: outliers are far away."""
+"""Of the opaque Gaussians, those that a circle of cameras is made to show: outliers are far away.
+"""
 COMPACT = 3.0
-"""Where nearly all are within so many times the distance of `SHOWN`, as of a person, there are no outliers: all are shown."""
+"""Where nearly all are within so many times the distance of `SHOWN`, as of a person, there are no
+outliers: all are shown.
+"""
 ROOM = 1.1
 PAIRS = 4_000_000
 """(splat, tile) pairs that are drawn at once: some hundred megabytes."""
 
 
 def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict[str, Camera]:
-    """Cameras around the middle of the Gaussians, by name. up: of their world. Without a distance all of them fit."""
+    """Cameras around the middle of the Gaussians, by name. up: of their world.
+
+    Without a distance all of them fit.
+    """
     means = np.asarray(gaussians.means)[
         np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
     ]
@@ -432,7 +482,9 @@ def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict
 def splat_images(
     gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """One image for each camera, in bounded memory; with alpha where the shot's background is transparent."""
+    """One image for each camera, in bounded memory; with alpha where the shot's background is
+    transparent.
+    """
     config = SPLAT_PRESETS["exact" if shot.splat == "as_trained" else shot.splat]
     drawn = (
         render_in_bands(gaussians, camera, config, jnp.zeros(3)) for camera in cameras.values()
@@ -444,7 +496,10 @@ def splat_images(
 def write_splat_views(
     out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot
 ) -> int:
-    """Images NAME.png in a folder, which appear together; other files stay. Returns how many. Raises: OSError."""
+    """Images NAME.png in a folder, which appear together; other files stay. Returns how many.
+
+    Raises: OSError.
+    """
 
     def write(folder: Path) -> None:
         for name, image in zip(cameras, splat_images(gaussians, cameras, shot), strict=True):
@@ -455,7 +510,8 @@ def write_splat_views(
     return len(cameras)
 
 
-# Large scenes in bounded memory: the image in bands of rows, one after the other, each with buffers of the same size -------
+# Large scenes in bounded memory: the image in bands of rows, one after the other, each with buffers
+# of the same size -------
 
 
 def render_in_bands(
@@ -465,11 +521,11 @@ def render_in_bands(
     background: Background = None,
     most_pairs: int = PAIRS,
 ) -> Rendering:
-    """The image of `render`, as arrays of numpy, drawn in as many bands as keep each below `most_pairs`; for calls outside of
-    transformations.
+    """The image of `render`, as arrays of numpy, drawn in as many bands as keep each below
+    `most_pairs`; for calls outside of transformations.
 
-    Bands of one row of tiles may still need more: they get it. Configurations whose image depends on its height (a
-    `jacobian_margin`, `visibility`) are drawn whole. Raises: as `render`.
+    Bands of one row of tiles may still need more: they get it. Configurations whose image depends
+    on its height (a `jacobian_margin`, `visibility`) are drawn whole. Raises: as `render`.
     """
     whole = config.jacobian_margin is not None or config.visibility
     planned = plan_buffers(gaussians, camera, config, margin=1.0)
@@ -492,7 +548,9 @@ def render_in_bands(
 
 
 def banded(camera: Camera, height: int) -> Camera:
-    """A camera for each band of `height` rows, from the top; the last band may reach beyond the image."""
+    """A camera for each band of `height` rows, from the top; the last band may reach beyond the
+    image.
+    """
     tops = np.arange(0, camera.height, height)
     shift = (
         jnp.zeros((len(tops), 3, 3), camera.K.dtype).at[:, 1, 2].set(tops.astype(camera.K.dtype))

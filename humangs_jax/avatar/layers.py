@@ -2,17 +2,20 @@
 
 Layers of a view, besides the colors:
 
-Z: depth along the camera's axis, metres. position: the point of the world on the ray of the pixel at that depth, metres.
-normal: of the body's surface, in the world; unit vectors. Each Gaussian has the normal of the vertex that is nearest to it in the
-    T-pose, turned by its own skinning transform; a pixel has the mean by the weights of its color, normalised.
-part: the joint that most of the pixel's color follows, 1 for the first of the header's `parts`, 0 where alpha is below 1/2. A
-    Gaussian follows the joint of its largest skinning weight.
+Z: depth along the camera's axis, metres. position: the point of the world on the ray of the pixel
+at that depth, metres.
+normal: of the body's surface, in the world; unit vectors. Each Gaussian has the normal of the
+    vertex that is nearest to it in the T-pose, turned by its own skinning transform; a pixel has
+    the mean by the weights of its color, normalised.
+part: the joint that most of the pixel's color follows, 1 for the first of the header's `parts`, 0
+    where alpha is below 1/2. A Gaussian follows the joint of its largest skinning weight.
 
 None of these is multiplied by alpha; they are 0 where alpha is.
 
-The OpenEXR file is lossless (ZIP); several views are its parts. The header of each has its camera: `K` (3x3, pixels) and
-`cam_from_world` (4x4, OpenCV, metres), float32, exact. R, G, B and A are premultiplied, as compositing programs expect. Colors
-are the values of the photos, as in PNG files: encoded for a display by the curve of sRGB, not linear in light.
+The OpenEXR file is lossless (ZIP); several views are its parts. The header of each has its camera:
+`K` (3x3, pixels) and `cam_from_world` (4x4, OpenCV, metres), float32, exact. R, G, B and A are
+premultiplied, as compositing programs expect. Colors are the values of the photos, as in PNG files:
+encoded for a display by the curve of sRGB, not linear in light.
 """
 
 import dataclasses
@@ -49,17 +52,17 @@ COVERED = 0.5
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
 WIDE = (DEPTH, "position.")
-"""How the names of channels start that stay in 32 bits when others are halved: metres, of which half precision has steps of 2 mm
-at 4 m."""
+"""How the names of channels start that stay in 32 bits when others are halved: metres, of which
+half precision has steps of 2 mm at 4 m."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExrView:
     """One rendered view.
 
-    rgba: (h, w, 4) premultiplied colors and coverage. depth: (h, w) metres, or None. K, cam_from_world: (3, 3) pixels and (4, 4)
-    metres of its camera. name: of the part; unique in a file. channels: further (h, w) images by name. attributes: strings for
-    the header.
+    rgba: (h, w, 4) premultiplied colors and coverage. depth: (h, w) metres, or None. K,
+    cam_from_world: (3, 3) pixels and (4, 4) metres of its camera. name: of the part; unique in a
+    file. channels: further (h, w) images by name. attributes: strings for the header.
     """
 
     rgba: Float[np.ndarray, "h w 4"]
@@ -73,8 +76,8 @@ class ExrView:
 
 @dataclasses.dataclass(frozen=True)
 class ExrLayers:
-    """The contents of an EXR file of views, besides colors. half: colors, normals and parts in 16 bits; Z and positions
-    stay in 32, since half floats are 2 mm apart at 4 m.
+    """The contents of an EXR file of views, besides colors. half: colors, normals and parts in 16
+    bits; Z and positions stay in 32, since half floats are 2 mm apart at 4 m.
     """
 
     layers: tuple[str, ...] = ("rgba", "z")
@@ -102,13 +105,17 @@ def write_views(
     exposures: Float[np.ndarray, "v 3"] | None = None,
     names: Sequence[str] | None = None,
 ) -> int:
-    """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and views.exr if asked.
+    """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and
+    views.exr if asked.
 
-    exposures: of the cameras, see `data.views`. names: of the images, instead of view_000 and so on.
+    exposures: of the cameras, see `data.views`. names: of the images, instead of view_000 and so
+    on.
 
-    The files appear together when all are drawn; other views of an earlier call are removed. Returns the number of views.
+    The files appear together when all are drawn; other views of an earlier call are removed.
+    Returns the number of views.
 
-    Raises: ValueError if the layers of all views are more than an EXR file may hold (see docs/security.md); OSError.
+    Raises: ValueError if the layers of all views are more than an EXR file may hold (see
+    docs/security.md); OSError.
     """
     out, count = Path(out), len(poses)
     names = [f"view_{i:03d}" for i in range(count)] if names is None else names
@@ -117,7 +124,8 @@ def write_views(
         most, size = limits().array_bytes, exr.bytes_of(count, cameras.width, cameras.height)
         if size > most:
             raise ValueError(
-                f"{out / EXR_NAME}: {count} views are {size:.3g} bytes, more than {most:.3g}: expected fewer or smaller ones"
+                f"{out / EXR_NAME}: {count} views are {size:.3g} bytes, more than {most:.3g}:"
+                " expected fewer or smaller ones"
             )
     how = splatting_of(shot, avatar)
     check_ours((out / f"{name}.png" for name in names), is_own_output)
@@ -186,7 +194,9 @@ def exr_view(
 def write_renderings_exr(
     path: str | os.PathLike[str], cameras: Camera, renderings: Iterable[Rendering]
 ) -> None:
-    """Renderings onto black as an EXR file of premultiplied RGBA in 32 bits, Z in metres and the camera, one part per view."""
+    """Renderings onto black as an EXR file of premultiplied RGBA in 32 bits, Z in metres and the
+    camera, one part per view.
+    """
     each = enumerate(zip(cameras, renderings, strict=True))
     write_exr(
         Path(path),
@@ -206,7 +216,9 @@ def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
 
 
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along the camera's axis, metres."""
+    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along
+    the camera's axis, metres.
+    """
     K, world_from_cam = (
         np.asarray(camera.K, np.float64),
         np.linalg.inv(np.asarray(camera.cam_from_world, np.float64)),
@@ -223,7 +235,9 @@ def splatted(
     how: SplatConfig,
     values: Mapping[str, Float[Array, "g c"]],
 ) -> dict[str, Float[np.ndarray, "h w c"]]:
-    """Any numbers of Gaussians, by name, summed by the weights of their colors; all of them in one image."""
+    """Any numbers of Gaussians, by name, summed by the weights of their colors; all of them in one
+    image.
+    """
     planned = plan_buffers(gaussians, camera, how)
     together = jnp.concatenate(list(values.values()), axis=-1)
     drawn = np.asarray(render(gaussians, camera, planned, features=together).features)
@@ -237,7 +251,9 @@ def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:
 
 
 def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
-    """Unit normals of the posed body's surface: of the nearest vertex, turned by the Gaussian's own transform."""
+    """Unit normals of the posed body's surface: of the nearest vertex, turned by the Gaussian's own
+    transform.
+    """
     normals = surface_normals(avatar.rest_vertices, avatar.faces, avatar.gaussians.means)
     return _posed_normals(normals, avatar, pose)
 
@@ -252,13 +268,15 @@ def _posed_normals(
     return turned_normals(normals, blend_transforms(avatar.skinning_weights, transforms)[:, :3, :3])
 
 
-# The file -------------------------------------------------------------------------------------------------------------
+# The file
+# --------------------------------------------------------------------------------------------------
 
 
 def write_exr(path: str | Path, views: Sequence[ExrView], half: bool = False) -> None:
     """Write views of one size as the parts of one file, which appears whole or not at all.
 
-    half: see `ExrLayers`; numbers beyond 65504 become infinite there. Raises: OSError if the file cannot be written.
+    half: see `ExrLayers`; numbers beyond 65504 become infinite there. Raises: OSError if the file
+    cannot be written.
     """
     import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 

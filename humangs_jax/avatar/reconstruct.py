@@ -1,7 +1,7 @@
 """Photos with body poses -> one forward pass -> an avatar; one person, or many in one batch.
 
-Programs are compiled once per bucket: numbers of views and of foreground tokens are rounded up to few sizes
-(`buffers.round_up`), and padding is masked.
+Programs are compiled once per bucket: numbers of views and of foreground tokens are rounded up to
+few sizes (`buffers.round_up`), and padding is masked.
 """
 
 import contextlib
@@ -64,7 +64,9 @@ LEGS = tuple(
     for side in ("left", "right")
 )
 SMALLEST_VOLUME = 0.2
-"""Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
+"""Blended transforms of limbs that are turned against each other collapse; below this determinant
+they are not inverted.
+"""
 POSED = "the posed vertices, which all arrays of the body move"
 BATCH = 8
 """Captures of `reconstruct_many` at a time: beyond it memory grows, and little else."""
@@ -74,13 +76,15 @@ BATCH = 8
 def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
 
-    Photos are brought to the network's image size, their exposure is made equal, and views whose mask does not show the person
-    are left out. Numbers of views and of foreground tokens are rounded up to few sizes, each with a program of its own.
+    Photos are brought to the network's image size, their exposure is made equal, and views whose
+    mask does not show the person are left out. Numbers of views and of foreground tokens are
+    rounded up to few sizes, each with a program of its own.
 
-    Worlds that are not y-up are turned for the network; the avatar then has no light, whose directions would be those of
-    another world. The body is displaced first (`Runtime.displacement`): by the capture's displacement; without one, to the masks
-    where it sticks out of them. Where masks show a skirt, the avatar's body has one (`data.skirt`). For a network with a driver
-    this is the avatar before any correction of a frame.
+    Worlds that are not y-up are turned for the network; the avatar then has no light, whose
+    directions would be those of another world. The body is displaced first
+    (`Runtime.displacement`): by the capture's displacement; without one, to the masks where it
+    sticks out of them. Where masks show a skirt, the avatar's body has one (`data.skirt`). For a
+    network with a driver this is the avatar before any correction of a frame.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -91,8 +95,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
         The avatar in the T-pose of the person's own shape.
 
     Raises:
-        ValueError: if the network makes no Gaussians, the capture has no view, none that shows the person, or values that
-            are not finite or out of range, naming the array.
+        ValueError: if the network makes no Gaussians, the capture has no view, none that shows the
+            person, or values that are not finite or out of range, naming the array.
 
     Examples:
         >>> avatar = hg.reconstruct(*hg.load_weights(), hg.load_capture("demo_capture"))
@@ -121,10 +125,11 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
 def reconstruct_batch(
     variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]
 ) -> list[Avatar]:
-    """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of views.
+    """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of
+    views.
 
-    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the number of people. People in
-    skirts, whose bodies have more vertices, are reconstructed alone.
+    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the
+    number of people. People in skirts, whose bodies have more vertices, are reconstructed alone.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -135,8 +140,8 @@ def reconstruct_batch(
         An avatar for each capture.
 
     Raises:
-        ValueError: if there is no capture, one has no view or values that are not finite or out of range, or their bodies
-            differ.
+        ValueError: if there is no capture, one has no view or values that are not finite or out of
+            range, or their bodies differ.
 
     Examples:
         >>> avatars = hg.reconstruct_batch(*hg.load_weights(), captures)
@@ -180,10 +185,11 @@ def reconstruct_many(
     captures: Mapping[str, Callable[[], Capture]],
     batch: int | None = None,
 ) -> Iterator[Reconstructed]:
-    """Yields the avatar of each capture, in their order; `batch` captures at a time are read and reconstructed by one `vmap`. A
-    capture that cannot be used does not stop the others.
+    """Yields the avatar of each capture, in their order; `batch` captures at a time are read and
+    reconstructed by one `vmap`. A capture that cannot be used does not stop the others.
 
-    Arguments: captures: functions that load one each, by its name; ValueError and OSError that they raise are yielded.
+    Arguments: captures: functions that load one each, by its name; ValueError and OSError that they
+    raise are yielded.
     batch: None for `BATCH`.
     """
     names, batch = list(captures), batch or BATCH
@@ -213,7 +219,9 @@ def reconstruct_many(
 def _tried(
     each: Reconstructed, field: str, make: Callable[[], Any], *faults: type[Exception]
 ) -> Reconstructed:
-    """`each` with the result of `make`, or with its error if that is a ValueError or one of `faults`."""
+    """`each` with the result of `make`, or with its error if that is a ValueError or one of
+    `faults`.
+    """
     try:
         return each._replace(**{field: make()})
     except (ValueError, *faults) as error:
@@ -224,32 +232,34 @@ def _tried(
 def stack_captures(
     config: HumanGSConfig, captures: Sequence[Capture]
 ) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
-    """What several people are reconstructed from in one program of your own, without the skirts of `reconstruct`.
+    """What several people are reconstructed from in one program of your own, without the skirts of
+    `reconstruct`.
 
     Args:
         config: of the network.
         captures: of people with one body model.
 
     Returns:
-        The body that carries the Gaussians; the photos as the network wants them (leading axis b, padded to the largest
-        number of views); `config` with room for as many tokens as these photos need.
+        The body that carries the Gaussians; the photos as the network wants them (leading axis b,
+        padded to the largest number of views); `config` with room for as many tokens as these
+        photos need.
 
     Raises:
-        ValueError: as `reconstruct_batch`; also if some worlds, but not all, are not y-up and the avatars are to have the
-            light of their photos: in a batch all have one or none has.
+        ValueError: as `reconstruct_batch`; also if some worlds, but not all, are not y-up and the
+            avatars are to have the light of their photos: in a batch all have one or none has.
 
     Examples:
         >>> body, views, config = hg.stack_captures(config, captures)
         >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
-        >>> avatars, dropped = batched(variables, config, body, views)  # `reconstruct_batch`, as one batch
+        >>> avatars, dropped = batched(variables, config, body, views)  # all as one batch
     """
     _check_all(captures)
     body, views, config, turned = _stacked(config, captures)
     if config.conventions.light and any(turned):
         if not all(turned):
             raise ValueError(
-                f"captures[{turned.index(True)}]: its world is not y-up, so that its avatar has no light, but others have: "
-                "stack them apart, or use reconstruct_batch"
+                f"captures[{turned.index(True)}]: its world is not y-up, so that its avatar has no"
+                " light, but others have: stack them apart, or use reconstruct_batch"
             )
         config = config.with_conventions(light=False)
     return body, views, config
@@ -280,7 +290,9 @@ def _stacked(
 
 
 def _check_all(captures: Sequence) -> None:
-    """Raises: TypeError, ValueError unless these are captures of one body model that can be reconstructed."""
+    """Raises: TypeError, ValueError unless these are captures of one body model that can be
+    reconstructed.
+    """
     if not captures:
         raise ValueError("captures: none given")
     for index, capture in enumerate(captures):
@@ -289,7 +301,8 @@ def _check_all(captures: Sequence) -> None:
         _check(capture, f"captures[{index}]")
         if capture.body is not captures[0].body and not _equal(capture.body, captures[0].body):
             raise ValueError(
-                f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model"
+                f"captures[{index}]: its body is not the one of captures[0]; a batch shares one"
+                " body model"
             )
 
 
@@ -308,14 +321,18 @@ def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[Su
 
 
 def displaces(config: HumanGSConfig) -> bool:
-    """Whether the body may be displaced and get a skirt: if the network looks at the person's pixels alone."""
+    """Whether the body may be displaced and get a skirt: if the network looks at the person's
+    pixels alone.
+    """
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
 
 
 def fit_buffers(
     foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, config: HumanGSConfig
 ) -> HumanGSConfig:
-    """The configuration with room for the foreground of some inputs, those of one subject or of a batch."""
+    """The configuration with room for the foreground of some inputs, those of one subject or of a
+    batch.
+    """
     patch, capacity = config.architecture.encoder.patch_size, 0
     if config.tokens != "all":
         capacity = round_up(int(needed_tokens(foreground, view_count, patch)))
@@ -326,10 +343,11 @@ def fit_buffers(
 def reconstruct_views(
     variables: Variables, config: HumanGSConfig, body: BodyModel, views: SubjectViews
 ) -> tuple[Avatar, Int[Array, ""]]:
-    """The pure function behind `reconstruct`: one subject's views to an avatar. Batch it with `jax.vmap`.
+    """The pure function behind `reconstruct`: one subject's views to an avatar. Batch it with
+    `jax.vmap`.
 
-    Weights files record no token capacity, and the default has room for all patches, which takes the time of all;
-    `stack_captures` sizes it.
+    Weights files record no token capacity, and the default has room for all patches, which takes
+    the time of all; `stack_captures` sizes it.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -338,13 +356,16 @@ def reconstruct_views(
         views: photos at the network's size, cameras and poses, of `stack_captures`.
 
     Returns:
-        The avatar, and how many foreground patches did not fit into `config.runtime.token_capacity`.
+        The avatar, and how many foreground patches did not fit into
+        `config.runtime.token_capacity`.
 
     Raises:
-        ValueError: if the body is not the one that this configuration wants, or the photos are not of its size.
+        ValueError: if the body is not the one that this configuration wants, or the photos are not
+            of its size.
 
     Examples:
-        >>> avatars, dropped = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
+        >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
+        >>> avatars, dropped = batched(variables, config, body, views)
     """
     made = "body, views, config = stack_captures(config, captures) makes what it wants"
     (height, width), side = views.images.shape[1:3], config.image_size
@@ -354,7 +375,8 @@ def reconstruct_views(
         )
     if not fits(body, config):
         raise ValueError(
-            f"reconstruct_views: a body of {len(body.template)} vertices that gaussian_body(body, config) has not made; {made}"
+            f"reconstruct_views: a body of {len(body.template)} vertices that gaussian_body(body,"
+            f" config) has not made; {made}"
         )
     return _reconstruct(variables, config, body, views)
 
@@ -375,7 +397,10 @@ def _reconstruct(
 def make_avatar(
     outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config: HumanGSConfig
 ) -> Avatar:
-    """Canonical Gaussians on the body of a person, shaped to `rest`: what can be posed. Raises: ValueError if there are none."""
+    """Canonical Gaussians on the body of a person, shaped to `rest`: what can be posed.
+
+    Raises: ValueError if there are none.
+    """
     if outputs.is_empty:
         name = type(config.architecture.decoder).__name__
         raise ValueError(
@@ -405,7 +430,9 @@ def make_avatar(
 def completed_avatar(
     outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig
 ) -> Avatar:
-    """`make_avatar`, and what the conventions take from the photos: the skinning between the legs, the light, the low-pass."""
+    """`make_avatar`, and what the conventions take from the photos: the skinning between the legs,
+    the light, the low-pass.
+    """
     conventions = config.conventions
     avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)
     if conventions.skinning_reach is not None and outputs.skinning_weights is None:
@@ -420,7 +447,10 @@ def completed_avatar(
 
 
 def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light."""
+    """The avatar with the light of its photos (`avatar.light`).
+
+    Gradients do not pass through the light.
+    """
     fixed, views = jax.lax.stop_gradient((avatar, views))
     vertices, gaussians = fixed.rest_vertices, fixed.gaussians
     per_vertex = len(gaussians.means) // len(vertices)
@@ -445,7 +475,8 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
 
 
 def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
-    """The avatar with the weights of `spread_weights`. In `pose`, that of the first photo, the means stay where they were.
+    """The avatar with the weights of `spread_weights`. In `pose`, that of the first photo, the
+    means stay where they were.
 
     The shapes of Gaussians are not corrected. Gradients do not pass through the weights.
     """
@@ -495,7 +526,8 @@ def _check(capture: Capture, name: str) -> None:
             raise ValueError(f"reconstruct: {name}: {field}: expected shape {shape}, got {found}")
     if not 0 <= np.min(capture.frames) <= np.max(capture.frames) < capture.frame_count:
         raise ValueError(
-            f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got {capture.frames}"
+            f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got"
+            f" {capture.frames}"
         )
     arrays = {
         "body.template": (capture.body.template, FINITE),

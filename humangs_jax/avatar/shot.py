@@ -1,7 +1,8 @@
-"""How an avatar is filmed: the size of the images, what is behind the person, where the camera stands.
+"""How an avatar is filmed: the size of the images, what is behind the person, where the camera
+stands.
 
-`Shot` is what `humangs animate` and `humangs render` have in common; their command line is made from it, so this module imports
-nothing heavy. `avatar.frames` draws by it.
+`Shot` is what `humangs animate` and `humangs render` have in common; their command line is made
+from it, so this module imports nothing heavy. `avatar.frames` draws by it.
 """
 
 import dataclasses
@@ -35,12 +36,17 @@ class Shot:
     fov: Annotated[float, Range(1, 150)] = 30.0
     """Vertical field of view, degrees."""
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = "as_trained"
-    """How Gaussians are rendered: near_exact and fast trade accuracy for time, inria is the published rasterizer."""
+    """How Gaussians are rendered: near_exact and fast trade accuracy for time, inria is the
+    published rasterizer.
+    """
     prune: bool = False
-    """Leave out Gaussians that no image shows; to find them, all images are drawn once more (docs: video)."""
+    """Leave out Gaussians that no image shows; to find them, all images are drawn once more (docs:
+    video).
+    """
 
     def check(self) -> None:
-        """Raises: ValueError naming what is out of range."""  # not on construction: the command line would make a box of it
+        # not on construction: the command line would make a box of it
+        """Raises: ValueError naming what is out of range."""
         for field in dataclasses.fields(self):
             check_range(Shot, field.name, getattr(self, field.name), field.name)
         self.color()
@@ -58,7 +64,10 @@ class Shot:
         return tangent * width / height, tangent
 
     def color(self) -> tuple[float, float, float] | None:
-        """Red, green and blue of the background in [0, 1]; None: transparent. Raises: ValueError for what is no color."""
+        """Red, green and blue of the background in [0, 1]; None: transparent.
+
+        Raises: ValueError for what is no color.
+        """
         if self.background == "white":  # without numpy: --help asks for it, too
             return 1.0, 1.0, 1.0
         if self.background.strip().lower() == "transparent":

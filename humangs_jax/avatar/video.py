@@ -1,5 +1,6 @@
-"""Frames -> a video: .mp4 (H.264, plays everywhere), .webm (VP9, may be transparent), .gif (256 colors for all frames, endless
-loop), or a folder of PNG files (may be transparent). At the end: sheets of labelled images, comparisons with the error in color.
+"""Frames -> a video: .mp4 (H.264, plays everywhere), .webm (VP9, may be transparent), .gif (256
+colors for all frames, endless loop), or a folder of PNG files (may be transparent). At the end:
+sheets of labelled images, comparisons with the error in color.
 """
 
 import contextlib
@@ -29,7 +30,8 @@ CONSTANT_RATE_FACTOR = 17
 VP9_QUALITY = 18
 """libvpx's constant quality, 0 to 63: its 18 is about as good as x264's."""
 LARGEST_GIF = 1 << 30
-"""Bytes of all frames of a GIF in 24 bits, which are kept in memory: one palette is chosen for all."""
+"""Bytes of all frames of a GIF in 24 bits, which are kept in memory: one palette is chosen for all.
+"""
 LARGEST_GIF_FPS = 50
 """Viewers slow down frames that are shorter than 2/100 s."""
 PALETTE_FRAMES = 16
@@ -39,10 +41,12 @@ PALETTE_FRAMES = 16
 def check_video(
     path: str | Path, frames: int, width: int, height: int, transparent: bool = False
 ) -> VideoFormat:
-    """Check that such a video can be written; call it before its frames are drawn. Returns its format.
+    """Check that such a video can be written; call it before its frames are drawn. Returns its
+    format.
 
-    Raises: ValueError for a suffix that is no video (none is a folder of PNG files), transparency that the
-    format does not have, or a GIF that would not fit into memory, or something else of that name.
+    Raises: ValueError for a suffix that is no video (none is a folder of PNG files), transparency
+    that the format does not have, or a GIF that would not fit into memory, or something else of
+    that name.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -61,7 +65,8 @@ def check_video(
     if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
         raise ArgumentError(
             "path",
-            f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm",
+            f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or"
+            " .webm",
         )
     if suffix and path.is_dir():
         raise ArgumentError("path", f"{path}: is a folder: expected a file name")
@@ -78,23 +83,25 @@ def write_video(
 ) -> int:
     """Write frames as a video or as PNG files; all appears at the end, or nothing does.
 
-    Frames are asked for one by one: a .gif keeps one byte a channel of all in memory, the others none. Video codecs want even
-    sides: odd ones get one more row or column, a copy of the last. A GIF of more than 50 frames a second leaves out frames to
-    keep its speed.
+    Frames are asked for one by one: a .gif keeps one byte a channel of all in memory, the others
+    none. Video codecs want even
+    sides: odd ones get one more row or column, a copy of the last. A GIF of more than 50 frames a
+    second leaves out frames to keep its speed.
 
     Args:
-        path: .mp4, .webm or .gif; without a suffix a folder of frame_00000.png and so on, which replace those that are
-            there.
-        frames: (h, w, 3) in [0, 1], or with straight alpha (h, w, 4), which only .webm and PNG files have. Frames of uint8,
-            as other programs give them, are from 0 to 255.
+        path: .mp4, .webm or .gif; without a suffix a folder of frame_00000.png and so on, which
+            replace those that are there.
+        frames: (h, w, 3) in [0, 1], or with straight alpha (h, w, 4), which only .webm and PNG
+            files have. Frames of uint8, as other programs give them, are from 0 to 255.
         fps: frames per second.
 
     Returns:
         The number of frames.
 
     Raises:
-        ValueError: if there is no frame, they differ in shape, a number is not in [0, 1], they hold integers other than uint8,
-            `fps` is not positive, or the suffix is another one or has no alpha.
+        ValueError: if there is no frame, they differ in shape, a number is not in [0, 1], they hold
+            integers other than uint8, `fps` is not positive, or the suffix is another one or has no
+            alpha.
         OSError: if the file cannot be written; also what `frames` raises.
 
     Examples:
@@ -124,7 +131,9 @@ def write_video(
 
 
 def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
-    """Width and height of the video that frames of this size become: formats with `even_sides` make odd ones longer."""
+    """Width and height of the video that frames of this size become: formats with `even_sides` make
+    odd ones longer.
+    """
     suffix = Path(path).suffix.lower()
     even = any(form.even_sides for form in VIDEOS.values() if suffix in form.suffixes)
     return (width + width % 2, height + height % 2) if even else (width, height)
@@ -173,8 +182,8 @@ def _check_numbers(name: str, frame: np.ndarray) -> None:
         raise ValueError(f"{name} has numbers that are not finite")
     if low < -ROUNDING or high > 1 + ROUNDING:
         raise ValueError(
-            f"{name}: expected numbers in [0, 1], or uint8, got {low:g} to {high:g}: divide those of 0 to 255 by 255, "
-            "np.clip others"
+            f"{name}: expected numbers in [0, 1], or uint8, got {low:g} to {high:g}: divide those"
+            " of 0 to 255 by 255, np.clip others"
         )
 
 
@@ -264,7 +273,9 @@ def _write_by_ffmpeg(
 
 
 def _indexed(frame: np.ndarray, palette: Any, background: np.ndarray) -> Any:
-    """A frame (h, w, 3) in the palette's colors; Pillow looks up colors by their upper 6 bits, which white and 252 share."""
+    """A frame (h, w, 3) in the palette's colors; Pillow looks up colors by their upper 6 bits,
+    which white and 252 share.
+    """
     from PIL import Image
 
     indices = np.array(Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE))
@@ -275,7 +286,9 @@ def _indexed(frame: np.ndarray, palette: Any, background: np.ndarray) -> Any:
 
 
 def _commonest(pixels: np.ndarray) -> tuple[int, int, int]:
-    """The most frequent color (3,) of (h, w, 3) pixels: the background, where it is of one color."""
+    """The most frequent color (3,) of (h, w, 3) pixels: the background, where it is of one
+    color.
+    """
     packed = pixels.reshape(-1, 3).astype(np.int32) @ (1 << 16, 1 << 8, 1)
     values, counts = np.unique(packed, return_counts=True)
     common = int(values[counts.argmax()])
@@ -298,7 +311,8 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
     colors[255] = _commonest(sampled)  # else the background would become the mean of colors like it
     palette.putpalette(colors.tobytes())
     images = [_indexed(frame, palette, colors[255]) for frame in kept]
-    # durations are whole hundredths of a second; rounding the times, not the durations, keeps the speed
+    # durations are whole hundredths of a second; rounding the times, not the durations, keeps the
+    # speed
     times = np.rint(np.arange(len(images) + 1) * 100 / fps).astype(int)
     durations = [10 * int(x) for x in np.diff(times)]
     first, *rest = images
@@ -313,7 +327,8 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
     )
 
 
-# Sheets ----------------------------------------------------------------------------------------------------------------
+# Sheets
+# --------------------------------------------------------------------------------------------------
 
 
 LARGEST_ERROR = 0.25
@@ -323,8 +338,8 @@ GAP = 4
 TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 14, 10, 22
 """Height of the letters: a share of the width of a tile, within limits, pixels."""
 ERROR_COLORS = ((1, 1, 1), (1, 0.87, 0.35), (0.93, 0.38, 0.13), (0.6, 0.04, 0.2), (0.12, 0, 0.12))
-"""Colors of errors from none to the largest, evenly spaced: white first, like the background, then darker
-at every step, so that the order is also visible in grey."""
+"""Colors of errors from none to the largest, evenly spaced: white first, like the background, then
+darker at every step, so that the order is also visible in grey."""
 
 
 def contact_sheet(
@@ -346,7 +361,9 @@ def side_by_side(
     *,
     labels: Sequence[str] | None = None,
 ) -> None:
-    """Write a PNG with truth, ours and the error of every view, and the scale of the error below. labels: one per view."""
+    """Write a PNG with truth, ours and the error of every view, and the scale of the error below.
+    labels: one per view.
+    """
     errors = error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)
     triples = np.stack([truth, ours, errors], axis=1).reshape(-1, *truth.shape[1:])
     headers = ("truth", "ours", "error")
@@ -367,7 +384,8 @@ def tile(
     """A white sheet with the images in rows.
 
     Arguments:
-        labels: one per image, written above it; what does not fit is cut off. headers: one per column.
+        labels: one per image, written above it; what does not fit is cut off. headers: one per
+            column.
         columns: images in a row; about as many as rows if left out.
     """
     count, height, width = images.shape[:3]
@@ -414,7 +432,9 @@ def write_texts(
 def error_colors(
     errors: Float[np.ndarray, "*shape"], largest: float | int
 ) -> Float[np.ndarray, "*shape 3"]:
-    """Colors of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get the last."""
+    """Colors of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get
+    the last.
+    """
     stops = np.linspace(0, largest, len(ERROR_COLORS))
     return np.stack(
         [np.interp(errors, stops, channel) for channel in zip(*ERROR_COLORS, strict=True)], axis=-1

@@ -1,14 +1,16 @@
 """Positions on a body of the landmarks that annotators and detectors mark in photos.
 
-A landmark is a mean of joints, or a vertex that a rule finds on the body's own template (`_Finder`), so that any body whose
-joints have SMPL-X's names has them. Sides are the person's. Joints: shoulder, elbow, wrist, hip, knee, ankle, jaw, eye (the
-centre of the eyeball), knuckles `{side}_FINGER_1, 2, 3` from the palm outwards, and means of them: neck (of the shoulders, as
-OpenPose has it), mid_hip. Vertices: nose (or face_30), face_8 the chin, face_27 the root of the nose, ears, finger tips, and of
-each foot big_toe, small_toe, heel and the foremost, foot_index. The other 65 points of the face follow expressions, which
-bodies without a face rig do not have.
+A landmark is a mean of joints, or a vertex that a rule finds on the body's own template
+(`_Finder`), so that any body whose joints have SMPL-X's names has them. Sides are the person's.
+Joints: shoulder, elbow, wrist, hip, knee, ankle, jaw, eye (the centre of the eyeball), knuckles
+`{side}_FINGER_1, 2, 3` from the palm outwards, and means of them: neck (of the shoulders, as
+OpenPose has it), mid_hip. Vertices: nose (or face_30), face_8 the chin, face_27 the root of the
+nose, ears, finger tips, and of each foot big_toe, small_toe, heel and the foremost, foot_index. The
+other 65 points of the face follow expressions, which bodies without a face rig do not have.
 
-Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres): fits give them less weight. Where
-it is known at which places a detector sees its landmarks, they are moved there: `Place`.
+Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres):
+fits give them less weight. Where it is known at which places a detector sees its landmarks, they
+are moved there: `Place`.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,11 +37,13 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
 
-# Names of the two sides ------------------------------------------------------------------------------------------------
+# Names of the two sides
+# ------------------------------------------------------------------------------------------------
 
 
 class _FacePart(NamedTuple):
-    """Points of the face, from `first` to before `end`. Two are mirror images if their numbers add up to `total`.
+    """Points of the face, from `first` to before `end`. Two are mirror images if their numbers add
+    up to `total`.
 
     left_is_later: whether the one with the larger number is on the person's left.
     """
@@ -64,7 +68,9 @@ _FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
 
 
 def mirrored_name(name: str) -> str:
-    """Returns the landmark that a mirror puts in the place of `name`; what is in the middle is its own mirror image."""
+    """Returns the landmark that a mirror puts in the place of `name`; what is in the middle is its
+    own mirror image.
+    """
     kind, _, rest = name.partition("_")
     if kind == "face":
         return f"face_{_mirrored_face(int(rest))[0]}"
@@ -91,7 +97,8 @@ def _mirrored_face(i: int) -> tuple[int, int]:
     return {left: right for right, left in _FACE_EYES.items()}.get(i, i), 1
 
 
-# Places of detectors --------------------------------------------------------------------------------------------------
+# Places of detectors
+# --------------------------------------------------------------------------------------------------
 
 
 Millimetres = tuple[float | int, float | int, float | int]
@@ -100,9 +107,10 @@ Millimetres = tuple[float | int, float | int, float | int]
 class Place(NamedTuple):
     """Where a detector sees one of its landmarks.
 
-    name: of the landmark. base: the landmark of `body.landmarks` that it is measured from. offset: from there, metres in T-pose:
-    x to the person's left, y up, z to the front. joints: whose turning carries the offset along, by equal shares; none: what
-    carries the base, which then is a vertex.
+    name: of the landmark. base: the landmark of `body.landmarks` that it is measured from. offset:
+    from there, metres in T-pose: x to the person's left, y up, z to the front. joints: whose
+    turning carries the offset along, by equal shares; none: what carries the base, which then is a
+    vertex.
     """
 
     name: str
@@ -151,7 +159,8 @@ def both_sides(
 ) -> tuple[Place, Place]:
     """A landmark of the left side and its mirror image.
 
-    Arguments: names: of the left and the right one. base, joints: with {side} for the side. millimetres: the left one's.
+    Arguments: names: of the left and the right one. base, joints: with {side} for the side.
+    millimetres: the left one's.
     """
     x, y, z = millimetres
     left, right = (
@@ -166,7 +175,8 @@ def both_sides(
     return left, right
 
 
-# Landmarks ------------------------------------------------------------------------------------------------------------
+# Landmarks
+# --------------------------------------------------------------------------------------------------
 
 
 SIDES = {"left": 1.0, "right": -1.0}
@@ -188,13 +198,17 @@ FOOT = {
 
 @pytree_dataclass
 class LandmarkModel:
-    """What of a body its landmarks depend on: k landmarks from j joints and p points of the surface.
+    """What of a body its landmarks depend on: k landmarks from j joints and p points of the
+    surface.
 
-    joints, joint_directions: (j, 3) rest joints of the mean shape and (j, 3, s) their change, metres. points: p of the surface.
-    regressor: (k, j + p) landmarks from posed joints and points; rows sum to 1, or are 0 where the body lacks a landmark.
-    certainty: (k,) weights of errors, see `LESS_CERTAIN`. Static: names; known, which of them the body has; parents, joint_names;
-    movers, the joints whose turning moves a landmark; placed, of the last points, which are those of `places`, the rows; groups:
-    (group, side) of these: of a pair, and of what is in the middle; side 1, and -1 for what is mirrored.
+    joints, joint_directions: (j, 3) rest joints of the mean shape and (j, 3, s) their change,
+    metres. points: p of the surface.
+    regressor: (k, j + p) landmarks from posed joints and points; rows sum to 1, or are 0 where the
+    body lacks a landmark.
+    certainty: (k,) weights of errors, see `LESS_CERTAIN`. Static: names; known, which of them the
+    body has; parents, joint_names; movers, the joints whose turning moves a landmark; placed, of
+    the last points, which are those of `places`, the rows; groups: (group, side) of these: of a
+    pair, and of what is in the middle; side 1, and -1 for what is mirrored.
     """
 
     joints: Float[Array, "j 3"]
@@ -211,7 +225,9 @@ class LandmarkModel:
     groups: tuple[tuple[int, int], ...] = static_field(default=())
 
     def moved(self, offsets: Float[Array, "g 3"]) -> "LandmarkModel":
-        """The model with more offsets of its places, metres, one for each group; x of a mirrored one is turned round."""
+        """The model with more offsets of its places, metres, one for each group; x of a mirrored
+        one is turned round.
+        """
         if not self.placed:
             return self
         which, sides = np.asarray(self.groups).T
@@ -248,11 +264,13 @@ def landmark_model(
     places: tuple[Place, ...] = (),
     certainty: tuple[float, ...] = (),
 ) -> LandmarkModel:
-    """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the joints alone.
+    """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the
+    joints alone.
 
-    Arguments: places: of the landmarks that may be elsewhere than the module says; ignored where the body lacks what they depend
-    on. certainty: of each, if it is known.
-    Raises: ValueError if it has none of them, which is so when its joints have other names than SMPL-X's.
+    Arguments: places: of the landmarks that may be elsewhere than the module says; ignored where
+    the body lacks what they depend on. certainty: of each, if it is known.
+    Raises: ValueError if it has none of them, which is so when its joints have other names than
+    SMPL-X's.
     """
     finder = _Finder(body)
     moved = {
@@ -264,8 +282,8 @@ def landmark_model(
     known = tuple(bool(found) or name in moved for name, found in zip(names, sources, strict=True))
     if names and not any(known):
         raise ValueError(
-            f"body '{body.name}' has none of these landmarks: are its joints named like SMPL-X's (left_hip, ...)? They are "
-            f"{', '.join(body.joint_names[:4]) or 'not named'}"
+            f"body '{body.name}' has none of these landmarks: are its joints named like SMPL-X's"
+            f" (left_hip, ...)? They are {', '.join(body.joint_names[:4]) or 'not named'}"
         )
     vertices = sorted({source for found in sources for source in found if source >= 0})
     joints, placed = len(body.parents), [moved[name] for name in names if name in moved]
@@ -325,7 +343,9 @@ def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
 
 
 def _placed(body: BodyModel, finder: "_Finder", place: Place) -> SurfacePoints:
-    """One point beside the sources of a landmark: it grows with them, and turns with the joints of the place."""
+    """One point beside the sources of a landmark: it grows with them, and turns with the joints of
+    the place.
+    """
     every, sources = surface_points(body), finder.find(place.base)
     points = [
         _rows(every, [source]) if source >= 0 else _joint_point(body, -1 - source)
@@ -346,7 +366,10 @@ def _concatenated(points: Sequence[SurfacePoints]) -> SurfacePoints:
 def pose_landmarks(
     model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
-    """Landmarks and joints of a person in a pose, metres. Landmarks that the body lacks are at the origin."""
+    """Landmarks and joints of a person in a pose, metres.
+
+    Landmarks that the body lacks are at the origin.
+    """
     transforms, joints = pose_joints(model, betas, pose)
     posed = pose_points(model.points, betas, pose_features(pose.rotations), transforms)
     return landmarks_from(model, joints, posed), joints
@@ -373,7 +396,9 @@ def _movers(
     joints_used: Bool[np.ndarray, " j"],
     point_weights: Float[np.ndarray, "p j"],
 ) -> tuple[int, ...]:
-    """Joints above the used joints, and those that move a used point (p, j): turning a joint does not move itself."""
+    """Joints above the used joints, and those that move a used point (p, j): turning a joint does
+    not move itself.
+    """
     moving = point_weights.max(axis=0, initial=0.0) > CARRIES
     for j in np.flatnonzero(joints_used | moving):
         while (j := parents[j]) >= 0:

@@ -1,8 +1,10 @@
-"""Loading a body: the CC0 body of the package, or a file; the package's own body file, one small npz without pickles; SMPL-X.
+"""Loading a body: the CC0 body of the package, or a file; the package's own body file, one small
+npz without pickles; SMPL-X.
 
-Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16, weights are the largest few
-of each vertex in uint16, indices are uint16 where they fit. `read_body` returns float32 weights whose rows sum to 1. SMPL-X's
-licence forbids redistribution: users bring the file.
+Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16,
+weights are the largest few of each vertex in uint16, indices are uint16 where they fit. `read_body`
+returns float32 weights whose rows sum to 1. SMPL-X's licence forbids redistribution: users bring
+the file.
 """
 
 from importlib import resources
@@ -30,7 +32,9 @@ from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, r
 
 FORMAT = "humangs-body-1"
 DIRECTION_STEP = 1e-5
-"""Metres. int16 then spans +-0.33 m per unit of a shape coefficient; larger directions are stored as float32."""
+"""Metres. int16 then spans +-0.33 m per unit of a shape coefficient; larger directions are stored
+as float32.
+"""
 WEIGHT_STEPS = 65535
 UV_STEPS = 65535
 KEYS = {
@@ -54,8 +58,8 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
     """A body model: the CC0 body that comes with the package, or one of a file.
 
     Args:
-        path: None for the shipped body (13,380 vertices, 55 joints in SMPL-X order, facing +z, pelvis at (0, -0.35, 0)); a
-            file of `save_body`; or an SMPL-X model file (.npz or .pkl).
+        path: None for the shipped body (13,380 vertices, 55 joints in SMPL-X order, facing +z,
+            pelvis at (0, -0.35, 0)); a file of `save_body`; or an SMPL-X model file (.npz or .pkl).
         **smplx_options: for SMPL-X files only, see `load_smplx`.
 
     Returns:
@@ -92,7 +96,9 @@ def _indices(array: np.ndarray) -> np.ndarray:
 
 
 def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and values (rows, k) of the non-zero entries, k the most in any row, padded with zeros."""
+    """Columns and values (rows, k) of the non-zero entries, k the most in any row, padded with
+    zeros.
+    """
     count = max(1, int((matrix != 0).sum(1).max()))
     columns = np.argsort(-np.abs(matrix), axis=1, kind="stable")[:, :count]
     return columns, np.take_along_axis(matrix, columns, axis=1)
@@ -119,7 +125,10 @@ def _dense_rows(
 
 
 def save_body(path: str | Path, body: BodyModel) -> None:
-    """Write a body model. Raises: ValueError for one with pose correctives, which this format does not hold."""
+    """Write a body model.
+
+    Raises: ValueError for one with pose correctives, which this format does not hold.
+    """
     if body.pose_directions is not None:
         raise ValueError(
             f"body '{body.name}' has pose directions: this format is for bodies without them"
@@ -159,7 +168,10 @@ def save_body(path: str | Path, body: BodyModel) -> None:
 
 
 def read_body(path: str | Path) -> BodyModel:
-    """Read what `save_body` wrote. Raises: ValueError, naming the file and the key, if it is something else."""
+    """Read what `save_body` wrote.
+
+    Raises: ValueError, naming the file and the key, if it is something else.
+    """
     with reading(path, "body file"):
         arrays, pickled = read_npz(path)
         if str(arrays.get("format")) != FORMAT:
@@ -212,7 +224,8 @@ def read_body(path: str | Path) -> BodyModel:
         )
 
 
-# SMPL-X ---------------------------------------------------------------------------------------------------------------
+# SMPL-X
+# --------------------------------------------------------------------------------------------------
 
 
 SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100
@@ -233,11 +246,14 @@ class HandBasis:
 
 
 def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int = 10) -> BodyModel:
-    """Read an SMPL-X model file, `.npz` (no pickled object in it is touched) or `.pkl` (see `restricted_pickle`).
+    """Read an SMPL-X model file, `.npz` (no pickled object in it is touched) or `.pkl` (see
+    `restricted_pickle`).
 
-    Arguments: shape_count, expression_count: how many of the file's directions to keep; `shape_directions` holds the
-    shape ones, then the expression ones. Numbers are float32, or float64 under `jax.enable_x64`.
-    Raises: FileNotFoundError; ValueError, naming file and key, for whatever does not fit the format.
+    Arguments: shape_count, expression_count: how many of the file's directions to keep;
+    `shape_directions` holds the shape ones, then the expression ones. Numbers are float32, or
+    float64 under `jax.enable_x64`.
+    Raises: FileNotFoundError; ValueError, naming file and key, for whatever does not fit the
+    format.
     """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
@@ -305,7 +321,10 @@ def _parents(file: ArrayFile) -> tuple[int, ...]:
 
 
 def load_hands(path: str | Path) -> HandBasis:
-    """Mean and principal components of the hand poses of an SMPL-X model file. Raises as `load_smplx`."""
+    """Mean and principal components of the hand poses of an SMPL-X model file.
+
+    Raises as `load_smplx`.
+    """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: key.startswith("hands_"))
         number = lambda arrays: jnp.asarray(np.stack(arrays), jnp.result_type(float))

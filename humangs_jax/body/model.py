@@ -4,16 +4,17 @@
     joints      = joint_regressor rest(beta)
     posed       = blend skinning of rest(beta) + pose_directions (R - I), then the translation.
 
-G_j = (posed frame of joint j) (rest frame of j)^-1 moves a point that is fixed to j. With R_j the local rotation, J_j the rest
-joint and p its parent:
+G_j = (posed frame of joint j) (rest frame of j)^-1 moves a point that is fixed to j. With R_j the
+local rotation, J_j the rest joint and p its parent:
 
     W_j = W_p R_j,    t_j = t_p + W_p (J_j - J_p),    G_j = [W_j | t_j - W_j J_j + translation].
 
-Rotations turn about the joints in the rest pose, whose frames are all aligned with the world (SMPL's convention). Products ask
-for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, millimetres here.
+Rotations turn about the joints in the rest pose, whose frames are all aligned with the world
+(SMPL's convention). Products ask for full precision: accelerators otherwise round float32 factors
+to 8 or 10 bits, millimetres here.
 
-Metres, y up, the person faces +z with the left side at +x. SMPL-X is one such model, the CC0 body shipped with the
-package another (`humangs_jax.body.library.load_body`).
+Metres, y up, the person faces +z with the left side at +x. SMPL-X is one such model, the CC0 body
+shipped with the package another (`humangs_jax.body.library.load_body`).
 """
 
 import jax
@@ -25,7 +26,8 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 
-# Skinning -------------------------------------------------------------------------------------------------------------
+# Skinning
+# --------------------------------------------------------------------------------------------------
 
 
 EXACT = transform.EXACT
@@ -38,7 +40,8 @@ BLOCK = 2048
 
 
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
-    """Indices (j,) of every joint's parent, then grandparent, then the fourth, eighth ... ancestor; j where there is none.
+    """Indices (j,) of every joint's parent, then grandparent, then the fourth, eighth ... ancestor;
+    j where there is none.
 
     Raises: ValueError unless all joints descend from one root (-1).
     """
@@ -65,11 +68,13 @@ def joint_transforms(
 ) -> Float[Array, "j 4 4"]:
     """G_j of every joint.
 
-    Arguments: rest_joints in metres; parents, root -1; rotations as axis-angle in radians, relative to the parent;
-    translation in metres, applied last. Returns: rigid transforms from rest to posed space.
+    Arguments: rest_joints in metres; parents, root -1; rotations as axis-angle in radians, relative
+    to the parent; translation in metres, applied last. Returns: rigid transforms from rest to posed
+    space.
 
-    The chain is composed by doubling: after each round a transform reaches twice as many joints up. Ten levels are four
-    iterations, and the program compiles in a third of the time of one that goes level by level.
+    The chain is composed by doubling: after each round a transform reaches twice as many joints up.
+    Ten levels are four iterations, and the program compiles in a third of the time of one that goes
+    level by level.
     """
     local = quaternion.matrix_from_axis_angle(rotations)
     iterations = ancestors(parents)
@@ -89,7 +94,8 @@ def joint_transforms(
 def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Array, "*b i k"]:
     """Matrix product by multiplying and adding: exact on every backend.
 
-    XLA's CPU compiler (jax 0.10 to 0.12) rejects the batched `dot` that two nested vmaps make of this product.
+    XLA's CPU compiler (jax 0.10 to 0.12) rejects the batched `dot` that two nested vmaps make of
+    this product.
     """
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
@@ -110,16 +116,18 @@ def spread_weights(
     legs: Bool[Array, "2 j"],
     reach: float,
 ) -> Float[Array, "g j"]:
-    """Skinning weights of points off the skin between the legs, by the body around them and not by one vertex.
+    """Skinning weights of points off the skin between the legs, by the body around them and not by
+    one vertex.
 
-    A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d from the vertex that it
-    belongs to takes the mean of the weights of the vertices around it, by a normal kernel whose standard deviation is d. It
-    keeps its own where d is less than 3/4 of `reach`, or where one of the legs has no share in that mean: hair and sleeves stay
-    as they are. At most a quarter of the points change, those with the largest d. LHM diffuses weights through a grid of voxels
-    to the same end (https://arxiv.org/abs/2503.10625).
+    A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d
+    from the vertex that it belongs to takes the mean of the weights of the vertices around it, by a
+    normal kernel whose standard deviation is d. It keeps its own where d is less than 3/4 of
+    `reach`, or where one of the legs has no share in that mean: hair and sleeves stay as they are.
+    At most a quarter of the points change, those with the largest d. LHM diffuses weights through a
+    grid of voxels to the same end (https://arxiv.org/abs/2503.10625).
 
-    Arguments: points in the rest pose, metres. distances: from the vertex of each. weights: of that vertex. legs: the joints of
-    each leg.
+    Arguments: points in the rest pose, metres. distances: from the vertex of each. weights: of that
+    vertex. legs: the joints of each leg.
     """
     near, near_weights = vertices[::THINNING], vertex_weights[::THINNING]
     distances, far = jax.lax.top_k(distances, -(-len(points) // 4))
@@ -138,15 +146,18 @@ def spread_weights(
     return weights.at[far].add(share[:, None] * (spread - weights[far]))
 
 
-# Points of the surface, posed without the rest of it ------------------------------------------------------------------
+# Points of the surface, posed without the rest of it
+# ------------------------------------------------------------------
 
 
 @pytree_dataclass
 class SurfacePoints:
     """p points of a body with j joints; batches and concatenations of them are again such points.
 
-    rest: (p, 3) of the mean shape in T-pose, metres. directions: (p, 3, s) metres per unit of a shape coefficient.
-    corrections: (p, 3, q) of the pose's features, see `pose_features`, or None. weights: (p, j) of the skinning.
+    rest: (p, 3) of the mean shape in T-pose, metres. directions: (p, 3, s) metres per unit of a
+    shape coefficient.
+    corrections: (p, 3, q) of the pose's features, see `pose_features`, or None. weights: (p, j) of
+    the skinning.
     """
 
     rest: Float[Array, "p 3"]
@@ -175,21 +186,25 @@ def pose_points(
     features: Float[Array, " q"] | None,
     transforms: Float[Array, "j 4 4"],
 ) -> Float[Array, "p 3"]:
-    """Where the points of a person are, metres. features: of the pose; ignored by bodies without correctives."""
+    """Where the points of a person are, metres. features: of the pose; ignored by bodies without
+    correctives.
+    """
     rest = shaped(points.rest, points.directions, betas)
     if points.corrections is not None:
         rest = rest + jnp.einsum("paq,q->pa", points.corrections, features, precision=EXACT)
     return transform.apply(blend_transforms(points.weights, transforms), rest)
 
 
-# Posing ---------------------------------------------------------------------------------------------------------------
+# Posing
+# --------------------------------------------------------------------------------------------------
 
 
 @pytree_dataclass
 class Texels:
     """Which point of the body's surface each texel of a map shows; row 0 on top.
 
-    corners: (h, w, 3) vertices of the texel's face. weights: (h, w, 3) of these vertices, of sum 1; 0 where it shows nothing.
+    corners: (h, w, 3) vertices of the texel's face. weights: (h, w, 3) of these vertices, of sum 1;
+    0 where it shows nothing.
     """
 
     corners: Int[Array, "h w 3"]
@@ -230,7 +245,8 @@ class BodyModel:
     """Of progressive decimation, with `collapse_into`: `body.resolution`."""
     collapse_into: Int[Array, " n"] | None = None
     spacing: Float[Array, " n"] | None = None
-    """Distance to neighboring vertices relative to the mesh that was subdivided: `body.resolution`."""
+    """Distance to neighboring vertices relative to the mesh that was subdivided: `body.resolution`.
+    """
     texels: Texels | None = None
     """A map of the surface, for networks that work on one: `network.parts`."""
     parents: tuple[int, ...] = static_field(default=())
@@ -265,7 +281,8 @@ class RestBody(Batchable):
 class PosedBody(Batchable):
     """A posed body.
 
-    vertices: (n, 3) metres. joint_transforms: (j, 4, 4) from rest to posed space, translation included.
+    vertices: (n, 3) metres. joint_transforms: (j, 4, 4) from rest to posed space, translation
+    included.
     joints: (j, 3) metres.
     """
 
@@ -298,7 +315,9 @@ def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
 
 
 def without_expression(body: BodyModel) -> BodyModel:
-    """The body without the directions of facial expressions, which come last in SMPL-X models: those are no shape of a person."""
+    """The body without the directions of facial expressions, which come last in SMPL-X models:
+    those are no shape of a person.
+    """
     count = sum(not name.startswith("expression_") for name in body.shape_names)
     if not body.shape_names or count == len(body.shape_names):
         return body

@@ -1,18 +1,20 @@
 """Bodies of other resolutions: long edges split, or vertices collapsed onto their neighbours.
 
-Modellers put few rings of vertices along arms and legs and many into faces and fingers. Gaussians hang on the vertices, and
-where those are sparse they leave gaps; midpoints of long edges fill them. A midpoint takes the mean of its two ends in
-everything that is linear (template, shape and pose directions, skinning weights), so it stays on the mesh in every shape.
+Modellers put few rings of vertices along arms and legs and many into faces and fingers. Gaussians
+hang on the vertices, and where those are sparse they leave gaps; midpoints of long edges fill them.
+A midpoint takes the mean of its two ends in everything that is linear (template, shape and pose
+directions, skinning weights), so it stays on the mesh in every shape.
 
-A half-edge collapse u -> v moves vertex u onto its neighbour v: the two triangles between them vanish, and what remains
-is a mesh on a subset of the vertices, whose positions, shape directions and skinning weights are the original ones.
-`collapse_sequence` orders all collapses once: `order[u]` is the rank of u (0 stays longest), `into[u]` the vertex it
-moves onto. Any size is then a table look-up.
+A half-edge collapse u -> v moves vertex u onto its neighbour v: the two triangles between them
+vanish, and what remains is a mesh on a subset of the vertices, whose positions, shape directions
+and skinning weights are the original ones. `collapse_sequence` orders all collapses once:
+`order[u]` is the rank of u (0 stays longest), `into[u]` the vertex it moves onto. Any size is then
+a table look-up.
 
-Cost of u -> v: |uv|^2 + FLATNESS q_u(v), with q_u the mean squared distance to the planes that u has gathered (Garland
-and Heckbert, Surface Simplification Using Quadric Error Metrics): the length spreads the vertices evenly over the skin,
-so that the crowded face and ears go before the torso, and the quadric keeps fingers round. What cannot be seen from
-outside goes first.
+Cost of u -> v: |uv|^2 + FLATNESS q_u(v), with q_u the mean squared distance to the planes that u
+has gathered (Garland and Heckbert, Surface Simplification Using Quadric Error Metrics): the length
+spreads the vertices evenly over the skin, so that the crowded face and ears go before the torso,
+and the quadric keeps fingers round. What cannot be seen from outside goes first.
 """
 
 import heapq
@@ -33,21 +35,26 @@ from humangs_jax.geometry.mesh import (
     vertex_areas,
 )
 
-# Finer ----------------------------------------------------------------------------------------------------------------
+# Finer
+# --------------------------------------------------------------------------------------------------
 
 
 SMALLEST_AREA = 1e-12
 """Metres^2: vertices without faces have no area."""
 FINEST = 64
-"""Edges are made at most this many times shorter: finer asks for billions of faces, and is a length in another unit."""
+"""Edges are made at most this many times shorter: finer asks for billions of faces, and is a length
+in another unit.
+"""
 
 
 def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
-    """The body with edges of its template at most `longest` metres; the original vertices stay first, in their order.
+    """The body with edges of its template at most `longest` metres; the original vertices stay
+    first, in their order.
 
-    Faces are cut into two, three or four along the midpoints of their long edges, consistently on both sides. Texture
-    coordinates and decimation order are dropped: they belong to the original mesh. `spacing` is the root of the area around a
-    vertex over what it was: 1/2 where every edge has been halved.
+    Faces are cut into two, three or four along the midpoints of their long edges, consistently on
+    both sides. Texture coordinates and decimation order are dropped: they belong to the original
+    mesh. `spacing` is the root of the area around a vertex over what it was: 1/2 where every edge
+    has been halved.
 
     Raises: ValueError if `longest` is not positive, or less than 1/64 of the longest edge.
     """
@@ -66,7 +73,8 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         )
         if lengths.max() > FINEST * longest:
             raise ValueError(
-                f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m"
+                f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest,"
+                f" {lengths.max():.3g} m"
             )
         long = np.flatnonzero(lengths > longest)
         if len(long) == 0:
@@ -102,7 +110,9 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
 def _cut(
     faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]
 ) -> Int[np.ndarray, "finer 3"]:
-    """Faces cut at the midpoints of their sides; middles (f, 3): the vertex on side i to i + 1, -1 for none."""
+    """Faces cut at the midpoints of their sides; middles (f, 3): the vertex on side i to i + 1, -1
+    for none.
+    """
     count = (middles >= 0).sum(1)
     parts = [faces[count == 0]]
     # turn each face until the pattern of its midpoints is the one that is written out below
@@ -127,15 +137,19 @@ def _cut(
     return np.concatenate(parts)
 
 
-# Coarser --------------------------------------------------------------------------------------------------------------
+# Coarser
+# --------------------------------------------------------------------------------------------------
 
 
 FLATNESS = 100.0
 """1 mm off the surface costs as much as 1 cm of edge."""
 HIDDEN = 0.01
-"""Factor on the cost of what cannot be seen from outside: edges there count as ten times shorter."""
+"""Factor on the cost of what cannot be seen from outside: edges there count as ten times shorter.
+"""
 RIM = 2
-"""Rings of hidden vertices next to visible ones that count as visible: they hold lips and eyelids in place."""
+"""Rings of hidden vertices next to visible ones that count as visible: they hold lips and eyelids
+in place.
+"""
 VIEWS = 40
 CELL = 0.004
 """Metres: size of a depth-buffer cell, and with it how narrow a gap lets light through."""
@@ -144,11 +158,17 @@ MOST_STEPS = 40
 SMALLEST_TURN = 0.3
 """A face may turn by at most acos(0.3) = 73 degrees in one collapse."""
 SMALLEST_QUALITY = 0.08
-"""Lower bound of 4 sqrt(3) area / (sum of squared edges), 1 for an equilateral triangle, unless it was worse."""
+"""Lower bound of 4 sqrt(3) area / (sum of squared edges), 1 for an equilateral triangle, unless it
+was worse.
+"""
 LOCAL = 200
-"""Smallest number of vertices near a joint that share the correction of its regressor (or three per equation, if more)."""
+"""Smallest number of vertices near a joint that share the correction of its regressor (or three per
+equation, if more).
+"""
 RIDGE = 1e-13
-"""Relative to the trace of the normal equations, which are singular where a shape direction moves nothing."""
+"""Relative to the trace of the normal equations, which are singular where a shape direction moves
+nothing.
+"""
 
 
 def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
@@ -164,7 +184,9 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> 
 
 
 def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The share of `VIEWS` parallel projections, in [0, 1], in which each vertex (n, 3) is not hidden."""
+    """The share of `VIEWS` parallel projections, in [0, 1], in which each vertex (n, 3) is not
+    hidden.
+    """
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
     points = _surface_points(vertices, faces, cell)
@@ -206,7 +228,9 @@ class _Mesh:
         return [f for f in self.around[u] if v in self.faces[f]]
 
     def uv_moves(self, u: int, shared: list[int], v: int) -> dict[int, int] | None:
-        """Texture vertex of u -> that of v in the same chart, or None if some chart at u does not reach v."""
+        """Texture vertex of u -> that of v in the same chart, or None if some chart at u does not
+        reach v.
+        """
         moves = {self.uv_at(f, u): self.uv_at(f, v) for f in shared}
         return moves if all(self.uv_at(f, u) in moves for f in self.around[u]) else None
 
@@ -214,7 +238,9 @@ class _Mesh:
         return self.uv_faces[face][self.faces[face].index(vertex)]
 
     def allowed(self, u: int, v: int) -> bool:
-        """Whether u -> v keeps the topology, the texture charts whole, and folds no face nor makes it a needle."""
+        """Whether u -> v keeps the topology, the texture charts whole, and folds no face nor makes
+        it a needle.
+        """
         shared = self.between(u, v)
         common = self.beside[u] & self.beside[v]
         if len(common) != len(shared) or not 1 <= len(shared) <= 2:
@@ -287,7 +313,9 @@ def _quality(
 def _vertex_quadrics(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 11"]:
-    """Per vertex: area-weighted sums over its faces of the outer product of (normal, d), and of the area: (n, 11)."""
+    """Per vertex: area-weighted sums over its faces of the outer product of (normal, d), and of the
+    area: (n, 11).
+    """
     normal = face_crosses(vertices, faces)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.maximum(area, 1e-30)
@@ -307,9 +335,10 @@ def collapse_sequence(
 ) -> tuple[np.ndarray, np.ndarray]:
     """All half-edge collapses of a triangle mesh, best first.
 
-    Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3), whose seams are then kept closed.
-    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex each one moves onto, itself if it
-    never can.
+    Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3), whose seams are then kept
+    closed.
+    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex each one moves
+    onto, itself if it never can.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     hidden = exposure(vertices, faces) == 0
@@ -356,10 +385,11 @@ def _follow(into: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
 
 def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """A joint regressor on the kept vertices that gives the joints of the full body, whatever its shape.
+    """A joint regressor on the kept vertices that gives the joints of the full body, whatever its
+    shape.
 
-    The weights of lost vertices move to where those went; the smallest change of the nearby weights then removes the
-    error.
+    The weights of lost vertices move to where those went; the smallest change of the nearby weights
+    then removes the error.
     """
     regressor = np.asarray(body.joint_regressor, np.float64)
     moved = np.zeros_like(regressor)
@@ -393,7 +423,9 @@ def _carry_uvs(
     target: Int[np.ndarray, " n"],
     kept_faces: Bool[np.ndarray, " f"],
 ) -> tuple[Float[Array, "u 2"], Int[Array, "kept 3"]]:
-    """Texture vertices of the remaining corners: of the vertex a corner moved onto, the one nearest in the texture."""
+    """Texture vertices of the remaining corners: of the vertex a corner moved onto, the one nearest
+    in the texture.
+    """
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
     pairs = np.unique(
         faces.ravel().astype(np.int64) * len(uvs) + uv_faces.ravel()
@@ -416,9 +448,9 @@ def _carry_uvs(
 def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     """A body on `vertex_count` of the body's own vertices, with the same joints for every shape.
 
-    Host-side numpy: about 0.1 s if the body carries its collapses (the shipped one does), seconds to find them
-    otherwise; the result carries its own. Raises: ValueError if vertex_count is larger than the body or too small for
-    its topology.
+    Host-side numpy: about 0.1 s if the body carries its collapses (the shipped one does), seconds
+    to find them otherwise; the result carries its own. Raises: ValueError if vertex_count is larger
+    than the body or too small for its topology.
     """
     total = body.template.shape[0]
     if not 0 < vertex_count <= total:
@@ -434,7 +466,8 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     smallest = int(np.sum(into == np.arange(total)))
     if vertex_count < smallest:
         raise ValueError(
-            f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices at most"
+            f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices"
+            " at most"
         )
     kept = np.flatnonzero(order < vertex_count)
     target = _follow(into, order < vertex_count)

@@ -1,10 +1,13 @@
-"""The `humangs` command. Each subcommand is a frozen dataclass whose fields are its options; `run` does the work.
+"""The `humangs` command. Each subcommand is a frozen dataclass whose fields are its options; `run`
+does the work.
 
-Modules here import nothing heavy, so that `--help` is fast: what a command needs is imported when it runs, after its options
-and the places that it will write to were checked. --quiet, --verbose and --version are for all commands.
+Modules here import nothing heavy, so that `--help` is fast: what a command needs is imported when
+it runs, after its options and the places that it will write to were checked. --quiet, --verbose and
+--version are for all commands.
 
-Exit codes: 0; 1 for bad data (a capture, a file that cannot be read); 2 for bad usage (an option, a place that cannot be written
-to); 130 after Ctrl-C; 141 where the reader of a pipe has gone. Errors are one line on stderr, with nothing half-written.
+Exit codes: 0; 1 for bad data (a capture, a file that cannot be read); 2 for bad usage (an option, a
+place that cannot be written to); 130 after Ctrl-C; 141 where the reader of a pipe has gone. Errors
+are one line on stderr, with nothing half-written.
 """
 
 import difflib
@@ -22,7 +25,10 @@ BAD_DATA, BAD_USAGE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 
 @runtime_checkable
 class Command(Protocol):
-    """A subcommand with its options. The first line of its docstring is its line in `humangs --help`."""
+    """A subcommand with its options.
+
+    The first line of its docstring is its line in `humangs --help`.
+    """
 
     examples: ClassVar[tuple[str, ...]]
     """Lines that --help ends with."""
@@ -79,7 +85,8 @@ def main() -> None:
     except KeyboardInterrupt:  # before the command has begun, or the second one
         code = _interrupted()
     if code == INTERRUPTED:
-        # XLA's threads may still be computing: they crash when the interpreter takes their arrays away
+        # XLA's threads may still be computing: they crash when the interpreter takes their arrays
+        # away
         os._exit(code)
     if code:
         sys.exit(code)
@@ -144,9 +151,11 @@ def _prepare(verbose: bool) -> None:
 
 
 def _parsed(arguments: list[str]) -> Command:
-    """The command with its options. Only its own module is imported, and only its options are looked at: that is faster.
+    """The command with its options. Only its own module is imported, and only its options are
+    looked at: that is faster.
 
-    Raises: SystemExit after --help; UsageError for an unknown command, or words that it does not take.
+    Raises: SystemExit after --help; UsageError for an unknown command, or words that it does not
+    take.
     """
     from humangs_jax.core.progress import say
 
@@ -173,7 +182,8 @@ def _parsed(arguments: list[str]) -> Command:
         if option.startswith("--") and option not in known:
             near = difflib.get_close_matches(option, known, n=1)
             raise UsageError(
-                f"{option}: no option of humangs {name}{f': did you mean {near[0]}?' if near else ''}"
+                f"{option}: no option of humangs"
+                f" {name}{f': did you mean {near[0]}?' if near else ''}"
             )
     typed = " ".join(arguments[: 2 if arguments[:2] == ["import", "cameras"] else 1])
     try:
@@ -183,14 +193,18 @@ def _parsed(arguments: list[str]) -> Command:
         raise
 
 
+def summary(command: type[Any]) -> str:
+    """The first paragraph of a command's docstring, on one line."""
+    paragraph, _, _ = (command.__doc__ or "").partition("\n\n")
+    return " ".join(paragraph.split())
+
+
 def overview() -> str:
     """What `humangs --help` prints: all commands by purpose, a line for each."""
     lines = ["usage: humangs COMMAND [OPTIONS]", "", ABOUT]
     for group, commands in GROUPS.items():
         lines += ["", f"{group}:"]
-        lines += [
-            f"  {name:<12} {(_command(name).__doc__ or '').splitlines()[0]}" for name in commands
-        ]
+        lines += [f"  {name:<12} {summary(_command(name))}" for name in commands]
     return "\n".join([*lines, "", EVERYWHERE])
 
 

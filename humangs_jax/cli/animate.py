@@ -1,4 +1,6 @@
-"""`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the browser."""
+"""`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the
+browser.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -36,8 +38,14 @@ _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).s
 FROM_THE_SIDE = Shot(azimuth=20.0)
 SPLATS = {suffix: each.up for each in EXPORTS.values() if not each.mesh for suffix in each.suffixes}
 """Files of Gaussians, and the axis that points up in them."""
-OF_A_FILE = "Cameras of a file: of Gaussians in its world, of an avatar around a person who stands on the floor."
-PATH = "Cameras of a file instead: one stands still, several are a path over the whole motion, around a person on the floor."
+OF_A_FILE = (
+    "Cameras of a file: of Gaussians in its world, of an avatar around a person who stands on the"
+    " floor."
+)
+PATH = (
+    "Cameras of a file instead: one stands still, several are a path over the whole motion, around"
+    " a person on the floor."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +122,8 @@ class Animate:
             )
         wrote(
             self.out,
-            f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {motion.fps:g} frames per second",
+            f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {motion.fps:g} frames"
+            " per second",
         )
         suggest(
             "humangs export", self.avatar, "--html avatar.html", *self.part.options(self.motion)
@@ -123,7 +132,8 @@ class Animate:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Render an avatar from a circle of cameras, or those of a file or capture; or Gaussians of any program.
+    """Render an avatar from a circle of cameras, or those of a file or capture; or Gaussians of any
+    program.
 
     As images, as layers of an EXR file, or as a video of one turn (docs: video).
     """
@@ -152,7 +162,8 @@ class Render:
     exr: bool = False
     """Also write views.exr, one part per view: premultiplied colors, --channels, and the camera."""
     channels: str = "rgba,z"
-    """Channels of views.exr: rgba (always there), z, position, normal, part, separated by commas."""
+    """Channels of views.exr: rgba (always there), z, position, normal, part, separated by commas.
+    """
     exr_type: Literal["float", "half"] = "float"
     """Number type of views.exr. half: depths and positions still have 32 bits."""
     preset: Preset | None = None
@@ -215,13 +226,19 @@ class Render:
                 written = write_video(
                     self.out, images(avatar, poses, cameras, shot, "render"), self.fps
                 )
-                what = f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {self.fps:g} frames per second"
+                what = (
+                    f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {self.fps:g}"
+                    " frames per second"
+                )
             else:
                 exr = layers if self.exr else None
                 written = write_views(
                     self.out, avatar, poses, cameras, shot, exr, exposures=exposed, names=names
                 )
-                what = f"{_counted(written, 'view')} of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
+                what = (
+                    f"{_counted(written, 'view')} of {cameras.width} x"
+                    f" {cameras.height}{' and views.exr' * self.exr}"
+                )
         wrote(self.out, what)
         suggest("humangs animate", self.avatar)
 
@@ -265,7 +282,10 @@ class Render:
         wrote(self.out, f"{what} of {len(gaussians.means):,} Gaussians")
 
     def _require_one_kind_of_cameras(self) -> None:
-        """With --capture or --camera nothing else is said about the cameras. Raises: UsageError naming the first option."""
+        """With --capture or --camera nothing else is said about the cameras.
+
+        Raises: UsageError naming the first option.
+        """
         said = ["views"] * (self.views is not None)
         if self.capture is not None:
             said += ["camera"] * (self.camera is not None) + ["pose"] * (self.pose != "t")
@@ -287,7 +307,8 @@ class Render:
 class View:
     """Show an avatar moving in the browser.
 
-    Or, with --live, what a running training or refinement makes. Serves the HTML viewer on this machine until Ctrl-C.
+    Or, with --live, what a running training or refinement makes. Serves the HTML viewer on this
+    machine until Ctrl-C.
     docs: viewer.
     """
 
@@ -296,7 +317,10 @@ class View:
         "humangs view runs/train --live",
     )
     avatar: Positional[Path]
-    """File written by `humangs reconstruct`. With --live: of `humangs refine --live`, or the folder of a training run."""
+    """File written by `humangs reconstruct`.
+
+    With --live: of `humangs refine --live`, or the folder of a training run.
+    """
     motion: Path | None = None
     """The motion it plays. Default: the shipped walk."""
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
@@ -354,7 +378,8 @@ ON_A_CIRCLE = ("azimuth", "elevation", "distance", "fov")
 
 
 def _require_no_circle(option: str, shot: Shot, usual: Shot, said: list[str]) -> None:
-    """Nothing is said about a circle of cameras beside an option that has its own. said: names of other options that are given.
+    """Nothing is said about a circle of cameras beside an option that has its own. said: names of
+    other options that are given.
 
     Raises: UsageError naming the first.
     """

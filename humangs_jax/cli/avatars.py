@@ -1,4 +1,6 @@
-"""`humangs demo`, `reconstruct`, `refine`, `export`: from photos to an avatar, and to files of it."""
+"""`humangs demo`, `reconstruct`, `refine`, `export`: from photos to an avatar, and to files of
+it.
+"""
 
 import dataclasses
 import functools
@@ -37,7 +39,10 @@ if TYPE_CHECKING:
 
 DEMO_REFINE = "15s"
 
-_USUAL_UP = f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers expect, else y."
+_USUAL_UP = (
+    f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers"
+    " expect, else y."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,9 +63,14 @@ class Demo:
     size: Side = 256
     """Side of the animation's frames in pixels."""
     refine: str | None = None
-    """How long to fit the avatar to its photos: 15s (or 15), 100steps, or 0. Default: 15s, or as --preset says."""
+    """How long to fit the avatar to its photos: 15s (or 15), 100steps, or 0.
+
+    Default: 15s, or as --preset says.
+    """
     preset: Preset | None = None
-    """Speed against accuracy (docs: tradeoff): photos, network, splatting, and refinement without --refine."""
+    """Speed against accuracy (docs: tradeoff): photos, network, splatting, and refinement
+    without --refine.
+    """
 
     def run(self) -> None:
         limits = first_refinement(DEMO_REFINE if self.refine is None else self.refine)
@@ -82,9 +92,10 @@ class Demo:
 class Reconstruct:
     """Reconstruct avatars from capture folders.
 
-    A capture is photos, cameras and body poses. Several captures, or a folder of them, become OUT/NAME.npz. Those that are
-    there are kept, so that the same command goes on after an interruption. One whose capture has other contents now is
-    named, and nothing is made. A capture that fails does not stop the others. docs: capture_format.
+    A capture is photos, cameras and body poses. Several captures, or a folder of them, become
+    OUT/NAME.npz. Those that are there are kept, so that the same command goes on after an
+    interruption. One whose capture has other contents now is named, and nothing is made. A capture
+    that fails does not stop the others. docs: capture_format.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -92,21 +103,34 @@ class Reconstruct:
         "humangs reconstruct people --out avatars --shard 0/8",
     )
     captures: Positional[tuple[Path, ...]]
-    """Folders with capture.json, or with such folders in them; "demo_capture" is the shipped one."""
+    """Folders with capture.json, or with such folders in them; "demo_capture" is the shipped
+    one.
+    """
     out: Path | None = None
-    """The avatar file to write or replace, default: avatar.npz; of several captures a folder, default: avatars."""
+    """The avatar file to write or replace, default: avatar.npz; of several captures a folder,
+    default: avatars.
+    """
     views: Annotated[int | Literal["auto"] | None, at_least(1)] = None
-    """How many photos to use: those that together show most of the body; auto: those that add something. Default: all."""
+    """How many photos to use: those that together show most of the body; auto: those that add
+    something. Default: all.
+    """
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
-    """The patches that the network reads: all, or several times faster those that show the person (docs: performance)."""
+    """The patches that the network reads: all, or several times faster those that show the
+    person (docs: performance).
+    """
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
     """Number type of the encoder's matrix products; the 16-bit ones are faster on GPU and TPU."""
     refine: str | None = None
-    """Fit the avatar to its photos for so long: 15s (or 15), 100steps, or 0. Default, with masks: iterations and the head."""
+    """Fit the avatar to its photos for so long: 15s (or 15), 100steps, or 0.
+
+    Default, with masks: iterations and the head.
+    """
     preset: Preset | None = None
-    """Speed against accuracy (docs: tradeoff): photos, network and refinement, without the options above."""
+    """Speed against accuracy (docs: tradeoff): photos, network and refinement, without the
+    options above.
+    """
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
     batch: Annotated[int | None, at_least(1)] = None
@@ -224,7 +248,10 @@ class Reconstruct:
         begin_set(out, AVATARS, {SETTINGS: said})
 
     def _photos(self, folder: Path, views: int | str | None) -> "Capture":
-        """The views of a capture that are used. Raises: ValueError; UsageError for --refine without masks."""
+        """The views of a capture that are used.
+
+        Raises: ValueError; UsageError for --refine without masks.
+        """
         photos = _read_capture(folder, self.check, self.fit_masks)
         if self.refine not in (None, "0") and photos.masks is None:
             raise UsageError(f"--refine {self.refine}: needs masks, and {folder} has none")
@@ -243,7 +270,8 @@ class Reconstruct:
 class Refine:
     """Fit an avatar to the photos of a capture.
 
-    By learned-optimizer iterations, then gradient descent. Ctrl-C ends it early; the best avatar until then is written.
+    By learned-optimizer iterations, then gradient descent. Ctrl-C ends it early; the best avatar
+    until then is written.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -289,7 +317,10 @@ class Refine:
 
 
 def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
-    """Capture folders by name, those inside of given folders too. Raises: UsageError for two of one name."""
+    """Capture folders by name, those inside of given folders too.
+
+    Raises: UsageError for two of one name.
+    """
     folders = []
     for path in given:
         inside = [] if (path / "capture.json").is_file() else sorted(path.glob("*/capture.json"))
@@ -306,18 +337,27 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
 
 
 def _check_source(avatar: Path, capture: Path) -> None:
-    """An avatar of a set that is kept was made from what the capture holds now. Raises: CaptureError, naming both."""
+    """An avatar of a set that is kept was made from what the capture holds now.
+
+    Raises: CaptureError, naming both.
+    """
     from humangs_jax.avatar.avatar import recorded_source
     from humangs_jax.data.capture import capture_checksum
     from humangs_jax.data.capture_checks import CaptureError
 
     if recorded_source(avatar) != capture_checksum(capture):
-        problem = f"made from other contents than {capture} has now: move it away, or choose another --out"
+        problem = (
+            f"made from other contents than {capture} has now: move it away, or choose another"
+            " --out"
+        )
         raise CaptureError(avatar, "made_from", problem)
 
 
 def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
-    """The views of a capture that show the person, after warnings about what looks wrong in them. Raises: ValueError for none."""
+    """The views of a capture that show the person, after warnings about what looks wrong in them.
+
+    Raises: ValueError for none.
+    """
     with stage("reading the capture"):
         from humangs_jax.data.body_and_masks import usable_views
         from humangs_jax.data.capture import load_capture
@@ -351,9 +391,11 @@ def _refine_and_save(
     unfinished: bool = True,
     made_from: str | None = None,
 ) -> None:
-    """Refine with a progress bar if asked, write the result (now and then, if live), say what it took.
+    """Refine with a progress bar if asked, write the result (now and then, if live), say what it
+    took.
 
-    unfinished: whether an avatar is written whose refinement was interrupted. made_from: a checksum to write with it.
+    unfinished: whether an avatar is written whose refinement was interrupted. made_from: a checksum
+    to write with it.
     Raises: KeyboardInterrupt, after that, if one ended it.
     """
     if how is None:
@@ -395,7 +437,10 @@ class Export:
     out: Annotated[
         Path | None,
         arg(
-            help=f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none with it."
+            help=(
+                f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none"
+                " with it."
+            )
         ),
     ] = None
     html: Annotated[Path | None, Place((".html",))] = None
@@ -403,12 +448,17 @@ class Export:
     mesh: bool = False
     """Write the body, not the Gaussians: a .glb then holds its skin, and --motion as animation."""
     motion: Path | None = None
-    """The motion that the viewer plays (default: the shipped walk) or that poses --out (default: T-pose). docs: motions."""
+    """The motion that the viewer plays (default: the shipped walk) or that poses --out (default:
+    T-pose). docs: motions.
+    """
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
     frame: int | None = None
     """Which frame of the motion, from 0. Default: the first."""
     frames: str | None = None
-    """Many frames: a:b:step as in Python, ":" for all. X.ply becomes X_0000.ply, X_0005.ply and so on."""
+    """Many frames: a:b:step as in Python, ":" for all.
+
+    X.ply becomes X_0000.ply, X_0005.ply and so on.
+    """
     up: Annotated[
         Up | None, arg(help=f"The axis that points up in the file. Default: {_USUAL_UP}")
     ] = None
@@ -438,7 +488,8 @@ class Export:
                 size = write_page(self.html, avatar, motion, self.avatar.stem, name)
             wrote(
                 self.html,
-                f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser",
+                f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a"
+                " browser",
             )
         if out is not None:
             self._write(out, avatar, motion)
@@ -537,8 +588,9 @@ class Export:
 class Tune:
     """Find the best settings within a budget of time or memory.
 
-    They are measured on this machine. The result is for --config of `reconstruct`, `animate`, `render`. Times are without
-    compilation. The exit code is 1, and nothing is written, if no setting is within the budget. docs: tradeoff.
+    They are measured on this machine. The result is for --config of `reconstruct`, `animate`,
+    `render`. Times are without compilation. The exit code is 1, and nothing is written, if no
+    setting is within the budget. docs: tradeoff.
     """
 
     examples: ClassVar[tuple[str, ...]] = (

@@ -1,4 +1,6 @@
-"""`humangs detect`, `import`, `synth`: who is in photos; capture folders from calibrated photos, and of synthetic people."""
+"""`humangs detect`, `import`, `synth`: who is in photos; capture folders from calibrated photos,
+and of synthetic people.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -31,7 +33,10 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
 
 
 def keypoints_of(views: Any, file: Path | None, person: int | None) -> Any:
-    """The keypoints of the views of a `Photos` or `Capture`, None if there is no file. Raises: see `read_keypoints`."""
+    """The keypoints of the views of a `Photos` or `Capture`, None if there is no file.
+
+    Raises: see `read_keypoints`.
+    """
     from humangs_jax.data.keypoints.reading import read_keypoints
 
     height, width = views.images.shape[1:3]
@@ -46,7 +51,10 @@ def keypoints_wanted() -> tuple[str, ...]:
         ()
         if available()
         else (
-            "--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the photos)",
+            (
+                "--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the"
+                " photos)"
+            ),
         )
     )
 
@@ -56,9 +64,11 @@ GIVE_IT = "move it away, or give keypoints that are there by --keypoints FILE"
 
 
 def found_here(capture: Path, person: int | None) -> Path:
-    """The file of keypoints in a capture folder. What it lacks is found in its photos: keypoints, and masks if there are none.
+    """The file of keypoints in a capture folder. What it lacks is found in its photos: keypoints,
+    and masks if there are none.
 
-    Arguments: person: the number on the sheet, where several may be meant; then they are found again.
+    Arguments: person: the number on the sheet, where several may be meant; then they are found
+    again.
     """
     from humangs_jax.apps import detect
     from humangs_jax.data.photos import capture_folder, load_photos
@@ -82,7 +92,8 @@ def found_here(capture: Path, person: int | None) -> Path:
 class Detect:
     """Find the person in photos: keypoints and masks.
 
-    people.png shows everybody with a number. Needs `pip install 'humangs_jax[photos]'`. docs: your_photos.
+    people.png shows everybody with a number. Needs `pip install 'humangs_jax[photos]'`. docs:
+    your_photos.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -142,7 +153,9 @@ class ImportCameras:
         Positional[Path], arg(help=f"File or folder with the calibration: {CAMERAS.listed()}.")
     ]
     images: Path
-    """Folder of the photos, or of a video of each camera (CAMERA.mp4; all begin at the same moment)."""
+    """Folder of the photos, or of a video of each camera (CAMERA.mp4; all begin at the same
+    moment).
+    """
     out: Path
     """The capture folder to write."""
     masks: Path | None = None
@@ -152,7 +165,10 @@ class ImportCameras:
     up: str | None = None
     """Axis of the source's world that points up, like --up=+z or --up=-y. Default: the format's."""
     pixel_centers: Literal["integer", "half"] | None = None
-    """Where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half). Default: the format's."""
+    """Where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half).
+
+    Default: the format's.
+    """
     every: int = 1
     """Frame step of videos: 10 takes frames 0, 10, 20 and so on."""
     max_frames: int | None = None
@@ -216,7 +232,10 @@ class Synth:
     views: Annotated[int | None, at_least(1)] = None
     """Photos of each pose, around the person, 1.8 to 2.2 bounding radii away. Default: 60."""
     close_views: Annotated[int | None, at_least(0)] = None
-    """Further photos of each pose, 0.8 to 1.7 radii away, of parts of the person. Default: 12, or 0 with --views."""
+    """Further photos of each pose, 0.8 to 1.7 radii away, of parts of the person.
+
+    Default: 12, or 0 with --views.
+    """
     poses: Annotated[int, at_least(1)] = 1
     """Poses per subject."""
     sequences: bool = False
@@ -244,7 +263,8 @@ class Synth:
             if getattr(self, name) not in (value, defaults[name]):
                 option = name.replace("_", "-")
                 raise UsageError(
-                    f"--{option} {getattr(self, name)}: does not go with --for-training, which means {value}"
+                    f"--{option} {getattr(self, name)}: does not go with --for-training, which"
+                    f" means {value}"
                 )
         with stage("starting"):
             from humangs_jax.people.writer import Layout, write_set

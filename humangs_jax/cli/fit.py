@@ -1,4 +1,5 @@
-"""`humangs fit` and `humangs check`: find the body of one's own photos or scans, and look at the result.
+"""`humangs fit` and `humangs check`: find the body of one's own photos or scans, and look at the
+result.
 
 Everything is checked before the work begins, and written after it.
 """
@@ -32,14 +33,18 @@ class Detections:
         Path | None, arg(help=f"Keypoint file or folder: {KEYPOINTS.listed()}.")
     ] = None
     person: int | None = None
-    """Which person of the keypoint file, from 0, if a view has several; without a file, of those on people.png."""
+    """Which person of the keypoint file, from 0, if a view has several; without a file, of those on
+    people.png.
+    """
 
     def read(self, views: Any) -> Any:
         """The keypoints of the views, see `keypoints_of`."""
         return keypoints_of(views, self.keypoints, self.person)
 
     def read_or_recorded(self, capture: Path, views: Any) -> tuple[Any, Any]:
-        """The keypoints of the views; without a file of them those of the fit in the capture's folder, and its record."""
+        """The keypoints of the views; without a file of them those of the fit in the capture's
+        folder, and its record.
+        """
         from humangs_jax.data.photos import capture_folder
         from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
@@ -57,13 +62,22 @@ class Scan:
     scan: Path | None = None
     """A mesh with a person in it, of any scale and orientation."""
     joints: Path | None = None
-    """3D landmarks of the scan by name (.json or .npz). Without these and --scan-views, the pose is searched."""
+    """3D landmarks of the scan by name (.json or .npz).
+
+    Without these and --scan-views, the pose is searched.
+    """
     scan_views: Path | None = None
-    """Folder of images of the scan. They are rendered there; then, with --keypoints, those that the keypoints are of."""
+    """Folder of images of the scan.
+
+    They are rendered there; then, with --keypoints, those that the keypoints are of.
+    """
     height: float | None = None
     """Height of the person in the scan without shoes, metres. It sets the scale of the scan."""
     bare: bool = False
-    """Fill the scan, or with --refine the masks: to measure a body in no or tight clothes. Avatars are better without."""
+    """Fill the scan, or with --refine the masks: to measure a body in no or tight clothes.
+
+    Avatars are better without.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +85,15 @@ class Refinement:
     """Refinement of a capture that has a body."""
 
     refine: bool = False
-    """Improve cameras, shape and poses by masks and keypoints: those of the fit, or --keypoints. Never worse than the start."""
+    """Improve cameras, shape and poses by masks and keypoints: those of the fit, or --keypoints.
+
+    Never worse than the start.
+    """
     fixed_cameras: bool = False
-    """Leave cameras as they are. Else a fit to keypoints turns back those that they show to be turned, and --refine moves all."""
+    """Leave cameras as they are.
+
+    Else a fit to keypoints turns back those that they show to be turned, and --refine moves all.
+    """
 
 
 Way = Literal["--scan", "--refine", "--keypoints"]
@@ -89,8 +109,9 @@ WAYS: dict[Way, set[str]] = {
 class Fit:
     """Find the body in photos with cameras, or in a scan.
 
-    With CAPTURE: shape and poses from 2D keypoints of --keypoints, or of the shipped detector. With CAPTURE --refine: better
-    cameras and poses from masks. With --scan: the body in a mesh. docs: fitting.
+    With CAPTURE: shape and poses from 2D keypoints of --keypoints, or of the shipped detector. With
+    CAPTURE --refine: better cameras and poses from masks. With --scan: the body in a mesh. docs:
+    fitting.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -105,7 +126,9 @@ class Fit:
     body: Path | None = None
     """Model file (SMPL-X .npz or .pkl). Default: the shipped body."""
     smoothness: Annotated[float, at_least(0)] = 0.0
-    """For sequences: typical acceleration of joints, metres per frame squared; 0.02 for walking at 24 fps. 0: none."""
+    """For sequences: typical acceleration of joints, metres per frame squared; 0.02 for walking at
+    24 fps. 0: none.
+    """
     out: Path | None = None
     """Folder for the result. Default: the capture folder itself."""
     overwrite: bool = False
@@ -130,7 +153,9 @@ class Fit:
         ]()
 
     def _given(self) -> Iterator[str]:
-        """Options of the ways of fitting whose value is not the default, in the order of the help."""
+        """Options of the ways of fitting whose value is not the default, in the order of the
+        help.
+        """
         for part in (self.refinement, self.scan, self.detections, self):
             for field in dataclasses.fields(part):
                 chosen = (
@@ -141,7 +166,9 @@ class Fit:
                     yield field.name
 
     def _check_places(self, way: Way) -> None:
-        """Whether the result can be written; the whole of it is checked again where the capture is known."""
+        """Whether the result can be written; the whole of it is checked again where the capture is
+        known.
+        """
         scan, keypoints = self.scan, self.detections.keypoints
         inputs = (self.capture, scan.scan, scan.joints, keypoints, self.body)
         in_place = self.capture is not None and (
@@ -179,7 +206,8 @@ class Fit:
         if detections.keypoints is None:
             if not available():
                 raise UsageError(
-                    "--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are found here"
+                    "--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are"
+                    " found here"
                 )
             with stage("finding the person"):
                 detections = Detections(found_here(self.capture, detections.person))
@@ -268,7 +296,8 @@ class Fit:
             images, found = scan.scan_views / "images", scan.scan_views / "found"
             wrote(
                 scan.scan_views,
-                f"images of the scan; find keypoints in {images}, as the first of these commands does",
+                f"images of the scan; find keypoints in {images}, as the first of these commands"
+                " does",
             )
             suggest("humangs detect", images, "--out", found)
             keypoints = found / KEYPOINTS_FILE
@@ -315,7 +344,8 @@ DEFAULT_SHEET = Path("check.png")
 class Check:
     """Draw the body over each photo, and name what looks wrong.
 
-    For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views do not determine.
+    For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views
+    do not determine.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -370,7 +400,9 @@ class Check:
             suggest("humangs reconstruct", self.capture, "--out avatar.npz")
 
     def _found(self, capture: Any, keypoints: Any) -> tuple[Any, Any]:
-        """The capture and its keypoints, with what is found in the photos where either is missing; in memory only."""
+        """The capture and its keypoints, with what is found in the photos where either is missing;
+        in memory only.
+        """
         import numpy as np
 
         from humangs_jax.apps import detect

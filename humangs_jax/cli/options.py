@@ -1,8 +1,10 @@
-"""Options that several commands share: checks, which raise an error of one line that names the option, and parsing.
+"""Options that several commands share: checks, which raise an error of one line that names the
+option, and parsing.
 
-Where results go is checked before the work begins, and before anything heavy is imported. One rule for all commands: a single
-file that exists is replaced, whole, once the work is done; an .npz by its own kind only, and none that the command reads. The
-folder of a capture or of a fit to a scan is replaced with --overwrite only; `demo`, `render`, `synth`, `train` add to theirs.
+Where results go is checked before the work begins, and before anything heavy is imported. One rule
+for all commands: a single file that exists is replaced, whole, once the work is done; an .npz by
+its own kind only, and none that the command reads. The folder of a capture or of a fit to a scan is
+replaced with --overwrite only; `demo`, `render`, `synth`, `train` add to theirs.
 """
 
 import dataclasses
@@ -36,7 +38,8 @@ if TYPE_CHECKING:
     from humangs_jax.data.motion import Motion
 
 LARGEST_IMAGE = 8192
-"""Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn."""
+"""Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn.
+"""
 
 
 Side = Annotated[int, Range(16, LARGEST_IMAGE)]
@@ -50,7 +53,9 @@ class UsageError(ValueError):
 
 
 def option_of(argument: str) -> str:
-    """The option that an argument of the library comes from: "frame_ms" is --frame-ms; files are written to --out."""
+    """The option that an argument of the library comes from: "frame_ms" is --frame-ms; files are
+    written to --out.
+    """
     return "--out" if argument == "path" else f"--{argument.replace('_', '-')}"
 
 
@@ -61,7 +66,10 @@ class PartOfMotion:
     motion_fps: Annotated[float | None, Range(0.01, 1000.0)] = None
     """Frames per second of the motion, where its file says none. Default: those of the file."""
     motion_up: Literal["y", "-y", "z", "-z", "x", "-x"] | None = None
-    """The axis that points up in the motion's world, like --motion-up=z. Default: the file's, or as people stand."""
+    """The axis that points up in the motion's world, like --motion-up=z.
+
+    Default: the file's, or as people stand.
+    """
     person: int | None = None
     """Number of the person, in a motion of several people."""
     clip: str | None = None
@@ -104,9 +112,11 @@ WHOLE = PartOfMotion()
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Annotation of an option that says where results go. Without suffixes it is a folder, which is made if it does not exist.
+    """Annotation of an option that says where results go. Without suffixes it is a folder, which is
+    made if it does not exist.
 
-    suffixes: of a file. folder: a name without suffix is a folder. avatar: the file replaces an avatar only.
+    suffixes: of a file. folder: a name without suffix is a folder. avatar: the file replaces an
+    avatar only.
     """
 
     suffixes: tuple[str, ...] = ()
@@ -118,7 +128,10 @@ AVATAR = Place((".npz",), avatar=True)
 
 
 def off(what: str) -> Any:
-    """Annotation of a switch that is on: what --no-SWITCH does not do. `--help` shows this, since that is what can be typed."""
+    """Annotation of a switch that is on: what --no-SWITCH does not do.
+
+    `--help` shows this, since that is what can be typed.
+    """
     return arg(help=f"Do not {what}.")
 
 
@@ -127,7 +140,8 @@ _VALUES = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 
 @functools.cache
 def described(command: type[Any]) -> type[Any]:
-    """The dataclass of a command with what --help shows of its options: positional arguments by name, no default that is None.
+    """The dataclass of a command with what --help shows of its options: positional arguments by
+    name, no default that is None.
 
     tyro alone shows `PATH` for every positional argument, `{None}|PATH`, and `(default: None)`.
     """
@@ -157,7 +171,9 @@ def option_names(command: type[Any]) -> set[str]:
 
 
 def _options(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any, Any, bool]]:
-    """Of each field: itself, its annotation, what that annotates, and whether it is a positional argument."""
+    """Of each field: itself, its annotation, what that annotates, and whether it is a positional
+    argument.
+    """
     hints = get_type_hints(command, include_extras=True)
     for field in dataclasses.fields(command):
         hint = hints[field.name]
@@ -187,7 +203,9 @@ def _value_shown(kind: Any) -> str | None:
 
 
 def check_options(command: Any) -> None:
-    """Before the work: are options in the ranges of their annotations, can their places be written to? Raises: UsageError."""
+    """Before the work: are options in the ranges of their annotations, can their places be written
+    to? Raises: UsageError.
+    """
     cls = type(command)
     hints = {
         name: hint
@@ -212,7 +230,10 @@ def check_options(command: Any) -> None:
 
 
 def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = ()) -> None:
-    """Results of that kind can be written to that path. read: what the command reads. Raises: UsageError."""
+    """Results of that kind can be written to that path. read: what the command reads.
+
+    Raises: UsageError.
+    """
     if not place.suffixes or (place.folder and not path.suffix):
         require_folder(path, option)
         return
@@ -234,7 +255,8 @@ def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = 
 def require_file(
     path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()
 ) -> None:
-    """A file with one of the suffixes can be written to that path, whose folder is made if it does not exist.
+    """A file with one of the suffixes can be written to that path, whose folder is made if it does
+    not exist.
 
     read: what the command reads. Raises: UsageError.
     """
@@ -255,7 +277,10 @@ def require_file(
 
 
 def require_folder(path: Path, option: str = "--out") -> None:
-    """Files can be written into that folder, which is made if it does not exist. Raises: UsageError."""
+    """Files can be written into that folder, which is made if it does not exist.
+
+    Raises: UsageError.
+    """
     if path.exists() and not path.is_dir():
         raise UsageError(f"{option} {path}: is a file: expected the name of a folder")
     _require_writable(path, option)
@@ -264,7 +289,9 @@ def require_folder(path: Path, option: str = "--out") -> None:
 def require_replaceable(
     folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = ()
 ) -> None:
-    """A folder of the kind that holds the file `mark` can be made there, or replaced with --overwrite. Raises: UsageError."""
+    """A folder of the kind that holds the file `mark` can be made there, or replaced with
+    --overwrite. Raises: UsageError.
+    """
     from humangs_jax.io.atomic import check_replaceable, remove_abandoned_lock
 
     require_folder(folder)
@@ -285,7 +312,9 @@ def _require_writable(path: Path, option: str) -> None:
 
 
 def tell_deleted(folder: Path, unless: Path | None = None) -> None:
-    """Say what --overwrite will delete in a folder that is replaced; nothing where it is the folder `unless`, or empty."""
+    """Say what --overwrite will delete in a folder that is replaced; nothing where it is the folder
+    `unless`, or empty.
+    """
     from humangs_jax.io.atomic import contents
 
     if (unless is None or folder.resolve() != unless.resolve()) and (found := contents(folder)):
@@ -297,7 +326,9 @@ ITERATIONS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 5
 
 
 def refine_limits(text: str, option: str) -> dict[str, Any]:
-    """Fields of `RefineConfig` for "15s", "15" (seconds), "100steps", or "0steps" (iterations only). Raises: UsageError."""
+    """Fields of `RefineConfig` for "15s", "15" (seconds), "100steps", or "0steps" (iterations
+    only). Raises: UsageError.
+    """
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
     number = float(match["number"]) if match else 0.0
     in_steps = match is not None and match["unit"] == "steps"
@@ -311,14 +342,19 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
 
 
 def first_refinement(text: str | None) -> dict[str, Any] | None:
-    """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by default `ITERATIONS_ALONE`."""
+    """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by
+    default `ITERATIONS_ALONE`.
+    """
     if text is None:
         return ITERATIONS_ALONE
     return None if text == "0" else refine_limits(text, "--refine")
 
 
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":
-    """The settings that --preset names or that --config holds, None without either. Raises: UsageError for both; FileError."""
+    """The settings that --preset names or that --config holds, None without either.
+
+    Raises: UsageError for both; FileError.
+    """
     if preset is not None and config is not None:
         raise UsageError(
             f"--config {config}: does not go with --preset {preset}: expected one of them"

@@ -1,4 +1,7 @@
-"""Words of a command line to a command with its options. What tyro refuses in a box with its help is one line here."""
+"""Words of a command line to a command with its options.
+
+What tyro refuses in a box with its help is one line here.
+"""
 
 import contextlib
 import difflib
@@ -20,7 +23,10 @@ FRAMES = re.compile("[\u2500-\u257f]+|-{3,}")
 
 
 def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
-    """The command with its options. name: as it is typed. Raises: UsageError; SystemExit after --help."""
+    """The command with its options. name: as it is typed.
+
+    Raises: UsageError; SystemExit after --help.
+    """
     import tyro
 
     asked_for_help = "--help" in words or "-h" in words
@@ -81,7 +87,9 @@ def _one_line(command: type[Any], name: str, words: Sequence[str], lines: list[s
 
 
 def _missing(lines: Sequence[str]) -> list[str]:
-    """The arguments that tyro lists with their help: those that are indented least below the first line."""
+    """The arguments that tyro lists with their help: those that are indented least below the first
+    line.
+    """
     start = next(i for i, line in enumerate(lines) if "Missing from" in line)
     rows = lines[start + 1 :]
     indents = [len(row) - len(row.lstrip()) for row in rows]
@@ -110,7 +118,9 @@ def _wrong_value(command: type[Any], option: str, given: str) -> str:
 
 
 def _no_value(command: type[Any], option: str, words: Sequence[str]) -> str:
-    """An option without a value; what follows it looks like an option, as negative numbers and axes do."""
+    """An option without a value; what follows it looks like an option, as negative numbers and axes
+    do.
+    """
     following = words[words.index(option) + 1 :] if option in words else []
     joined = (
         f", as in {option}={following[0]}"

@@ -1,7 +1,9 @@
-"""What a command shows: stages while it works, warnings, what it wrote, how long its stages took, and what to do next. Ctrl-C.
+"""What a command shows: stages while it works, warnings, what it wrote, how long its stages took,
+and what to do next. Ctrl-C.
 
-Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `finish` and `fail`.
-Results go to stdout, everything else to stderr. --quiet leaves results and errors, --verbose shows what libraries log as well.
+Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls
+`finish` and `fail`. Results go to stdout, everything else to stderr. --quiet leaves results and
+errors, --verbose shows what libraries log as well.
 """
 
 import atexit
@@ -24,22 +26,27 @@ from humangs_jax.core.progress import bar as bar
 from humangs_jax.core.progress import say
 from humangs_jax.core.progress import stage as stage
 
-# Ctrl-C that would get lost. While a program compiles or runs, Python hears of it only when that returns, which can be minutes
-# later. In callbacks of the garbage collector (JAX has one) and destructors, Python drops the KeyboardInterrupt with a note, and
-# the command would go on. And extensions crash where it comes while they are imported.
+# Ctrl-C that would get lost. While a program compiles or runs, Python hears of it only when that
+# returns, which can be minutes later. In callbacks of the garbage collector (JAX has one) and
+# destructors, Python drops the KeyboardInterrupt with a note, and the command would go on. And
+# extensions crash where it comes while they are imported.
 heard = threading.Event()
 """Whether Python has heard of Ctrl-C in this command."""
 AGAIN = 0.02
 """Seconds after which an interrupt that was dropped, or came at a bad time, is repeated."""
 PATIENCE = 2.0
-"""Seconds that Python gets to hear of it and to tidy up; files are written by calls that are shorter."""
+"""Seconds that Python gets to hear of it and to tidy up; files are written by calls that are
+shorter.
+"""
 
 
 def end_within_seconds() -> None:
-    """From now on Ctrl-C ends this process by a KeyboardInterrupt or, if that is not heard in time, at once.
+    """From now on Ctrl-C ends this process by a KeyboardInterrupt or, if that is not heard in time,
+    at once.
 
-    For the console script. So does what asks a process to end (`timeout`, a terminal that is closed). Where a command handles the
-    signal itself, as training does to save its state, nothing is forced.
+    For the console script. So does what asks a process to end (`timeout`, a terminal that is
+    closed). Where a command handles the signal itself, as training does to save its state, nothing
+    is forced.
     """
     if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # there, wake-up descriptors are sockets; or somebody else handles it
@@ -64,7 +71,8 @@ def end_within_seconds() -> None:
         if signal.getsignal(number) is signal.SIG_DFL:  # not below nohup
             signal.signal(number, end)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    # when Python ends it gives signals back to the system, whose handler kills: a command that was done had no exit code
+    # when Python ends it gives signals back to the system, whose handler kills: a command that was
+    # done had no exit code
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
     def watch():
@@ -93,7 +101,9 @@ def end_within_seconds() -> None:
 
 
 def _importing(frame: FrameType | None) -> bool:
-    """Whether a module is being imported: extensions that are interrupted while they begin crash, or raise other errors."""
+    """Whether a module is being imported: extensions that are interrupted while they begin crash,
+    or raise other errors.
+    """
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True
@@ -102,8 +112,8 @@ def _importing(frame: FrameType | None) -> bool:
 
 
 XLA_LEVELS = {False: "3", True: "0"}
-"""TF_CPP_MIN_LOG_LEVEL without and with --verbose. 3 leaves fatal errors: XLA logs its boxes about slow compilation as errors,
-and real errors of a program arrive as exceptions.
+"""TF_CPP_MIN_LOG_LEVEL without and with --verbose. 3 leaves fatal errors: XLA logs its boxes about
+slow compilation as errors, and real errors of a program arrive as exceptions.
 """
 
 
@@ -118,8 +128,8 @@ class _Handler(logging.Handler):
 
 
 def silence(verbose: bool) -> None:
-    """Keep what libraries log off the screen, and errors in threads of their own, for a program of its own (not a test). Before
-    JAX is imported.
+    """Keep what libraries log off the screen, and errors in threads of their own, for a program of
+    its own (not a test). Before JAX is imported.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", XLA_LEVELS[verbose])
     if not verbose and not sys.warnoptions:
@@ -128,7 +138,8 @@ def silence(verbose: bool) -> None:
     shown = sys.unraisablehook
 
     def unraisable(what):
-        # TensorStore's threads have nobody to report to when a disk is full; the command itself says that it is
+        # TensorStore's threads have nobody to report to when a disk is full; the command itself
+        # says that it is
         if verbose or threading.current_thread() is threading.main_thread():
             shown(what)
 
@@ -170,7 +181,9 @@ def warn(text: object) -> None:
 
 
 def fail(error: BaseException, verbose: bool) -> None:
-    """The command ends with this error: one line below what is on the screen, with --verbose the traceback above it."""
+    """The command ends with this error: one line below what is on the screen, with --verbose the
+    traceback above it.
+    """
     progress.end()
     if verbose:
         say("".join(traceback.format_exception(error)).rstrip(), error=True)
@@ -185,7 +198,9 @@ def suggest(*command: str | Path) -> None:
 
 
 def quoted(path: Path) -> str:
-    r"""A path as a shell takes it, even where the terminal cannot show it: then as $'f\xc3\xbcr', which bash and zsh read."""
+    r"""A path as a shell takes it, even where the terminal cannot show it: then as $'f\xc3\xbcr',
+    which bash and zsh read.
+    """
     text = str(path)
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     try:

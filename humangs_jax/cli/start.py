@@ -26,15 +26,17 @@ if TYPE_CHECKING:
     from humangs_jax.data.capture import Capture
 
 MARK = START_MARK
-"""In a capture folder that `humangs start` imported: a later run may replace it until it has a body, and go on from there."""
+"""In a capture folder that `humangs start` imported: a later run may replace it until it has a
+body, and go on from there.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Start:
     """From photos or a video of a person to an avatar in the browser.
 
-    Cameras, masks and keypoints are used where they are there, and estimated where they are not. Run it again when something was
-    added. docs: your_photos.
+    Cameras, masks and keypoints are used where they are there, and estimated where they are not.
+    Run it again when something was added. docs: your_photos.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -42,7 +44,10 @@ class Start:
         "humangs start photos --cameras calibration.json --out me",
     )
     photos: Positional[Path]
-    """Folder of photos, perhaps with cameras, masks and keypoints in it. Or a video: its best frames become OUT_photos."""
+    """Folder of photos, perhaps with cameras, masks and keypoints in it.
+
+    Or a video: its best frames become OUT_photos.
+    """
     out: Path
     """The capture folder to write, with avatar.npz, avatar.html and check.png in it."""
     cameras: Annotated[
@@ -54,13 +59,21 @@ class Start:
         Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")
     ] = None
     person: Annotated[int | None, at_least(0)] = None
-    """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
+    """Which person of the keypoint file, from 0, if a view has several; without such a file, of
+    those on people.png.
+    """
     height: Annotated[float | None, Range(0.3, 3)] = None
-    """Height of the person without shoes, metres: the scale where there is no calibration. Default: an average person's."""
+    """Height of the person without shoes, metres: the scale where there is no calibration.
+
+    Default: an average person's.
+    """
     scale: float | None = None
     """Metres per unit of the calibration. Default: 1."""
     up: str | None = None
-    """Axis of the calibration's world that points up, like --up=+z or --up=-y. Default: the format's."""
+    """Axis of the calibration's world that points up, like --up=+z or --up=-y.
+
+    Default: the format's.
+    """
     without_masks: bool = False
     """Use no masks: the photos have nothing but white behind the person."""
     fit_masks: Annotated[
@@ -68,7 +81,10 @@ class Start:
     ] = True
     """Move masks that are too large or too small to the edges in the photos."""
     refine: str | None = None
-    """Fit the avatar to the photos for so long: 15s (or 15), 100steps, or 0. Default, with masks: iterations and the head."""
+    """Fit the avatar to the photos for so long: 15s (or 15), 100steps, or 0.
+
+    Default, with masks: iterations and the head.
+    """
     browser: Annotated[bool, off("open the page at the end")] = True
     """Open the page at the end."""
     overwrite: bool = False
@@ -96,7 +112,9 @@ class Start:
             self._go_on(material, limits)
 
     def _check_lengths(self, material: "Material") -> None:
-        """Raises: UsageError for an option that sets a scale or a direction which something else sets."""
+        """Raises: UsageError for an option that sets a scale or a direction which something else
+        sets.
+        """
         if material.cameras is not None and self.height is not None:
             raise UsageError(
                 "--height: is for photos without cameras: the calibration has a scale (--scale)"
@@ -105,11 +123,14 @@ class Start:
             for option, value in (("--scale", self.scale), ("--up", self.up)):
                 if value is not None:
                     raise UsageError(
-                        f"{option}: is for a calibration, and there is none (--height sets the scale)"
+                        f"{option}: is for a calibration, and there is none (--height sets the"
+                        " scale)"
                     )
 
     def _mark(self, **more: Any) -> dict[str, dict[str, Any]]:
-        """The file that says which run made the folder: its photos, and the options that a later run has to repeat."""
+        """The file that says which run made the folder: its photos, and the options that a later
+        run has to repeat.
+        """
         return {MARK: {"photos": str(self.photos.resolve()), "options": self._decisive(), **more}}
 
     def _decisive(self) -> dict[str, Any]:
@@ -132,7 +153,9 @@ class Start:
         }
 
     def _check_same_options(self, mark: Any) -> None:
-        """Raises: UsageError if the body of the earlier run was made with other options than this run has."""
+        """Raises: UsageError if the body of the earlier run was made with other options than this
+        run has.
+        """
         earlier = mark.get("options") if isinstance(mark, dict) else None
         if not isinstance(earlier, dict):  # of a version that did not record them
             return
@@ -229,7 +252,9 @@ class Start:
         return self._with_found(material, "masks" in wanted)
 
     def _with_found(self, material: "Material", masks: bool) -> "Material":
-        """The material with what was found in the photos: keypoints where there are none, and perhaps masks."""
+        """The material with what was found in the photos: keypoints where there are none, and
+        perhaps masks.
+        """
         from humangs_jax.apps.detect import KEYPOINTS_FILE, MASKS
 
         keypoints = material.keypoints or self.out / KEYPOINTS_FILE
@@ -250,7 +275,10 @@ class Start:
         return folder
 
     def _resumes(self) -> bool:
-        """Whether an earlier run left a body to go on from. Raises: UsageError if --out may not be replaced."""
+        """Whether an earlier run left a body to go on from.
+
+        Raises: UsageError if --out may not be replaced.
+        """
         ours = (self.out / MARK).is_file()
         begun = ours and not (self.out / "body.npz").exists()
         finished = begun or self.overwrite or (self.out / "avatar.html").exists()
@@ -288,11 +316,13 @@ class Start:
         )
         if report.undistorted and material.keypoints is not None:
             warn(
-                f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}"
+                f"lens distortion was removed: {material.keypoints} should be of the photos in"
+                f" {self.out / 'images'}"
             )
         if report.turned and material.keypoints is not None:
             warn(
-                f"photos were turned upright: {material.keypoints} should be of those in {self.out / 'images'}"
+                f"photos were turned upright: {material.keypoints} should be of those in"
+                f" {self.out / 'images'}"
             )
         return report
 

@@ -1,4 +1,6 @@
-"""`humangs preprocess`, `train`, `convert`, `evaluate`: data sets, weights of one's own and the authors', scores."""
+"""`humangs preprocess`, `train`, `convert`, `evaluate`: data sets, weights of one's own and the
+authors', scores.
+"""
 
 import dataclasses
 import hashlib
@@ -43,7 +45,8 @@ class ScanViews:
 class Preprocess:
     """Turn a data set into photos with cameras and bodies.
 
-    By the published protocol. Can be interrupted and resumed. Layouts, licences, and lines for SLURM: docs: datasets.
+    By the published protocol. Can be interrupted and resumed. Layouts, licences, and lines for
+    SLURM: docs: datasets.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -52,7 +55,9 @@ class Preprocess:
     )
     kind: Annotated[Positional[Kind], arg(help=RAW.listed())]
     source: Positional[Path]
-    """The data set; of thuman the folder that holds model/ and smplx/, of videos a subject or the folder of several."""
+    """The data set; of thuman the folder that holds model/ and smplx/, of videos a subject or the
+    folder of several.
+    """
     scans: OmitArgPrefixes[ScanViews]
     out: Annotated[Path, Place()]
     """The folder to write: one folder for each scan or subject, lists, and manifest.json."""
@@ -107,9 +112,15 @@ class LossNetworkFiles:
     """Networks under perceptual losses (docs: loss_networks)."""
 
     vgg19: Path | None = None
-    """Weights of VGG-19 for the perceptual loss. Default: structural dissimilarity (SSIM) takes its place."""
+    """Weights of VGG-19 for the perceptual loss.
+
+    Default: structural dissimilarity (SSIM) takes its place.
+    """
     lpips_backbone: Path | None = None
-    """Weights of the network under LPIPS. Default: no LPIPS in validation; in the loss SSIM takes its place."""
+    """Weights of the network under LPIPS.
+
+    Default: no LPIPS in validation; in the loss SSIM takes its place.
+    """
     lpips_heads: Path | None = None
     """The linear heads of LPIPS, if the backbone's file does not have them."""
     lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
@@ -121,7 +132,10 @@ class Processes:
     """Training in several processes (docs: scaling)."""
 
     distributed: bool = False
-    """This is one of several processes. SLURM or a TPU pod says which one, or the following options do."""
+    """This is one of several processes.
+
+    SLURM or a TPU pod says which one, or the following options do.
+    """
     coordinator: str | None = None
     """HOST:PORT of process 0."""
     processes: int | None = None
@@ -151,30 +165,43 @@ class Train:
     networks: OmitArgPrefixes[LossNetworkFiles]
     processes: OmitArgPrefixes[Processes]
     data: Positional[Path | None] = None
-    """Folder of capture folders, a scene list (`humangs preprocess`), or a data set (docs: datasets)."""
+    """Folder of capture folders, a scene list (`humangs preprocess`), or a data set (docs:
+    datasets).
+    """
     body: Path | None = None
-    """Model file that DATA's parameters belong to, such as SMPLX_NEUTRAL.npz. Default: the body that comes with the package."""
+    """Model file that DATA's parameters belong to, such as SMPLX_NEUTRAL.npz.
+
+    Default: the body that comes with the package.
+    """
     out: Annotated[Path, Place()] = Path("runs/train")
     """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
     config: str = "small"
     """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
     on_the_fly: Annotated[int, at_least(0)] = 0
-    """Also (or without DATA only) train on this number of synthetic people who are rendered anew for every step."""
+    """Also (or without DATA only) train on this number of synthetic people who are rendered anew
+    for every step.
+    """
     validation: Path | None = None
     """Other people to evaluate on now and then: anything that DATA accepts."""
     steps: Annotated[int | None, at_least(1)] = None
-    """Length of the run. Default: that of the configuration. A finished run goes on if it is longer."""
+    """Length of the run. Default: that of the configuration.
+
+    A finished run goes on if it is longer.
+    """
     init_weights: Path | None = None
     """Start from these weights, and their network, instead of random ones."""
     fsdp: Annotated[int | None, at_least(1)] = None
     """How many devices share one copy of parameters and moments. Default: all."""
     diagnose: bool = False
-    """Repeat the step of the run that failed, or the next one, and name the first stage whose numbers are not finite."""
+    """Repeat the step of the run that failed, or the next one, and name the first stage whose
+    numbers are not finite.
+    """
 
     def run(self) -> None:
         if self.data is None and not self.on_the_fly:
             raise UsageError(
-                "nobody to train on: name a folder of captures, or give --on-the-fly a number of people"
+                "nobody to train on: name a folder of captures, or give --on-the-fly a number of"
+                " people"
             )
         with stage("starting"):
             self.processes.join()  # before anything asks for devices
@@ -245,7 +272,8 @@ class Train:
 class Convert:
     """Convert a checkpoint of the published network into our weights.
 
-    Without torch. Sizes and parts are read off the shapes; everything else is as in the preset `published`. docs: parity.
+    Without torch. Sizes and parts are read off the shapes; everything else is as in the preset
+    `published`. docs: parity.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -257,9 +285,13 @@ class Convert:
     out: Annotated[Path, TENSORS] = Path("weights.safetensors")
     """The weights file to write."""
     losses: Annotated[Path | None, TENSORS] = None
-    """Also write the loss networks that the checkpoint carries (VGG-19, LPIPS), for training and evaluation."""
+    """Also write the loss networks that the checkpoint carries (VGG-19, LPIPS), for training and
+    evaluation.
+    """
     head_width: int | None = None
-    """Features per attention head, needed if no shape tells it (networks without q_norm and k_norm)."""
+    """Features per attention head, needed if no shape tells it (networks without q_norm and
+    k_norm).
+    """
     pool: Literal["all", "visible"] = "all"
     """Average a vertex's features over all views (as released) or over those that see it."""
     dtype: Literal["float32", "float16"] = "float32"
@@ -294,7 +326,8 @@ class Convert:
         wrote(out, describe(converted))
         if losses is None:
             tell(
-                f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them"
+                f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*);"
+                " --losses keeps them"
             )
         else:
             wrote(losses, " and ".join(names))
@@ -309,7 +342,9 @@ PAGE_IMAGES = 120
 
 @dataclasses.dataclass(frozen=True)
 class LpipsFiles:
-    """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs: loss_networks)."""
+    """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs:
+    loss_networks).
+    """
 
     lpips_vgg: tuple[Path, ...] = ()
     """LPIPS of vgg. Default: of the extra `lpips`, if it is installed."""
@@ -323,8 +358,9 @@ class LpipsFiles:
 class Evaluate:
     """Score novel views of people against photos: PSNR, SSIM, LPIPS.
 
-    Of weights (people are reconstructed from some photos and compared on the others), of avatars, or of images that any program
-    rendered. The same command goes on after an interruption. Protocols of papers: docs: evaluation.
+    Of weights (people are reconstructed from some photos and compared on the others), of avatars,
+    or of images that any program rendered. The same command goes on after an interruption.
+    Protocols of papers: docs: evaluation.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -337,7 +373,10 @@ class Evaluate:
     avatar: Path | None = None
     """File written by `humangs reconstruct`, or a folder with PERSON.npz."""
     weights: Path | None = None
-    """Network weights (.safetensors). Default, without --avatar and --predictions: the shipped ones."""
+    """Network weights (.safetensors).
+
+    Default, without --avatar and --predictions: the shipped ones.
+    """
     predictions: Path | None = None
     """Folder with PERSON/VIEW.png, named like the photos; VIEW.png for one capture."""
     protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = (
@@ -345,11 +384,16 @@ class Evaluate:
     )
     """Whose backgrounds, crops, networks and SSIM."""
     body: Path | None = None
-    """Model file that the parameters of a data set belong to. Default: the body that comes with the package."""
+    """Model file that the parameters of a data set belong to.
+
+    Default: the body that comes with the package.
+    """
     inputs: Annotated[int | None, at_least(1)] = None
     """How many photos are inputs, evenly spaced. Default: 4."""
     indices: Path | None = None
-    """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target": [...]}}."""
+    """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target":
+    [...]}}.
+    """
     json: Annotated[Path | None, Place((".json",))] = None
     """Write all numbers here."""
     html: Annotated[Path | None, Place((".html",))] = None
@@ -372,7 +416,8 @@ class Evaluate:
             if found := getattr(self.lpips, f"lpips_{net}"):
                 if len(found) > 2:
                     raise UsageError(
-                        f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}"
+                        f"--lpips-{net}: expected a backbone and at most one file of heads, got"
+                        f" {len(found)}"
                     )
                 networks.append(load_lpips(net, *found))
         keep = self._kept()
@@ -405,7 +450,9 @@ class Evaluate:
                 )
 
     def _kept(self) -> Path | None:
-        """A folder in the user's cache, that of the same command on the same files; None where nothing can be written."""
+        """A folder in the user's cache, that of the same command on the same files; None where
+        nothing can be written.
+        """
         from humangs_jax import __version__
         from humangs_jax.core.processes import user_cache
 

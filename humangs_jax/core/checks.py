@@ -1,11 +1,14 @@
-"""Checks of what users hand in: arguments of the right class with shapes that fit each other, and values that are finite and in
-range.
+"""Checks of what users hand in: arguments of the right class with shapes that fit each other, and
+values that are finite and in range.
 
-    render(gaussians, camera, ...): gaussians: expected Gaussians, got Avatar; animate(avatar, pose) poses them
-    ValueError: render: gaussians.opacities: expected numbers in [0, 1], but 2 of 52375 are not, the first at [17]: nan
+    render(gaussians, camera, ...): gaussians: expected Gaussians, got Avatar; animate(avatar, pose)
+    poses them
+    ValueError: render: gaussians.opacities: expected numbers in [0, 1], but 2 of 52375 are not, the
+        first at [17]: nan
 
-Classes and shapes are known inside transformations, too, and checking them computes nothing. Values are there only outside of
-`jit`, `vmap` and `grad`: inside nothing is checked, so the pure function behind a public one needs no switch.
+Classes and shapes are known inside transformations, too, and checking them computes nothing. Values
+are there only outside of `jit`, `vmap` and `grad`: inside nothing is checked, so the pure function
+behind a public one needs no switch.
 """
 
 import dataclasses
@@ -50,11 +53,13 @@ HINTS = {
 
 
 def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: arguments are of the classes of their annotations, and arrays of one pytree fit each other.
+    """Decorator: arguments are of the classes of their annotations, and arrays of one pytree fit
+    each other.
 
-    Parameters that may be something else than plain classes, sequences or arrays (numbers, callables) are left alone.
-    Raises: TypeError, one line, for another class or a name that the function does not have; ValueError for shapes, and for
-    a batch of what functions take one of (`one_at_a_time`).
+    Parameters that may be something else than plain classes, sequences or arrays (numbers,
+    callables) are left alone.
+    Raises: TypeError, one line, for another class or a name that the function does not have;
+    ValueError for shapes, and for a batch of what functions take one of (`one_at_a_time`).
     """
     signature = inspect.signature(function)
     expected = {
@@ -81,8 +86,8 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
                 raise TypeError(f"{call}: {name}: {_other_class(classes, value)}")
             if getattr(value, "one_at_a_time", False) and value.batch_shape:
                 raise ValueError(
-                    f"{call}: {name}: expected one {type(value).__name__}, got a batch {value.batch_shape}: take one, "
-                    f"{name}[0], or use jax.vmap"
+                    f"{call}: {name}: expected one {type(value).__name__}, got a batch"
+                    f" {value.batch_shape}: take one, {name}[0], or use jax.vmap"
                 )
             if fault := shape_fault(value):
                 raise ValueError(f"{call}: {name}{fault}")
@@ -97,7 +102,9 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _arrays(annotation: Any) -> tuple[Any, ...]:
-    """The types of arrays that an annotation stands for, with None where it may be that; none if it may be something else."""
+    """The types of arrays that an annotation stands for, with None where it may be that; none if it
+    may be something else.
+    """
     options = typing.get_args(annotation) or (annotation,)
     known = all(hasattr(x, "dims") or x is type(None) for x in options)
     return options if known and any(hasattr(x, "dims") for x in options) else ()
@@ -174,13 +181,18 @@ def _of_a_field(
         for parameter, classes in expected.items():
             for x in classes:
                 if dataclasses.is_dataclass(x) and name in x.__dataclass_fields__:
-                    return f"no argument {name!r}: it is a field of {x.__name__}, {parameter}={x.__name__}({name}=...)"
+                    return (
+                        f"no argument {name!r}: it is a field of {x.__name__},"
+                        f" {parameter}={x.__name__}({name}=...)"
+                    )
         return f"no argument {name!r}; its arguments are {', '.join(signature.parameters)}"
     return None
 
 
 class Values(NamedTuple):
-    """What the entries of an array may be: finite numbers in [low, high]. words: how an error message says it."""
+    """What the entries of an array may be: finite numbers in [low, high]. words: how an error
+    message says it.
+    """
 
     words: str
     low: float = -math.inf
@@ -189,11 +201,13 @@ class Values(NamedTuple):
 
 FINITE = Values("finite numbers")
 LARGEST = 1e6
-"""Of avatars and what is written of them, metres or any unit: nobody is larger, and float32 holds products of several such
-numbers."""
+"""Of avatars and what is written of them, metres or any unit: nobody is larger, and float32 holds
+products of several such numbers."""
 BOUNDED = Values(f"finite numbers of at most {LARGEST:g} in magnitude", -LARGEST, LARGEST)
 ROUNDING = 1e-6
-"""Photos that were resized, and opacities from a sigmoid, may be a few float32 roundings outside of [0, 1]."""
+"""Photos that were resized, and opacities from a sigmoid, may be a few float32 roundings outside of
+[0, 1].
+"""
 UNIT = Values("numbers in [0, 1]", -ROUNDING, 1 + ROUNDING)
 NOT_NEGATIVE = Values("finite numbers >= 0", 0.0)
 POSITIVE = Values("finite numbers > 0", math.ulp(0.0))
@@ -205,11 +219,12 @@ def check_values(
 ) -> None:
     """Checks that arrays hold what they should.
 
-    Arguments: owner: the function that was called, for the message. arrays: by name (for the message too), each with the
-    values that it may have; None and empty arrays pass. Arrays of JAX are reduced together on their device, by one program and
-    one transfer of two numbers each; numpy's are checked on the host, without a copy to a device.
-    Raises: ValueError that names the first array with other values, says how many they are, and where the first one is.
-    Nothing is checked if one of the arrays is traced.
+    Arguments: owner: the function that was called, for the message. arrays: by name (for the
+    message too), each with the values that it may have; None and empty arrays pass. Arrays of JAX
+    are reduced together on their device, by one program and one transfer of two numbers each;
+    numpy's are checked on the host, without a copy to a device.
+    Raises: ValueError that names the first array with other values, says how many they are, and
+    where the first one is. Nothing is checked if one of the arrays is traced.
     """
     given = {
         name: (array, values)
@@ -237,7 +252,9 @@ def check_values(
 
 
 def require_concrete(owner: str, why: str, *trees: Any) -> None:
-    """Raises: TypeError, one line, where arrays are traced. owner: the function that was called. why: it needs their values."""
+    """Raises: TypeError, one line, where arrays are traced. owner: the function that was called.
+    why: it needs their values.
+    """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees)):
         raise TypeError(
             f"{owner} {why}: call it outside of jit, vmap and grad, which know shapes only"
@@ -254,4 +271,7 @@ def _fault(array: np.ndarray, values: Values) -> str:
     wrong = ~(np.isfinite(array) & (array >= values.low) & (array <= values.high))
     first = np.argwhere(wrong)[0]
     place = f"the first at {first.tolist()}: " if array.ndim else ""
-    return f"expected {values.words}, but {wrong.sum()} of {wrong.size} are not, {place}{array[tuple(first)]:.9g}"
+    return (
+        f"expected {values.words}, but {wrong.sum()} of {wrong.size} are not,"
+        f" {place}{array[tuple(first)]:.9g}"
+    )

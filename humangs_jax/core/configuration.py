@@ -6,8 +6,9 @@ Numbers are annotated with their range, which every way to make a configuration 
     class Fit:
         steps: Annotated[int, Range(1, 1000)] = 100
 
-A field annotated with a class of `Part` may hold any `part` that derives from it. Its JSON names the class under "kind", as
-"PatchTransformer". Reading imports nothing: a part of another package is known once its module is imported.
+A field annotated with a class of `Part` may hold any `part` that derives from it. Its JSON names
+the class under "kind", as "PatchTransformer". Reading imports nothing: a part of another package is
+known once its module is imported.
 """
 
 import dataclasses
@@ -100,7 +101,9 @@ def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
 
 
 class ArgumentError(ValueError):
-    """An argument of a function that cannot be meant; the command line shows its name as that of an option."""
+    """An argument of a function that cannot be meant; the command line shows its name as that of an
+    option.
+    """
 
     def __init__(self, argument: str, problem: str) -> None:
         super().__init__(f"{argument} {problem}")
@@ -131,9 +134,11 @@ class Presets(dict[str, T]):
 
 
 def check_fields(cls: type, values: Mapping[str, Any], owner: str) -> None:
-    """Checks that values of fields are what the annotations of a configuration say, and in their ranges.
+    """Checks that values of fields are what the annotations of a configuration say, and in their
+    ranges.
 
-    Any integer and any real number will do. owner: what the message begins with. Raises: ValueError naming owner and field.
+    Any integer and any real number will do. owner: what the message begins with. Raises: ValueError
+    naming owner and field.
     """
     annotations = _annotations(cls)
     for name, value in values.items():
@@ -150,7 +155,9 @@ def _annotations(cls: Any) -> dict[str, Any]:
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Whether a value is what an annotation says, as far as that is plain; parts and arrays may be anything."""
+    """Whether a value is what an annotation says, as far as that is plain; parts and arrays may be
+    anything.
+    """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, option) for option in arguments)
@@ -196,7 +203,9 @@ def in_words(annotation: Any) -> str:
 
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
 def configuration(cls: type[T]) -> type[T]:
-    """A frozen dataclass whose fields are checked when it is made: ValueError naming class, field, value and what it may be."""
+    """A frozen dataclass whose fields are checked when it is made: ValueError naming class, field,
+    value and what it may be.
+    """
     own = getattr(cls, "__post_init__", None)
 
     def __post_init__(self):
@@ -212,7 +221,9 @@ def configuration(cls: type[T]) -> type[T]:
 
 
 class Part:
-    """Base of what a field may hold by its registered name: modules of Linen, whose fields are made frozen here."""
+    """Base of what a field may hold by its registered name: modules of Linen, whose fields are made
+    frozen here.
+    """
 
     def __setattr__(self, name: str, val: Any) -> None:  # the names of Linen's
         if _MADE in self.__dict__ and name in field_names(type(self)):
@@ -238,7 +249,8 @@ _PARTS: dict[str, type] = {}
 
 
 def part(cls: type[T]) -> type[T]:
-    """A `Part` that files may name by its class; its fields are checked as those of a `configuration`.
+    """A `Part` that files may name by its class; its fields are checked as those of a
+    `configuration`.
 
     Raises: ValueError if there is another part of this name.
     """
@@ -263,11 +275,12 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
         The changed copy.
 
     Raises:
-        ValueError: naming the path, and those that are like it, for a field that does not exist; and as the configuration's own
-            checks. docs/knobs.md lists all paths.
+        ValueError: naming the path, and those that are like it, for a field that does not exist;
+            and as the configuration's own checks. docs/knobs.md lists all paths.
 
     Examples:
-        >>> hg.vary(config, {"model.architecture.encoder.transformer.class_token": False, "loss.squared": 0.5})
+        >>> class_token = "model.architecture.encoder.transformer.class_token"
+        >>> hg.vary(config, {class_token: False, "loss.squared": 0.5})
     """
     for path, value in changes.items():
         known = field_paths(config)
@@ -277,7 +290,8 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
             like = same or difflib.get_close_matches(path, known, cutoff=0.7)
             meant = f"; did you mean {' or '.join(like[:3])}?" if like else ""
             raise ValueError(
-                f"{path}: {type(config).__name__} has no such field{meant} (all paths: docs/knobs.md)"
+                f"{path}: {type(config).__name__} has no such field{meant} (all paths:"
+                " docs/knobs.md)"
             )
         config = _varied(config, path.split("."), value)
     return config
@@ -300,7 +314,9 @@ def _varied(config: Any, names: list[str], value: Any) -> Any:
 
 
 def check_range(cls: type, name: str, value: Any, path: str) -> None:
-    """Raises: ValueError if a number of a field, or one in its tuple, is out of the range of its annotation."""
+    """Raises: ValueError if a number of a field, or one in its tuple, is out of the range of its
+    annotation.
+    """
     ranges = _ranges(cls).get(name, ())
     values = value if isinstance(value, tuple | list) else (value,)
     if len(values) > MOST_ITEMS:
@@ -322,7 +338,9 @@ def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
 
 
 def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
-    """What of one kind is said of an annotation or a part of it, as in `Annotated[int, Range(1, 9)] | None`."""
+    """What of one kind is said of an annotation or a part of it, as in `Annotated[int, Range(1, 9)]
+    | None`.
+    """
     if typing.get_origin(annotation) is Annotated:
         yield from (each for each in annotation.__metadata__ if isinstance(each, kind))
     for part in typing.get_args(annotation):
@@ -358,9 +376,11 @@ def _is_part(annotation: Any) -> bool:
 
 
 def config_from_json(cls: type[T], text: str) -> T:
-    """Inverse of `config_to_json` for a configuration of class `cls`; missing fields take their defaults.
+    """Inverse of `config_to_json` for a configuration of class `cls`; missing fields take their
+    defaults.
 
-    Raises: ValueError for a field that the configuration does not have or a value of another type, naming it.
+    Raises: ValueError for a field that the configuration does not have or a value of another type,
+    naming it.
     """
     try:
         values = json.loads(text)
@@ -409,8 +429,8 @@ def _find_part(kind: Any, base: Any, path: str) -> type:
     )  # the first files say in which module, too
     if name not in known:
         raise ValueError(
-            f"{path}.{KIND}: expected the name of a registered {base.__name__}, one of {', '.join(sorted(known))} "
-            f"(others: import their module first); got {kind!r}"
+            f"{path}.{KIND}: expected the name of a registered {base.__name__}, one of"
+            f" {', '.join(sorted(known))} (others: import their module first); got {kind!r}"
         )
     return known[name]
 

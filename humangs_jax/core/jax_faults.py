@@ -1,4 +1,6 @@
-"""Faults of published versions of JAX that change numbers in silence, and how a process avoids them."""
+"""Faults of published versions of JAX that change numbers in silence, and how a process avoids
+them.
+"""
 
 import os
 import sys
@@ -17,8 +19,8 @@ def avoid_wrong_sums() -> None:
     """Set the flag that jaxlib 0.10.2 needs to compute right sums on CPUs.
 
     `import humangs_jax` calls it. XLA reads its flags when the first array is made: if that has
-    happened, a warning says what to do. Other versions of jaxlib, and a flag of the user for the same
-    option, are left alone.
+    happened, a warning says what to do. Other versions of jaxlib, and a flag of the user for the
+    same option, are left alone.
     """
     try:
         installed = version("jaxlib")

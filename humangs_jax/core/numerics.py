@@ -1,7 +1,8 @@
 """Every gradient-safety trick of the package, in one tested place.
 
-The double-where rule: a `jnp.where` that selects a finite value still back-propagates NaN from the branch it rejects, so the
-rejected branch must be evaluated at a harmless argument first. All functions here obey it.
+The double-where rule: a `jnp.where` that selects a finite value still back-propagates NaN from the
+branch it rejects, so the rejected branch must be evaluated at a harmless argument first. All
+functions here obey it.
 """
 
 import jax
@@ -11,7 +12,10 @@ from humangs_jax.core.array_types import Array, Float, PyTree
 
 
 def at_least_float32(tree: PyTree) -> PyTree:
-    """The tree with its bfloat16 and float16 arrays in float32; wider ones unchanged. Gradients come back in the narrow type."""
+    """The tree with its bfloat16 and float16 arrays in float32; wider ones unchanged.
+
+    Gradients come back in the narrow type.
+    """
     widen = lambda a: (
         a.astype(dtype) if (dtype := jnp.promote_types(a.dtype, jnp.float32)) != a.dtype else a
     )
@@ -27,20 +31,25 @@ def safe_divide(
 
 
 def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """sqrt(max(x, 0)) with zero gradient where x <= 0, where the true one is infinite or undefined."""
+    """sqrt(max(x, 0)) with zero gradient where x <= 0, where the true one is infinite or
+    undefined.
+    """
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def absolute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """|x| with zero gradient at 0, where that of `jnp.abs` is 1: an L1 of images would push where they agree."""
+    """|x| with zero gradient at 0, where that of `jnp.abs` is 1: an L1 of images would push where
+    they agree.
+    """
     return x * jax.lax.stop_gradient(jnp.sign(x))
 
 
 def safe_normalize(x: Float[Array, "*b d"], fallback: Float[Array, " d"]) -> Float[Array, "*b d"]:
     """x / |x|, and `fallback` with zero gradient where |x| is 0.
 
-    Scaled by the largest magnitude first, so that neither squares overflow nor small vectors underflow.
+    Scaled by the largest magnitude first, so that neither squares overflow nor small vectors
+    underflow.
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
     zero = ~(largest > 0)

@@ -1,7 +1,9 @@
-"""What concerns whole processes: the memory they keep, Ctrl-C at times when it would do harm, workers, compiled programs on disk.
+"""What concerns whole processes: the memory they keep, Ctrl-C at times when it would do harm,
+workers, compiled programs on disk.
 
-XLA's CPU backend allocates the temporaries of a program as one block in each call and frees it afterwards. glibc gives blocks
-above 32 MiB back to the system, and the next call waits for each of its pages to be mapped anew: `keep_freed_memory` prevents it.
+XLA's CPU backend allocates the temporaries of a program as one block in each call and frees it
+afterwards. glibc gives blocks above 32 MiB back to the system, and the next call waits for each of
+its pages to be mapped anew: `keep_freed_memory` prevents it.
 """
 
 import contextlib
@@ -27,9 +29,11 @@ _KEPT = 1 << 30
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep what it frees. Programs call it once, before the first large array; the library never does.
+    """Lets the process keep what it frees. Programs call it once, before the first large array; the
+    library never does.
 
-    Returns whether this C library has the setting (glibc). The process then never gets smaller than its peak.
+    Returns whether this C library has the setting (glibc). The process then never gets smaller than
+    its peak.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -41,9 +45,11 @@ def keep_freed_memory() -> bool:
 
 @contextlib.contextmanager
 def peak_memory() -> Generator[list[float | None]]:
-    """What the work inside adds to the memory of the process at its peak, MiB, in a list of one number.
+    """What the work inside adds to the memory of the process at its peak, MiB, in a list of one
+    number.
 
-    None where the system does not tell: it is read from Linux's /proc, with glibc. Memory of a GPU or TPU is not in it.
+    None where the system does not tell: it is read from Linux's /proc, with glibc. Memory of a GPU
+    or TPU is not in it.
     """
     result: list[float | None] = [None]
     trim = (
@@ -67,7 +73,10 @@ def peak_memory() -> Generator[list[float | None]]:
 
 
 def memory_status(name: str) -> float:
-    """A line of /proc/self/status, MiB: "VmRSS", resident now; "VmHWM", at the peak. Linux alone."""
+    """A line of /proc/self/status, MiB: "VmRSS", resident now; "VmHWM", at the peak.
+
+    Linux alone.
+    """
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{name}:"))
 
@@ -90,9 +99,11 @@ def undisturbed() -> Generator[None]:
 
 @contextlib.contextmanager
 def started_deaf() -> Generator[None]:
-    """Processes that are started in the block never hear Ctrl-C, which reaches all processes of a terminal: this one decides.
+    """Processes that are started in the block never hear Ctrl-C, which reaches all processes of a
+    terminal: this one decides.
 
-    Else it ends, with tracebacks, those that are still importing. Windows has no such masks: there it does.
+    Else it ends, with tracebacks, those that are still importing. Windows has no such masks: there
+    it does.
     """
     with undisturbed():
         if not hasattr(signal, "pthread_sigmask"):
@@ -116,10 +127,11 @@ def in_processes(
     prepare: Callable[..., object],
     *given: Any,
 ) -> Iterator[tuple[K, T]]:
-    """Yields (name, work(*arguments)) of tasks by name, as they end, from several processes of one thread each, on the CPU.
+    """Yields (name, work(*arguments)) of tasks by name, as they end, from several processes of one
+    thread each, on the CPU.
 
-    Arguments: prepare: called as prepare(*given) when a process starts. All of it is pickled. If the caller stops, by Ctrl-C or
-    otherwise, unfinished tasks are dropped and the processes end.
+    Arguments: prepare: called as prepare(*given) when a process starts. All of it is pickled. If
+    the caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end.
     Raises: OSError if a process is killed.
     """
     import concurrent.futures.process
@@ -159,9 +171,11 @@ def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
 
 
 def end_with_parent() -> None:
-    """Called in a worker: it ends as soon as the process that started it has ended, however that ended.
+    """Called in a worker: it ends as soon as the process that started it has ended, however that
+    ended.
 
-    The workers of a pool whose process is killed would otherwise wait for work for ever: their queue stays open in each other.
+    The workers of a pool whose process is killed would otherwise wait for work for ever: their
+    queue stays open in each other.
     """
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -173,28 +187,33 @@ def _wait(sentinel: int) -> None:
     os._exit(1)
 
 
-# How XLA compiles: a program of this package takes seconds to a minute. JAX has the cache; here is where it lies, and how large
-# it may grow.
+# How XLA compiles: a program of this package takes seconds to a minute. JAX has the cache; here is
+# where it lies, and how large it may grow.
 
 VARIABLE, OF_JAX = "HUMANGS_COMPILE_CACHE", "JAX_COMPILATION_CACHE_DIR"
 LARGEST = 2 << 30
-"""Bytes; the files that were not used for longest are deleted beyond. JAX's own limit needs the package `filelock`."""
+"""Bytes; the files that were not used for longest are deleted beyond.
+
+JAX's own limit needs the package `filelock`.
+"""
 
 
 def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Turn on JAX's persistent compilation cache, in a folder for each version of JAX and kind of processor.
+    """Turn on JAX's persistent compilation cache, in a folder for each version of JAX and kind of
+    processor.
 
-    Programs call it once, before the first computation; the library never does. JAX is not imported here: it finds the folder
-    in its environment variable, as do the programs that this one starts. A cache that JAX already has
-    (`JAX_COMPILATION_CACHE_DIR`) stays.
+    Programs call it once, before the first computation; the library never does. JAX is not imported
+    here: it finds the folder in its environment variable, as do the programs that this one starts.
+    A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays.
 
     Args:
-        folder: where the cache lies. None: what the environment variable `HUMANGS_COMPILE_CACHE` names, else `humangs_jax`
-            in the user's cache folder (`XDG_CACHE_HOME`, or what the platform has in its place).
+        folder: where the cache lies. None: what the environment variable `HUMANGS_COMPILE_CACHE`
+            names, else `humangs_jax` in the user's cache folder (`XDG_CACHE_HOME`, or what the
+            platform has in its place).
 
     Returns:
-        The folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache off, and a folder that
-        cannot be written to is not an error.
+        The folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache
+        off, and a folder that cannot be written to is not an error.
 
     Examples:
         >>> hg.enable_compile_cache()
@@ -202,8 +221,8 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
         return None
-    if (
-        given := sys.modules["jax"].config.jax_compilation_cache_dir
+    if given := (
+        sys.modules["jax"].config.jax_compilation_cache_dir
         if "jax" in sys.modules
         else os.environ.get(OF_JAX)
     ):
@@ -232,7 +251,9 @@ def user_cache() -> Path:
 
 
 def _processor() -> str:
-    """A short mark of the processor and its instructions: machines of a cluster share a home, not their programs."""
+    """A short mark of the processor and its instructions: machines of a cluster share a home, not
+    their programs.
+    """
     about = platform.machine() + platform.processor()
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -241,7 +262,9 @@ def _processor() -> str:
 
 
 def _delete_oldest(root: Path, largest: int) -> None:
-    """Deletes the cached programs under `root`, of all versions, that were not used for longest, beyond `largest` bytes."""
+    """Deletes the cached programs under `root`, of all versions, that were not used for longest,
+    beyond `largest` bytes.
+    """
     files = []
     for file in root.glob("jax-*/*-cache"):
         with contextlib.suppress(OSError):  # another program deletes, too
@@ -256,13 +279,17 @@ def _delete_oldest(root: Path, largest: int) -> None:
 
 CPU_COMPILER_OPTIONS = {
     "xla_cpu_prefer_vector_width": 512,
-    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander,small-while-loop-hoisting",
+    "xla_disable_hlo_passes": (
+        "cpu-parallel-task-assigner,cse_barrier_expander,small-while-loop-hoisting"
+    ),
 }
-"""`jax.jit(..., compiler_options=compiler_options())` of a program that draws on a CPU: wide vectors make the loops over
-pixels up to a third faster where there is AVX-512; XLA no longer divides its small kernels, tens of microseconds each,
-among several threads, which took twice the CPU time and gained nothing; and it keeps barriers, so that tables are stored
-before they are gathered from (the loops of tiny images must then not become single kernels, which know no barriers).
-Eager calls use it; your own jitted functions need it themselves. Works from jax 0.10 to 0.12."""
+"""`jax.jit(..., compiler_options=compiler_options())` of a program that draws on a CPU: wide
+vectors make the loops over pixels up to a third faster where there is AVX-512; XLA no longer
+divides its small kernels, tens of microseconds each, among several threads, which took twice the
+CPU time and gained nothing; and it keeps barriers, so that tables are stored before they are
+gathered from (the loops of tiny images must then not become single kernels, which know no
+barriers). Eager calls use it; your own jitted functions need it themselves. Works from jax 0.10 to
+0.12."""
 
 
 def compiler_options() -> dict[str, Any] | None:

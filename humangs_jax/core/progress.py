@@ -1,13 +1,14 @@
-"""What the package shows on a terminal: stages of long work, bars, and lines of text (`say`), all of it printable.
+"""What the package shows on a terminal: stages of long work, bars, and lines of text (`say`), all
+of it printable.
 
     with stage("reading the capture"):
         ...
     for view in bar(views, desc="render"):
         ...
 
-No other module prints. The library opens stages where work takes long. Unless a program asked for it by `begin`, a stage shows
-and costs nothing. The seconds of the outermost stages are kept for whoever began; stages inside of them only change the line that
-is shown.
+No other module prints. The library opens stages where work takes long. Unless a program asked for
+it by `begin`, a stage shows and costs nothing. The seconds of the outermost stages are kept for
+whoever began; stages inside of them only change the line that is shown.
 """
 
 import contextlib
@@ -21,16 +22,20 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from typing import Any
 
 SHOWN = {"Zs", "Cn", "Co"}
-"""Categories that Python escapes in `repr` but that do nothing to a terminal: wide spaces, characters newer than Python."""
+"""Categories that Python escapes in `repr` but that do nothing to a terminal: wide spaces,
+characters newer than Python.
+"""
 JOINERS = "\u200c\u200d"
 """Format characters that words of Persian and Indic languages need."""
 
 
 def printable(text: object, lines: bool = False) -> str:
-    r"""The text with every character that a terminal would act on escaped as in Python (\x1b, \u202e, \n).
+    r"""The text with every character that a terminal would act on escaped as in Python (\x1b,
+    \u202e, \n).
 
-    These are control characters, C1 included, marks of direction and other format characters, separators of lines, and bytes of
-    file names that are not UTF-8 (\xe9). lines: line feeds and tabs stay, for a report of several lines.
+    These are control characters, C1 included, marks of direction and other format characters,
+    separators of lines, and bytes of file names that are not UTF-8 (\xe9). lines: line feeds and
+    tabs stay, for a report of several lines.
     """
     text = str(text)
     if text.isprintable():
@@ -50,7 +55,9 @@ def _escaped(c: str) -> str:
 
 
 def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Lines of a table: the first columns (left) aligned to the left, the others to the right; rows may end early."""
+    """Lines of a table: the first columns (left) aligned to the left, the others to the right; rows
+    may end early.
+    """
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows)))]
     aligned = lambda row: (
         f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row)
@@ -70,9 +77,10 @@ CLEAR = "\r\033[K"
 class Progress:
     """What is shown, and what was measured.
 
-    ticking: a line on stderr counts the seconds of a stage while it runs. naming: without a terminal, a `LONG` stage leaves its
-    name there. lines: each stage leaves a line with its seconds. quiet: neither stages nor bars are shown. seconds: of the
-    finished outermost stages by name, since `started`. names: of the stages that run; paused: a bar has the line. next: what the
+    ticking: a line on stderr counts the seconds of a stage while it runs. naming: without a
+    terminal, a `LONG` stage leaves its name there. lines: each stage leaves a line with its
+    seconds. quiet: neither stages nor bars are shown. seconds: of the finished outermost stages by
+    name, since `started`. names: of the stages that run; paused: a bar has the line. next: what the
     user may do next, for whoever began.
     """
 
@@ -95,7 +103,8 @@ _bars: "weakref.WeakSet[Any]" = weakref.WeakSet()
 def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
     """Show stages from now on; a terminal on stderr gets a line that counts seconds.
 
-    Arguments: quiet: show neither stages nor bars. lines: leave a line for each stage, wherever stderr goes.
+    Arguments: quiet: show neither stages nor bars. lines: leave a line for each stage, wherever
+    stderr goes.
     """
     global _current
     terminal, shown = sys.stderr.isatty(), not quiet
@@ -114,16 +123,21 @@ def current() -> Progress:
 
 
 def end() -> None:
-    """Show nothing any more, as before `begin`. Bars that an error has left open get their last line."""
+    """Show nothing any more, as before `begin`.
+
+    Bars that an error has left open get their last line.
+    """
     global _current
     _current = Progress()
     _close(set(_bars))
 
 
 def say(text: object, *, error: bool = False, lines: bool = True) -> None:
-    """Print text, with what a terminal would act on escaped. Bars and the line of a stage make room for it.
+    """Print text, with what a terminal would act on escaped. Bars and the line of a stage make room
+    for it.
 
-    Arguments: error: to stderr. lines: whether it may have several lines; else line feeds are escaped, too.
+    Arguments: error: to stderr. lines: whether it may have several lines; else line feeds are
+    escaped, too.
     """
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"  # a terminal may know ASCII only
@@ -171,18 +185,21 @@ def stage(name: str) -> Generator[None]:
 
 
 COMPILING = "compiling, once"
-"""What a bar says until its first item is there, where a program of JAX is compiled for that: many seconds."""
+"""What a bar says until its first item is there, where a program of JAX is compiled for that: many
+seconds.
+"""
 
 
 def bar(
     iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any
 ) -> Any:
-    """A bar of tqdm, whose options `how` are. It takes the place of the line of the stage around it.
+    """A bar of tqdm, whose options `how` are. It takes the place of the line of the stage around
+    it.
 
     Where stderr is no terminal (a log, a notebook) it moves every `LONG` seconds.
 
-    Arguments: shown: whether the caller of the library asked for bars; a program may still hide all of them. first: what it
-    says until the first item is there.
+    Arguments: shown: whether the caller of the library asked for bars; a program may still hide all
+    of them. first: what it says until the first item is there.
     """
     from tqdm import tqdm
 
@@ -221,7 +238,9 @@ def followed() -> bool:
 
 
 def watched() -> bool:
-    """Whether a program shows stages on a terminal: then long loops without a bar of their own show one."""
+    """Whether a program shows stages on a terminal: then long loops without a bar of their own show
+    one.
+    """
     return _current.ticking
 
 

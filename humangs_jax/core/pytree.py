@@ -1,7 +1,8 @@
 """Frozen dataclasses that are JAX pytrees, and batches of them that can be indexed.
 
-`jax.vmap`, `jax.lax.scan` and friends rebuild pytrees with leaves of other ranks, tracers or plain objects. A rebuild here
-never calls `__init__`, so shape checks of the constructor (jaxtyping) hold for what users build and never for what JAX builds.
+`jax.vmap`, `jax.lax.scan` and friends rebuild pytrees with leaves of other ranks, tracers or plain
+objects. A rebuild here never calls `__init__`, so shape checks of the constructor (jaxtyping) hold
+for what users build and never for what JAX builds.
 """
 
 import dataclasses
@@ -24,13 +25,16 @@ _PYTREES: set[type] = set()
 
 
 def static_field(**kwargs: Any) -> Any:
-    """A dataclass field that belongs to the tree structure (hashable, compared by `==`), not to its leaves."""
+    """A dataclass field that belongs to the tree structure (hashable, compared by `==`), not to its
+    leaves.
+    """
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static_field, dataclasses.field))
 def pytree_dataclass(cls: type[T]) -> type[T]:
-    """Class decorator: a frozen, keyword-friendly dataclass registered as a pytree with named leaves.
+    """Class decorator: a frozen, keyword-friendly dataclass registered as a pytree with named
+    leaves.
 
     With `Batchable` as a base class, batches of it can be indexed and iterated over.
     """
@@ -71,8 +75,8 @@ _EXPORTABLE: dict[str, str] = {}
 def _make_exportable(cls: type[Any]) -> None:
     """Let `jax.export` serialize functions whose arguments or results are of this class.
 
-    The name in its files is that of the package and the class, so that files outlive a module that moves. Classes that are
-    defined inside functions have no such name.
+    The name in its files is that of the package and the class, so that files outlive a module that
+    moves. Classes that are defined inside functions have no such name.
     """
     name = f"{cls.__module__.partition('.')[0]}.{cls.__qualname__}"
     if "<locals>" in name or cls.__module__ == "__main__":
@@ -93,7 +97,10 @@ def _make_exportable(cls: type[Any]) -> None:
 
 
 def _static_bytes(values: tuple[Any, ...]) -> bytes:
-    """Static fields as JSON. Raises: TypeError for one that is more than numbers, texts and tuples of them."""
+    """Static fields as JSON.
+
+    Raises: TypeError for one that is more than numbers, texts and tuples of them.
+    """
     return json.dumps(values).encode()
 
 
@@ -108,7 +115,9 @@ SHORT = 80
 
 
 def short_repr(tree: Any) -> str:
-    """A dataclass on one line, arrays by type and shape, as equinox prints them: "Gaussians(means=f32[100,3], ...)"."""
+    """A dataclass on one line, arrays by type and shape, as equinox prints them:
+    "Gaussians(means=f32[100,3], ...)".
+    """
     shown = [f"{f.name}={_shortened(getattr(tree, f.name))}" for f in dataclasses.fields(tree)]
     return f"{type(tree).__name__}({', '.join(shown)})"
 
@@ -134,10 +143,11 @@ def _shortened(value: Any) -> str:
 
 
 class Batchable:
-    """Base of the pytree dataclasses whose leaves may share leading batch axes: indexing, length, iteration.
+    """Base of the pytree dataclasses whose leaves may share leading batch axes: indexing, length,
+    iteration.
 
-    The annotations of the fields are unbatched, so the batch axes are those that a leaf has in addition: a `Camera`
-    whose `K` is (4, 3, 3) is a batch of 4 cameras.
+    The annotations of the fields are unbatched, so the batch axes are those that a leaf has in
+    addition: a `Camera` whose `K` is (4, 3, 3) is a batch of 4 cameras.
     """
 
     @property
@@ -157,7 +167,8 @@ class Batchable:
         if shape := self.batch_shape:
             return shape[0]
         raise TypeError(
-            f"this {type(self).__name__} is not a batch: it has no length and cannot be indexed or iterated"
+            f"this {type(self).__name__} is not a batch: it has no length and cannot be indexed or"
+            " iterated"
         )
 
     def __bool__(self) -> bool:
@@ -165,9 +176,11 @@ class Batchable:
         return True
 
     def __getitem__(self: B, index: Any) -> B:
-        """One example of a batch (integer), or some of them (slice, mask or array of integers), along the first axis.
+        """One example of a batch (integer), or some of them (slice, mask or array of integers),
+        along the first axis.
 
-        Raises: TypeError for one example; IndexError for an integer out of range. JAX clamps traced integers and arrays.
+        Raises: TypeError for one example; IndexError for an integer out of range. JAX clamps traced
+        integers and arrays.
         """
         size = len(self)
         if not isinstance(index, slice | Tracer) and getattr(index, "ndim", 0) == 0:
@@ -184,7 +197,9 @@ class Batchable:
 
 
 def _annotated_rank(annotation: Any) -> int | None:
-    """Number of axes in a jaxtyping annotation, or in that of an optional array; None for any other annotation."""
+    """Number of axes in a jaxtyping annotation, or in that of an optional array; None for any other
+    annotation.
+    """
     for option in typing.get_args(annotation) or (annotation,):
         dims = getattr(option, "dims", None)
         if isinstance(dims, tuple) and option.index_variadic is None:
@@ -193,11 +208,12 @@ def _annotated_rank(annotation: Any) -> int | None:
 
 
 def shape_fault(tree: Any) -> str | None:
-    """What is wrong with the fields of a pytree dataclass, by their annotations: ".colors: expected shape ...".
+    """What is wrong with the fields of a pytree dataclass, by their annotations: ".colors: expected
+    shape ...".
 
-    Axes of one name have one size. In a batch they come behind its own axes, as many as most of the arrays have. Arrays that
-    are annotated as floating-point numbers hold no integers, and sizes (static fields that are `int`) are whole numbers.
-    None if all fit, or for anything else.
+    Axes of one name have one size. In a batch they come behind its own axes, as many as most of the
+    arrays have. Arrays that are annotated as floating-point numbers hold no integers, and sizes
+    (static fields that are `int`) are whole numbers. None if all fit, or for anything else.
     """
     cls, sizes = type(tree), dict[str, int]()
     if cls not in _PYTREES:
@@ -239,7 +255,9 @@ def _batch_ranks(tree: Any, fields: dict[str, _Field]) -> Iterator[int]:
 
 
 def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, int]) -> str | None:
-    """What is wrong with one array. sizes: of the axes that are known, to which those of this array are added."""
+    """What is wrong with one array. sizes: of the axes that are known, to which those of this array
+    are added.
+    """
     axes = field.axes
     assert axes is not None
     wanted = [sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in axes]
@@ -328,7 +346,8 @@ def _is_floating(annotation: Any) -> bool:
 
 
 def replace(tree: T, **changes: Any) -> T:
-    """A copy of a pytree with some fields exchanged, without checks of shapes, so that it works on batches, too.
+    """A copy of a pytree with some fields exchanged, without checks of shapes, so that it works on
+    batches, too.
 
     Args:
         tree: an instance of a dataclass.

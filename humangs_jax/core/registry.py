@@ -1,8 +1,8 @@
 """Tables of formats: files, folders and data sets that can be read or written, a row each.
 
-A row names its code and imports it when it is first asked for, so that the command line, its help and the docs can list every
-format without importing any. A new format is one file and one line: `MOTIONS["mine"] = Format("my program's", "my.module:read",
-(".mine",))`.
+A row names its code and imports it when it is first asked for, so that the command line, its help
+and the docs can list every format without importing any. A new format is one file and one line:
+`MOTIONS["mine"] = Format("my program's", "my.module:read", (".mine",))`.
 """
 
 import dataclasses
@@ -26,7 +26,8 @@ class Format:
     suffixes: tuple[str, ...] = ()
     """Of its files, in lower case, with the dot; FOLDER for a folder. Empty: names do not tell."""
     recognizes: str | Callable[[Path], bool] | None = None
-    """Whether a file with such a suffix is of this format, where suffixes are shared; None: it is."""
+    """Whether a file with such a suffix is of this format, where suffixes are shared; None: it is.
+    """
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """What the code makes of the arguments."""
@@ -50,7 +51,9 @@ class Formats(dict[str, F]):
         return self.where(lambda each: suffix in each.suffixes)
 
     def recognized(self, path: Path) -> F | None:
-        """The first of them that the file is, None for none; those that look into it are asked first."""
+        """The first of them that the file is, None for none; those that look into it are asked
+        first.
+        """
         found = sorted(self.of(path).values(), key=lambda each: each.recognizes is None)
         return next(
             (each for each in found if each.recognizes is None or imported(each.recognizes)(path)),
@@ -62,7 +65,9 @@ class Formats(dict[str, F]):
         return Formats({name: each for name, each in self.items() if holds(each)})
 
     def listed(self) -> str:
-        """All in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or by name where names do not tell."""
+        """All in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or by
+        name where names do not tell.
+        """
         groups: dict[tuple[str, ...], dict[str, None]] = {}  # each name once
         for name, each in self.items():
             groups.setdefault(each.suffixes or (name,), {}).update(

@@ -1,16 +1,20 @@
-"""The posed body against the masks: which views show the person, and how far the body's skin moves to fill the masks.
+"""The posed body against the masks: which views show the person, and how far the body's skin moves
+to fill the masks.
 
-A mask that is empty, or nowhere near the body, does not only say nothing: the network takes its white photo for the person, and
-refinement makes the avatar transparent there. All that reads photos leaves such views out, by name.
+A mask that is empty, or nowhere near the body, does not only say nothing: the network takes its
+white photo for the person, and refinement makes the avatar transparent there. All that reads photos
+leaves such views out, by name.
 
-The body is displaced: its vertices are moved along their normals until its silhouettes meet those of all photos. Where a vertex
-lies on the body's own silhouette in a photo, the mask's edge along its normal says how far it should move. A sparse least-squares
-fit carries this over the rest of the mesh, smoothly:
+The body is displaced: its vertices are moved along their normals until its silhouettes meet those
+of all photos. Where a vertex lies on the body's own silhouette in a photo, the mask's edge along
+its normal says how far it should move. A sparse least-squares fit carries this over the rest of the
+mesh, smoothly:
 
     sum over photos of (t - target)^2 + WEAKNESS t^2 + SMOOTHNESS^4 (Laplacian t)^2,    per area,
 
-so that a section between two photos becomes round. What is then still outside a mask is moved inwards. Clothes become part of the
-body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). All on the host, by numpy and scipy: nothing is compiled.
+so that a section between two photos becomes round. What is then still outside a mask is moved
+inwards. Clothes become part of the body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). All on
+the host, by numpy and scipy: nothing is compiled.
 """
 
 import dataclasses
@@ -37,15 +41,20 @@ logger = logging.getLogger(__name__)
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
 LEAST_SHARE = 0.05
-"""Of the body in the frame that lies on the mask. In the demo's photos the head alone has 6 to 7 %, an inverted mask 1.4 %."""
+"""Of the body in the frame that lies on the mask.
+
+In the demo's photos the head alone has 6 to 7 %, an inverted mask 1.4 %.
+"""
 POINTS = 1000
 """On the skin."""
 
 
 def usable_views(capture: Capture) -> Capture:
-    """The capture with the views that show the person: all but those of `unusable_views`, which a warning names.
+    """The capture with the views that show the person: all but those of `unusable_views`, which a
+    warning names.
 
-    The same object where these are all, and without masks. Raises: CaptureError, one line that names the views, if none is left.
+    The same object where these are all, and without masks. Raises: CaptureError, one line that
+    names the views, if none is left.
     """
     found = unusable_views(capture)
     if not found:
@@ -62,7 +71,8 @@ def usable_views(capture: Capture) -> Capture:
 
 
 def unusable_views(capture: Capture) -> dict[int, str]:
-    """The views whose mask is empty or hardly meets what of the posed body is in the frame, and which of the two.
+    """The views whose mask is empty or hardly meets what of the posed body is in the frame, and
+    which of the two.
 
     A body that is not finite is another fault, which whoever poses it names.
     """
@@ -92,7 +102,8 @@ def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
     ]
 
 
-# Points on the skin ---------------------------------------------------------------------------------------------------
+# Points on the skin
+# --------------------------------------------------------------------------------------------------
 
 
 def surface_points(
@@ -102,7 +113,9 @@ def surface_points(
     frames: Int[np.ndarray, " v"],
     count: int,
 ) -> dict[int, Float[np.ndarray, "count 3"]]:
-    """Points spread evenly over the skin, metres, by the frames that views show; without pose correctives."""
+    """Points spread evenly over the skin, metres, by the frames that views show; without pose
+    correctives.
+    """
     rest = shaped(body, betas)
     joints = np.asarray(body.joint_regressor) @ rest
     corners, weights = _sampling(rest, np.asarray(body.faces), count)
@@ -126,7 +139,8 @@ def skinned(
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """Matrices and offsets from the rest pose to a frame, of vertices with these skinning weights.
 
-    joints: of the rest pose. corrected: with the body's pose correctives, if it has some; weights are those of all vertices.
+    joints: of the rest pose. corrected: with the body's pose correctives, if it has some; weights
+    are those of all vertices.
     """
     turns = Rotation.from_rotvec(np.asarray(poses.rotations[frame], float)).as_matrix()
     moves = np.zeros((len(joints), 3, 4))
@@ -167,7 +181,8 @@ def _sampling(
     return faces[np.minimum(chosen, len(faces) - 1)], np.stack([1 - u - v, u, v], axis=-1)
 
 
-# Displacement ----------------------------------------------------------------------------------------------------------
+# Displacement
+# --------------------------------------------------------------------------------------------------
 
 STEP = 0.0025
 """Metres along a normal, of the search for a mask's edge."""
@@ -177,17 +192,18 @@ HELD = 20.0
 """The same, for hands and head."""
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
 NEAR, PROBE, LEAVES = 2.5, 0.012, 0.6
-"""A vertex is on the body's silhouette if it is within this many pixels of the edge, and if a move by PROBE metres along its
-normal leaves the silhouette by this share of it."""
+"""A vertex is on the body's silhouette if it is within this many pixels of the edge, and if a move
+by PROBE metres along its normal leaves the silhouette by this share of it."""
 DRAWN = 0.5
 """Pixels by which polygons are drawn larger than they are."""
 WRAP, WRAP_ROUNDS = 0.07, 6
-"""At last, vertices outside a mask move inwards up to the first, metres, until all masks contain them by the inset; the moves are
-averaged over the neighbours this often."""
+"""At last, vertices outside a mask move inwards up to the first, metres, until all masks contain
+them by the inset; the moves are averaged over the neighbours this often."""
 OUTSIDE, MISFIT = 0.01, 0.025
-"""Metres, and a share. A body does not fit its masks if more than this share of its vertices (no head, no hands) lies more than
-OUTSIDE outside of a mask. Clothes never cause that: of true bodies the share is 0. It was at least 0.03 for bodies that are a
-centimetre off, 0.02 to 0.06 for a real man fitted to keypoints alone, and at most 0.02 for his fits refined by the masks."""
+"""Metres, and a share. A body does not fit its masks if more than this share of its vertices (no
+head, no hands) lies more than OUTSIDE outside of a mask. Clothes never cause that: of true bodies
+the share is 0. It was at least 0.03 for bodies that are a centimetre off, 0.02 to 0.06 for a real
+man fitted to keypoints alone, and at most 0.02 for his fits refined by the masks."""
 LONGEST = 480
 """Pixels of the window around the person in which silhouettes are compared."""
 MARGIN = 0.12
@@ -201,8 +217,9 @@ PerVertex = Float[np.ndarray, " n"]
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """How a surface moves to the edges of the masks, metres: within which distance along its normals they are looked for, over
-    which a move spreads, and how far the surface may lie inside. Bodies: the network adds clothes on top, and knows naked ones.
+    """How a surface moves to the edges of the masks, metres: within which distance along its
+    normals they are looked for, over which a move spreads, and how far the surface may lie inside.
+    Bodies: the network adds clothes on top, and knows naked ones.
     """
 
     outwards: float = 0.05
@@ -214,9 +231,11 @@ class Reach:
 
 @dataclasses.dataclass(frozen=True)
 class MaskedView:
-    """One photo: the window around the person. coverage: by the person. project: (3, 4) to the window's pixels.
+    """One photo: the window around the person. coverage: by the person. project: (3, 4) to the
+    window's pixels.
 
-    linear, offset: from the rest pose to the posed body, for each vertex. low, high: x, y of the photo's corners.
+    linear, offset: from the rest pose to the posed body, for each vertex. low, high: x, y of the
+    photo's corners.
     """
 
     coverage: Float[np.ndarray, "h w"]
@@ -234,7 +253,9 @@ class MaskedView:
     def seen(
         self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)
     ) -> tuple:
-        """Pixels (*n, 2) of points in the rest pose, pixels for a metre there, and which the photo shows."""
+        """Pixels (*n, 2) of points in the rest pose, pixels for a metre there, and which the photo
+        shows.
+        """
         posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
         posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
         clip = posed @ self.project[:, :3].T + self.project[:, 3]
@@ -251,11 +272,14 @@ def displacement(
     *,
     always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
-    """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it fills the masks; bounded.
+    """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it
+    fills the masks; bounded.
 
-    Arguments: body: the capture's, or one of `data.views.gaussian_body`. capture: with masks; frames and worlds may be any.
-    always: else 0 where the body fits the masks already, see `MISFIT`: it then gains less than the network's own clothes lose.
-    Where masks say nothing, or nothing of the body is near them, it is 0.
+    Arguments: body: the capture's, or one of `data.views.gaussian_body`. capture: with masks;
+    frames and worlds may be any.
+    always: else 0 where the body fits the masks already, see `MISFIT`: it then gains less than the
+    network's own clothes lose. Where masks say nothing, or nothing of the body is near them, it is
+    0.
     """
     assert capture.masks is not None
     rest = shaped(body, capture.betas)
@@ -280,7 +304,8 @@ def displacement(
 def to_edges(
     views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: Reach
 ) -> Points:
-    """How far the vertices of a surface in the T-pose move along its normals to the masks' edges, smoothly.
+    """How far the vertices of a surface in the T-pose move along its normals to the masks' edges,
+    smoothly.
 
     held: weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette.
     """
@@ -330,7 +355,10 @@ def _window(
     linear: Float[np.ndarray, "n 3 3"],
     offset: Points,
 ) -> MaskedView:
-    """A view, cut to the person and brought to one size. Beyond the border of the photo the mask goes on as it ends there."""
+    """A view, cut to the person and brought to one size.
+
+    Beyond the border of the photo the mask goes on as it ends there.
+    """
     (top, bottom), (left, right) = box_of(mask > MASK_THRESHOLD).tolist()
     margin = int(np.ceil(MARGIN * max(bottom - top, right - left)))
     top, left, bottom, right = top - margin, left - margin, bottom + margin, right + margin
@@ -353,7 +381,9 @@ def _window(
 def _share_outside(
     views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]
 ) -> float:
-    """Of the free vertices, those that are `OUTSIDE` outside of a mask; if few are outside at all, these."""
+    """Of the free vertices, those that are `OUTSIDE` outside of a mask; if few are outside at all,
+    these.
+    """
 
     def share(outside: Callable[[MaskedView, np.ndarray, np.ndarray], np.ndarray]) -> float:
         found = np.zeros(len(rest), bool)
@@ -375,7 +405,9 @@ def _share_outside(
 def _targets(
     views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: Reach
 ) -> tuple[PerVertex, PerVertex]:
-    """For each vertex the number of photos that show it on the silhouette, and the sum of the distances to the masks' edges."""
+    """For each vertex the number of photos that show it on the silhouette, and the sum of the
+    distances to the masks' edges.
+    """
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
     reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
     for view in views:
@@ -398,7 +430,9 @@ def _targets(
 def _crossing(
     depths: Float[np.ndarray, "e r"], reach: Float[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
-    """Where the mask ends along each normal, nearest to its start: outwards from the inside, inwards from the outside."""
+    """Where the mask ends along each normal, nearest to its start: outwards from the inside,
+    inwards from the outside.
+    """
     zero = int(np.argmin(np.abs(reach)))
     distance, found = np.zeros(len(depths)), np.zeros(len(depths), bool)
     starts_inside = depths[:, zero] > 0

@@ -1,12 +1,15 @@
-"""A capture: photos of one person, their calibrated cameras, and the body pose of each frame; a folder on disk.
+"""A capture: photos of one person, their calibrated cameras, and the body pose of each frame; a
+folder on disk.
 
-    me/capture.json       {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": [...]}
-    me/body.npz           body (name or file of the model), betas and shape_names (s,), rotations (m, j, 3), translations (m, 3)
-                          and perhaps displacement (n, 3)
+    me/capture.json       {"format": "humangs-capture", "version": 1, "body": "body.npz",
+                          "views": [...]}
+    me/body.npz           body (name or file of the model), betas and shape_names (s,), rotations
+                          (m, j, 3), translations (m, 3) and perhaps displacement (n, 3)
     me/images/*.png ...   one photo per view, all of one size; masks likewise
 
-docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a `CaptureError`: one line that names
-the file, the field and what was expected. In memory the images have a white background wherever masks are known.
+docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a
+`CaptureError`: one line that names the file, the field and what was expected. In memory the images
+have a white background wherever masks are known.
 """
 
 import dataclasses
@@ -51,7 +54,9 @@ from humangs_jax.io.images import image_row, png_bytes, resized, write_png
 from humangs_jax.io.reading import FileError, check_limit, reading
 
 DEFAULT_BODY = "makehuman"
-"""Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
+"""Name of the body that comes with the package; any other `body` in body.npz is the path of a model
+file.
+"""
 BODY_KEYS = {"body", "betas", "rotations", "translations"}
 OPTIONAL_BODY_KEYS = {"shape_names", "displacement"}
 
@@ -79,8 +84,9 @@ class Capture:
     body_file: str = DEFAULT_BODY
     """Where the model comes from, "makehuman" or a path."""
     displacement: Float[np.ndarray, "n 3"] | None = None
-    """Metres by which the vertices of the shaped body move in the T-pose, as another tool registered them (SMPL+D); joints stay.
-    It belongs to `betas`: who changes those leaves it out. None: `reconstruct` finds one by the masks."""
+    """Metres by which the vertices of the shaped body move in the T-pose, as another tool
+    registered them (SMPL+D); joints stay. It belongs to `betas`: who changes those leaves it out.
+    None: `reconstruct` finds one by the masks."""
     calibrated: bool = True
     """False: the cameras were found from the person, and are centimetres off."""
 
@@ -99,7 +105,10 @@ class Capture:
         return len(self.poses.translation)
 
     def pose(self, frame: int) -> BodyPose:
-        """The pose of one frame (not of one view: that is `pose(capture.frames[view])`). Raises: IndexError."""
+        """The pose of one frame (not of one view: that is `pose(capture.frames[view])`).
+
+        Raises: IndexError.
+        """
         return self.poses[frame]
 
     def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "Capture":
@@ -155,26 +164,31 @@ def capture_from_arrays(
         rotations: (m, j, 3) axis-angle in the body's joint order, radians.
         translations: (m, 3) metres.
         betas: (s,) shape coefficients.
-        shape_names: (s,) the body's directions that betas belong to. None: all of them, or the first of SMPL-X's shape.
+        shape_names: (s,) the body's directions that betas belong to. None: all of them, or the
+            first of SMPL-X's shape.
         masks: (v, h, w) in [0, 1], or None.
         frames: (v,) which of the m poses each view shows; may be left out when m is 1.
         names: (v,) file names without suffix. None: "000", "001" and so on.
         background: "photo": the masks put the images on white. "white": they are on white already.
-        fit_masks: first move masks of photos that are too large or too small to the edges in the photos.
+        fit_masks: first move masks of photos that are too large or too small to the edges in the
+            photos.
         body: the model. None: that of `body_file`.
         body_file: where the model comes from. Default: the shipped body.
         displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
-        calibrated: False for cameras that were found from the person: refinement moves them further.
+        calibrated: False for cameras that were found from the person: refinement moves them
+            further.
         source: what errors call the arrays.
 
     Returns:
         The capture.
 
     Raises:
-        CaptureError: one line that names the array and what was expected: a shape, finite numbers, a range.
+        CaptureError: one line that names the array and what was expected: a shape, finite numbers,
+            a range.
 
     Examples:
-        >>> capture = hg.capture_from_arrays(photos, K, cam_from_world, rotations, translations, masks=masks)
+        >>> pose = (rotations, translations)
+        >>> capture = hg.capture_from_arrays(photos, K, cam_from_world, *pose, masks=masks)
     """
     images = numbers(images, source, "images")
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
@@ -233,11 +247,12 @@ def load_capture(
     """Read and check a capture folder.
 
     Args:
-        path: the folder that holds capture.json. "demo_capture", if there is no such folder, is the shipped one
-            ("demo_capture/held_out": its held-out views).
+        path: the folder that holds capture.json. "demo_capture", if there is no such folder, is the
+            shipped one ("demo_capture/held_out": its held-out views).
         body: a model to use in place of the one that body.npz names.
         views: read these views only, in this order; the photos of others are not opened.
-        fit_masks: move masks that are too large or too small to the edges in the photos, and log by how much.
+        fit_masks: move masks that are too large or too small to the edges in the photos, and log by
+            how much.
 
     Returns:
         The photos on white, cameras, poses and body, in memory.
@@ -289,7 +304,8 @@ def capture_checksum(path: str | Path) -> str:
 def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> None:
     """Write a capture folder: PNG images and masks, capture.json, body.npz; all of it or nothing.
 
-    The model file of a body other than the default one is referred to by its relative path, never copied.
+    The model file of a body other than the default one is referred to by its relative path, never
+    copied.
 
     Args:
         path: the folder to write.
@@ -297,8 +313,8 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
         overwrite: replace a capture folder, as a whole, sub-folders included.
 
     Raises:
-        CaptureError: if the capture is not valid, or `path` is a folder with something in it (with `overwrite`: with
-            something else than a capture).
+        CaptureError: if the capture is not valid, or `path` is a folder with something in it (with
+            `overwrite`: with something else than a capture).
 
     Examples:
         >>> hg.save_capture("me", capture)
@@ -378,7 +394,8 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
     return str(name.astype(str)), parameters
 
 
-# Writing -------------------------------------------------------------------------------------------------------------
+# Writing
+# --------------------------------------------------------------------------------------------------
 
 
 def _check_before_writing(capture: Capture) -> None:
@@ -451,7 +468,9 @@ def parameter_arrays(
     rotations: Any,
     translations: Any,
 ) -> dict[str, np.ndarray]:
-    """The arrays of body.npz of a capture that will be in `folder`; a model file is named relative to it."""
+    """The arrays of body.npz of a capture that will be in `folder`; a model file is named relative
+    to it.
+    """
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()
     numbers = {"betas": betas, "rotations": rotations, "translations": translations}

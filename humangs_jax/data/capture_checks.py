@@ -1,4 +1,6 @@
-"""Values of capture, camera and keypoint files, checked one by one; every fault is a `CaptureError` of one line."""
+"""Values of capture, camera and keypoint files, checked one by one; every fault is a `CaptureError`
+of one line.
+"""
 
 import functools
 import re
@@ -16,19 +18,25 @@ from humangs_jax.io.atomic import check_replaceable
 from humangs_jax.io.reading import FileError, inside, parse_json, read_text, reading, shown
 
 COLOR_SLACK = 1e-3
-"""Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
+"""Resampled images overshoot [0, 1] a little; values further outside have another range, for
+instance 0 to 255.
+"""
 
 
 LARGEST_TURN, LARGEST_DISTANCE, LARGEST_BETA, LARGEST_DISPLACEMENT = 1e3, 1e4, 100.0, 0.5
-"""Radians of a rotation; metres from the origin (farther, float32 loses millimetres, and the numbers are no metres); shape
-coefficients, of which bodies that exist have less than 10; metres that clothes put between a body and its surface."""
+"""Radians of a rotation; metres from the origin (farther, float32 loses millimetres, and the
+numbers are no metres); shape coefficients, of which bodies that exist have less than 10; metres
+that clothes put between a body and its surface."""
 
 
 class CaptureError(FileError):
-    """Something is wrong with a capture; the message is one line: file, field, and what was expected."""
+    """Something is wrong with a capture; the message is one line: file, field, and what was
+    expected.
+    """
 
 
-# Files ---------------------------------------------------------------------------------------------------------------
+# Files
+# --------------------------------------------------------------------------------------------------
 
 
 def checked_text(file: Path, missing: str = "no such file") -> str:
@@ -48,7 +56,9 @@ def checked_json(file: Path, text: str | None = None, missing: str = "no such fi
 
 
 def checked_path(folder: Path, name: object, where: object) -> Path:
-    """The path of a photo that a file in a folder names, see `io.reading.inside`. where: what errors name."""
+    """The path of a photo that a file in a folder names, see `io.reading.inside`. where: what
+    errors name.
+    """
     with reading(where, "path", CaptureError):
         return inside(folder, str(name), photo=True)
 
@@ -110,7 +120,8 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-# Numbers -------------------------------------------------------------------------------------------------------------
+# Numbers
+# --------------------------------------------------------------------------------------------------
 
 
 file_numbers = functools.partial(arrays.numbers, error=CaptureError)
@@ -137,7 +148,8 @@ def check_range(array: np.ndarray, file: object, field: str) -> None:
         raise CaptureError(file, field, f"expected values in [0, 1], got {low:.4g} to {high:.4g}")
 
 
-# Parts of a capture --------------------------------------------------------------------------------------------------
+# Parts of a capture
+# --------------------------------------------------------------------------------------------------
 
 
 def checked_camera(
@@ -175,7 +187,8 @@ def body_parameters(
 ]:
     """betas, rotations, translations and displacement in float32, of the sizes that the body has.
 
-    Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is none.
+    Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is
+    none.
     """
     joints = len(body.parents)
     rotations = numbers(rotations, file, "rotations")
@@ -209,8 +222,9 @@ def shape_coefficients(
 ) -> Float[np.ndarray, " used"]:
     """Coefficients of the body's first directions, from numbers whose kind is known.
 
-    Arguments: names: of the directions that the numbers belong to, as in `BodyModel.shape_names`. None: the numbers are those of
-    SMPL-X's shape, without expressions, or of all of the body's own directions.
+    Arguments: names: of the directions that the numbers belong to, as in `BodyModel.shape_names`.
+    None: the numbers are those of SMPL-X's shape, without expressions, or of all of the body's own
+    directions.
     Raises: CaptureError for coefficients that the body has no direction for, unless they are 0.
     """
     directions = body.shape_names or tuple(
@@ -236,7 +250,10 @@ def shape_coefficients(
     ]
     if unknown:
         known = f"{len(places)}, from {directions[0]!r} to {directions[-1]!r}" if places else "none"
-        problem = f"{unknown[0]!r} is no shape direction of body '{body.name}': expected coefficients of its own ({known})"
+        problem = (
+            f"{unknown[0]!r} is no shape direction of body '{body.name}': expected coefficients of"
+            f" its own ({known})"
+        )
         raise CaptureError(file, "betas", problem)
     used = [places[name] for name in names if name in places]
     ordered = np.zeros(max(used, default=-1) + 1, betas.dtype)

@@ -1,7 +1,8 @@
 """What a folder holds: the photos that are used, and what is not used, each file with the reason.
 
-Every command that looks for photos asks `scan_folder`, so that all of them take the same files and can say what they leave out.
-Names that begin with a dot are no photos: macOS writes `._IMG_1.jpg` beside `IMG_1.jpg` on disks of other systems.
+Every command that looks for photos asks `scan_folder`, so that all of them take the same files and
+can say what they leave out. Names that begin with a dot are no photos: macOS writes `._IMG_1.jpg`
+beside `IMG_1.jpg` on disks of other systems.
 """
 
 import dataclasses
@@ -165,9 +166,11 @@ def is_video(path: Path) -> bool:
 
 
 def photo_of_mask(name: str) -> str | None:
-    """The name of the photo that the name of a mask tells, perhaps without suffix; None if it does not say "mask".
+    """The name of the photo that the name of a mask tells, perhaps without suffix; None if it does
+    not say "mask".
 
-    "1.jpg.mask.png" and "mask_1.jpg.png" are masks of "1.jpg", "1_mask.png" and "1-matte.png" of "1".
+    "1.jpg.mask.png" and "mask_1.jpg.png" are masks of "1.jpg", "1_mask.png" and "1-matte.png" of
+    "1".
     """
     stem = Path(name).stem
     found = _MASK_BEHIND.fullmatch(stem) or _MASK_BEFORE.fullmatch(stem)
@@ -175,7 +178,9 @@ def photo_of_mask(name: str) -> str | None:
 
 
 def masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
-    """Mask -> photo, of pictures that are called like the mask of another one in the same folder."""
+    """Mask -> photo, of pictures that are called like the mask of another one in the same
+    folder.
+    """
     pictures = list(pictures)
     named: dict[tuple[Path, str], Path] = {}
     for file in pictures:
@@ -190,7 +195,9 @@ def masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
 
 
 def unused_line(unused: Iterable[Unused]) -> str | None:
-    """What is not used, with numbers, reasons and the first names, in one line; None for nothing."""
+    """What is not used, with numbers, reasons and the first names, in one line; None for
+    nothing.
+    """
     groups: dict[Reason, list[str]] = {}
     for each in unused:
         groups.setdefault(each.why, []).append(each.path.name)

@@ -1,4 +1,5 @@
-"""What is read: cameras, keypoints, motions and data sets. A row each; a new format is a reader and a line here.
+"""What is read: cameras, keypoints, motions and data sets. A row each; a new format is a reader and
+a line here.
 
 `--help`, `humangs start`, errors and the tables in the docs are made of these rows.
 """
@@ -15,18 +16,24 @@ from humangs_jax.io.reading import visible
 START_MARK = "start.json"
 """What `humangs start` leaves in a capture folder that it made."""
 
-# Cameras and keypoints --------------------------------------------------------------------------------------------------
-# The module of a row has two functions; where several recognize a file, the first reads it, those of its suffix before others.
-# Suffixes are for files that are neither JSON nor text.
-#     recognizes_NAME(source) -> bool            whether the content of a file is of this format; not asked where `folder` is set
-#     read_NAME(source, format) -> Calibration   or Detections; source: `calibration.Source`, `keypoints.keypoints.Source`
+# Cameras and keypoints
+# --------------------------------------------------------------------------------------------------
+# The module of a row has two functions; where several recognize a file, the first reads it, those
+# of its suffix before others. Suffixes are for files that are neither JSON nor text.
+# recognizes_NAME(source) -> bool            whether the content of a file is of this format; not
+# asked where `folder` is set
+# read_NAME(source, format) -> Calibration   or Detections; source: `calibration.Source`,
+# `keypoints.keypoints.Source`
 
 F = TypeVar("F", bound="SourceFormat")
 
 
 @dataclasses.dataclass(frozen=True)
 class SourceFormat(Format):
-    """A format whose files have usual names, but are known by their content. Its code is "module:read_NAME"."""
+    """A format whose files have usual names, but are known by their content.
+
+    Its code is "module:read_NAME".
+    """
 
     files: tuple[str, ...] = ()
     """Usual names in a folder, patterns of `Path.glob`."""
@@ -87,7 +94,9 @@ class SourceFormats(Formats[F]):
         return next(named, None)
 
     def of_content(self, source: Any) -> F | None:
-        """The first format that recognizes a source, a file; those of its suffix are asked before the others."""
+        """The first format that recognizes a source, a file; those of its suffix are asked before
+        the others.
+        """
         asked = sorted(
             self.values(), key=lambda each: source.path.suffix.lower() not in each.suffixes
         )
@@ -136,7 +145,10 @@ CAMERAS = SourceFormats(
         _CAMERAS + "rigs:read_toml",
         (".toml",),
         files=("camera_array.toml", "calibration.toml", "Calib*.toml"),
-        content="TOML: `matrix`, `distortions`, `rotation`, `translation`, `size` in a table of each camera",
+        content=(
+            "TOML: `matrix`, `distortions`, `rotation`, `translation`, `size` in a table of each"
+            " camera"
+        ),
         up="+z",
     ),
     qualisys=CameraFormat(
@@ -157,14 +169,19 @@ CAMERAS = SourceFormats(
         "multical",
         _CAMERAS + "rigs:read_multical",
         files=("calibration.json",),
-        content="JSON: `K`, `dist`, `image_size` of each in `cameras`, `R`, `T` in `camera_poses` (`NAME` or `NAME_to_OTHER`)",
+        content=(
+            "JSON: `K`, `dist`, `image_size` of each in `cameras`, `R`, `T` in `camera_poses`"
+            " (`NAME` or `NAME_to_OTHER`)"
+        ),
     ),
     opencv=CameraFormat(
         "OpenCV, AvatarReX or THuman4.0",
         _CAMERAS + "rigs:read_opencv",
         files=("calibration_full.json", "calibration.json", "calibration_shelf.json"),
-        content="YAML or JSON: `K`, `R`, `T` in a map of each camera, or `K_NAME`, `R_NAME`, `T_NAME`; lens as `dist...` or "
-        "`D`, size as `imgSize`, `image_size` or `width`, `height`",
+        content=(
+            "YAML or JSON: `K`, `R`, `T` in a map of each camera, or `K_NAME`, `R_NAME`, `T_NAME`;"
+            " lens as `dist...` or `D`, size as `imgSize`, `image_size` or `width`, `height`"
+        ),
     ),
 )
 """Calibrations."""
@@ -180,7 +197,10 @@ KEYPOINTS = SourceFormats(
         "OpenPose",
         _KEYPOINTS + "openpose",
         files=("openpose",),
-        content="`--write_json`, a file an image: BODY_25, BODY_25B, COCO (18), hands; a list of frames of ControlNet's nodes",
+        content=(
+            "`--write_json`, a file an image: BODY_25, BODY_25B, COCO (18), hands; a list of frames"
+            " of ControlNet's nodes"
+        ),
     ),
     easymocap=SourceFormat(
         "EasyMocap",
@@ -204,16 +224,30 @@ KEYPOINTS = SourceFormats(
 """Keypoints of detectors; files may be folders."""
 
 
-# Motions ----------------------------------------------------------------------------------------------------------------
+# Motions
+# --------------------------------------------------------------------------------------------------
 
 DEFAULT_FPS = 30.0
 ARRAYS = "humangs_jax.data.motion.arrays:read_arrays"
 ARRAY_SUFFIXES = (".npz", ".pkl", ".pickle", ".pt", ".pth", ".npy", ".smpl", ".json", FOLDER)
 PLACES = {
-    "all": (0, 55), "body": (0, 22), "root": (0, 1), "limbs": (1, 21), "jaw": (22, 1), "left_eye": (23, 1), "right_eye": (24, 1),
-    "eyes": (23, 2), "face": (22, 3), "left_hand": (25, 15), "right_hand": (40, 15), "hands": (25, 30),
-}  # fmt: skip
-"""Of SMPL-X's joints: the first, and how many. SMPL's body and limbs end with two more, whole hands."""
+    "all": (0, 55),
+    "body": (0, 22),
+    "root": (0, 1),
+    "limbs": (1, 21),
+    "jaw": (22, 1),
+    "left_eye": (23, 1),
+    "right_eye": (24, 1),
+    "eyes": (23, 2),
+    "face": (22, 3),
+    "left_hand": (25, 15),
+    "right_hand": (40, 15),
+    "hands": (25, 30),
+}
+"""Of SMPL-X's joints: the first, and how many.
+
+SMPL's body and limbs end with two more, whole hands.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,8 +273,8 @@ class ArrayKeys:
     scaling: str | None = None
     """The key of what translations are divided by, 1000 without it."""
     pivot: str = "pelvis"
-    """What a person turns about, and positions are of: the pelvis at rest, the "origin" (in which positions are applied last),
-    the "head", or the root "joint" in space."""
+    """What a person turns about, and positions are of: the pelvis at rest, the "origin" (in which
+    positions are applied last), the "head", or the root "joint" in space."""
     six: bool = False
     """Rotations are six numbers each, with the frames as last axis."""
     stays: bool = False
@@ -252,7 +286,9 @@ class ArrayKeys:
 
 @dataclasses.dataclass(frozen=True)
 class MotionFormat(Format):
-    """Files of motions. code: called as code(path, `motion.Reading`), returns `motion.Poses` or a `skeleton.Clip`."""
+    """Files of motions. code: called as code(path, `motion.Reading`), returns `motion.Poses` or a
+    `skeleton.Clip`.
+    """
 
     arrays: ArrayKeys | None = None
     """Of files of arrays by key; the first that fits a file is used, whatever its suffix."""
@@ -280,7 +316,9 @@ _OF_CAMERA = (
     *("camera", "cam_trans", "translation", "orig_cam"),
 )
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
-"""Estimators write what they find in a world, or in the coordinates of a camera, whose y points down."""
+"""Estimators write what they find in a world, or in the coordinates of a camera, whose y points
+down.
+"""
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
 MOTIONS = Formats(
     humangs=_arrays(
@@ -315,7 +353,13 @@ MOTIONS = Formats(
     mdm=_arrays(
         *("MDM (_smpl_params.npy)", "thetas root_translation", "all=thetas"),
         use=_ALONE
-        | {"moves": ("root_translation",), "fps": 20.0, "also": (), "pivot": "joint", "six": True},
+        | {
+            "moves": ("root_translation",),
+            "fps": 20.0,
+            "also": (),
+            "pivot": "joint",
+            "six": True,
+        },
     ),
     kimodo=_arrays(
         *("Kimodo", "local_rot_mats root_positions", "all=local_rot_mats"),
@@ -385,19 +429,26 @@ MOTIONS = Formats(
 )
 """By name, in the order in which keys and files are asked."""
 
-# Data sets --------------------------------------------------------------------------------------------------------------
+# Data sets
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class DataSetFormat(Format):
-    """A data set of captured people. code: opens one subject, code(its path, body) -> `subject.Subject`."""
+    """A data set of captured people. code: opens one subject, code(its path, body) ->
+    `subject.Subject`.
+    """
 
     find: str | Callable[[Path], tuple[Path, ...]] = ""
-    """Paths of the subjects in a folder, sorted, or the folder itself; empty if it has another layout."""
+    """Paths of the subjects in a folder, sorted, or the folder itself; empty if it has another
+    layout.
+    """
     lists: bool = False
     """A file lists many: code(path, body, size) -> tuple of `subject.Person`."""
     scans: bool = False
-    """Textured scans: there are no photos before `humangs preprocess` has rendered some. code: see `preprocess.run`."""
+    """Textured scans: there are no photos before `humangs preprocess` has rendered some. code: see
+    `preprocess.run`.
+    """
 
 
 def _data_set(about: str, place: str, **options: bool) -> DataSetFormat:

@@ -1,11 +1,14 @@
 """Masks that are too large or too small, moved to where the photo has its edges.
 
-Segmentation leaves silhouettes that are some pixels off. A pixel too much shows the background at the person's rim, a pixel too
-little cuts the person, in all photos alike, so no later stage can find it. Here the photo is searched along the normals of the
-silhouette: at which distance from it do the colors change most, on average over the silhouette, and near each of its points?
+Segmentation leaves silhouettes that are some pixels off. A pixel too much shows the background at
+the person's rim, a pixel too little cuts the person, in all photos alike, so no later stage can
+find it. Here the photo is searched along the normals of the
+silhouette: at which distance from it do the colors change most, on average over the silhouette, and
+near each of its points?
 
-A stripe along the rim that looks like the background (rim light before a bright wall, piping) has a stronger edge on its other
-side. So a mask is moved only where sectors of the silhouette agree, and views do, that there is no edge where it ends now.
+A stripe along the rim that looks like the background (rim light before a bright wall, piping) has a
+stronger edge on its other side. So a mask is moved only where sectors of the silhouette agree, and
+views do, that there is no edge where it ends now.
 """
 
 import itertools
@@ -23,31 +26,50 @@ PERSON_HEIGHT = 200
 REACH, STEP = 4.0, 0.5
 """Largest distance that a silhouette is moved, and the steps that are tried."""
 NEIGHBORHOOD, SMOOTHING = 4.0, 2.0
-"""Standard deviations: of the part of the silhouette whose colors decide about a point, and of the distances found."""
+"""Standard deviations: of the part of the silhouette whose colors decide about a point, and of the
+distances found.
+"""
 LEAST = 0.75
-"""Masks whose silhouette is off by less on average stay as they are: exact ones would only lose (docs/stability.md)."""
+"""Masks whose silhouette is off by less on average stay as they are: exact ones would only lose
+(docs/stability.md).
+"""
 LEAST_MOVE = 0.5
 """Parts of the silhouette that would move by less stay where they are."""
 MOST_PIXELS = 400
 """Height of the person at which the photo is searched; larger photos are reduced."""
 LEAST_PART = 0.005
-"""Connected parts of a mask that are smaller, as a share of the largest one's area, are specks and not the person."""
+"""Connected parts of a mask that are smaller, as a share of the largest one's area, are specks and
+not the person.
+"""
 WHITE = 0.98
-"""A photo with nothing darker around the mask, beyond `REACH`, shows no background: there is nothing to find."""
+"""A photo with nothing darker around the mask, beyond `REACH`, shows no background: there is
+nothing to find.
+"""
 SECTORS, SECTOR_POINTS = 16, 8
-"""Parts of the silhouette, of equal numbers of points, by the angle about its middle; fewer where points are few."""
+"""Parts of the silhouette, of equal numbers of points, by the angle about its middle; fewer where
+points are few.
+"""
 AGREE, AGREE_ALONE = 0.7, 0.5
-"""Shares of the sectors that must find the edge at one distance: of all views that would be moved alike, and of the view."""
+"""Shares of the sectors that must find the edge at one distance: of all views that would be moved
+alike, and of the view.
+"""
 EDGE, OF_TEXTURE = 0.06, 1.0
-"""There is an edge where colors change more than beside it, by these shares of the strongest change and of that beside it."""
+"""There is an edge where colors change more than beside it, by these shares of the strongest change
+and of that beside it.
+"""
 SEEN_APART, CLEAR = 1.5, 1.3
-"""Pixels: an edge that is nearer than the first to the mask's is not told from it; a blurred edge ends within the second."""
+"""Pixels: an edge that is nearer than the first to the mask's is not told from it; a blurred edge
+ends within the second.
+"""
 THIN = 0.0007
-"""Area of the parts of a mask that are too thin for one that is too large, over the area that it would lose."""
+"""Area of the parts of a mask that are too thin for one that is too large, over the area that it
+would lose.
+"""
 
 
 class _Shift(NamedTuple):
-    """What the photo says about a mask: it is too large by `excess` pixels (0: it stays), in `window` by `moves` at each pixel.
+    """What the photo says about a mask: it is too large by `excess` pixels (0: it stays), in
+    `window` by `moves` at each pixel.
 
     votes: sectors for it and against it. thin: see `THIN`.
     """
@@ -63,11 +85,13 @@ class _Shift(NamedTuple):
 def masks_at_edges(
     images: Sequence[Float[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
 ) -> list[tuple[Float[np.ndarray, "h w"], float]]:
-    """Each mask with its silhouette at the photo's edges, and by how many pixels of the photo it was too large (negative: small).
+    """Each mask with its silhouette at the photo's edges, and by how many pixels of the photo it
+    was too large (negative: small).
 
-    Arguments: images: the photos of one person with their background, values in [0, 1]. masks: coverage in [0, 1].
-    A mask is kept, with 0, if it is empty, full or a line, off by less than `LEAST`, or of a photo without a background; and if
-    the silhouette has an edge where the mask ends, if its sectors do not agree, or if most views are right as they are.
+    Arguments: images: the photos of one person with their background, values in [0, 1]. masks:
+    coverage in [0, 1]. A mask is kept, with 0, if it is empty, full or a line, off by less than
+    `LEAST`, or of a photo without a background; and if the silhouette has an edge where the mask
+    ends, if its sectors do not agree, or if most views are right as they are.
     """
     found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
     seen = [shift for shift in found if shift is not None]
@@ -128,8 +152,8 @@ def _shift(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) ->
 def boundary_moves(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], unit: float
 ) -> tuple[float, Float[np.ndarray, "h w"]]:
-    """How far inside the mask's silhouette (pixels; negative: outside) the photo has its edges: on the whole, and near each
-    pixel.
+    """How far inside the mask's silhouette (pixels; negative: outside) the photo has its edges: on
+    the whole, and near each pixel.
 
     unit: pixels of this image for one of a person `PERSON_HEIGHT` high.
     """
@@ -155,8 +179,9 @@ def boundary_moves(
 def sector_votes(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float
 ) -> tuple[int, int]:
-    """How many sectors of the silhouette have their edge about `whole` pixels inside of it, and how many do not, or have one
-    where the mask ends. Sectors whose edge is not clear say nothing; nor do those where both sides of it are white.
+    """How many sectors of the silhouette have their edge about `whole` pixels inside of it, and how
+    many do not, or have one where the mask ends. Sectors whose edge is not clear say nothing; nor
+    do those where both sides of it are white.
     """
     distances = signed_distance(mask)
     normal = np.stack(np.gradient(ndimage.gaussian_filter(distances, 1.0)))
@@ -190,7 +215,8 @@ def sector_votes(
     best, highest = steps[np.argmax(profile, axis=1)], profile.max(axis=1)
     clear = highest >= 2 * np.median(profile, axis=1)
 
-    # across the mask's end, and twice beside it on the side where there is no edge if the mask is off
+    # across the mask's end, and twice beside it on the side where there is no edge if the mask is
+    # off
     lag = min(unit, max(abs(whole) - CLEAR, 0.5))
     beside = [colors(-np.sign(whole) * lag * i) for i in (-1, 1, 3, 5)]
     (across, over), *textures = [change(one, other) for one, other in itertools.pairwise(beside)]
@@ -220,9 +246,11 @@ def sector_votes(
 
 
 def _thin_parts(mask: Float[np.ndarray, "h w"], excess: float) -> float:
-    """Area of the parts of a mask that it could not have if it were that much too large (in units), over the area of the excess.
+    """Area of the parts of a mask that it could not have if it were that much too large (in units),
+    over the area of the excess.
 
-    A silhouette that has grown by some distance has no part thinner than twice that; one with fingers has not grown.
+    A silhouette that has grown by some distance has no part thinner than twice that; one with
+    fingers has not grown.
     """
     if excess <= 0:
         return 0.0
@@ -236,7 +264,9 @@ def _thin_parts(mask: Float[np.ndarray, "h w"], excess: float) -> float:
 
 
 def person_box(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
-    """`box_of` the person among the True pixels: the largest connected part, and others of at least `LEAST_PART` of its area."""
+    """`box_of` the person among the True pixels: the largest connected part, and others of at least
+    `LEAST_PART` of its area.
+    """
     parts, _ = ndimage.label(inside, np.ones((3, 3)))
     areas = np.bincount(parts.ravel())
     areas[0] = 0
@@ -244,13 +274,17 @@ def person_box(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
 
 
 def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
-    """First row and the one after the last, then columns, of the True pixels; zeros if there are none."""
+    """First row and the one after the last, then columns, of the True pixels; zeros if there are
+    none.
+    """
     lines = [np.flatnonzero(inside.any(axis)) for axis in (1, 0)]
     return np.asarray([(line[0], line[-1] + 1) if len(line) else (0, 0) for line in lines])
 
 
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Pixels from the silhouette, positive inside; where the mask is neither 0 nor 1, its values say how far."""
+    """Pixels from the silhouette, positive inside; where the mask is neither 0 nor 1, its values
+    say how far.
+    """
     inside = mask >= 0.5
     whole = np.where(
         inside,
@@ -261,25 +295,32 @@ def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return np.where(partly, mask - 0.5, whole)
 
 
-# Rims -----------------------------------------------------------------------------------------------------------------
-# Along the edge of a mask a photo mixes the person with the room, and on white the mixture would be the person's.
+# Rims
+# --------------------------------------------------------------------------------------------------
+# Along the edge of a mask a photo mixes the person with the room, and on white the mixture would be
+# the person's.
 
 RIM_HEIGHT = 440
 """Lengths below are in pixels of a person who is that high."""
 DEPTH, SPREAD = 2.0, 1.5
-"""Pixels that are nearer to the edge than the first are cleaned, by the means of what lies further inside and further outside,
-weighted by a Gaussian of the second."""
+"""Pixels that are nearer to the edge than the first are cleaned, by the means of what lies further
+inside and further outside, weighted by a Gaussian of the second."""
 LEAST_WEIGHT = 1e-3
-"""Weight of what lies further inside below which there is nothing: of fingers, which are thinner, the rim stays as it is."""
+"""Weight of what lies further inside below which there is nothing: of fingers, which are thinner,
+the rim stays as it is.
+"""
 CONTRAST, CERTAIN = 0.02, 0.15
-"""A pixel is taken for a mixture where the means differ by more than the first, if the room's share exceeds the second."""
+"""A pixel is taken for a mixture where the means differ by more than the first, if the room's share
+exceeds the second.
+"""
 
 
 def clean_rims(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """A photo without the room's share in the pixels along the edge of the mask, and beyond: what they have of the difference
-    between the colors further outside and further inside is taken away, and all other detail stays.
+    """A photo without the room's share in the pixels along the edge of the mask, and beyond: what
+    they have of the difference between the colors further outside and further inside is taken away,
+    and all other detail stays.
     """
     inside = mask > 0.5
     if not inside.any() or inside.all():
@@ -306,7 +347,9 @@ def clean_rims(
 
 
 def _depth(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Pixels from each pixel's centre to the edge, negative outside; the photo's own border is no edge of the person."""
+    """Pixels from each pixel's centre to the edge, negative outside; the photo's own border is no
+    edge of the person.
+    """
     of = lambda part: (
         ndimage.distance_transform_edt(np.pad(part, 1, mode="edge"))[1:-1, 1:-1]
         if part.any()

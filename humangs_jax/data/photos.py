@@ -1,7 +1,9 @@
-"""The photos of a capture folder: capture.json, then images, masks and cameras, and the frame that each view shows.
+"""The photos of a capture folder: capture.json, then images, masks and cameras, and the frame that
+each view shows.
 
-No body is needed for these: it is what `humangs import cameras` writes and `humangs fit` finds the body for. Every fault
-is a `CaptureError`, one line with file and field. docs/capture_format.md describes the format.
+No body is needed for these: it is what `humangs import cameras` writes and `humangs fit` finds the
+body for. Every fault is a `CaptureError`, one line with file and field. docs/capture_format.md
+describes the format.
 """
 
 import contextlib
@@ -52,10 +54,13 @@ OPTIONAL_TOP_KEYS = {"calibrated"}
 VIEW_KEYS = {"image", "mask", "K", "cam_from_world", "frame"}
 Background = Literal["photo", "white"]
 OFF_CENTER = 0.05
-"""Share of a side by which a principal point has to be nearer to the middle of the turned photo to be one of that."""
+"""Share of a side by which a principal point has to be nearer to the middle of the turned photo to
+be one of that.
+"""
 LARGEST_LABEL, NEARLY_WHITE, LEAST_LABELLED = 20 / 255, 0.9, 1e-3
-"""Masks with nothing above the first are labels (0 and 1, or parts of a person), as are those of 0 and one other value below the
-second; with fewer pixels than the third share they are the rim of someone outside the photo."""
+"""Masks with nothing above the first are labels (0 and 1, or parts of a person), as are those of 0
+and one other value below the second; with fewer pixels than the third share they are the rim of
+someone outside the photo."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,7 +87,8 @@ class Photos:
 
 
 def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
-    """Read the photos of a capture folder, whose body.npz need not exist. fit_masks: see `read_photos`.
+    """Read the photos of a capture folder, whose body.npz need not exist. fit_masks: see
+    `read_photos`.
 
     Raises: CaptureError, one line naming file and field.
     """
@@ -92,18 +98,24 @@ def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
 
 
 def capture_folder(path: str | Path) -> Path:
-    """The folder; "demo_capture", if there is no such folder, means the one that comes with the package."""
+    """The folder; "demo_capture", if there is no such folder, means the one that comes with the
+    package.
+    """
     folder = Path(path)
     if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):
         return Path(str(resources.files("humangs_jax"))) / "assets" / folder
     return folder
 
 
-# capture.json --------------------------------------------------------------------------------------------------------
+# capture.json
+# --------------------------------------------------------------------------------------------------
 
 
 def read_description(file: Path) -> dict[str, Any]:
-    """capture.json with all keys and types checked, except the matrices. Its paths stay in the folder."""
+    """capture.json with all keys and types checked, except the matrices.
+
+    Its paths stay in the folder.
+    """
     description = checked_json(
         file, missing="no such file: a capture is a folder with a capture.json"
     )
@@ -163,7 +175,8 @@ def write_description(
 
 
 def is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
-    """Whether the cameras of a capture are of a calibration, which is what is supposed where nothing else is said.
+    """Whether the cameras of a capture are of a calibration, which is what is supposed where
+    nothing else is said.
 
     Before captures said so themselves, `humangs start` left it in a file beside them.
     """
@@ -181,7 +194,9 @@ def is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
 def check_keys(
     mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = ""
 ) -> None:
-    """Unknown keys are errors: most are misspelt optional ones, which would otherwise be ignored in silence."""
+    """Unknown keys are errors: most are misspelt optional ones, which would otherwise be ignored in
+    silence.
+    """
     for key in mapping:
         if key not in known:
             raise CaptureError(
@@ -224,7 +239,8 @@ def read_frames_and_matrices(
     return np.asarray(frames, np.int32), K, cam_from_world
 
 
-# Images --------------------------------------------------------------------------------------------------------------
+# Images
+# --------------------------------------------------------------------------------------------------
 
 
 def read_photos(
@@ -236,9 +252,10 @@ def read_photos(
 ) -> Photos:
     """Photos and cameras that a checked capture.json describes.
 
-    Arguments: chosen: read these views only, in this order. poses: how many frames there are; None: one more than the
-    last that a view names. fit_masks: move masks that are too large or too small to the edges in the photos (`data.masks`), and
-    log by how much; only masks in files of their own, of photos that show a background.
+    Arguments: chosen: read these views only, in this order. poses: how many frames there are; None:
+    one more than the last that a view names. fit_masks: move masks that are too large or too small
+    to the edges in the photos (`data.masks`), and log by how much; only masks in files of their
+    own, of photos that show a background.
     Raises: CaptureError.
     """
     file, views = folder / "capture.json", description["views"]
@@ -290,7 +307,9 @@ def _check_orientations(
     height: int,
     warns: bool,
 ) -> None:
-    """Photos are read as stored: those with an EXIF flag are warned of, and refused where K is of the turned photo."""
+    """Photos are read as stored: those with an EXIF flag are warned of, and refused where K is of
+    the turned photo.
+    """
     flagged = []
     for view, camera in zip(views, K, strict=True):
         if (flag := read_checked(orientation, file := folder / view["image"])) == 1:
@@ -300,17 +319,25 @@ def _check_orientations(
             np.abs(camera[:2, 2] / size - 0.5).max() for size in ((width, height), (height, width))
         )
         if flag >= 5 and shown < stored - OFF_CENTER:
-            problem = f"EXIF orientation {flag} is ignored, but K is of the turned photo: save it turned, without the flag"
+            problem = (
+                f"EXIF orientation {flag} is ignored, but K is of the turned photo: save it turned,"
+                " without the flag"
+            )
             raise CaptureError(file, "orientation", problem)
     if flagged and warns:
-        told = "K, mask and keypoints have to be of the pixels as stored (`humangs import cameras` turns such photos)"
+        told = (
+            "K, mask and keypoints have to be of the pixels as stored (`humangs import cameras`"
+            " turns such photos)"
+        )
         logger.warning("%s: EXIF orientation of %s is ignored: %s", folder, few(flagged, 1), told)
 
 
 def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:
-    """Whether views of a description cost no more than the limits allow, before their photos are read.
+    """Whether views of a description cost no more than the limits allow, before their photos are
+    read.
 
-    Arguments: together: they are to be in memory at one time. Then the size of the first one is looked at, which all must have.
+    Arguments: together: they are to be in memory at one time. Then the size of the first one is
+    looked at, which all must have.
     Raises: CaptureError.
     """
     file = folder / "capture.json"
@@ -324,7 +351,10 @@ def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) 
 
 
 def check_repeats(file: Path, photos: Sequence[Path]) -> None:
-    """Whether the views of a file name about as many photos; links to one photo are that photo. Raises: CaptureError."""
+    """Whether the views of a file name about as many photos; links to one photo are that photo.
+
+    Raises: CaptureError.
+    """
     found = set()
     for photo in photos:
         with contextlib.suppress(OSError, ValueError):  # whoever reads it says what is wrong
@@ -385,7 +415,9 @@ def _read_images(
 def read_view(
     folder: Path, view: dict[str, Any], on_white: bool
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, bool]:
-    """Image, mask or None, and whether the image still has its background although a mask is known; else it is on white."""
+    """Image, mask or None, and whether the image still has its background although a mask is known;
+    else it is on white.
+    """
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:
         image = on_white_background(image, alpha)
@@ -440,12 +472,16 @@ def on_white_background(
 def cut_out(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The person of a photo over white, without what the rim has of the background (`clean_rims`)."""
+    """The person of a photo over white, without what the rim has of the background
+    (`clean_rims`).
+    """
     return on_white_background(clean_rims(image, mask), mask)
 
 
 def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
-    """File names without folder and suffix, in letters, digits, '.', '_' and '-'; with their folders where they are ambiguous."""
+    """File names without folder and suffix, in letters, digits, '.', '_' and '-'; with their
+    folders where they are ambiguous.
+    """
     plain = lambda name, i: re.sub(r"[^\w.-]", "_", name).lstrip(".") or f"{i:03d}"
     for name_of in (lambda path: path.stem, lambda path: "_".join(path.with_suffix("").parts)):
         names = tuple(plain(name_of(Path(path)), i) for i, path in enumerate(paths))

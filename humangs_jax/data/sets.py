@@ -1,8 +1,10 @@
-"""A set of many that is made bit by bit: one folder, a manifest of what it is made with, a folder for each one that is finished.
+"""A set of many that is made bit by bit: one folder, a manifest of what it is made with, a folder
+for each one that is finished.
 
-The same call goes on with an interrupted set: what is finished is kept, other settings are refused. Several processes may make
-parts of one set at the same time; each ends by writing the manifest of what is there. A name alone does not tell what something
-was made from: whoever keeps what is finished compares contents, too (`avatar.recorded_source`, `files_key`).
+The same call goes on with an interrupted set: what is finished is kept, other settings are refused.
+Several processes may make parts of one set at the same time; each ends by writing the manifest of
+what is there. A name alone does not tell what something was made from: whoever keeps what is
+finished compares contents, too (`avatar.recorded_source`, `files_key`).
 """
 
 import functools
@@ -55,7 +57,8 @@ def begin_set(
 ) -> None:
     """Start a set in a folder, or check that the one that is there can be gone on with.
 
-    Arguments: made_with: what all of it is made with; `SETTINGS` in it is a dictionary. alone: a new set needs an empty folder.
+    Arguments: made_with: what all of it is made with; `SETTINGS` in it is a dictionary. alone: a
+    new set needs an empty folder.
     Raises: CaptureError for a set that was made with something else; ValueError.
     """
     if not (folder / MANIFEST).is_file():
@@ -76,7 +79,10 @@ def begin_set(
     if changed := [
         f"{name} {shown(old)} -> {shown(new)}" for name, (old, new) in pairs.items() if old != new
     ]:
-        problem = f"written with settings other than asked for now ({', '.join(changed)}): choose another folder"
+        problem = (
+            f"written with settings other than asked for now ({', '.join(changed)}): choose another"
+            " folder"
+        )
         raise CaptureError(folder / MANIFEST, SETTINGS, problem)
 
 
@@ -85,7 +91,8 @@ def _flat(content: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
 
 
 def files_key(root: Path, files: Iterable[Path]) -> str:
-    """A checksum of the names below `root`, the sizes and the first `LOOK` bytes of files; some may be missing.
+    """A checksum of the names below `root`, the sizes and the first `LOOK` bytes of files; some may
+    be missing.
 
     It tells data sets apart without reading all of their photos.
     """
@@ -102,7 +109,10 @@ def files_key(root: Path, files: Iterable[Path]) -> str:
 def write_manifest(
     folder: Path, kind: SetFormat, made_with: Mapping[str, Any], **found: Any
 ) -> dict[str, Any]:
-    """Written aside, then renamed, so that it is never half there. found: what is in the set. Returns its content."""
+    """Written aside, then renamed, so that it is never half there. found: what is in the set.
+
+    Returns its content.
+    """
     content = {**kind._asdict(), **made_with, **found}
     write_json(folder / MANIFEST, content)
     return content
@@ -123,10 +133,12 @@ def made(
     workers: int,
     load: Callable[[], object],
 ) -> Iterator[tuple[K, Exception | None]]:
-    """Yields (name, None or what is wrong with it) of tasks by name, as they end; an OSError ends all: the disk may be full.
+    """Yields (name, None or what is wrong with it) of tasks by name, as they end; an OSError ends
+    all: the disk may be full.
 
-    Arguments: work: called as work(what `load` has made, *arguments of the task). workers: processes, which use the CPU; `load`
-    is called once in each. All of it is pickled, and the calling script is guarded by `if __name__ == "__main__"`.
+    Arguments: work: called as work(what `load` has made, *arguments of the task). workers:
+    processes, which use the CPU; `load` is called once in each. All of it is pickled, and the
+    calling script is guarded by `if __name__ == "__main__"`.
     """
     once = functools.partial(_attempt, work)
     if workers > 1 and len(tasks) > 1:

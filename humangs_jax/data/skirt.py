@@ -1,12 +1,15 @@
 """A skirt: a tube of vertices around both legs, where the photos show cloth between them.
 
-Each leg of a body is a tube of its own, and no vertex spans the gap between them: on a body alone, a long skirt becomes a pair of
-ragged trousers. The vertices of the skirt are linear combinations of those of the legs, in shape, pose directions and skinning
-weights: where it spans the gap, of one point on each leg. So it bends smoothly between them. Its rows lie on the convex section
-of both legs; from there it is displaced along its normals to the edges of the masks, as the body is (`data.body_and_masks`).
+Each leg of a body is a tube of its own, and no vertex spans the gap between them: on a body alone,
+a long skirt becomes a pair of ragged trousers. The vertices of the skirt are linear combinations of
+those of the legs, in shape, pose directions and skinning
+weights: where it spans the gap, of one point on each leg. So it bends smoothly between them. Its
+rows lie on the convex section of both legs; from there it is displaced along its normals to the
+edges of the masks, as the body is (`data.body_and_masks`).
 
-The photos show a skirt where points between the legs, and beside both, lie inside the masks. It ends above the first row where
-they do not. Legs that no photo shows apart have no skirt. All on the host, by numpy and scipy.
+The photos show a skirt where points between the legs, and beside both, lie inside the masks. It
+ends above the first row where they do not. Legs that no photo shows apart have no skirt. All on the
+host, by numpy and scipy.
 """
 
 import jax
@@ -34,16 +37,25 @@ from humangs_jax.geometry.mesh import vertex_areas
 LEGS = (("left_hip", "left_knee", "left_ankle"), ("right_hip", "right_knee", "right_ankle"))
 TRUNK = ("pelvis", "spine1")
 TOP, BOTTOM = 0.08, 0.97
-"""Where a skirt may begin and end: 0 at the hips, 0.5 at the knees, 1 at the ankles. Above, the body is around both legs."""
+"""Where a skirt may begin and end: 0 at the hips, 0.5 at the knees, 1 at the ankles.
+
+Above, the body is around both legs.
+"""
 ROWS, GAP, HALF = 28, 11, 13
-"""Rows of a skirt; vertices of a row in each gap, and on the outer half of each leg. All skirts share one program."""
+"""Rows of a skirt; vertices of a row in each gap, and on the outer half of each leg.
+
+All skirts share one program.
+"""
 BESIDE = 0.02
 """Metres beside the legs: trousers reach as far."""
 SHOWN, VOTES = 0.8, 4
-"""A row is part of a skirt if this share of its points is inside the masks; rows with fewer points say nothing."""
+"""A row is part of a skirt if this share of its points is inside the masks; rows with fewer points
+say nothing.
+"""
 LEAST_ROWS, CLEAR, LONG_CLEAR = 4, 0.06, 0.1
-"""Wide trousers look worse with a skirt. To tell them apart, at least `LEAST_ROWS` rows must have a point inside the masks that
-is `CLEAR` metres beside both legs, or `LONG_CLEAR` where no photo shows the legs apart below the hem."""
+"""Wide trousers look worse with a skirt. To tell them apart, at least `LEAST_ROWS` rows must have a
+point inside the masks that is `CLEAR` metres beside both legs, or `LONG_CLEAR` where no photo shows
+the legs apart below the hem."""
 REACH = Reach(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
 """Weight of no displacement of the body, in the fit of the skirt."""
@@ -52,9 +64,11 @@ HELD = 1e4
 def with_skirt(
     body: BodyModel, capture: Capture, displacement: Float[np.ndarray, "n 3"]
 ) -> tuple[BodyModel, Float[np.ndarray, "m 3"]] | None:
-    """The body with a skirt, and the displacement of both, metres; None where the photos show no skirt.
+    """The body with a skirt, and the displacement of both, metres; None where the photos show no
+    skirt.
 
-    Arguments: body: one of `data.views.gaussian_body`, whose vertices come first. capture: with masks. displacement: of the body.
+    Arguments: body: one of `data.views.gaussian_body`, whose vertices come first. capture: with
+    masks. displacement: of the body.
     """
     hem = (
         find_hem(body, capture) if body.texels is None else None
@@ -77,7 +91,9 @@ def with_skirt(
 
 
 def find_hem(body: BodyModel, capture: Capture) -> float | None:
-    """How far down the legs the photos show a skirt, from `TOP` to `BOTTOM`; None: they show none."""
+    """How far down the legs the photos show a skirt, from `TOP` to `BOTTOM`; None: they show
+    none.
+    """
     legs = _legs(body)
     if legs is None or capture.masks is None:
         return None
@@ -121,7 +137,10 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
 
 
 def with_tube(body: BodyModel, hem: float) -> BodyModel:
-    """The body, then the vertices of a tube around its legs down to `hem`. Raises: ValueError if it has no such legs."""
+    """The body, then the vertices of a tube around its legs down to `hem`.
+
+    Raises: ValueError if it has no such legs.
+    """
     combined = _tube(body, np.linspace(TOP, hem, ROWS))
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
     linear = {
@@ -197,7 +216,8 @@ def _radii(
 def _tube(body: BodyModel, levels: Float[np.ndarray, " r"]) -> sparse.csr_array:
     """Rows (r * loop, n) that make the vertices of a tube of those of the body.
 
-    A loop goes over the front from the left to the right, around the right leg, over the back, and around the left leg.
+    A loop goes over the front from the left to the right, around the right leg, over the back, and
+    around the left leg.
     """
     legs = _legs(body)
     if legs is None:
@@ -234,7 +254,8 @@ def _farthest(
     origin: Float[np.ndarray, "3"],
     rays: Float[np.ndarray, "r 3"],
 ) -> sparse.csr_array:
-    """The last points (r, n) of a surface along horizontal rays, in barycentric coordinates (Moller and Trumbore 1997).
+    """The last points (r, n) of a surface along horizontal rays, in barycentric coordinates (Moller
+    and Trumbore 1997).
 
     Raises: ValueError where a ray meets none.
     """

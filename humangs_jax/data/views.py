@@ -1,8 +1,10 @@
-"""Photos of one subject with the body parameters of each, what the network computes of them, which to use, and their exposure.
+"""Photos of one subject with the body parameters of each, what the network computes of them, which
+to use, and their exposure.
 
-Cameras that meter for themselves show one skin in several colors; a gain for each channel makes them agree. What two photos both
-show of the body should have one color in both. The gains are those that bring the medians of the ratios nearest to 1; their
-logarithms have the mean 0 over the photos. Where little is shared they stay near 1.
+Cameras that meter for themselves show one skin in several colors; a gain for each channel makes
+them agree. What two photos both show of the body should have one color in both. The gains are those
+that bring the medians of the ratios nearest to 1; their logarithms have the mean 0 over the photos.
+Where little is shared they stay near 1.
 """
 
 import dataclasses
@@ -52,13 +54,16 @@ logger = logging.getLogger(__name__)
 
 @pytree_dataclass
 class SubjectViews:
-    """Views of one subject; each has a pose of its own, so that inputs of varying poses are nothing special.
+    """Views of one subject; each has a pose of its own, so that inputs of varying poses are nothing
+    special.
 
-    images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v, metric.
-    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: how many are
-    views, those after them are padding (see `pad_views`); None: all are. depths: (v, h, w) mean z of the person in a pixel,
-    metres, where the mask is not 0; 0: unknown there. None: unknown everywhere. displacement: (n, 3) of the vertices of the
-    shaped body in the T-pose, metres (`data.body_and_masks`); None: none.
+    images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v,
+    metric.
+    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients.
+    view_count: how many are views, those after them are padding (see `pad_views`); None: all are.
+    depths: (v, h, w) mean z of the person in a pixel, metres, where the mask is not 0; 0: unknown
+    there. None: unknown everywhere. displacement: (n, 3) of the vertices of the shaped body in the
+    T-pose, metres (`data.body_and_masks`); None: none.
     """
 
     images: Float[Array, "v h w 3"]
@@ -72,7 +77,10 @@ class SubjectViews:
     displacement: Float[Array, "n 3"] | None = None
 
     def upright(self, body: BodyModel) -> "SubjectViews":
-        """The views in a world whose y axis points up; the same object if theirs does. See `upright_world`. On the host."""
+        """The views in a world whose y axis points up; the same object if theirs does.
+
+        See `upright_world`. On the host.
+        """
         pelvis = lambda: np.asarray(shape_body(body, self.betas).joints[0])
         poses, cameras = upright_world(
             jax.vmap(BodyPose)(self.rotations, self.translations), self.cameras, pelvis
@@ -85,7 +93,8 @@ class SubjectViews:
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
-    """The views, then ignored copies of the last one, so that subjects with fewer views can share a batch.
+    """The views, then ignored copies of the last one, so that subjects with fewer views can share a
+    batch.
 
     Raises: ValueError if there are no views, or more than `count`.
     """
@@ -100,25 +109,28 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 
 @checked_arguments
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
-    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it; with the map
-    of its surface where the network works on one.
+    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the
+    weights want it; with the map of its surface where the network works on one.
 
-    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `runtime.longest_edge` asks for more
-    vertices or `runtime.body_vertices` for fewer. The last four results are kept: making one takes as long as
-    a small network does on a CPU.
+    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless
+    `runtime.longest_edge` asks for more vertices or `runtime.body_vertices` for fewer. The last
+    four results are kept: making one takes as long as a small network does on a CPU.
 
     Raises: ValueError if `runtime` has both.
     """
     asked = config.runtime
     if None not in (asked.body_vertices, asked.longest_edge):
         raise ValueError(
-            "runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of them"
+            "runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of"
+            " them"
         )
     return body if fits(body, config) else _remeshed(_ByContent(body), *_wanted(config))
 
 
 def fits(body: BodyModel, config: HumanGSConfig) -> bool:
-    """Whether a body is one of `gaussian_body` for this configuration; any is if the configuration asks for nothing."""
+    """Whether a body is one of `gaussian_body` for this configuration; any is if the configuration
+    asks for nothing.
+    """
     return body.made_for == _wanted(config) or not any(_wanted(config))
 
 
@@ -176,7 +188,9 @@ def _remeshed(
 def on_gaussian_body(
     displacement: Float[np.ndarray, "n 3"], body: BodyModel, config: HumanGSConfig
 ) -> Float[Array, "m 3"]:
-    """A displacement of a body's vertices, of those of its `gaussian_body`: midpoints of edges move by the mean of the ends."""
+    """A displacement of a body's vertices, of those of its `gaussian_body`: midpoints of edges move
+    by the mean of the ends.
+    """
     carrier = replace(
         body, pose_directions=jnp.asarray(displacement)[..., None]
     )  # linear, and no joint depends on them
@@ -195,7 +209,8 @@ def subject_rest(
 
 @checked_arguments
 def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
-    """Pose the body for every view and rasterize it: position maps, depth maps and the foreground of the photos.
+    """Pose the body for every view and rasterize it: position maps, depth maps and the foreground
+    of the photos.
 
     Pure and jittable; nothing here is differentiated with respect to the body.
     """
@@ -251,7 +266,8 @@ CROP_MARGIN = 0.04
 def cropped(capture: Capture, size: int) -> Capture:
     """The photos, each cut to a square around the person in its mask and resized to `size` pixels.
 
-    All stay as they are if there are no masks, if one is empty, or if no crop is smaller than its photo.
+    All stay as they are if there are no masks, if one is empty, or if no crop is smaller than its
+    photo.
     """
     if capture.masks is None:
         return capture
@@ -276,7 +292,9 @@ def _squares(
     boxes: Sequence[tuple[int, int, int]],
     size: int,
 ) -> tuple[Float[np.ndarray, "v size size 3"], Float[np.ndarray, "v size size"] | None, Camera]:
-    """Photos, masks and cameras, each cut to a square (left, top, side), white beyond the photo, and resized to `size` pixels."""
+    """Photos, masks and cameras, each cut to a square (left, top, side), white beyond the photo,
+    and resized to `size` pixels.
+    """
     cut = lambda array, fill: np.stack(
         [resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)]
     )
@@ -307,13 +325,16 @@ def _window(
 def upright_world(
     poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]
 ) -> tuple[BodyPose, Camera]:
-    """Poses and cameras of some views in a world whose y axis points up; the same objects if theirs does.
+    """Poses and cameras of some views in a world whose y axis points up; the same objects if theirs
+    does.
 
-    Captures are to have y up. One with z up is as consistent, but the network has seen no such world, and an avatar's light is
-    that of a world with y up: it is turned, and a warning logged, where the person and the cameras both stand along another axis.
-    The person alone may lie. On the host.
+    Captures are to have y up. One with z up is as consistent, but the network has seen no such
+    world, and an avatar's light is that of a world with y up: it is turned, and a warning logged,
+    where the person and the cameras both stand along another axis. The person alone may lie. On the
+    host.
 
-    Arguments: poses, cameras: batches of one length. pelvis: the root joint in T-pose, metres, where it is needed.
+    Arguments: poses, cameras: batches of one length. pelvis: the root joint in T-pose, metres,
+    where it is needed.
     """
     rotations, translations = np.asarray(poses.rotations), np.asarray(poses.translation)
     up = standing_axis(rotations[:, 0])
@@ -338,10 +359,12 @@ def upright_world(
 
 
 def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews:
-    """A capture's photos as the network wants them: padded with white to a centred square and resized to `size`.
+    """A capture's photos as the network wants them: padded with white to a centred square and
+    resized to `size`.
 
-    Intrinsics follow the pixels. Without masks only what the posed body covers will count as foreground. crop: cut to the person
-    first, see `cropped`. Views whose mask does not show the person are left out, see `usable_views`.
+    Intrinsics follow the pixels. Without masks only what the posed body covers will count as
+    foreground. crop: cut to the person first, see `cropped`. Views whose mask does not show the
+    person are left out, see `usable_views`.
     """
     capture = usable_views(capture)
     capture = cropped(capture, size) if crop else capture
@@ -361,24 +384,32 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     )
 
 
-# Which photos of many -------------------------------------------------------------------------------------------------
+# Which photos of many
+# -------------------------------------------------------------------------------------------------
 
 SELECTION_SIZE, SELECTION_VERTICES = 128, 2000
-"""Pixels a side of the depth maps, and vertices of the body: enough to know which side of it a photo shows."""
+"""Pixels a side of the depth maps, and vertices of the body: enough to know which side of it a
+photo shows.
+"""
 LEAST_GAIN = 0.03
-"""A further photo has to add this share to what the chosen ones show. Only where no number of photos is given."""
+"""A further photo has to add this share to what the chosen ones show.
+
+Only where no number of photos is given.
+"""
 
 
 @checked_arguments
 def select_views(capture: Capture, count: int | None) -> list[int]:
-    """The numbers of `count` photos, in ascending order, that together show the body best; all of them if there are no more.
+    """The numbers of `count` photos, in ascending order, that together show the body best; all of
+    them if there are no more.
 
     count: None leaves out the photos that add less than `LEAST_GAIN` to what the others show.
 
-    Greedy: each next photo adds most to the sum, over the vertices, of area times the best `view_quality`. The sum
-    is submodular, so the choice reaches at least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978,
-    https://doi.org/10.1007/BF01588971). What a photo shows outside its mask does not count; photos whose mask does not show
-    the person are never chosen (`usable_views`).
+    Greedy: each next photo adds most to the sum, over the vertices, of area times the best
+    `view_quality`. The sum is submodular, so the choice reaches at least 63 % of the best one
+    (Nemhauser, Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971). What a photo shows outside
+    its mask does not count; photos whose mask does not show the person are never chosen
+    (`usable_views`).
 
     Raises: ValueError for a count below 1; CaptureError if no photo shows the person.
     """
@@ -401,8 +432,8 @@ def select_views(capture: Capture, count: int | None) -> list[int]:
 
 
 def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
-    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima most; none after the first that
-    raises it by less than the share `least`.
+    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima
+    most; none after the first that raises it by less than the share `least`.
     """
     chosen, best = list[int](), np.zeros(quality.shape[1])
     for _ in range(min(count, len(quality))):
@@ -419,8 +450,8 @@ def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0
 def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
     """How well every view shows every vertex, in [0, 1].
 
-    The cosine between normal and line of sight, times pixels per metre over the most of all views; 0 where the
-    vertex is hidden or outside of the mask.
+    The cosine between normal and line of sight, times pixels per metre over the most of all views;
+    0 where the vertex is hidden or outside of the mask.
     """
     config = presets.small().with_conventions(pixels="person")
     inputs = prepare_inputs(body, views, config)
@@ -447,30 +478,35 @@ def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
     return shown / jnp.maximum(jnp.max(shown), 1e-6)
 
 
-# Equal exposure --------------------------------------------------------------------------------------------------------
+# Equal exposure
+# --------------------------------------------------------------------------------------------------
 
 EXPOSURE_SIZE = 256
 """Pixels a side of the crops around the person that are compared."""
 FACING, THICKNESS = 0.5, 0.02
-"""Of a point that a photo shows: least cosine between normal and ray; metres by which it may lie behind the nearest surface."""
+"""Of a point that a photo shows: least cosine between normal and ray; metres by which it may lie
+behind the nearest surface.
+"""
 INSIDE, WHOLE, BLUR = 5, 0.99, 3
-"""Side of the square of pixels around each point that lies in the mask, least value of the mask in it; and side of the one over
-which colors are averaged."""
+"""Side of the square of pixels around each point that lies in the mask, least value of the mask in
+it; and side of the one over which colors are averaged."""
 USABLE = (0.06, 0.95)
 """Darker and brighter values say nothing about a gain."""
 LEAST_POINTS, ALIKE = 50, 50
 """Points that two photos share, at least; and how many neighbours err alike."""
 NOISE, EXPECTED = 0.03, 0.15
-"""Standard deviations of a median of log ratios, whatever the number of points, and of the logarithm of a gain."""
+"""Standard deviations of a median of log ratios, whatever the number of points, and of the
+logarithm of a gain.
+"""
 CLEAR = 1.0
-"""Root mean square of the medians over their standard errors, below which all photos stay as they are: loose clothes and shadows
-make 0.3 to 0.9 in photos of equal exposure (eight test people)."""
+"""Root mean square of the medians over their standard errors, below which all photos stay as they
+are: loose clothes and shadows make 0.3 to 0.9 in photos of equal exposure (eight test people)."""
 NORMAL_MAD = 1.4826
 
 
 def equal_exposure(capture: Capture) -> Capture:
-    """The usable views of a capture in equal exposure, which is what network and refinement see; the same object where all
-    views are usable and equal. The same again for its own result.
+    """The usable views of a capture in equal exposure, which is what network and refinement see;
+    the same object where all views are usable and equal. The same again for its own result.
 
     Raises: CaptureError if no view shows the person.
     """
@@ -482,7 +518,9 @@ def equal_exposure(capture: Capture) -> Capture:
 
 
 def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """By what to multiply the colors of an avatar of these photos, so that it is rendered as each camera exposed it."""
+    """By what to multiply the colors of an avatar of these photos, so that it is rendered as each
+    camera exposed it.
+    """
     apart, found = unusable_views(capture), np.ones((capture.view_count, 3))
     if usable := [i for i in range(capture.view_count) if i not in apart]:
         found[usable] = 1 / camera_gains(capture.select(usable))
@@ -513,7 +551,8 @@ def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
 def gains_of(
     colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Gains of views from the colors of common points; all 1 where there is hardly a difference, or nothing in common.
+    """Gains of views from the colors of common points; all 1 where there is hardly a difference, or
+    nothing in common.
 
     colors: in [0, 1]. seen: which points a view shows.
     """
@@ -544,7 +583,10 @@ def multiplied(
     alpha: Float[np.ndarray, "v h w"],
     gains: Float[np.ndarray, "v 3"],
 ) -> Float[np.ndarray, "v h w 3"]:
-    """Images over white with their colors multiplied. A rendering in the exposure of its camera: by 1 / gains."""
+    """Images over white with their colors multiplied.
+
+    A rendering in the exposure of its camera: by 1 / gains.
+    """
     white = 1 - alpha[..., None]
     return np.clip((images - white) * gains[:, None, None].astype(np.float32) + white, 0, 1)
 

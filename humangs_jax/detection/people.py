@@ -1,20 +1,24 @@
-"""All people of a photo, small ones too, whichever way up the photo is, by BlazePose (https://arxiv.org/abs/2006.10204).
+"""All people of a photo, small ones too, whichever way up the photo is, by BlazePose
+(https://arxiv.org/abs/2006.10204).
 
 Its result: 33 landmarks of a person, metric 3D landmarks, a mask.
 
-Two networks, run by LiteRT. The detector looks at a square window of the photo and finds, for each person, the middle of the
-hips and a point whose distance from it is the size of the body. The landmark network looks at the square around them, turned so
-that the person stands upright. Pre- and postprocessing are mediapipe's for its pose graph, in numpy: bilinear samples from the
-crop's corner, no antialiasing. The networks depend on both.
+Two networks, run by LiteRT. The detector looks at a square window of the photo and finds, for each
+person, the middle of the hips and a point whose distance from it is the size of the body. The
+landmark network looks at the square around them, turned so that the person stands upright. Pre- and
+postprocessing are mediapipe's for its pose graph, in numpy: bilinear samples from the crop's
+corner, no antialiasing. The networks depend on both.
 
-Pixels of the networks are mediapipe's: (x, y), the centre of the first at 0. `detect_people` adds our half pixel.
+Pixels of the networks are mediapipe's: (x, y), the centre of the first at 0. `detect_people` adds
+our half pixel.
 
-The detector finds people from a third of its window's side on, so it looks at the whole photo and at windows of a half of its
-longer side that overlap by half, and, where nobody in these is large, of a quarter. What several windows find is one person if
-the landmarks agree.
+The detector finds people from a third of its window's side on, so it looks at the whole photo and
+at windows of a half of its longer side that overlap by half, and, where nobody in these is large,
+of a quarter. What several windows find is one person if the landmarks agree.
 
-Masks have 256 pixels a side; a guided filter moves their edges to the photo's (He, Sun, Tang, Guided image filtering, 2013):
-within each window the mask is an affine function of the photo's colors, of a reduced photo (Fast guided filter, 2015).
+Masks have 256 pixels a side; a guided filter moves their edges to the photo's (He, Sun, Tang,
+Guided image filtering, 2013): within each window the mask is an affine function of the photo's
+colors, of a reduced photo (Fast guided filter, 2015).
 """
 
 import contextlib
@@ -34,7 +38,10 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.io.images import resized
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_heavy.tflite"
-"""Files of `assets/blazepose`. The lite and full landmark networks exchange left and right often, heavy hardly ever."""
+"""Files of `assets/blazepose`.
+
+The lite and full landmark networks exchange left and right often, heavy hardly ever.
+"""
 DETECTOR_SIZE, LANDMARK_SIZE = 224, 256
 """Pixels a side of the two networks' inputs."""
 LANDMARK_COUNT = 33
@@ -49,11 +56,16 @@ SAME_BOX = 0.3
 ENLARGED = 1.25
 """Side of the crop over the diameter of the circle through the detector's second point."""
 PEAK, WINDOW = 0.5, 7
-"""Least height of the heatmap around a landmark that is moved to the centroid, and side of the window."""
+"""Least height of the heatmap around a landmark that is moved to the centroid, and side of the
+window.
+"""
 
 
 class Crop(NamedTuple):
-    """A square of the photo. center: (2,) pixels; side: pixels; angle: radians, by which its upright is turned clockwise."""
+    """A square of the photo.
+
+    center: (2,) pixels; side: pixels; angle: radians, by which its upright is turned clockwise.
+    """
 
     center: Float[np.ndarray, "2"]
     side: float
@@ -75,7 +87,10 @@ class Crop(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """A person in a window. score: in [0, 1]. hips, head: (2,) pixels; the second is a point at the body's size from the hips."""
+    """A person in a window. score: in [0, 1].
+
+    hips, head: (2,) pixels; the second is a point at the body's size from the hips.
+    """
 
     score: float
     hips: Float[np.ndarray, "2"]
@@ -92,8 +107,9 @@ class Detection(NamedTuple):
 class Landmarks(NamedTuple):
     """What the landmark network says of a crop.
 
-    pixels: (33, 2). visibility: (33,) probability that a landmark is seen and not hidden. world: (33, 3) metres from the middle
-    of the hips in the camera's axes (x right, y down, z away), of a person of average size. presence: probability of a person.
+    pixels: (33, 2). visibility: (33,) probability that a landmark is seen and not hidden. world:
+    (33, 3) metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
+    person of average size. presence: probability of a person.
     mask: (256, 256) probability, of the crop. again: where the detector's points are.
     """
 
@@ -121,8 +137,9 @@ class Networks:
                 interpreter = importlib.import_module("ai_edge_litert.interpreter").Interpreter
         except ImportError as error:
             raise ImportError(
-                "finding people in photos needs LiteRT: pip install 'humangs_jax[photos]' (there is none for Macs with Intel "
-                "processors: give keypoints and masks of another program there, see docs/your_photos.md)"
+                "finding people in photos needs LiteRT: pip install 'humangs_jax[photos]' (there is"
+                " none for Macs with Intel processors: give keypoints and masks of another program"
+                " there, see docs/your_photos.md)"
             ) from error
         folder = resources.files("humangs_jax") / "assets" / "blazepose"
         self._runs = [self._load(interpreter, folder / name) for name in (DETECTOR, LANDMARKS)]
@@ -144,7 +161,10 @@ class Networks:
         }
 
     def detect(self, photo: Float[np.ndarray, "h w 3"], window: Crop) -> list[Detection]:
-        """People in an upright window of a photo with values in [0, 1]; black around it. The best first."""
+        """People in an upright window of a photo with values in [0, 1]; black around it.
+
+        The best first.
+        """
         outputs = self._run(0, 2 * sampled(photo, window, DETECTOR_SIZE, outside=0.0) - 1)
         scores, raw = _sigmoid(outputs["Identity_1"][:, 0]), outputs["Identity"]
         kept = scores > LEAST_SCORE
@@ -189,7 +209,9 @@ def bilinear(
     points: Float[np.ndarray, "a b 2"],
     outside: float | None = None,
 ) -> Float[np.ndarray, "a b *c"]:
-    """Values between pixels; whole numbers are pixels. outside: value beyond the image; None: that of its edge."""
+    """Values between pixels; whole numbers are pixels. outside: value beyond the image; None: that
+    of its edge.
+    """
     height, width = image.shape[:2]
     x, y = points[..., 0], points[..., 1]
     inside = (x > -1) & (x < width) & (y > -1) & (y < height)
@@ -246,7 +268,9 @@ Window = tuple[slice, slice]
 
 
 def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> Window:
-    """Returns the part of a photo that a crop reaches, and so many pixels around it; it may be empty."""
+    """Returns the part of a photo that a crop reaches, and so many pixels around it; it may be
+    empty.
+    """
     corners = found.crop.to_photo(np.asarray([[0.0, 0], [0, 1], [1, 0], [1, 1]]))
     left, top = (np.floor(corners.min(0)).astype(int) - margin).clip(0, [width, height]).tolist()
     right, bottom = (
@@ -266,7 +290,8 @@ def mask_in_window(found: Landmarks, window: Window) -> Float[np.ndarray, "h w"]
     corners = np.asarray([[0.0, 0], [1, 0], [0, 1]]) + np.asarray([columns.start, rows.start])
     origin, right_of, below = found.crop.from_photo(corners) * LANDMARK_SIZE
     across, down = right_of - origin, below - origin
-    # Pillow counts from corners of pixels and adds the half pixel of the target itself; it is ten times faster than numpy
+    # Pillow counts from corners of pixels and adds the half pixel of the target itself; it is ten
+    # times faster than numpy
     start = origin + 0.5 - (across + down) / 2
     affine = tuple(np.stack([across, down, start], axis=-1).ravel().tolist())
     picture = Image.fromarray(found.mask.astype(np.float32))
@@ -335,28 +360,39 @@ def _silent() -> Generator[None]:
         os.close(kept)
 
 
-# All people of a photo -------------------------------------------------------------------------------------------------
+# All people of a photo
+# -------------------------------------------------------------------------------------------------
 
 SHARES, SMALL_SHARES = (1.0, 0.5), (0.25,)
-"""Sides of the windows over the photo's longer side; the second, most of all windows, where nobody is large."""
+"""Sides of the windows over the photo's longer side; the second, most of all windows, where nobody
+is large.
+"""
 LARGE = 0.4
-"""Of the photo's longer side. Windows of a half find people from a sixth of it on, whose crops are a fifth: whoever needs smaller
-windows has at most a quarter of the pixels of a person with a crop of two fifths, and is not the one who is meant."""
+"""Of the photo's longer side. Windows of a half find people from a sixth of it on, whose crops are
+a fifth: whoever needs smaller windows has at most a quarter of the pixels of a person with a crop
+of two fifths, and is not the one who is meant."""
 SMALLEST = 0.06
-"""Of the photo's longer side: a person whose crop is smaller is somebody in the background, or nobody."""
+"""Of the photo's longer side: a person whose crop is smaller is somebody in the background, or
+nobody.
+"""
 MOST_CROPS = 16
 """The landmark network looks at, best detections first."""
 SAME_HIPS, SAME_SIZE = 0.15, 1.6
-"""Two detections are one person if their hips are nearer than this share of the larger crop, and the sides of the crops differ
-by at most this factor."""
+"""Two detections are one person if their hips are nearer than this share of the larger crop, and
+the sides of the crops differ by at most this factor."""
 LEAST_PRESENCE, LEAST_ON_MASK, MOST_SHARED = 0.95, 0.8, 0.5
-"""Of a person: presence; share of the landmarks in the photo that lie on the mask; share of the smaller mask that both have.
-Measured on 8 photos of a laboratory with 2 to 3 people each: legs, lamps and chairs that the detector takes for people have 0.69
-to 0.88, 0.33 to 0.76 or 0.77 to 0.94; people 0.999, 0.94 and 0.02 at the worst."""
+"""Of a person: presence; share of the landmarks in the photo that lie on the mask; share of the
+smaller mask that both have. Measured on 8 photos of a laboratory with 2 to 3 people each: legs,
+lamps and chairs that the detector takes for people have 0.69 to 0.88, 0.33 to 0.76 or 0.77 to 0.94;
+people 0.999, 0.94 and 0.02 at the worst."""
 LARGER = 1.25
-"""Side of the second crop over the first, at the most: the mask has 256 pixels a side, whatever the side."""
+"""Side of the second crop over the first, at the most: the mask has 256 pixels a side, whatever the
+side.
+"""
 MOST_LOOKS, SETTLED = 4, 0.05
-"""Looks of the landmark network at a person, at most, and the drift of the crop (see `_settled`) below which it has found it."""
+"""Looks of the landmark network at a person, at most, and the drift of the crop (see `_settled`)
+below which it has found it.
+"""
 SEEN = 0.5
 """Probability from which on a pixel of a mask is a person's."""
 
@@ -364,8 +400,9 @@ SEEN = 0.5
 class DetectedPerson(NamedTuple):
     """A person in a photo.
 
-    pixels: (33, 2) landmarks, the centre of the first pixel at (0.5, 0.5). visibility: (33,) in [0, 1]. world: (33, 3) metres
-    from the middle of the hips in the camera's axes, of a person of average size. presence: in [0, 1]. mask: (h, w) probability.
+    pixels: (33, 2) landmarks, the centre of the first pixel at (0.5, 0.5). visibility: (33,) in [0,
+    1]. world: (33, 3) metres from the middle of the hips in the camera's axes, of a person of
+    average size. presence: in [0, 1]. mask: (h, w) probability.
     side: pixels of the crop that holds the person.
     """
 
@@ -388,7 +425,9 @@ def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list
 
 
 def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Landmarks]:
-    """The same with masks of the crops alone: photos of many megapixels have one of hundreds of megabytes for each person."""
+    """The same with masks of the crops alone: photos of many megapixels have one of hundreds of
+    megabytes for each person.
+    """
     longest = max(photo.shape[:2])
     detections = window_detections(networks, photo, SHARES)
     found = _people(networks, photo, detections)
@@ -410,7 +449,8 @@ def _people(
         if person.presence >= LEAST_PRESENCE and _on_mask(person, width, height) >= LEAST_ON_MASK:
             found.append((drift, person))
     kept: list[Landmarks] = []
-    # crops far off that still drift towards a person have wrong landmarks: the one that settled speaks for the person
+    # crops far off that still drift towards a person have wrong landmarks: the one that settled
+    # speaks for the person
     for _, person in sorted(
         found, key=lambda pair: pair[0] > SETTLED
     ):  # among these the detector's best
@@ -426,7 +466,8 @@ def _people(
 def _settled(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop
 ) -> tuple[Landmarks, float]:
-    """Landmarks of a crop that they confirm, and how far they would still move it, a share of its side.
+    """Landmarks of a crop that they confirm, and how far they would still move it, a share of its
+    side.
 
     The landmark network knows hips and size better than the detector. It looks at least twice.
     """
@@ -455,7 +496,9 @@ def window_detections(
 def windows(
     width: int, height: int, shares: Sequence[float] = (*SHARES, *SMALL_SHARES)
 ) -> list[Crop]:
-    """Upright squares that cover a photo: one around it, then smaller ones that overlap by half, without those beside it."""
+    """Upright squares that cover a photo: one around it, then smaller ones that overlap by half,
+    without those beside it.
+    """
     longest, found = max(width, height), []
     for share in shares:
         side = share * longest
@@ -510,9 +553,13 @@ def _inside(pixels: Float[np.ndarray, "n 2"], width: int, height: int) -> Bool[n
 
 
 LEVEL = 0.4
-"""Of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands and feet."""
+"""Of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands and
+feet.
+"""
 RADIUS, EPSILON = 2.0, 1e-4
-"""Of the filter: half side of its windows in pixels of the detector's mask, and variance of colors that is no edge."""
+"""Of the filter: half side of its windows in pixels of the detector's mask, and variance of colors
+that is no edge.
+"""
 STEEPER = 2.0
 """The filter's masks rise more slowly than true ones by this factor."""
 MOST = 2.0
@@ -522,7 +569,9 @@ MOST = 2.0
 def sharpened(
     mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float
 ) -> Float[np.ndarray, "h w"]:
-    """A mask with its edges at those of the photo. pixel: pixels of the photo for one of the detector's mask."""
+    """A mask with its edges at those of the photo. pixel: pixels of the photo for one of the
+    detector's mask.
+    """
     rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     if not len(rows):
         return mask
@@ -554,7 +603,9 @@ def filter_margin(pixel: float) -> int:
 def _affine(
     guide: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], radius: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colors, means over the windows of each pixel."""
+    """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colors, means over the
+    windows of each pixel.
+    """
     side = 2 * radius + 1
     mean = lambda x: ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
     colors, level = mean(guide), mean(mask)

@@ -1,4 +1,6 @@
-"""Who is compared with what: people from captures or a `Source`, and the methods that predict their views, the simplest last."""
+"""Who is compared with what: people from captures or a `Source`, and the methods that predict their
+views, the simplest last.
+"""
 
 import dataclasses
 import functools
@@ -31,18 +33,24 @@ from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 HELD_OUT = "held_out"
-"""A capture in this folder of another one has views that are no inputs; `humangs synth` writes them."""
+"""A capture in this folder of another one has views that are no inputs; `humangs synth` writes
+them.
+"""
 DEFAULT_INPUTS = 4
 MOST_TARGETS = 2000
 """Views of one person that are compared: they are in memory together."""
 SUFFIXES = (".png", ".jpg", ".jpeg")
 Indices = Mapping[str, Mapping[str, Sequence[int]]]
-"""By person: "context", the views that are inputs, and "target", those to compare with, by their numbers in the capture."""
+"""By person: "context", the views that are inputs, and "target", those to compare with, by their
+numbers in the capture.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """One person. truth: the views to compare with. inputs: the photos that a reconstruction may see; None: not known."""
+    """One person. truth: the views to compare with. inputs: the photos that a reconstruction may
+    see; None: not known.
+    """
 
     name: str
     truth: Capture
@@ -68,7 +76,8 @@ class People(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """What a method shows of a case's views: images (v, h, w, 3) in [0, 1], alpha (v, h, w) or None, and of which views;
+    """What a method shows of a case's views: images (v, h, w, 3) in [0, 1], alpha (v, h, w) or
+    None, and of which views;
     missing: what was not found.
     """
 
@@ -92,14 +101,17 @@ def find_people(
     """The people of a source.
 
     Arguments:
-        source: a capture folder or a folder of them; a scene list or a data set of `data.formats.DATASETS`; a capture; cases; or
-            a `Source`, whose examples give inputs and targets.
-        body: the model that the parameters of data sets and sources belong to, or its file (default: the one that comes with the
-            package). Captures name theirs.
-        inputs: how many photos are inputs: evenly spaced around the person, of the first view's frame. Default: 4, or all of them
-            where a capture with a folder held_out has fewer. indices: says it by person instead.
-        reconstructs: whether the method needs inputs. One that does not, and is given neither `inputs` nor `indices`, is compared
-            with every view of a capture that has nothing held out.
+        source: a capture folder or a folder of them; a scene list or a data set of
+            `data.formats.DATASETS`; a capture; cases; or a `Source`, whose examples give inputs and
+            targets.
+        body: the model that the parameters of data sets and sources belong to, or its file
+            (default: the one that comes with the package). Captures name theirs.
+        inputs: how many photos are inputs: evenly spaced around the person, of the first view's
+            frame. Default: 4, or all of them where a capture with a folder held_out has fewer.
+            indices: says it by person instead.
+        reconstructs: whether the method needs inputs. One that does not, and is given neither
+            `inputs` nor `indices`, is compared with every view of a capture that has nothing held
+            out.
 
     Raises: ValueError naming what is wrong; CaptureError when a capture is loaded.
     """
@@ -155,7 +167,8 @@ def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path |
         chosen, targets = choose_views(name, subject.frames, subject.cam_from_world, choice)
         if len(targets) > MOST_TARGETS:
             raise ValueError(
-                f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices"
+                f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some"
+                " by indices"
             )
         seen = subject.capture(chosen, file_body, size) if chosen else None
         return Case(name, subject.capture(targets, file_body, size), seen)
@@ -164,7 +177,9 @@ def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path |
 
 
 def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """The last parts of the paths, as many as tell all of them apart: ActorsHQ has a Sequence1 of every actor."""
+    """The last parts of the paths, as many as tell all of them apart: ActorsHQ has a Sequence1 of
+    every actor.
+    """
     for parts in range(1, 1 + max(len(path.parts) for path in paths)):
         names = tuple("_".join(path.parts[-parts:]) for path in paths)
         if len(set(names)) == len(names):
@@ -186,7 +201,10 @@ def choose_views(
     cam_from_world: Float[np.ndarray, "v 4 4"],
     choice: Choice = ANY,
 ) -> tuple[list[int], list[int]]:
-    """The views of a person that are inputs, and those to compare with. Raises: ValueError naming the person."""
+    """The views of a person that are inputs, and those to compare with.
+
+    Raises: ValueError naming the person.
+    """
     count, (inputs, indices, reconstructs) = len(frames), choice
     if indices is not None:
         if name not in indices:
@@ -211,7 +229,9 @@ def choose_views(
 def spread_views(
     name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
 ) -> list[int]:
-    """Views of the first view's frame, that one among them, evenly spaced around the person; in order. Raises: ValueError."""
+    """Views of the first view's frame, that one among them, evenly spaced around the person; in
+    order. Raises: ValueError.
+    """
     same = np.flatnonzero(np.asarray(frames) == frames[0])
     if not 1 <= count <= len(same):
         raise ValueError(f"{name}: {count} inputs, but {len(same)} views show the first frame")
@@ -257,7 +277,8 @@ def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
     )
 
 
-# Methods -------------------------------------------------------------------------------------------------------------
+# Methods
+# --------------------------------------------------------------------------------------------------
 
 
 def draw_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Predicted:
@@ -294,7 +315,9 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
 
 def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
-    """Reconstruction from the inputs of a case; networks with a driver are run again for every view."""
+    """Reconstruction from the inputs of a case; networks with a driver are run again for every
+    view.
+    """
 
     def method(case: Case, background: float) -> Predicted:
         if case.inputs is None:
@@ -308,10 +331,12 @@ def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
 
 
 def predictions_method(folder: str | Path, people: int) -> Method:
-    """Images that another program rendered: FOLDER/PERSON/VIEW.png (or .jpg), FOLDER/VIEW.png where there is one person.
+    """Images that another program rendered: FOLDER/PERSON/VIEW.png (or .jpg), FOLDER/VIEW.png where
+    there is one person.
 
-    VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render` numbers them. An alpha channel is
-    the coverage, and the colors are put on the background; without one the image is on the protocol's background already.
+    VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render`
+    numbers them. An alpha channel is the coverage, and the colors are put on the background;
+    without one the image is on the protocol's background already.
     Raises: FileNotFoundError if the folder does not exist.
     """
     root = Path(folder)
@@ -343,7 +368,9 @@ def _predictions_of(case: Case, root: Path, people: int) -> Path:
 
 
 def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | None]:
-    """The image of each view of a case in a folder of predictions; None for those that are not there."""
+    """The image of each view of a case in a folder of predictions; None for those that are not
+    there.
+    """
     place = _predictions_of(case, root, people)
     return {name: _prediction(place, name, i) for i, name in enumerate(case.truth.names)}
 
@@ -386,7 +413,10 @@ def choose_method(
     predictions: str | Path | None = None,
     method: Method | None = None,
 ) -> tuple[str, Method]:
-    """What is asked for, by a name for reports; the shipped weights if nothing is. Raises: ValueError for more than one."""
+    """What is asked for, by a name for reports; the shipped weights if nothing is.
+
+    Raises: ValueError for more than one.
+    """
     given: dict[str, Any] = {
         "avatar": avatar,
         "weights": weights,
@@ -411,7 +441,9 @@ def choose_method(
 
 
 def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
-    """A color for each vertex of the body: the mean photo color over the views that see it, grey where none does."""
+    """A color for each vertex of the body: the mean photo color over the views that see it, grey
+    where none does.
+    """
     body = inputs.body
     rest = shape_body(body, jnp.asarray(inputs.betas))
     size = (inputs.cameras.width, inputs.cameras.height)

@@ -3,8 +3,9 @@
 folder/manifest.json           what all of it is made with, see `data.sets`
 folder/person_NAME_KEY.json    the scores of one person; KEY: a checksum of all that they depend on
 
-The key of a person holds contents, not names: photos, masks, cameras, poses and body, and the weights, avatar or images that
-are compared. Scores of other contents are never taken for those that are asked for.
+The key of a person holds contents, not names: photos, masks, cameras, poses and body, and the
+weights, avatar or images that are compared. Scores of other contents are never taken for those that
+are asked for.
 """
 
 import inspect
@@ -34,7 +35,8 @@ CaseKey = Callable[[Case], str]
 
 
 class KeptScores:
-    """The scores in a folder. ordered: those of a person also depend on who comes before, as the images of a page do.
+    """The scores in a folder. ordered: those of a person also depend on who comes before, as the
+    images of a page do.
 
     Raises: CaptureError for a folder of scores that were made with other settings.
     """
@@ -49,7 +51,9 @@ class KeptScores:
     def __call__(
         self, case: Case, score: Callable[[], dict[str, Any]]
     ) -> tuple[dict[str, Any], bool]:
-        """What there is to say of a person, and whether it was kept; `score` is called where it was not."""
+        """What there is to say of a person, and whether it was kept; `score` is called where it was
+        not.
+        """
         key = checksum({}, self._before, case_key(case), self._method(case))
         if self._ordered:
             self._before = key
@@ -125,7 +129,8 @@ def method_key(
     predictions: str | Path | None,
     method: Method | None,
 ) -> tuple[str, CaseKey]:
-    """What the predictions of all people depend on, as a short text, and what those of one depend on; see `choose_method`.
+    """What the predictions of all people depend on, as a short text, and what those of one depend
+    on; see `choose_method`.
 
     A `method` is known by its name and source alone: not by the values of variables that it reads.
     """
@@ -155,7 +160,8 @@ def _files_key(files: Iterable[Path]) -> str:
 
 
 def _source_key(method: Method) -> str:
-    name = f"{getattr(method, '__module__', '')}.{getattr(method, '__qualname__', type(method).__qualname__)}"
+    qualified = getattr(method, "__qualname__", type(method).__qualname__)
+    name = f"{getattr(method, '__module__', '')}.{qualified}"
     try:
         source = inspect.getsource(method)
     except (OSError, TypeError):  # written in a prompt, or an object that is called

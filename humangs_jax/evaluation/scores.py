@@ -1,12 +1,14 @@
-"""How images are compared: protocols (background, crops, networks, windows, as the papers that report such numbers do it), and
-scores under them: pure jitted functions of one image, and the host's part around them.
+"""How images are compared: protocols (background, crops, networks, windows, as the papers that
+report such numbers do it), and scores under them: pure jitted functions of one image, and the
+host's part around them.
 
-A protocol is data. Crops work on numpy arrays of one image and are the same for truth and prediction: they look at the true mask
-alone.
+A protocol is data. Crops work on numpy arrays of one image and are the same for truth and
+prediction: they look at the true mask alone.
 
-Images are padded below and right to few sizes (`buffers.round_up`) and their own size is passed along, so that an evaluation
-of photos and crops of any sizes compiles few programs. Padding changes no score: windows and pixels beyond the size do not
-count, and LPIPS sees zeros where its convolutions would.
+Images are padded below and right to few sizes (`buffers.round_up`) and their own size is passed
+along, so that an evaluation of photos and crops of any sizes compiles few programs. Padding changes
+no score: windows and pixels beyond the size do not count, and LPIPS sees zeros where its
+convolutions would.
 """
 
 import dataclasses
@@ -54,7 +56,10 @@ class Crop(Protocol):
     def cut(
         self, image: Image, mask: Float[np.ndarray, "h w"], background: float
     ) -> Float[np.ndarray, "y x 3"]:
-        """The part; `background` (0 or 1) fills what lies outside of the image. The mask is not empty."""
+        """The part; `background` (0 or 1) fills what lies outside of the image.
+
+        The mask is not empty.
+        """
         ...
 
 
@@ -81,8 +86,9 @@ class MaskBox:
 
 @dataclasses.dataclass(frozen=True)
 class SquareBox:
-    """The bounding box of the pixels where the mask is not 0, `margin` pixels wider where the image goes on, made a square of
-    background, and resampled to `side` pixels (bilinear, without a filter).
+    """The bounding box of the pixels where the mask is not 0, `margin` pixels wider where the image
+    goes on, made a square of background, and resampled to `side` pixels (bilinear, without a
+    filter).
 
     The box ends before the last row and column plus the margin, as in
     https://github.com/lizhe00/AnimatableGaussians/blob/master/eval/score.py.
@@ -112,9 +118,11 @@ class SquareBox:
 
 @dataclasses.dataclass(frozen=True)
 class CentredWindow:
-    """The image with its longer side brought to `side` pixels, and of that a window of height x width: the bounding box of the
-    pixels where the mask is not 0 in its middle, moved into the image where it leaves it (metrics/compute_metrics.py of
-    https://github.com/humansensinglab/Generalizable-Human-Gaussians). A smaller image is taken whole.
+    """The image with its longer side brought to `side` pixels, and of that a window of height x
+    width: the bounding box of the pixels where the mask is not 0 in its middle, moved into the
+    image where it leaves it (metrics/compute_metrics.py of
+    https://github.com/humansensinglab/Generalizable-Human-Gaussians). A smaller image is taken
+    whole.
     """
 
     height: int = 1000
@@ -142,7 +150,8 @@ class CentredWindow:
 class EvaluationProtocol:
     """One way to compare.
 
-    background: behind the person, in truth and prediction. "dataset": the photos as they are; renderings get white.
+    background: behind the person, in truth and prediction. "dataset": the photos as they are;
+    renderings get white.
     crop: what PSNR and SSIM see. lpips_crop: what LPIPS sees; None: the same.
     masked: predictions are cut out by the true mask first, which hides errors of the silhouette.
     lpips: networks under LPIPS. ssim: its window.
@@ -192,11 +201,14 @@ PROTOCOLS: Presets[EvaluationProtocol] = Presets(
         "lvsm": EvaluationProtocol("dataset"),
     }
 )
-"""By the name of the system whose paper reports such numbers; docs/evaluation.md has them as a table."""
+"""By the name of the system whose paper reports such numbers; docs/evaluation.md has them as a
+table.
+"""
 
 
-# Means: first over the images of a frame, then over the frames of a person, then over people: a person counts once, however often
-# photographed. An interval is of the mean over people; with one person, over the frames; with one frame, over the images.
+# Means: first over the images of a frame, then over the frames of a person, then over people: a
+# person counts once, however often photographed. An interval is of the mean over people; with one
+# person, over the frames; with one frame, over the images.
 
 Row = dict[str, float | None]
 """Scores by name; None for what is missing."""
@@ -215,7 +227,9 @@ class Scored(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """A mean and its interval of `CONFIDENCE`; count: how many of `over` it is of. low and high are None for one."""
+    """A mean and its interval of `CONFIDENCE`; count: how many of `over` it is of. low and high are
+    None for one.
+    """
 
     mean: float
     low: float | None
@@ -238,7 +252,9 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
 
 
 def known_means(rows: Sequence[Row]) -> Row:
-    """Means of the scores over those that have them, such as images with patches; None for what none has."""
+    """Means of the scores over those that have them, such as images with patches; None for what
+    none has.
+    """
     known = {name: [value for row in rows if (value := row[name]) is not None] for name in rows[0]}
     return {name: sum(values) / len(values) if values else None for name, values in known.items()}
 
@@ -261,7 +277,9 @@ def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
 
 
 def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
-    """The mean of each score with its interval, see the head of this module; None for scores that no image has."""
+    """The mean of each score with its interval, see the head of this module; None for scores that
+    no image has.
+    """
     levels = {
         "people": list(person_means(rows).values()),
         "frames": list(_frame_means(rows).values()),
@@ -278,7 +296,9 @@ def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
 
 
 def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, float | None]:
-    """The percentile interval of the mean of some values under resampling (Efron, 1979); (None, None) for one value."""
+    """The percentile interval of the mean of some values under resampling (Efron, 1979); (None,
+    None) for one value.
+    """
     if len(values) < 2:
         return None, None
     generator, numbers = np.random.default_rng(seed), np.asarray(values, np.float64)
@@ -288,7 +308,8 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, flo
     return float(low), float(high)
 
 
-# Scores ---------------------------------------------------------------------------------------------------------------
+# Scores
+# --------------------------------------------------------------------------------------------------
 
 
 PATCH, STRIDE = 64, 32
@@ -309,7 +330,9 @@ def pair_scores(
     size: Int[Array, "2"],
     window: SsimWindow,
 ) -> dict[str, Scalar]:
-    """psnr (dB) and ssim of two images in [0, 1], of which the first size[0] rows and size[1] columns count."""
+    """psnr (dB) and ssim of two images in [0, 1], of which the first size[0] rows and size[1]
+    columns count.
+    """
     rows, columns = (jnp.arange(side) < n for side, n in zip(truth.shape[:2], size, strict=True))
     inside = (rows[:, None] & columns).astype(truth.dtype)
     similarity = mean_similarity(similarity_map(predicted, truth, window), size - window.size + 1)
@@ -325,9 +348,11 @@ def person_scores(
     size: Int[Array, "2"],
     window: SsimWindow,
 ) -> tuple[dict[str, Scalar], Bool[Array, "y x"]]:
-    """psnr_fg, psnr_boundary (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and which patches count.
+    """psnr_fg, psnr_boundary (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and
+    which patches count.
 
-    mask: coverage. band: 1 along its silhouette. Both 0 beyond the size. Without a patch that counts their scores are NaN.
+    mask: coverage. band: 1 along its silhouette. Both 0 beyond the size. Without a patch that
+    counts their scores are NaN.
     """
     shares = _patch_means(mask, PATCH)
     within = [
@@ -377,7 +402,8 @@ def score_image(
 ) -> Row:
     """All scores of one image by name; None for what is not defined here, see `missing_reasons`.
 
-    predicted, truth: in [0, 1], on the protocol's background. mask: the true one. alpha: the prediction's coverage.
+    predicted, truth: in [0, 1], on the protocol's background. mask: the true one. alpha: the
+    prediction's coverage.
     """
     empty = mask is None or not (mask > 0.5).any()
     predicted, window, row = (
@@ -463,7 +489,9 @@ def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
 def missing_reasons(
     protocol: EvaluationProtocol, networks: Networks, masks: bool, alpha: bool
 ) -> dict[str, str]:
-    """Why scores are missing, by name. masks, alpha: whether truths have masks and predictions have alpha."""
+    """Why scores are missing, by name. masks, alpha: whether truths have masks and predictions have
+    alpha.
+    """
     reasons = {}
     for name in score_names(protocol):
         net = name.rpartition("lpips_")[2]
@@ -483,9 +511,11 @@ def score_views(
     alpha: Float[np.ndarray, "v h w"] | None = None,
     networks: Networks | None = None,
 ) -> Iterator[Row]:
-    """The scores of each view of a capture; see `score_image`. predicted: on the protocol's background.
+    """The scores of each view of a capture; see `score_image`. predicted: on the protocol's
+    background.
 
-    Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks that the capture lacks.
+    Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks
+    that the capture lacks.
     """
     if predicted.shape != truth.images.shape:
         raise ValueError(
@@ -515,7 +545,9 @@ def on_background(
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """Means over views. psnr and psnr_fg in dB, ssim by scikit-image, foreground: share of the true mask."""
+    """Means over views. psnr and psnr_fg in dB, ssim by scikit-image, foreground: share of the true
+    mask.
+    """
 
     psnr: float
     ssim: float
@@ -524,7 +556,10 @@ class Scores:
 
 
 def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
-    """Compare images on white with a capture's photos. Raises: ValueError if the capture has no masks."""
+    """Compare images on white with a capture's photos.
+
+    Raises: ValueError if the capture has no masks.
+    """
     if truth.masks is None:
         raise ValueError("the foreground PSNR needs a mask for every view")
     means = mean_scores(score_views(predicted, truth))

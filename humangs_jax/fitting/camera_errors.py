@@ -1,13 +1,15 @@
-"""Whether a calibration is right: a camera that is turned sees all landmarks beside where the other cameras see them, and one
-that is late sees where they were.
+"""Whether a calibration is right: a camera that is turned sees all landmarks beside where the other
+cameras see them, and one that is late sees where they were.
 
-The rotations that would mend it come from linearised bundle adjustment, in which every landmark of every moment is a free point
-(Triggs et al. 2000, "Bundle Adjustment"). Landmarks of a detector err, too, but each its own way: a camera is only named where
-its rotation exceeds several times the standard error that the scatter over landmarks gives (a sandwich estimate, clustered by
-landmark). As few cameras are turned as explain the residuals, because turning all of them explains no more.
+The rotations that would mend it come from linearised bundle adjustment, in which every landmark of
+every moment is a free point (Triggs et al. 2000, "Bundle Adjustment"). Landmarks of a detector err,
+too, but each its own way: a camera is only named where its rotation exceeds several times the
+standard error that the scatter over landmarks gives (a sandwich estimate, clustered by landmark).
+As few cameras are turned as explain the residuals, because turning all of them explains no more.
 
-A camera is late by as many frames as bring its landmarks to those of the others, with all cameras free to turn: a turn explains
-what a shift of a person who moves evenly does, but not limbs that swing. Turns are looked for after that.
+A camera is late by as many frames as bring its landmarks to those of the others, with all cameras
+free to turn: a turn explains what a shift of a person who moves evenly does, but not limbs that
+swing. Turns are looked for after that.
 """
 
 import dataclasses
@@ -28,25 +30,33 @@ from humangs_jax.geometry import quaternion, transform
 
 P = TypeVar("P", Photos, Capture)
 LEAST_DEGREES, MOST_DEGREES = 0.3, 8.0
-"""Smaller errors hardly matter: a third of a degree is 1.5 cm at 3 m. Larger ones are no calibration that is a little off."""
+"""Smaller errors hardly matter: a third of a degree is 1.5 cm at 3 m.
+
+Larger ones are no calibration that is a little off.
+"""
 CLEAR, LEAST_GAIN = 5.0, 25.0
-"""Standard errors, and fall of the cost, from which on a rotation is no chance. A detector that errs alike in all landmarks of a
-view imitates one: on five synthetic people in rooms with exact cameras the cost fell by 5 to 16, on five photos of a man whose
-calibration is off by 32 to 121.
+"""Standard errors, and fall of the cost, from which on a rotation is no chance. A detector that
+errs alike in all landmarks of a view imitates one: on five synthetic people in rooms with exact
+cameras the cost fell by 5 to 16, on five photos of a man whose calibration is off by 32 to 121.
 """
 PRIOR = np.radians(1.0)
 """Expected size of rotations: holds what cameras and points together can do without a residual."""
 ALIKE = 0.9
 """Share of the cost from which on another camera explains as much."""
 ITERATIONS, FRAMES, CAMERAS = 8, 24, 64
-"""Of reweighting; moments that are looked at, at most; with more cameras than this nothing is said."""
+"""Of reweighting; moments that are looked at, at most; with more cameras than this nothing is said.
+"""
 ROBUST_SCALE = 3.0
 """Of residuals, standard deviations."""
 MOST_LATE, TIMED = 3, 12
-"""Frames that a camera may be late or early; frames and cameras with more and fewer than which nothing is said of time."""
+"""Frames that a camera may be late or early; frames and cameras with more and fewer than which
+nothing is said of time.
+"""
 EITHER_WAY = tuple(range(-MOST_LATE, MOST_LATE + 1))
 LATE_SHARE, LATE_CLEAR = 0.15, 4.0
-"""Share of the cost, and standard errors over landmarks, by which a shift in time has to explain more than none."""
+"""Share of the cost, and standard errors over landmarks, by which a shift in time has to explain
+more than none.
+"""
 PARTS = (
     "nose",
     "eye",
@@ -72,9 +82,10 @@ Bundle = tuple[
 
 @dataclasses.dataclass(frozen=True)
 class CameraError:
-    """A camera that is turned or late. views: indices of its views. names: of its first view, and of other cameras that would
-    explain as much. rotation: (3,) axis-angle in the camera's axes that mends it, radians. late: frames by which its photos show
-    what the others have shown; below 0 it is early.
+    """A camera that is turned or late. views: indices of its views. names: of its first view, and
+    of other cameras that would explain as much. rotation: (3,) axis-angle in the camera's axes that
+    mends it, radians. late: frames by which its photos show what the others have shown; below 0 it
+    is early.
     """
 
     views: tuple[int, ...]
@@ -91,13 +102,16 @@ class CameraError:
         """One line."""
         if self.late:
             frames = "1 frame" if abs(self.late) == 1 else f"{abs(self.late)} frames"
-            return f"camera {' or '.join(self.names)} is {frames} {'late' if self.late > 0 else 'early'}"
+            return (
+                f"camera {' or '.join(self.names)} is {frames}"
+                f" {'late' if self.late > 0 else 'early'}"
+            )
         return f"camera {' or '.join(self.names)} is off by {self.degrees:.1f} degrees"
 
 
 def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
-    """The cameras that keypoints show to be late, and those that they show to be turned, those that explain most first; none with
-    fewer than three of them.
+    """The cameras that keypoints show to be late, and those that they show to be turned, those that
+    explain most first; none with fewer than three of them.
     """
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     if not 3 <= camera_of.max() + 1 <= CAMERAS:
@@ -143,7 +157,9 @@ def _turned_cameras(
 
 
 def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
-    """The same photos with cameras turned about their centres as the errors say; late ones stay late."""
+    """The same photos with cameras turned about their centres as the errors say; late ones stay
+    late.
+    """
     rotations = np.zeros((len(photos.names), 3), np.float32)
     for error in errors:
         rotations[list(error.views)] = error.rotation
@@ -154,13 +170,16 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
     return dataclasses.replace(photos, cameras=replace(photos.cameras, cam_from_world=matrices))
 
 
-# Time ----------------------------------------------------------------------------------------------------------------
+# Time
+# --------------------------------------------------------------------------------------------------
 
 
 def _late_cameras(
     photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"]
 ) -> tuple[list[CameraError], Keypoints]:
-    """The cameras that are late, and the keypoints as if they were not; what then has no photo has no certainty."""
+    """The cameras that are late, and the keypoints as if they were not; what then has no photo has
+    no certainty.
+    """
     count, frames, found = int(camera_of.max()) + 1, photos.frame_count, {}
     if count > TIMED or frames < TIMED:
         return [], keypoints
@@ -170,7 +189,9 @@ def _late_cameras(
         return [], keypoints
 
     def shifted(late):
-        """The keypoints of late cameras, {camera: frames by which it is late}, when the others saw the same."""
+        """The keypoints of late cameras, {camera: frames by which it is late}, when the others saw
+        the same.
+        """
         by = np.zeros(count, int)
         by[list(late)] = list(late.values())
         views = view_at[camera_of, np.asarray(photos.frames) + MOST_LATE + by[camera_of]]
@@ -212,7 +233,8 @@ def _late_cameras(
     return errors, shifted(found)
 
 
-# Equations -----------------------------------------------------------------------------------------------------------
+# Equations
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -234,7 +256,9 @@ class _Seen:
         camera_of: Int[np.ndarray, " v"],
         edge: int = 0,
     ) -> "_Seen | None":
-        """None if there is too little to say anything. edge: moments at either end that are left out."""
+        """None if there is too little to say anything. edge: moments at either end that are left
+        out.
+        """
         kinds = [
             name.removeprefix("left_").removeprefix("right_") in PARTS
             for name in keypoints.set.names
@@ -257,8 +281,9 @@ class _Seen:
         )
 
     def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
-        """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and Hessians (k, 3 n, 3 n), in
-        standard deviations, landmark by landmark; the points are eliminated. Outliers are found with all cameras free.
+        """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and
+        Hessians (k, 3 n, 3 n), in standard deviations, landmark by landmark; the points are
+        eliminated. Outliers are found with all cameras free.
         """
         turned, points, weights, _ = self.bundle()
         for _ in range(ITERATIONS):
@@ -266,7 +291,9 @@ class _Seen:
         return gradients, matrices
 
     def bundle(self) -> Bundle:
-        """Rotations (n, 3) and points (m, k, 3) that fit best, weights (m, c, k) of what is no outlier, noise in pixels."""
+        """Rotations (n, 3) and points (m, k, 3) that fit best, weights (m, c, k) of what is no
+        outlier, noise in pixels.
+        """
         turned, points, weights, noise = (
             np.zeros((self.count, 3)),
             self._middle(),
@@ -283,7 +310,9 @@ class _Seen:
         return turned, points, weights, noise
 
     def costs(self, state: Bundle, units: Bundle | None = None) -> Float[np.ndarray, " k"]:
-        """(k,) means of the robust costs of the landmarks of a bundle, in units of its noise, or of another one's."""
+        """(k,) means of the robust costs of the landmarks of a bundle, in units of its noise, or of
+        another one's.
+        """
         noise = (units or state)[3]
         lengths = np.linalg.norm(self._project(*state[:2])[-1], axis=-1) / noise
         total = self.weights.sum((0, 1))
@@ -316,7 +345,9 @@ class _Seen:
     def _project(
         self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
     ) -> tuple[np.ndarray, ...]:
-        """Rotations (m, c, 3, 3), points in the cameras (m, c, k, 3), depths, slopes, focal lengths, and errors (m, c, k, 2)."""
+        """Rotations (m, c, 3, 3), points in the cameras (m, c, k, 3), depths, slopes, focal
+        lengths, and errors (m, c, k, 2).
+        """
         turn = Rotation.from_rotvec(turned).as_matrix()[self.camera]
         rotation = turn @ self.matrices[..., :3, :3]
         shift = np.einsum("mcab,mcb->mca", turn, self.matrices[..., :3, 3])
@@ -343,7 +374,9 @@ class _Seen:
         Float[np.ndarray, "m c k 2"],
         Float[np.ndarray, "m k 3"],
     ]:
-        """Gradients and Hessians at rotations, the residuals, and the points after one more step of Gauss and Newton."""
+        """Gradients and Hessians at rotations, the residuals, and the points after one more step of
+        Gauss and Newton.
+        """
         rotation, local, depth, slope, focal, errors = self._project(turned, points)
         by_local = np.zeros((*depth.shape, 2, 3))
         by_local[..., [0, 1], [0, 1]] = focal / depth[..., None]
@@ -379,7 +412,9 @@ def _solve(
 
 
 class _Solved(NamedTuple):
-    """rotations: (s, 3). gain: by how much the cost falls. clear: standard errors of the last camera's rotation."""
+    """rotations: (s, 3). gain: by how much the cost falls. clear: standard errors of the last
+    camera's rotation.
+    """
 
     rotations: Float[np.ndarray, "s 3"]
     gain: float

@@ -1,16 +1,19 @@
-"""What fits write: fit.npz and fit.json beside the body.npz of a capture, and the folder of a fit to a scan.
+"""What fits write: fit.npz and fit.json beside the body.npz of a capture, and the folder of a fit
+to a scan.
 
 fit.npz, the input of a fit to keypoints and how well its result is known:
 
-    set, names (v,), points (v, k, 2), confidences (v, k)    the keypoints, as `humangs_jax.data.keypoints` stores them
+    set, names (v,), points (v, k, 2), confidences (v, k)    the keypoints, as
+                                                             `humangs_jax.data.keypoints` stores
+                                                             them
     noise (m,)               std of the detections, pixels
     joint_std (m, j)         of the joints' positions, metres
     determined (m, j)        share of the joints' rotations that the views determine
     shape_covariance (s, s)
     places (k, 3), certainty (k,)    of the set, as the fit found them, metres and weights
 
-fit.json is the report (`FitReport.to_json`). The folder of a scan holds body.npz, scan_fit.json (the report and where the scan
-is) and body_in_scan.ply.
+fit.json is the report (`FitReport.to_json`). The folder of a scan holds body.npz, scan_fit.json
+(the report and where the scan is) and body_in_scan.ply.
 """
 
 import dataclasses
@@ -40,7 +43,8 @@ FOUND = ("noise", "joint_std", "determined", "shape_covariance")
 KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
 
 
-# fit.npz -------------------------------------------------------------------------------------------------------------
+# fit.npz
+# --------------------------------------------------------------------------------------------------
 
 
 class UnknownViewError(ValueError):
@@ -115,7 +119,8 @@ def read_fit_record(path: str | Path) -> FitRecord:
         )
 
 
-# Captures ------------------------------------------------------------------------------------------------------------
+# Captures
+# --------------------------------------------------------------------------------------------------
 
 
 def check_place(
@@ -126,10 +131,11 @@ def check_place(
 ) -> Path:
     """The folder that a fit of the capture `source` is written to, checked before the work begins.
 
-    Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced. inputs: further files and
-    folders that the fit reads, None is left out; another folder that is replaced may hold none of them, nor a photo.
-    Raises: ValueError if something would be overwritten without `overwrite`; OSError for a place that cannot be written to; see
-    also `check_replaceable`.
+    Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced.
+    inputs: further files and folders that the fit reads, None is left out; another folder that is
+    replaced may hold none of them, nor a photo.
+    Raises: ValueError if something would be overwritten without `overwrite`; OSError for a place
+    that cannot be written to; see also `check_replaceable`.
     """
     source = capture_folder(source)
     target = source if out is None else Path(out)
@@ -157,9 +163,11 @@ def write_fitted(
     report: FitReport,
     record: FitRecord | None = None,
 ) -> None:
-    """Write cameras and body of a capture: into the capture folder `source` itself, or with its photos into another folder.
+    """Write cameras and body of a capture: into the capture folder `source` itself, or with its
+    photos into another folder.
 
-    Arguments: record: of a fit to keypoints. None: a fit.npz of the source no longer holds; it is left out or removed.
+    Arguments: record: of a fit to keypoints. None: a fit.npz of the source no longer holds; it is
+    left out or removed.
     """
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")
@@ -216,7 +224,8 @@ def _copy(source: Path, folder: Path, file: str) -> None:
     shutil.copyfile(source / file, target)
 
 
-# Scans ---------------------------------------------------------------------------------------------------------------
+# Scans
+# --------------------------------------------------------------------------------------------------
 
 
 def save_scan_fit(
@@ -224,7 +233,8 @@ def save_scan_fit(
 ) -> None:
     """Write body.npz (as in captures), scan_fit.json and body_in_scan.ply; all or nothing.
 
-    Arguments: body_file: where the model comes from, see `Capture`. Raises: see `check_scan_folder`.
+    Arguments: body_file: where the model comes from, see `Capture`. Raises: see
+    `check_scan_folder`.
     """
     check_scan_folder(Path(folder), overwrite)
     pose, align = fit.pose, fit.world_from_scan
@@ -252,5 +262,7 @@ def save_scan_fit(
 def check_scan_folder(
     folder: Path, overwrite: bool, inputs: Iterable[str | Path | None] = ()
 ) -> None:
-    """Raises: ValueError unless the folder is empty, or with `overwrite` a fit to a scan; see also `check_replaceable`."""
+    """Raises: ValueError unless the folder is empty, or with `overwrite` a fit to a scan; see also
+    `check_replaceable`.
+    """
     check_replaceable(folder, overwrite, SCAN_REPORT_FILE, inputs)

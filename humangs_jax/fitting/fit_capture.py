@@ -1,4 +1,6 @@
-"""From photos with cameras and keypoints to a capture with a body: how well it is known, and how it agrees with the keypoints."""
+"""From photos with cameras and keypoints to a capture with a body: how well it is known, and how it
+agrees with the keypoints.
+"""
 
 import dataclasses
 import functools
@@ -47,14 +49,17 @@ from humangs_jax.fitting.residuals.keypoints import (
 from humangs_jax.fitting.swaps import find_exchanged_hands, find_swaps
 
 UNSEEN = 1e-8
-"""Least information about position and orientation; keeps the inverse finite for frames without keypoints."""
+"""Least information about position and orientation; keeps the inverse finite for frames without
+keypoints.
+"""
 
 
 class Uncertainty(NamedTuple):
     """The uncertainty of a fit of m frames.
 
-    joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j) share of the prior's variance of
-    a joint's rotation, mean over axes, that the views remove: 1 all, 0 nothing, as for joints that no keypoint depends on.
+    joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j)
+    share of the prior's variance of a joint's rotation, mean over axes, that the views remove: 1
+    all, 0 nothing, as for joints that no keypoint depends on.
     shape_covariance: (s, s).
     """
 
@@ -101,7 +106,9 @@ def fit_uncertainty(
 def _determined(
     problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]
 ) -> Float[np.ndarray, "m j"]:
-    """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order global_orient, transl, body_pose."""
+    """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order
+    global_orient, transl, body_pose.
+    """
     joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
     left = variances[:, 6:].reshape(len(poses), len(joints), 3)
     std = np.radians(problem.origin.std.global_orient) * np.sqrt(variances[:, :3])
@@ -115,7 +122,9 @@ def _determined(
 def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
-    """Of residuals and joints of each frame by its unknowns: global_orient, transl, body_pose, then the shape."""
+    """Of residuals and joints of each frame by its unknowns: global_orient, transl, body_pose, then
+    the shape.
+    """
     problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
     poses = jnp.concatenate(
         [state.global_orient, state.transl, state.body_pose.reshape(m, -1)], axis=1
@@ -131,16 +140,19 @@ def _derivatives(
         moved = replace(state, betas=vector[p:], **pose)
         found = frame_residuals(problem, seen, moved, ROBUST_SCALES[-1])
         found.pop("shape")
-        return jnp.concatenate(
-            [leaf.ravel() for leaf in found.values()]
-        ), problem.landmarks_and_joints(moved)[1]
+        return (
+            jnp.concatenate([leaf.ravel() for leaf in found.values()]),
+            problem.landmarks_and_joints(moved)[1],
+        )
 
     vectors = jnp.concatenate([poses, jnp.tile(state.betas, (m, 1))], axis=1)
     return jax.lax.map(lambda each: jax.jacfwd(both)(*each), (vectors, observations))
 
 
 OUTLIER = 5.0
-"""Standard deviations of the noise beyond which a keypoint is an outlier: the robust scale of the last stage of a fit."""
+"""Standard deviations of the noise beyond which a keypoint is an outlier: the robust scale of the
+last stage of a fit.
+"""
 
 
 REMEDIES = "`humangs fit` turns it back", "give its photos to other frames"
@@ -163,9 +175,10 @@ class Examination:
 def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = None) -> Examination:
     """Compare the body of a capture with keypoints of its views, in the order of the views.
 
-    Arguments: record: of the fit to these keypoints, if that is known: its noise (default: from the median error), and what
-    the views determine.
-    Raises: ValueError if the number of views differs, the record is of fewer frames, or the body has none of the landmarks.
+    Arguments: record: of the fit to these keypoints, if that is known: its noise (default: from the
+    median error), and what the views determine.
+    Raises: ValueError if the number of views differs, the record is of fewer frames, or the body
+    has none of the landmarks.
     """
     if len(keypoints.points) != capture.view_count:
         raise ValueError(
@@ -176,8 +189,9 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(names)
     ):
         raise ValueError(
-            f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]} joints, but the capture has "
-            f"{capture.frames.max() + 1} and {len(names)}: fit it again"
+            f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]}"
+            f" joints, but the capture has {capture.frames.max() + 1} and {len(names)}: fit it"
+            " again"
         )
     observations, views = group_by_frame(capture, keypoints)
     expected, poses = (
@@ -266,14 +280,17 @@ def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
 FAR_MM = 10.0
 """Millimetres between places of landmarks that are worth a line."""
 FAR = 4.0
-"""A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of half their distance."""
+"""A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of
+half their distance.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedCapture:
     """A fit in memory: the capture with its body, and the record that is stored beside it.
 
-    notes, warnings: of the fit itself. camera_errors: turns of cameras, which the capture's are without.
+    notes, warnings: of the fit itself. camera_errors: turns of cameras, which the capture's are
+    without.
     """
 
     capture: Capture
@@ -300,12 +317,15 @@ def fit_photos(
     smoothness: float = 0.0,
     fixed_cameras: bool = False,
 ) -> FittedCapture:
-    """Find shape and poses of the person in photos, and turn cameras back that the keypoints show to be turned.
+    """Find shape and poses of the person in photos, and turn cameras back that the keypoints show
+    to be turned.
 
-    Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes from, see `Capture`.
-    smoothness: see `fit_landmarks`. fixed_cameras: they stay as they are, as do those that were found from the person.
-    Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or the body's root is not its
-    first joint.
+    Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes
+    from, see `Capture`.
+    smoothness: see `fit_landmarks`. fixed_cameras: they stay as they are, as do those that were
+    found from the person.
+    Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or
+    the body's root is not its first joint.
     """
     if len(keypoints.points) != len(photos.names):
         raise ValueError(
@@ -313,7 +333,8 @@ def fit_photos(
         )
     if body.parents.index(-1) != 0:
         raise ValueError(
-            f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
+            f"body '{body.name}': expected the root to be its first joint, got joint"
+            f" {body.parents.index(-1)}"
         )
     fixed_cameras = (
         fixed_cameras or not photos.calibrated
@@ -364,11 +385,16 @@ def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
         if moved[group] > FAR_MM
     ]
     if far:
-        yield f"the detector sees landmarks beside where the body has them, which is undone: {', '.join(far)}"
+        yield (
+            "the detector sees landmarks beside where the body has them, which is undone:"
+            f" {', '.join(far)}"
+        )
 
 
 def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str]:
-    """Warnings about frames (m, c, k) with few keypoints or a single view. smooth: whether the motion is."""
+    """Warnings about frames (m, c, k) with few keypoints or a single view. smooth: whether the
+    motion is.
+    """
     taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
     for frame, views in enumerate(seen):
         points, cameras = int(views.any(0).sum()), int(views.any(1).sum())
@@ -381,7 +407,9 @@ def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str
 def _motion_warnings(
     joints: Float[np.ndarray, "m j 3"], held: float, smoothness: float
 ) -> Iterator[str]:
-    """Warnings about motion that was to be smooth. held: the smoothness to which accelerations were held."""
+    """Warnings about motion that was to be smooth. held: the smoothness to which accelerations were
+    held.
+    """
     if not smoothness:
         return
     if len(joints) < 3:
@@ -390,8 +418,14 @@ def _motion_warnings(
     if not held:
         yield "smoothness: the keypoints contradict a smooth motion: frames are fitted one by one"
     elif held > 1.5 * smoothness:
-        yield f"smoothness {smoothness:g}: the keypoints contradict it: accelerations are held to {held:g} instead"
+        yield (
+            f"smoothness {smoothness:g}: the keypoints contradict it: accelerations are held to"
+            f" {held:g} instead"
+        )
     off = np.linalg.norm(accelerations(joints), axis=-1).mean(-1) / 2
     around = np.linalg.norm(joints[2:] - joints[:-2], axis=-1).mean(-1)
     for frame in 1 + np.flatnonzero(off > FAR * around / 2 + MOTION_SCALE * smoothness):
-        yield f"frame {frame}: {off[frame - 1]:.2f} m from where the frames beside it would have it: is it somebody else?"
+        yield (
+            f"frame {frame}: {off[frame - 1]:.2f} m from where the frames beside it would have it:"
+            " is it somebody else?"
+        )

@@ -1,14 +1,18 @@
-"""A body through keypoints: rigid, points, body, hands, then all frames together with one shape. Pure; vmap it over people.
+"""A body through keypoints: rigid, points, body, hands, then all frames together with one shape.
+Pure; vmap it over people.
 
     rigid   position and orientation of a resting body, from the best of several starts
     points  body joints and shape against triangulated points; skipped by frames without any
     body    the same against the keypoints of every view
     hands   all joints that a keypoint depends on, with a smaller robust scale
-    person  all frames at once: one shape, the noise that was found, of each landmark too, and, of several frames that several
-            views show, the places at which the detector sees its landmarks
-    motion  where requested, the same with smooth motion, which is expected weakly first: see `smooth_motion`
+    person  all frames at once: one shape, the noise that was found, of each landmark too, and, of
+            several frames that several views show, the places at which the detector sees its
+            landmarks
+    motion  where requested, the same with smooth motion, which is expected weakly first: see
+            `smooth_motion`
 
-The first four are one program that runs with other weights and other free unknowns, because compilation dominates the time.
+The first four are one program that runs with other weights and other free unknowns, because
+compilation dominates the time.
 """
 
 import functools
@@ -59,9 +63,13 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.transform import EXACT
 
 PLACED_FRAMES = 4
-"""With this many frames a fit finds where the detector sees its landmarks: fewer say too little about both shape and places."""
+"""With this many frames a fit finds where the detector sees its landmarks: fewer say too little
+about both shape and places.
+"""
 USUAL_COUNT, LEAST_RATIO = 16, 0.5
-"""Keypoints that what is usual counts for, and its least share, where the noise of a landmark is found."""
+"""Keypoints that what is usual counts for, and its least share, where the noise of a landmark is
+found.
+"""
 ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
 """Of keypoint errors in the stages rigid, points, body, hands and person, standard deviations."""
 STARTS = (4, 2)
@@ -74,10 +82,12 @@ TOLERANCE = 3e-4
 
 @pytree_dataclass
 class LandmarkFit:
-    """A person in m frames. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j, 3) metres.
+    """A person in m frames. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j,
+    3) metres.
 
-    noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's origin. smoothness: () the
-    acceleration that the motion was held to, metres per frame squared; 0: to none. certainty: (k,) of the landmarks.
+    noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's
+    origin. smoothness: () the acceleration that the motion was held to, metres per frame squared;
+    0: to none. certainty: (k,) of the landmarks.
     """
 
     betas: Float[Array, " s"]
@@ -96,9 +106,10 @@ def fit_landmarks(
 ) -> LandmarkFit:
     """Shape and poses of one person.
 
-    Arguments: observations: a batch of m frames, in their order in time where motion is to be smooth. smoothness: expected
-    acceleration of joints, metres per frame squared; 0: frames are independent. The result is finite for all finite observations;
-    frames without keypoints rest in the prior's usual pose, or with smooth motion are interpolated.
+    Arguments: observations: a batch of m frames, in their order in time where motion is to be
+    smooth. smoothness: expected acceleration of joints, metres per frame squared; 0: frames are
+    independent. The result is finite for all finite observations; frames without keypoints rest in
+    the prior's usual pose, or with smooth motion are interpolated.
     """
     fit = _fit_frames(model, observations)
     return (
@@ -150,7 +161,9 @@ def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
 
 
 def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
-    """The problem in which every joint is free that moves a landmark; the others rest in the usual pose."""
+    """The problem in which every joint is free that moves a landmark; the others rest in the usual
+    pose.
+    """
     prior, joints = pose_prior(model.joint_names), tuple(j for j in model.movers if j > 0)
     origin = usual_origin(prior, joints, model.joint_directions.shape[-1])
     return KeypointProblem(model, prior, origin)
@@ -174,7 +187,8 @@ def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
     return jax.tree.map(lambda leaf: leaf[best], states)
 
 
-# The start of a frame ------------------------------------------------------------------------------------------------
+# The start of a frame
+# ------------------------------------------------------------------------------------------------
 
 COARSE = 30.0
 """Robust scale of keypoints while the body rests, standard deviations."""
@@ -189,10 +203,12 @@ def _rigid_starts(
 ) -> FitState:
     """The `kept` best positions and orientations of a resting body, a batch.
 
-    The trunk of a resting body is turned onto triangulated points (Kabsch 1976); the 24 orientations of a cube compete with it.
-    The position for an orientation solves linear equations. The best by keypoints are kept.
+    The trunk of a resting body is turned onto triangulated points (Kabsch 1976); the 24
+    orientations of a cube compete with it. The position for an orientation solves linear equations.
+    The best by keypoints are kept.
 
-    Arguments: points, counts: triangulated landmarks (k, 3) and how many views agree with each (k,), 0: unknown.
+    Arguments: points, counts: triangulated landmarks (k, 3) and how many views agree with each
+    (k,), 0: unknown.
     """
     resting = zero_state(problem.origin)
     landmarks, joints = problem.landmarks_and_joints(resting)
@@ -235,7 +251,9 @@ def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
 def _kabsch(
     a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
 ) -> Float[Array, "3 3"]:
-    """The rotation about weighted centres that takes points a to b best; the identity where nothing is known."""
+    """The rotation about weighted centres that takes points a to b best; the identity where nothing
+    is known.
+    """
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
     u, _, vt = jnp.linalg.svd(
@@ -251,8 +269,8 @@ def _position(
     offsets: Float[Array, "k 3"],
     weights: Float[Array | np.ndarray, " k"],
 ) -> Float[Array, "3"]:
-    """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a detection over the focal
-    length, x (z + t_z) = X + t_x and likewise y, linear in t.
+    """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a
+    detection over the focal length, x (z + t_z) = X + t_x and likewise y, linear in t.
     """
     rotation = observations.cam_from_world[:, :3, :3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
@@ -275,12 +293,16 @@ def _metres_per_pixel(
     return jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4
 
 
-# Stages --------------------------------------------------------------------------------------------------------------
+# Stages
+# --------------------------------------------------------------------------------------------------
 
 
 @pytree_dataclass
 class _Stage:
-    """One run of the solver. views: (k,) weights of keypoints. targets: triangulated points with weights. free: what moves."""
+    """One run of the solver. views: (k,) weights of keypoints.
+
+    targets: triangulated points with weights. free: what moves.
+    """
 
     views: Float[Array, " k"]
     targets: Targets
@@ -333,8 +355,8 @@ def _noise_found(
 def _certainty_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " k"]:
-    """(k,) of landmarks, from the errors of the first stages in the frames that several views show: a robust noise of each pair,
-    over that of all. The fewer there are, the nearer to the usual.
+    """(k,) of landmarks, from the errors of the first stages in the frames that several views show:
+    a robust noise of each pair, over that of all. The fewer there are, the nearer to the usual.
     """
     model, pair = (
         problem.model,
@@ -368,13 +390,16 @@ def _person_residuals(
     return found
 
 
-# Smooth motion -------------------------------------------------------------------------------------------------------
+# Smooth motion
+# --------------------------------------------------------------------------------------------------
 
 MOTION_LEVELS = (64.0, 16.0, 4.0, 1.0)
-"""Multiples of the expected acceleration, one solve each. Weak ones first: frames that one view hardly determines come together
-before anything pulls hard."""
+"""Multiples of the expected acceleration, one solve each. Weak ones first: frames that one view
+hardly determines come together before anything pulls hard."""
 MOTION_SCALE = 5.0
-"""Robust scale of accelerations, multiples of the expected one: a frame that shows somebody else hardly pulls the others."""
+"""Robust scale of accelerations, multiples of the expected one: a frame that shows somebody else
+hardly pulls the others.
+"""
 FEW = 6
 """Keypoints below which a frame's pose is mostly the prior's. Smooth motion interpolates it."""
 
@@ -390,10 +415,11 @@ def smooth_motion(
 
     Arguments: observations: those of the fit. fit: without smooth motion, of at least three frames.
 
-    The result is that of the last of `MOTION_LEVELS` which follows the keypoints of every frame as well as the fit does, up to
-    their noise: the robust cost of a frame may exceed the fit's by the number of its unknowns. That is twice what the true pose
-    exceeds it by on average, because a fit with p unknowns takes up p of the squared normal errors and half of them are the cost.
-    If no level does, the fit itself.
+    The result is that of the last of `MOTION_LEVELS` which follows the keypoints of every frame as
+    well as the fit does, up to their noise: the robust cost of a frame may exceed the fit's by the
+    number of its unknowns. That is twice what the true pose exceeds it by on average, because a fit
+    with p unknowns takes up p of the squared normal errors and half of them are the cost. If no
+    level does, the fit itself.
     """
     problem = keypoint_problem(replace(model, certainty=fit.certainty))
     seen = replace(observations, noise=fit.noise)
@@ -442,7 +468,9 @@ def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) ->
 
 
 def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> FitState:
-    """The state with the poses of frames that show nothing interpolated between their nearest neighbours that show something."""
+    """The state with the poses of frames that show nothing interpolated between their nearest
+    neighbours that show something.
+    """
     m = len(seen.noise)
     shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW
     frames = jnp.arange(m)

@@ -1,20 +1,27 @@
-"""Cameras around a person from landmarks alone: a start from the detector's 3D landmarks, then bundle adjustment.
+"""Cameras around a person from landmarks alone: a start from the detector's 3D landmarks, then
+bundle adjustment.
 
-A detector that sees one photo gives landmarks in metres in the axes of that photo's camera, as if the camera looked straight at
-the person. Their depths are guesses, 5 to 10 cm off, and the whole is turned by up to 20 degrees. Rotations that bring those of
-several photos together (generalised Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478) are a start. Bundle adjustment then
-needs the pixels only; the 3D landmarks keep the size, and what pixels leave open.
+A detector that sees one photo gives landmarks in metres in the axes of that photo's camera, as if
+the camera looked straight at the person. Their depths are guesses, 5 to 10 cm off, and the whole is
+turned by up to 20 degrees. Rotations that bring those of several photos together (generalised
+Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478) are a start. Bundle adjustment then needs
+the pixels only; the 3D landmarks keep the size, and what pixels leave open.
 
-What is minimised is half the square sum of these residuals, with X = R_v L_k, p = X + t_v, u = (p_x, p_y) / p_z:
+What is minimised is half the square sum of these residuals, with X = R_v L_k, p = X + t_v, u =
+(p_x, p_y) / p_z:
 
-    pixels  sqrt(w) rho((f_v u - x) / noise_v)       rho(q) = q s / sqrt(s^2 + |q|^2), Geman and McClure
-    world   sqrt(w) (X - mean_v(X) - W) / WORLD      W: the detector's 3D landmarks; means are weighted by w
-    size    (log r(X) - log r(W)) / SIZE             r: the root of all views' weighted mean square distances from the mean
+    pixels  sqrt(w) rho((f_v u - x) / noise_v)       rho(q) = q s / sqrt(s^2 + |q|^2), Geman and
+                                                     McClure
+    world   sqrt(w) (X - mean_v(X) - W) / WORLD      W: the detector's 3D landmarks; means are
+                                                     weighted by w
+    size    (log r(X) - log r(W)) / SIZE             r: the root of all views' weighted mean square
+                                                     distances from the mean
     bones   (|left bone| - |right bone|) / BONES
     focal   y_g, with f_v = f0_v exp(std_v y_g)      one y for each kind of camera
 
-A pixel depends on one landmark, one camera and one y. So the landmarks are eliminated (Schur complement: Triggs et al. 2000,
-"Bundle adjustment: a modern synthesis", section 6.1); what is left is a small system of the cameras.
+A pixel depends on one landmark, one camera and one y. So the landmarks are eliminated (Schur
+complement: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6.1); what is left
+is a small system of the cameras.
 
 On the host in float64: every number of photos would be another program to compile.
 """
@@ -30,23 +37,31 @@ from humangs_jax.core.array_types import Float, Int
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
 WORLD = 0.15
-"""Std of the detector's 3D landmarks, metres, shared errors included: pixels decide where several views see them."""
+"""Std of the detector's 3D landmarks, metres, shared errors included: pixels decide where several
+views see them.
+"""
 BONES = 0.01
 """Std of the difference of left and right bones, metres."""
 SIZE = 0.01
-"""Std of the logarithm of the person's size against the detector's 3D landmarks: what keeps the scale."""
+"""Std of the logarithm of the person's size against the detector's 3D landmarks: what keeps the
+scale.
+"""
 ROBUST_SCALES = (40.0, 6.0)
 """Of pixels, standard deviations: the start is off by tens of them."""
 STEPS = 60
 """Of Levenberg and Marquardt for each robust scale, at most, rejected ones included."""
 EXACT, COARSE = 1e-9, 1e-3
-"""Relative decrease of the cost that ends the search: of a result, and where costs are only compared."""
+"""Relative decrease of the cost that ends the search: of a result, and where costs are only
+compared.
+"""
 DAMPING = 1e-3
 """Share of the diagonal of the normal equations that is added to it at first."""
 STILL = 1e-6
 """Added to that diagonal: what no residual moves stays where it is."""
 FURTHEST = 5.0
-"""Largest logarithm of the change of a depth in one step, and of a focal length in all, as multiples of e."""
+"""Largest logarithm of the change of a depth in one step, and of a focal length in all, as
+multiples of e.
+"""
 ALTERNATIONS = 20
 """Of turns and mean shape: a mean of ten photos is still by then."""
 VIEW = 9
@@ -55,11 +70,12 @@ VIEW = 9
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """Landmarks of a person in c photos. points: (c, k, 2) pixels from the principal point. weights: (c, k). noise: (c,) pixels.
+    """Landmarks of a person in c photos. points: (c, k, 2) pixels from the principal point.
+    weights: (c, k). noise: (c,) pixels.
 
-    world: (c, k, 3) metres in camera axes about their weighted mean, all of one size. focal: (c,) pixels; focal_std: (c,) of
-    its logarithm. kinds: (c,) from 0: cameras of one kind keep the ratio of their focal lengths. bones: (b, 2, 2) landmarks of
-    left bones and of their right partners.
+    world: (c, k, 3) metres in camera axes about their weighted mean, all of one size. focal: (c,)
+    pixels; focal_std: (c,) of its logarithm. kinds: (c,) from 0: cameras of one kind keep the ratio
+    of their focal lengths. bones: (b, 2, 2) landmarks of left bones and of their right partners.
     """
 
     points: Float[np.ndarray, "c k 2"]
@@ -74,7 +90,8 @@ class Evidence:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rig:
-    """c cameras about a person. landmarks: (k, 3) metres. rotations: (c, 3, 3) and places: (c, 3) take them to camera axes.
+    """c cameras about a person. landmarks: (k, 3) metres. rotations: (c, 3, 3) and places: (c, 3)
+    take them to camera axes.
 
     focal: (c,) pixels.
     """
@@ -85,14 +102,15 @@ class Rig:
     focal: Float[np.ndarray, " c"]
 
 
-# The start -----------------------------------------------------------------------------------------------------------
+# The start
+# --------------------------------------------------------------------------------------------------
 
 
 def align_views(
     worlds: Float[np.ndarray, "c k 3"], weights: Float[np.ndarray, "c k"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "c 3 3"]]:
-    """Generalised Kabsch: the mean shape (k, 3) of landmarks that are turned together, and the rotations (c, 3, 3) from it to
-    each view's axes.
+    """Generalised Kabsch: the mean shape (k, 3) of landmarks that are turned together, and the
+    rotations (c, 3, 3) from it to each view's axes.
     """
     shape, rotations = (
         worlds[int(np.argmax(weights.sum(1)))],
@@ -110,8 +128,8 @@ def turns_onto(
     worlds: Float[np.ndarray, "c k 3"],
     weights: Float[np.ndarray, "c k"],
 ) -> Float[np.ndarray, "c 3 3"]:
-    """The rotations (c, 3, 3) that bring a shape onto the landmarks of each view best (Kabsch 1976); of points on a line, one of
-    those.
+    """The rotations (c, 3, 3) that bring a shape onto the landmarks of each view best (Kabsch
+    1976); of points on a line, one of those.
     """
     share = weights / weights.sum(1, keepdims=True)
     source = shape - (share @ shape)[:, None]
@@ -127,8 +145,9 @@ def place_person(
     offsets: Float[np.ndarray, "k 3"],
     focal: float,
 ) -> Float[np.ndarray, "3"]:
-    """Where landmarks at `offsets`, in camera axes, have to be put to project to their pixels: with (x, y) a pixel over the focal
-    length, x (z + t_z) = X + t_x and likewise y, linear in t. By the person's size where that puts it behind the camera.
+    """Where landmarks at `offsets`, in camera axes, have to be put to project to their pixels: with
+    (x, y) a pixel over the focal length, x (z + t_z) = X + t_x and likewise y, linear in t. By the
+    person's size where that puts it behind the camera.
     """
     xy = points / focal
     rows = np.zeros((*xy.shape, 3))
@@ -147,14 +166,16 @@ def place_person(
     return np.asarray([*(share @ (xy * distance - offsets[:, :2])), distance])
 
 
-# Residuals -----------------------------------------------------------------------------------------------------------
+# Residuals
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rows:
     """Residuals of a rig.
 
-    seen: (c, k, 5) pixels and world, of a landmark in a view. tied: (t,) size and bones, which tie landmarks to each other.
+    seen: (c, k, 5) pixels and world, of a landmark in a view. tied: (t,) size and bones, which tie
+    landmarks to each other.
     focal: (g,) the logarithms of the kinds' factors, standard deviations.
     """
 
@@ -172,7 +193,8 @@ class Rows:
 class Derivatives:
     """Of the residuals; see `moved` for the unknowns.
 
-    by_landmark: of `seen`, by their landmark. by_view: by turn, place and mean of their view. by_focal: by the y of its kind.
+    by_landmark: of `seen`, by their landmark. by_view: by turn, place and mean of their view.
+    by_focal: by the y of its kind.
     tied: (t, k, 3) of `tied`, by all landmarks. Those of `focal` by y are 1.
     """
 
@@ -208,12 +230,15 @@ def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
 
 
 def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
-    """Of `residuals`, with the mean of a view as an unknown of its own, which does not change the minimum."""
+    """Of `residuals`, with the mean of a view as an unknown of its own, which does not change the
+    minimum.
+    """
     root, turned = np.sqrt(evidence.weights)[..., None, None], _turned(rig)
     c, k = evidence.weights.shape
     by_turn = -_cross(turned)  # a small turn by w moves X by w x X
 
-    # d p / d place, for the changes of `moved`: sideways over the depth twice, and the logarithm of the depth
+    # d p / d place, for the changes of `moved`: sideways over the depth twice, and the logarithm of
+    # the depth
     by_place = np.zeros((c, 3, 3))
     by_place[:, 0, 0] = by_place[:, 1, 1] = rig.places[:, 2]
     by_place[:, :, 2] = rig.places
@@ -256,7 +281,9 @@ def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
 def _tied(
     evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "c k 3"]
 ) -> Float[np.ndarray, "t k 3"]:
-    """d log r / d L = the sum over views of share R^T (X - mean) / r^2, and of bones d |a - b| / d a = (a - b) / |a - b|."""
+    """d log r / d L = the sum over views of share R^T (X - mean) / r^2, and of bones d |a - b| / d
+    a = (a - b) / |a - b|.
+    """
     share = _shares(evidence)
     centered = turned - np.sum(share * turned, axis=1, keepdims=True)
     square = np.sum(share * centered**2) + 1e-12
@@ -298,13 +325,15 @@ def _cross(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     return out - np.swapaxes(out, -1, -2)
 
 
-# Adjustment ----------------------------------------------------------------------------------------------------------
+# Adjustment
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Step:
-    """A change of a rig. landmarks: (k, 3) metres. views: (c, 9): turn (radians), place (sideways over the depth, twice, and the
-    logarithm of the depth), and the mean of the view, which follows from the rest. focal: (g,) of the y of each kind.
+    """A change of a rig. landmarks: (k, 3) metres. views: (c, 9): turn (radians), place (sideways
+    over the depth, twice, and the logarithm of the depth), and the mean of the view, which follows
+    from the rest. focal: (g,) of the y of each kind.
     """
 
     landmarks: Float[np.ndarray, "k 3"]
@@ -337,9 +366,11 @@ def adjust(
     tolerance: float = EXACT,
     scales: Sequence[float] = ROBUST_SCALES,
 ) -> tuple[Rig, float]:
-    """Bundle adjustment by Levenberg and Marquardt: the cameras, and half the square sum of the residuals.
+    """Bundle adjustment by Levenberg and Marquardt: the cameras, and half the square sum of the
+    residuals.
 
-    Arguments: tolerance: relative decrease of the cost that ends the search. scales: robust ones, one search after the other.
+    Arguments: tolerance: relative decrease of the cost that ends the search. scales: robust ones,
+    one search after the other.
     """
     rig, cost = start, np.inf
     for scale in scales:
@@ -348,7 +379,10 @@ def adjust(
 
 
 def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tuple[Rig, float]:
-    """With one robust scale. The damping follows Nielsen 1999, as Madsen, Nielsen and Tingleff 2004, algorithm 3.16."""
+    """With one robust scale.
+
+    The damping follows Nielsen 1999, as Madsen, Nielsen and Tingleff 2004, algorithm 3.16.
+    """
     rows = residuals(evidence, rig, scale)
     normal = normal_equations(evidence, rows, derivatives(evidence, rig, scale))
     damping, growth = DAMPING, 2.0
@@ -373,9 +407,11 @@ def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tu
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """J^T J and J^T r in blocks, of `seen` and `focal`: landmarks (k, 3, 3), cameras (m, m) with m = 9 c + g, and between them.
+    """J^T J and J^T r in blocks, of `seen` and `focal`: landmarks (k, 3, 3), cameras (m, m) with m
+    = 9 c + g, and between them.
 
-    tied: (t, k, 3) derivatives of the rows that tie landmarks, and their residuals (t,), which stay rows.
+    tied: (t, k, 3) derivatives of the rows that tie landmarks, and their residuals (t,), which stay
+    rows.
     """
 
     landmarks: Float[np.ndarray, "k 3 3"]
@@ -433,13 +469,15 @@ def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalE
 def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     """The damped step of Gauss and Newton, and the decrease of the cost that it expects.
 
-    With l the landmarks, q the cameras, U the tied rows, r their residuals, and t = U l + r as unknowns of their own:
+    With l the landmarks, q the cameras, U the tied rows, r their residuals, and t = U l + r as
+    unknowns of their own:
 
         D l + E q + U^T t = -a                  D block diagonal: landmarks by landmark
         E^T l + C q       = -b
         U l         - t   = -r
 
-    With F = (E, U^T) and K = diag(C, -1), l = -D^-1 (a + F (q, t)) leaves (K - F^T D^-1 F) (q, t) = F^T D^-1 a - (b, r).
+    With F = (E, U^T) and K = diag(C, -1), l = -D^-1 (a + F (q, t)) leaves (K - F^T D^-1 F) (q, t) =
+    F^T D^-1 a - (b, r).
     """
     k, ties, m = len(normal.landmarks), len(normal.tied_rows), len(normal.by_cameras)
     diagonal = np.einsum("kaa->ka", normal.landmarks)

@@ -1,7 +1,8 @@
 """Cameras of photos of one moment, from the person in them: no calibration, no board.
 
-Where the cameras stand is known up to a similarity. Size and axes come from the person: metres by the detector's 3D landmarks, or
-by the person's height where that is given; y up by the cameras, which people hold level, and by the body.
+Where the cameras stand is known up to a similarity. Size and axes come from the person: metres by
+the detector's 3D landmarks, or by the person's height where that is given; y up by the cameras,
+which people hold level, and by the body.
 
 Which photos are of that moment, and the cameras up to that similarity: `person_moments`.
 """
@@ -49,9 +50,11 @@ STATURE = 1.52
 class PersonCameras:
     """Cameras around a person who stands on y = 0 at x = z = 0, facing +z.
 
-    views: photos that are used. The rest is of these: cameras: one of each. landmarks: (c, k, 3) metres, of the person in each.
-    moments: 1, or as many as photos: then each camera stands in a world of its own. mirrored: (c,) whether the detector exchanged
-    left and right. errors: (c,) median distance of landmarks from their pixels, pixels. warnings: what a user should know.
+    views: photos that are used. The rest is of these: cameras: one of each. landmarks: (c, k, 3)
+    metres, of the person in each.
+    moments: 1, or as many as photos: then each camera stands in a world of its own. mirrored: (c,)
+    whether the detector exchanged left and right. errors: (c,) median distance of landmarks from
+    their pixels, pixels. warnings: what a user should know.
     """
 
     views: tuple[int, ...]
@@ -64,12 +67,15 @@ class PersonCameras:
 
 
 def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> PersonCameras:
-    """Cameras of photos from the person in them: of one moment, if one set of landmarks explains them all, else each on its own.
+    """Cameras of photos from the person in them: of one moment, if one set of landmarks explains
+    them all, else each on its own.
 
     One photo of many that contradicts the others is left out.
 
-    Arguments: height: of the person without shoes, metres. Without it the person has the size of the detector's 3D landmarks.
-    Raises: ValueError naming the photo, if one shows too little of the person, or where no camera is found.
+    Arguments: height: of the person without shoes, metres. Without it the person has the size of
+    the detector's 3D landmarks.
+    Raises: ValueError naming the photo, if one shows too little of the person, or where no camera
+    is found.
     """
     _check(seen, height)
     seen = cleaned(seen)
@@ -101,7 +107,8 @@ def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCam
     rig = trial.rig
     if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):
         raise ValueError(
-            f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the person"
+            f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the"
+            " person"
         )
     medians = np.asarray(
         [np.median(e[w > SEEN]) for e, w in zip(trial.pixels, trial.evidence.weights, strict=True)]
@@ -115,7 +122,8 @@ def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCam
     return PersonCameras(views, cameras, every, trial.mirrored, 1, medians, warnings)
 
 
-# What is given -------------------------------------------------------------------------------------------------------
+# What is given
+# --------------------------------------------------------------------------------------------------
 
 
 def _check(seen: PersonViews, height: float | None) -> None:
@@ -134,7 +142,8 @@ def _check(seen: PersonViews, height: float | None) -> None:
     for photo, points, visible in zip(seen.photos, seen.points, known_landmarks(seen), strict=True):
         if visible.sum() < FEWEST:
             raise ValueError(
-                f"{photo}: {visible.sum()} landmarks of the person are seen, expected {FEWEST} or more"
+                f"{photo}: {visible.sum()} landmarks of the person are seen, expected {FEWEST} or"
+                " more"
             )
         if np.ptp(points[visible], axis=0).max() < SMALLEST:
             raise ValueError(
@@ -150,13 +159,16 @@ def _check(seen: PersonViews, height: float | None) -> None:
             )
 
 
-# The world -----------------------------------------------------------------------------------------------------------
+# The world
+# --------------------------------------------------------------------------------------------------
 
 
 def _in_world(
     seen: PersonViews, rig: Rig, height: float | None
 ) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
-    """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this height."""
+    """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this
+    height.
+    """
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
     names = seen.names
     hips, shoulders, ankles = (
@@ -203,15 +215,23 @@ def _warnings(
     seen: PersonViews, mirrored: Bool[np.ndarray, " c"], height: float | None
 ) -> Iterator[str]:
     if height is None:
-        yield "the person's height is not given: lengths are a detector's guess, often 6 to 11 % too small"
+        yield (
+            "the person's height is not given: lengths are a detector's guess, often 6 to 11 % too"
+            " small"
+        )
     if not np.isfinite(seen.focal).any():
-        yield f"no photo says its focal length: {USUAL_FOCAL:.0f} mm of 35-mm film, give or take {USUAL_STD:.0%}, is supposed"
+        yield (
+            f"no photo says its focal length: {USUAL_FOCAL:.0f} mm of 35-mm film, give or take"
+            f" {USUAL_STD:.0%}, is supposed"
+        )
     for photo in np.asarray(seen.photos, object)[mirrored]:
         yield f"{photo}: the detector exchanged left and right; they are changed back"
 
 
 def scaled_to_height(capture: Capture, height: float) -> Capture:
-    """A capture in which the person is so tall at rest, metres: cameras, places and shape change alike; photos show the same."""
+    """A capture in which the person is so tall at rest, metres: cameras, places and shape change
+    alike; photos show the same.
+    """
     betas = np.asarray(capture.betas, np.float64)
     before = shape_body(capture.body, jnp.asarray(betas, jnp.float32))
     heights = np.asarray(before.vertices)[:, 1]

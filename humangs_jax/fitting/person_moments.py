@@ -1,10 +1,12 @@
-"""Whether photos of a person are of one moment, and the cameras about that moment, from the person's landmarks.
+"""Whether photos of a person are of one moment, and the cameras about that moment, from the
+person's landmarks.
 
-A detector that takes a back for a front exchanges left and right of a whole view. The other views tell: each view is mirrored on
-trial. That all are mirrored is told by the body, whose toes and nose are in front.
+A detector that takes a back for a front exchanges left and right of a whole view. The other views
+tell: each view is mirrored on trial. That all are mirrored is told by the body, whose toes and nose
+are in front.
 
-A trial is an adjustment with some views mirrored. While trials are compared they are as exact as that needs; the one that is
-taken is then made as exact as it can be.
+A trial is an adjustment with some views mirrored. While trials are compared they are as exact as
+that needs; the one that is taken is then made as exact as it can be.
 """
 
 import dataclasses
@@ -31,31 +33,41 @@ from humangs_jax.fitting.residuals.keypoints import NOISE, OUTER, in_camera_axes
 from humangs_jax.io.images import DIAGONAL_35MM
 
 USUAL_FOCAL, USUAL_STD, EXIF_STD = 29.0, 0.2, 0.03
-"""35-mm equivalent of a telephone's main camera, mm, and stds of the logarithm of focal lengths: supposed, and of EXIF."""
+"""35-mm equivalent of a telephone's main camera, mm, and stds of the logarithm of focal lengths:
+supposed, and of EXIF.
+"""
 SEEN, FEWEST = 0.1, 6
 """Least visibility of a landmark that counts, and least number of those in a photo."""
 SMALLEST = 16.0
 """Pixels: a person who is smaller in a photo is a point."""
 LEAST_ANGLE = 4.0
-"""Degrees between the directions from which photos see the person; below it they are taken one by one."""
+"""Degrees between the directions from which photos see the person; below it they are taken one by
+one.
+"""
 CLEARLY = 0.7
 """A view is mirrored if the cost is then less than this share of what it is without."""
 ONE_MOMENT = 0.02
-"""Rms distance of the landmarks from the person's points, a share of the person's size in the photo, up to which the photos show
-one moment. Measured on a man in a laboratory: 7 moments, four cameras each, 0.007 to 0.014; photos of several moments 0.045 to
-0.073, with one photo of another moment among four 0.033."""
+"""Rms distance of the landmarks from the person's points, a share of the person's size in the
+photo, up to which the photos show one moment. Measured on a man in a laboratory: 7 moments, four
+cameras each, 0.007 to 0.014; photos of several moments 0.045 to 0.073, with one photo of another
+moment among four 0.033."""
 DOUBTFUL = 0.012
-"""The same distance above which mirrorings are also tried from the other end, all views mirrored. Detections of one moment with
-an error of 3 pixels of 900 leave 0.004 to 0.007, a mirrored view 0.02 and more."""
+"""The same distance above which mirrorings are also tried from the other end, all views mirrored.
+Detections of one moment with an error of 3 pixels of 900 leave 0.004 to 0.007, a mirrored view 0.02
+and more."""
 FEWEST_WITHOUT, MOMENT_WITHOUT = 4, 0.015
-"""Photos of which one may be left out because it contradicts the others, and the distance up to which these are of one moment:
-three of four photos of several moments leave 0.021 or more."""
+"""Photos of which one may be left out because it contradicts the others, and the distance up to
+which these are of one moment: three of four photos of several moments leave 0.021 or more."""
 FAR = 0.2
 """Share of the person's size; errors above count as this one."""
 DECIDING = 8
-"""Photos that decide between one moment and several, at most; others are compared with what these say."""
+"""Photos that decide between one moment and several, at most; others are compared with what these
+say.
+"""
 ANOTHER_MOMENT = 0.03
-"""Rms distance of the landmarks of one such photo, a share of the person's size, above which it shows another moment."""
+"""Rms distance of the landmarks of one such photo, a share of the person's size, above which it
+shows another moment.
+"""
 BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 
 
@@ -63,9 +75,10 @@ BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "a
 class PersonViews:
     """What a detector sees of one person in c photos of one moment.
 
-    points: (c, k, 2) pixels, centres at +0.5. visibility: (c, k) in [0, 1]; 0: not seen. world: (c, k, 3) metres about the
-    middle of the hips in the camera's axes (x right, y down, z away), as if the camera looked straight at the person. names: of
-    the landmarks, see `KeypointSet`. sizes: (width, height) of the photos, pixels. focal: (c,) pixels, NaN where unknown.
+    points: (c, k, 2) pixels, centres at +0.5. visibility: (c, k) in [0, 1]; 0: not seen. world: (c,
+    k, 3) metres about the middle of the hips in the camera's axes (x right, y down, z away), as if
+    the camera looked straight at the person. names: of the landmarks, see `KeypointSet`. sizes:
+    (width, height) of the photos, pixels. focal: (c,) pixels, NaN where unknown.
     photos: their names.
     """
 
@@ -103,12 +116,15 @@ def cleaned(seen: PersonViews) -> PersonViews:
     )
 
 
-# What explains the photos --------------------------------------------------------------------------------------------
+# What explains the photos
+# --------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """Cameras if these views are mirrored. cost: of the adjustment. error: see `_relative_error`."""
+    """Cameras if these views are mirrored. cost: of the adjustment. error: see
+    `_relative_error`.
+    """
 
     mirrored: Bool[np.ndarray, " c"]
     rig: Rig
@@ -136,7 +152,8 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Explanation:
-    """What explains the landmarks of photos. trial: cameras of `views` about one person; None: each photo stands alone.
+    """What explains the landmarks of photos. trial: cameras of `views` about one person; None: each
+    photo stands alone.
 
     views: all photos, or all but one. warnings: what a user should know of it.
     """
@@ -147,7 +164,9 @@ class Explanation:
 
 
 def explain(seen: PersonViews) -> Explanation:
-    """Whether one person in one pose explains all photos, all but one of them, or none of them together."""
+    """Whether one person in one pose explains all photos, all but one of them, or none of them
+    together.
+    """
     every = tuple(range(len(seen.photos)))
 
     # a few photos decide
@@ -174,7 +193,10 @@ def explain(seen: PersonViews) -> Explanation:
             if len(views) == len(every)
             else ", ".join(seen.photos[view] for view in views)
         )
-        side = f"{which} are from one side (directions differ by {angle:.1f} degrees, expected {LEAST_ANGLE:.0f} or more)"
+        side = (
+            f"{which} are from one side (directions differ by {angle:.1f} degrees, expected"
+            f" {LEAST_ANGLE:.0f} or more)"
+        )
         return Explanation(None, every, (f"{side}: each photo stands for itself",))
 
     out = [seen.photos[view] for view in every if view not in views]
@@ -201,7 +223,9 @@ def _without_one(
 def _with_others(
     seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
 ) -> tuple[Trial, tuple[int, ...]]:
-    """Cameras of further photos, too: of those that show the person of the trial, mirrored or not."""
+    """Cameras of further photos, too: of those that show the person of the trial, mirrored or
+    not.
+    """
     mirrored = dict(zip(views, trial.mirrored, strict=True))
     for view in under_bar(others, "cameras of further photos"):
         pair = seen.select([*views, view])
@@ -214,7 +238,9 @@ def _with_others(
 
 
 def _different(seen: PersonViews) -> tuple[int, ...]:
-    """Up to `DECIDING` photos, from sides that differ: always the one that is farthest from all that were chosen."""
+    """Up to `DECIDING` photos, from sides that differ: always the one that is farthest from all
+    that were chosen.
+    """
     count = len(seen.photos)
     if count <= DECIDING:
         return tuple(range(count))
@@ -233,7 +259,8 @@ def under_bar(items: Sequence[Any], what: str) -> Iterator[Any]:
     yield from bar(items, desc=what, leave=False, shown=watched() and len(items) > 1)
 
 
-# Trials --------------------------------------------------------------------------------------------------------------
+# Trials
+# --------------------------------------------------------------------------------------------------
 
 
 def best_trial(seen: PersonViews) -> Trial:
@@ -276,7 +303,9 @@ def _polished(trial: Trial) -> Trial:
 
 
 def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
-    """Rms of errors (c, k), by degrees of freedom where there are any: points and cameras were fitted to them."""
+    """Rms of errors (c, k), by degrees of freedom where there are any: points and cameras were
+    fitted to them.
+    """
     views, shown = len(errors), weights.max(0) > SEEN
     numbers = 2 * (weights > SEEN).sum()
     left = max(numbers - 3 * shown.sum() - 6 * views + 7, numbers / 4)
@@ -296,15 +325,18 @@ def _directions(rig: Rig) -> Float[np.ndarray, "c 3"]:
     return -np.einsum("cba,cb->ca", rig.rotations, places)
 
 
-# Evidence ------------------------------------------------------------------------------------------------------------
+# Evidence
+# --------------------------------------------------------------------------------------------------
 
 
 def _focal_lengths(
     seen: PersonViews,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Int[np.ndarray, " c"]]:
-    """Focal lengths (c,), stds of their logarithms, and kinds of cameras; photos without one are like the others, or as usual.
+    """Focal lengths (c,), stds of their logarithms, and kinds of cameras; photos without one are
+    like the others, or as usual.
 
-    Lengths of EXIF share one factor. Those of photos without share another, photos of one size taken for those of one camera.
+    Lengths of EXIF share one factor. Those of photos without share another, photos of one size
+    taken for those of one camera.
     """
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)
@@ -363,7 +395,8 @@ def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
     return np.asarray(rows, int).reshape(-1, 2, 2)
 
 
-# The body ------------------------------------------------------------------------------------------------------------
+# The body
+# --------------------------------------------------------------------------------------------------
 
 
 def middle_of(

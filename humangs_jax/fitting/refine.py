@@ -1,7 +1,9 @@
-"""Cameras, shape and poses refined against silhouettes and keypoints: kept only if the score is better.
+"""Cameras, shape and poses refined against silhouettes and keypoints: kept only if the score is
+better.
 
-As in iterated closest points, each iteration matches the rendered silhouette with the mask's and solves a few steps of damped
-least squares. `StateStd` is a Gaussian prior around the start: without it cameras and people could move together.
+As in iterated closest points, each iteration matches the rendered silhouette with the mask's and
+solves a few steps of damped least squares. `StateStd` is a Gaussian prior around the start: without
+it cameras and people could move together.
 """
 
 import dataclasses
@@ -61,13 +63,15 @@ from humangs_jax.geometry.camera import Camera
 LEAST_NOISE = 0.7
 """Pixels: silhouettes of masks are no better."""
 LM_UNKNOWNS = 400
-"""With more unknowns L-BFGS replaces least squares, whose Jacobian grows with rows times columns."""
+"""With more unknowns L-BFGS replaces least squares, whose Jacobian grows with rows times columns.
+"""
 PATIENCE = 6
 """Steps of L-BFGS for one of least squares."""
 STEPS, LONGEST_SIDE = 4, 512
 """Of the solver in a round; pixels to which larger photos are shrunk."""
 REACH = (0.08, 0.015)
-"""How far points look in the first and the last round, shares of the person's height in the image."""
+"""How far points look in the first and the last round, shares of the person's height in the image.
+"""
 KEYPOINT_SCALE = 5.0
 """Robust scale of keypoints, standard deviations."""
 BARE = 5.0
@@ -78,11 +82,12 @@ BARE = 5.0
 class CaptureRefineConfig:
     """Static settings of a refinement.
 
-    std: how far off the start is expected to be. coefficients: of the shape, where the capture has fewer. fixed_cameras: only
-    shape and poses move. iterations: number of matchings. points: of a silhouette. independent: number of independent equations
-    that all points of a view count for. robust_scales: multiples of the reach, outwards and inwards of the mask. keypoints_worse:
-    a result whose keypoints' error is more than this multiple of the start's is not kept; a fit to them made it small, right
-    results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
+    std: how far off the start is expected to be. coefficients: of the shape, where the capture has
+    fewer. fixed_cameras: only shape and poses move. iterations: number of matchings. points: of a
+    silhouette. independent: number of independent equations that all points of a view count for.
+    robust_scales: multiples of the reach, outwards and inwards of the mask. keypoints_worse: a
+    result whose keypoints' error is more than this multiple of the start's is not kept; a fit to
+    them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
     """
 
     std: StateStd = dataclasses.field(default_factory=StateStd)
@@ -96,8 +101,8 @@ class CaptureRefineConfig:
 
 
 FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
-"""Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its keypoints hold the joints where
-clothes would pull them away."""
+"""Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its
+keypoints hold the joints where clothes would pull them away."""
 FROM_PERSON = dataclasses.replace(FITTED, focal=0.05, camera_rotation=2.0, camera_center=0.08)
 """The same with cameras that were found from the person."""
 SKIN, TIGHT = 0.001, 0.015
@@ -112,8 +117,9 @@ def usual_config(
     tight: bool = False,
     calibrated: bool = True,
 ) -> CaptureRefineConfig:
-    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the body is to fill the
-    masks. tight: the person wears tight clothes. calibrated: False for cameras that were found from the person.
+    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given.
+    bare: the body is to fill the masks. tight: the person wears tight clothes. calibrated: False
+    for cameras that were found from the person.
     """
     start = FITTED if calibrated else FROM_PERSON
     std = start if fitted else StateStd()
@@ -136,11 +142,14 @@ def usual_config(
 
 
 def cameras_are_unseen(capture: Capture) -> bool:
-    """Whether nothing tells how cameras should move: they were found from the person, and each photo shows a pose of its own."""
+    """Whether nothing tells how cameras should move: they were found from the person, and each
+    photo shows a pose of its own.
+    """
     return not capture.calibrated and capture.frame_count >= capture.view_count
 
 
-# The state of a capture ----------------------------------------------------------------------------------------------
+# The state of a capture
+# ----------------------------------------------------------------------------------------------
 
 
 def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfig) -> Origin:
@@ -170,8 +179,8 @@ def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
 
 
 def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
-    """A capture with cameras, shape and poses of a state, whatever the size of the origin's images; its displacement belonged to
-    the shape before, and is left out.
+    """A capture with cameras, shape and poses of a state, whatever the size of the origin's images;
+    its displacement belonged to the shape before, and is left out.
     """
     own = replace(origin, cameras=replace(origin.views, K=capture.cameras.K))
     (K, cam_from_world), betas, poses = _moved(own, state)
@@ -188,13 +197,15 @@ def _moved(
     return cameras_of(origin, state), betas_of(origin, state), pose_of(origin, state)
 
 
-# Equations -----------------------------------------------------------------------------------------------------------
+# Equations
+# --------------------------------------------------------------------------------------------------
 
 
 @pytree_dataclass
 class Evidence:
-    """What v views show. points: of the body's silhouette, and matches: their equations, batches of v. noise: () pixels; scales:
-    (2,) robust scales, pixels, outwards and inwards. keypoints: a batch of v, each with one view (c = 1), or None.
+    """What v views show. points: of the body's silhouette, and matches: their equations, batches of
+    v. noise: () pixels; scales: (2,) robust scales, pixels, outwards and inwards. keypoints: a
+    batch of v, each with one view (c = 1), or None.
     """
 
     points: SurfacePoints
@@ -207,7 +218,9 @@ class Evidence:
 def evidence_residuals(
     model: LandmarkModel, origin: Origin, state: FitState, evidence: Evidence, independent: float
 ) -> dict[str, Float[Array, "..."]]:
-    """Residuals of the views, in standard deviations, by kind: silhouettes (v, e) and keypoints (v, 1, k, 2)."""
+    """Residuals of the views, in standard deviations, by kind: silhouettes (v, e) and keypoints (v,
+    1, k, 2).
+    """
     K, cam_from_world = cameras_of(origin, state)
     betas, poses, frame = betas_of(origin, state), pose_of(origin, state), origin.views.frame
     transforms, joints = jax.vmap(lambda pose: pose_joints(model, betas, pose))(poses)
@@ -266,13 +279,15 @@ def solve_round(
     )[0]
 
 
-# Iterations ----------------------------------------------------------------------------------------------------------
+# Iterations
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Score:
-    """ious: (v,) of silhouettes, NaN without a mask. iou: their mean; None without any mask. keypoints: median error, pixels;
-    None without. loss: 1 - iou plus the keypoints' error as a share of the person's height.
+    """ious: (v,) of silhouettes, NaN without a mask. iou: their mean; None without any mask.
+    keypoints: median error, pixels; None without. loss: 1 - iou plus the keypoints' error as a
+    share of the person's height.
     """
 
     ious: Float[np.ndarray, " v"]
@@ -282,7 +297,9 @@ class Score:
 
 
 class Scene:
-    """What stays the same over the iterations: masks at the size that is looked at, keypoints, and the origin."""
+    """What stays the same over the iterations: masks at the size that is looked at, keypoints, and
+    the origin.
+    """
 
     def __init__(
         self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig
@@ -310,7 +327,9 @@ class Scene:
         self.origin = capture_origin(capture, self.cameras, config)
 
     def run(self) -> tuple[FitState, float]:
-        """The state after all iterations, and the largest move of the last round, in expected standard deviations."""
+        """The state after all iterations, and the largest move of the last round, in expected
+        standard deviations.
+        """
         config, state, move = self.config, start_state(self.origin, self.config), 0.0
         first, last = REACH
         for turn in range(config.iterations):
@@ -350,7 +369,9 @@ class Scene:
         )
 
     def _keypoints(self, capture: Capture) -> Observations | None:
-        """The keypoints, with the noise that a body finds: a detector's own bias is no evidence against the masks."""
+        """The keypoints, with the noise that a body finds: a detector's own bias is no evidence
+        against the masks.
+        """
         if self.keypoints is None or self.observations is None:
             return None
         errors = jnp.asarray(self._errors(capture, self.keypoints) * self.scale, jnp.float32)
@@ -415,7 +436,9 @@ def posed_vertices(
 def _noise(
     boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
 ) -> float:
-    """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a body that is not yet there."""
+    """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a
+    body that is not yet there.
+    """
     off = [
         np.asarray(silhouettes.distances(m, jnp.asarray(boundary.positions, jnp.float32)))[
             np.asarray(m.weights) > 0
@@ -431,7 +454,9 @@ def _person_height(
     masks: Sequence[Float[np.ndarray, "h w"]] | Float[np.ndarray, "v h w"],
     observations: Observations | None,
 ) -> float:
-    """Height of the person in the image, pixels: median over the views of the extent of masks, or else of keypoints."""
+    """Height of the person in the image, pixels: median over the views of the extent of masks, or
+    else of keypoints.
+    """
     sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
     if not sizes and observations is not None:
         pairs = zip(
@@ -444,11 +469,14 @@ def _person_height(
 
 
 LEAST_GAIN, LEAST_GAIN_OF_MASKS = 0.02, 0.2
-"""Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of clothes are fitted a little better
-by wrong bodies: for four people who started at the truth, by up to 0.15; keypoints show that.
+"""Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of
+clothes are fitted a little better by wrong bodies: for four people who started at the truth, by up
+to 0.15; keypoints show that.
 """
 LEAST_DIFFERENCE = 0.005
-"""Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding of pixels."""
+"""Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding
+of pixels.
+"""
 LEAST_IOU = 0.6
 """Bodies in clothes overlap masks by more than this; less means that the start was too far off."""
 
@@ -471,10 +499,10 @@ def refine_capture(
 ) -> RefinedCapture:
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 
-    Arguments: keypoints: of the capture's views. config: after a fit to these keypoints, see `usual_config`. Views whose mask is
-    empty take no part.
-    Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if the keypoints are of another
-    number of views.
+    Arguments: keypoints: of the capture's views. config: after a fit to these keypoints, see
+    `usual_config`. Views whose mask is empty take no part.
+    Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if
+    the keypoints are of another number of views.
     """
     if keypoints is not None and len(keypoints.points) != capture.view_count:
         raise ValueError(
@@ -496,7 +524,10 @@ def refine_capture(
     kinds = {"silhouettes": before.iou, "keypoints": before.keypoints}
     kinds = " and ".join(name for name, value in kinds.items() if value is not None)
     verdict = "kept" if kept else "no sufficient improvement, the start is kept"
-    note = f"{kinds}: loss {before.loss:.4f} -> {found.loss:.4f}, {verdict} (last move {move:.2g} expected std)"
+    note = (
+        f"{kinds}: loss {before.loss:.4f} -> {found.loss:.4f}, {verdict} (last move {move:.2g}"
+        " expected std)"
+    )
     return RefinedCapture(best, _report(capture, best, before, score, note))
 
 
@@ -519,8 +550,9 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, note: st
     notes = [note, f"kept: {'refined' if kept else 'start'}"]
     if kept:
         notes.append(
-            "moved: focal length x {focal_factor:.4f}, cameras {camera_degrees:.2f} degrees and {camera_cm:.1f} cm, "
-            "joints {joint_degrees:.2f} degrees, person {transl_cm:.1f} cm (means)".format(**moved)
+            "moved: focal length x {focal_factor:.4f}, cameras {camera_degrees:.2f} degrees and"
+            " {camera_cm:.1f} cm, joints {joint_degrees:.2f} degrees, person {transl_cm:.1f} cm"
+            " (means)".format(**moved)
         )
         if start.displacement is not None:
             notes.append(
@@ -538,8 +570,8 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, note: st
         violations=limit_violations(best.body.joint_names, best.poses),
         notes=tuple(notes),
         warnings=(
-            "body and masks do not agree: the start was too far off; `humangs check` shows why",
-        )
-        if apart
-        else (),
+            ("body and masks do not agree: the start was too far off; `humangs check` shows why",)
+            if apart
+            else ()
+        ),
     )

@@ -46,8 +46,10 @@ class Change:
 
 @dataclasses.dataclass(frozen=True)
 class ViewReport:
-    """One view. keypoints: that were compared. median, high: their median error and 90th percentile, pixels (NaN: none).
-    outliers: share. iou_before, iou_after: of silhouettes, NaN without a mask, None if masks are not part of the fit.
+    """One view. keypoints: that were compared. median, high: their median error and 90th
+    percentile, pixels (NaN: none).
+    outliers: share. iou_before, iou_after: of silhouettes, NaN without a mask, None if masks are
+    not part of the fit.
     """
 
     name: str
@@ -74,9 +76,11 @@ class Violation:
 class FitReport:
     """What came of a fit.
 
-    kept: False if the start was better and stays. start: of a fit to a scan, where it came from: "landmarks" or "search".
-    errors: by name, see `LABELS`. moved: how far parameters moved, by name. violations: of joint limits. swaps: what
-    seems exchanged. undetermined: joints, or groups of joints, that the views do not determine.
+    kept: False if the start was better and stays. start: of a fit to a scan, where it came from:
+    "landmarks" or "search".
+    errors: by name, see `LABELS`. moved: how far parameters moved, by name. violations: of joint
+    limits. swaps: what seems exchanged. undetermined: joints, or groups of joints, that the views
+    do not determine.
     notes: further results. warnings: what points to a mistake.
     """
 
@@ -131,9 +135,11 @@ def _view_rows(views: Sequence[ViewReport]) -> list[str]:
     worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
     masks = views[0].iou_after is not None
     rows = [
-        ["view", "IoU before", "after"]
-        if masks
-        else ["view", "keypoints", "median error", "90 % below", "outliers"]
+        (
+            ["view", "IoU before", "after"]
+            if masks
+            else ["view", "keypoints", "median error", "90 % below", "outliers"]
+        )
     ]
     for view in (views[i] for i in sorted(worst)):
         if not masks:
@@ -151,17 +157,24 @@ def _view_rows(views: Sequence[ViewReport]) -> list[str]:
     )
 
 
-# What points to a mistake --------------------------------------------------------------------------------------------
+# What points to a mistake
+# --------------------------------------------------------------------------------------------
 
 MANY_OUTLIERS = 0.3
-"""Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw something else."""
+"""Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw
+something else.
+"""
 OFF = 4.0
-"""Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows another pose or camera."""
+"""Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows
+another pose or camera.
+"""
 SLIGHTLY_BEYOND, FAR_BEYOND = np.rad2deg(0.05), 10.0
-"""Degrees beyond a joint's limit that are no violation, and from which there is a warning: limits are rough."""
+"""Degrees beyond a joint's limit that are no violation, and from which there is a warning: limits
+are rough.
+"""
 UNSURE, UNDECIDED = 0.03, 0.1
-"""A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is determined: a mean over axes, of
-which knees and fingers have one that turns."""
+"""A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is
+determined: a mean over axes, of which knees and fingers have one that turns."""
 
 _FINGERS = {
     side: [f"{side}_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)]
@@ -233,7 +246,8 @@ def keypoint_warnings(
         found.append(f"no keypoints in {_names(blind)}")
     if off:
         found.append(
-            f"body and keypoints disagree in {_names(off)}: median error {_span(off, 'median', '{:.0f}')} px"
+            f"body and keypoints disagree in {_names(off)}: median error"
+            f" {_span(off, 'median', '{:.0f}')} px"
         )
     if wild:
         found.append(
@@ -263,8 +277,8 @@ def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
 
 
 def how_far(start: Capture, refined: Capture) -> dict[str, float]:
-    """How far two captures of one person differ, means: focal_factor; camera_degrees, camera_cm; joint_degrees of the joints'
-    rotations, transl_cm of the root.
+    """How far two captures of one person differ, means: focal_factor; camera_degrees, camera_cm;
+    joint_degrees of the joints' rotations, transl_cm of the root.
     """
     a, b = start.cameras, refined.cameras
     turns = lambda cameras: Rotation.from_matrix(

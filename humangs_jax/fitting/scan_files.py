@@ -1,10 +1,11 @@
 """Scans and their landmarks: from files, and by images of the scan for a keypoint detector.
 
-Any mesh format that trimesh reads; parts of a scene are put together where the scene has them. A fixed number of random points
-with outward normals is taken from the surface. Points that cannot be seen from outside (inside of a mouth, skin under cloth,
-lining) are left out, as by a scanner.
+Any mesh format that trimesh reads; parts of a scene are put together where the scene has them. A
+fixed number of random points with outward normals is taken from the surface. Points that cannot be
+seen from outside (inside of a mouth, skin under cloth, lining) are left out, as by a scanner.
 
-render_scan_views("scan.obj", "views")          a capture folder without a body; run a detector on views/images
+render_scan_views("scan.obj", "views")          a capture folder without a body; run a detector on
+                                                views/images
 joints = joints_from_views("views", keypoints)  then fit_scan("scan.obj", joints=joints, ...)
 """
 
@@ -40,7 +41,9 @@ PER_CELL = 20
 BEHIND = 1.0
 """A visible point lies at most this many cells behind the nearest point of its cell."""
 OCCLUDERS = 5
-"""Points that fill the cells, for each that is kept: with 30,000 points of a person, cells are 1.5 cm wide."""
+"""Points that fill the cells, for each that is kept: with 30,000 points of a person, cells are 1.5
+cm wide.
+"""
 LEAST_FACES = 50
 """A surface of a person has at least this many."""
 
@@ -49,8 +52,8 @@ LEAST_FACES = 50
 class Scan:
     """Points of a scan in the file's own coordinates, float64.
 
-    points: (p, 3). normals: (p, 3) unit, outwards. turned: whether the file's faces were inside out. hidden: share of the
-    surface that is left out because it cannot be seen.
+    points: (p, 3). normals: (p, 3) unit, outwards. turned: whether the file's faces were inside
+    out. hidden: share of the surface that is left out because it cannot be seen.
     """
 
     points: Float[np.ndarray, "p 3"]
@@ -63,25 +66,29 @@ def read_mesh(path: str | Path, colors: bool = False) -> Any:
     """A trimesh.Trimesh with all geometry of the file.
 
     Arguments: colors: give it colors of the vertices, see `read_meshes`.
-    Raises: ValueError, naming the file, if it cannot be read, has no faces or corners that are not finite.
+    Raises: ValueError, naming the file, if it cannot be read, has no faces or corners that are not
+    finite.
     """
     import trimesh
 
     path = Path(path)
     if not path.is_file():
         raise ValueError(
-            f"{path}: {'a folder' if path.is_dir() else 'no such file'}: expected a mesh (OBJ, PLY, GLB, ...)"
+            f"{path}: {'a folder' if path.is_dir() else 'no such file'}: expected a mesh (OBJ, PLY,"
+            " GLB, ...)"
         )
     parts = read_meshes(path, colors=colors)
     faces = sum(len(part.faces) for part in parts)
     if faces < LEAST_FACES:
         raise ValueError(
-            f"{path}: {faces} faces: expected the surface of a person, at least {LEAST_FACES}, no cloud of points"
+            f"{path}: {faces} faces: expected the surface of a person, at least {LEAST_FACES}, no"
+            " cloud of points"
         )
     mesh: Any = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
     if not (np.isfinite(mesh.vertices[np.unique(mesh.faces)]).all() and mesh.area > 0):
         raise ValueError(
-            f"{path}: corners that are not finite numbers, or faces without area: expected a clean mesh"
+            f"{path}: corners that are not finite numbers, or faces without area: expected a clean"
+            " mesh"
         )
     return mesh
 
@@ -95,7 +102,8 @@ def read_scan(path: str | Path, count: int = 30_000) -> Scan:
 def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: int = 30_000) -> Scan:
     """Random points of a surface, uniform over its area.
 
-    Arguments: vertices (n, 3), faces (f, 3) counter-clockwise seen from outside; reversed faces are detected.
+    Arguments: vertices (n, 3), faces (f, 3) counter-clockwise seen from outside; reversed faces are
+    detected.
     Raises: ValueError if the surface has no area.
     """
     center = vertices[np.unique(faces)].mean(axis=0)
@@ -127,7 +135,8 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
     return Scan(points[outside] + center, normals, turned, float(1 - len(outside) / count))
 
 
-# Known landmarks ------------------------------------------------------------------------------------------------------
+# Known landmarks
+# --------------------------------------------------------------------------------------------------
 
 SIDES = ("left", "right")
 PARTS = (
@@ -153,7 +162,9 @@ SCAN_LANDMARKS = (
         for joint in FINGER_JOINTS
     ),
 )
-"""Names that joints of a scan may have: the landmarks of `body/landmarks.py` without duplicates and the face."""
+"""Names that joints of a scan may have: the landmarks of `body/landmarks.py` without duplicates and
+the face.
+"""
 
 
 def checked_joints(
@@ -165,7 +176,8 @@ def checked_joints(
     """
     if unknown := sorted(set(joints) - set(SCAN_LANDMARKS)):
         raise ValueError(
-            f"joint '{unknown[0]}' is no landmark of ours: expected names such as {', '.join(SCAN_LANDMARKS[:6])}"
+            f"joint '{unknown[0]}' is no landmark of ours: expected names such as"
+            f" {', '.join(SCAN_LANDMARKS[:6])}"
         )
     points, known = np.zeros((len(SCAN_LANDMARKS), 3)), np.zeros(len(SCAN_LANDMARKS))
     for name, point in joints.items():
@@ -177,7 +189,8 @@ def checked_joints(
 
 
 def read_joints(path: str | Path) -> dict[str, Float[np.ndarray, "3"]]:
-    """Landmarks by name in a scan's coordinates: JSON {"left_hip": [x, y, z], ...}, or npz with names (k,) and points (k, 3).
+    """Landmarks by name in a scan's coordinates: JSON {"left_hip": [x, y, z], ...}, or npz with
+    names (k,) and points (k, 3).
 
     Raises: ValueError, naming the file, if it is neither, or a name or a point is not one.
     """
@@ -213,10 +226,10 @@ def render_scan_views(
 ) -> Path:
     """Write images of a scan from all around as a capture folder without a body.
 
-    Arguments: up: which axis of the file is up for the person, "+y", "-z", ...; None: the positive one along which the scan is
-    longest. Detectors expect standing people: look at the images.
-    Raises: ValueError for a mesh that cannot be used (see `read_mesh`), an unknown axis, or a folder that is not empty or
-    cannot be replaced (see `check_replaceable`).
+    Arguments: up: which axis of the file is up for the person, "+y", "-z", ...; None: the positive
+    one along which the scan is longest. Detectors expect standing people: look at the images.
+    Raises: ValueError for a mesh that cannot be used (see `read_mesh`), an unknown axis, or a
+    folder that is not empty or cannot be replaced (see `check_replaceable`).
     """
     out = Path(out)
     check_replaceable(out)
@@ -270,7 +283,8 @@ def read_placement(file: Path) -> Similarity:
         )
         if not rigid or (matrix[3] != (0, 0, 0, 1)).any():
             raise Refused(
-                f"{PLACEMENT}: expected a rotation times a scale above 0, a translation, and 0 0 0 1"
+                f"{PLACEMENT}: expected a rotation times a scale above 0, a translation, and 0"
+                " 0 0 1"
             )
         return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 

@@ -2,15 +2,18 @@
 
 start   position, size and stance: from given landmarks, or by a search over turns and stances
 coarse  without landmarks: few points and the body's joints, from several starts; the best goes on
-fine    all joints and the shape, many points; every iteration pairs scan and body anew, for a few steps of damped least squares
+fine    all joints and the shape, many points; every iteration pairs scan and body anew, for a few
+        steps of damped least squares
 
-A scan has no unit: scale and height are those of a body of likely shape, unless `height` is given. Nor has it an up axis: the
-scan's axis nearest to the person's is used if one is near (`UPRIGHT`), otherwise the person's own.
+A scan has no unit: scale and height are those of a body of likely shape, unless `height` is given.
+Nor has it an up axis: the scan's axis nearest to the person's is used if one is near (`UPRIGHT`),
+otherwise the person's own.
 
-From landmarks: the similarity that takes the trunk's landmarks to those of a resting body, robustly. Without landmarks: the
-root mean square distance from the centre of the surface gives the scale; turns and stances are compared by the distances of few
-points, and the best are followed for a few coarse iterations. A surface hardly distinguishes a person's front from the back as
-long as the limbs are in the same place, so the best are also followed for a body that faces the other way.
+From landmarks: the similarity that takes the trunk's landmarks to those of a resting body,
+robustly. Without landmarks: the root mean square distance from the centre of the surface gives the
+scale; turns and stances are compared by the distances of few points, and the best are followed for
+a few coarse iterations. A surface hardly distinguishes a person's front from the back as long as
+the limbs are in the same place, so the best are also followed for a body that faces the other way.
 """
 
 import dataclasses
@@ -65,7 +68,9 @@ from humangs_jax.fitting.triangulation import Similarity, align_robustly
 from humangs_jax.geometry.mesh import directions_around, face_areas
 
 COARSE_POINTS, FINE_POINTS = 600, 2500
-"""Points of the scan and vertices of the body that are matched: in the search, and in the last iterations."""
+"""Points of the scan and vertices of the body that are matched: in the search, and in the last
+iterations.
+"""
 STEPS, SHAPES = 4, 32
 """Steps of the solver in an iteration; coefficients that are fitted."""
 FOLLOWED, TURNED = 16, 2
@@ -74,7 +79,9 @@ FOLLOWED, TURNED = 16, 2
 
 @dataclasses.dataclass(frozen=True)
 class Round:
-    """Settings of an iteration: gate and robust_scale of `Target.matches`, about metres; weight of the pose prior."""
+    """Settings of an iteration: gate and robust_scale of `Target.matches`, about metres; weight of
+    the pose prior.
+    """
 
     gate: float
     robust_scale: float
@@ -127,7 +134,9 @@ def improve(
     state: FitState,
     steps: int = STEPS,
 ) -> tuple[FitState, Float[Array, "2"]]:
-    """The body after at most `steps` steps of the solver with these pairs, and the cost before and after them."""
+    """The body after at most `steps` steps of the solver with these pairs, and the cost before and
+    after them.
+    """
     residuals = lambda y: scan_residuals(problem, matches, given, tolerances, y)
     found, after = solve(residuals, state, steps, method="lm")
     return found, jnp.stack([half_squares(residuals(state)), after])
@@ -168,7 +177,8 @@ def landmarks_and_joints(
     return pose_vertices(problem.surface, jnp.zeros(1, jnp.int32), betas, pose)[1:]
 
 
-# Starts --------------------------------------------------------------------------------------------------------------
+# Starts
+# --------------------------------------------------------------------------------------------------
 
 STANCES = {
     "T": {"left_shoulder": (0, 0, 0), "left_elbow": (0, 0, 0)},
@@ -202,7 +212,10 @@ HALF_TURN = np.asarray([-1.0, 1.0, -1.0])
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Start:
-    """align: from the scan to a frame in which a body in this pose is nearly right. rotations: (j, 3). cost: lower is better."""
+    """align: from the scan to a frame in which a body in this pose is nearly right.
+
+    rotations: (j, 3). cost: lower is better.
+    """
 
     align: Similarity
     rotations: Float[np.ndarray, "j 3"]
@@ -248,7 +261,9 @@ def _stances(joint_names: tuple[str, ...]) -> Iterator[Float[np.ndarray, "j 3"]]
 def _stance_points(
     surface: BodySurface, stance: Float[np.ndarray, "j 3"]
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "3"], float]:
-    """Evenly spread points of the mean body in a stance about their centre and over their size; centre and size, metres."""
+    """Evenly spread points of the mean body in a stance about their centre and over their size;
+    centre and size, metres.
+    """
     betas = jnp.zeros(surface.points.directions.shape[-1])
     posed = pose_surface(surface, betas, BodyPose(jnp.asarray(stance, jnp.float32), jnp.zeros(3)))
     vertices, faces = np.asarray(posed[0], np.float64), np.asarray(surface.faces)
@@ -294,9 +309,11 @@ def facing_back(
     pelvis: Float[np.ndarray, "3"],
     size: float,
 ) -> Start:
-    """The start for a body that fills the same place but faces the other way: left limbs where right ones were, if joints allow.
+    """The start for a body that fills the same place but faces the other way: left limbs where
+    right ones were, if joints allow.
 
-    Arguments: start: from which a body was fitted. rotations, pelvis: of that body. size: metres per unit of the start's frame.
+    Arguments: start: from which a body was fitted. rotations, pelvis: of that body. size: metres
+    per unit of the start's frame.
     """
     model, prior = surface.landmarks, pose_prior(surface.landmarks.joint_names)
     swapped = (
@@ -322,7 +339,8 @@ def search(
 ) -> tuple[Start, FitState]:
     """The best start, and the body after its coarse iterations, with all joints of `whole` free.
 
-    Arguments: given: what is known, in the frame of an alignment of the scan. effective: see `Target`.
+    Arguments: given: what is known, in the frame of an alignment of the scan. effective: see
+    `Target`.
     """
     trunk = scan_problem(whole.surface, BODY_NAMES, SHAPES)
     loose = dataclasses.replace(tolerances, inside=jnp.float32(LOOSE), outside=jnp.float32(LOOSE))
@@ -352,7 +370,8 @@ def search(
     return start, replace(state_of(whole.origin, *trunk.body(state)), log_scale=state.log_scale)
 
 
-# The fit ---------------------------------------------------------------------------------------------------------------
+# The fit
+# --------------------------------------------------------------------------------------------------
 
 LANDMARK_STDS = (0.2, 0.1, 0.05, 0.02, 0.01)
 """Metres: std of given joints in the iterations that bring a body to them."""
@@ -375,22 +394,30 @@ LEAST_SCALE = 0.03
 SETTLED = 0.02
 """A last iteration that gains more than this share of the cost: the body was still moving."""
 LITTLE = 0.6
-"""A smaller share of the scan near the body puts the fit in doubt. Wide skirts and long hair leave 0.7."""
+"""A smaller share of the scan near the body puts the fit in doubt.
+
+Wide skirts and long hair leave 0.7.
+"""
 UPRIGHT = np.cos(np.radians(25.0))
 """Cosine between an axis of the scan and the person's axis from which the former is up."""
 SKIN, CLOTH, JOINT_STD = 0.004, 0.015, 0.01
-"""Metres: std of a scan on bare skin, and of a body that pokes out of clothes; of clothes off the skin; of given joints."""
+"""Metres: std of a scan on bare skin, and of a body that pokes out of clothes; of clothes off the
+skin; of given joints.
+"""
 EFFECTIVE = (1500.0, 300.0)
-"""Number of independent points that all pairs count for, bare and clothed, because neighbours on a surface err together."""
+"""Number of independent points that all pairs count for, bare and clothed, because neighbours on a
+surface err together.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScanFit:
     """A body in a scan.
 
-    body; betas: (s,). pose: in our world: metres, y up, facing +z, the lowest point of the scan at y = 0. world_from_scan:
-    from the file's coordinates to there. up: what of the scan is up, in words. distances: (r,) metres by which the scan is
-    outside of the skin at sampled points, negative inside; points without a partner nearby are left out.
+    body; betas: (s,). pose: in our world: metres, y up, facing +z, the lowest point of the scan at
+    y = 0. world_from_scan: from the file's coordinates to there. up: what of the scan is up, in
+    words. distances: (r,) metres by which the scan is outside of the skin at sampled points,
+    negative inside; points without a partner nearby are left out.
     """
 
     body: BodyModel
@@ -412,9 +439,12 @@ def fit_scan(
 ) -> ScanFit:
     """Fit a body to a mesh file, or to a scan in memory.
 
-    Arguments: joints: landmarks by name, in the scan's coordinates; any of `SCAN_LANDMARKS`, at least three of the trunk.
-    clothed: whether the surface may be outside of the skin. height: of the person without shoes, metres, if it is known.
-    Raises: ValueError, naming the file, if it holds no usable surface; ValueError for unknown or too few joints.
+    Arguments: joints: landmarks by name, in the scan's coordinates; any of `SCAN_LANDMARKS`, at
+    least three of the trunk.
+    clothed: whether the surface may be outside of the skin. height: of the person without shoes,
+    metres, if it is known.
+    Raises: ValueError, naming the file, if it holds no usable surface; ValueError for unknown or
+    too few joints.
     """
     if not isinstance(scan, Scan):
         scan = read_scan(scan)
@@ -528,10 +558,13 @@ def place_upright(
     align: Similarity,
     size: float,
 ) -> tuple[BodyPose, Similarity, str]:
-    """A fit in our world: y up, facing +z, the scan standing on y = 0 with the pelvis over the origin.
+    """A fit in our world: y up, facing +z, the scan standing on y = 0 with the pelvis over the
+    origin.
 
-    Arguments: betas (s,), pose: of the body in metres, in a frame where the scan is `size * align(points)`.
-    Returns: the pose there, the similarity from the file's coordinates to there, and what of the scan is up, in words.
+    Arguments: betas (s,), pose: of the body in metres, in a frame where the scan is `size *
+    align(points)`.
+    Returns: the pose there, the similarity from the file's coordinates to there, and what of the
+    scan is up, in words.
     """
     frame_from_scan = Similarity(size, np.eye(3), np.zeros(3)).after(align)
     root = Rotation.from_rotvec(np.asarray(pose.rotations[0], np.float64)).as_matrix()

@@ -1,24 +1,28 @@
-"""One state and one solver for every fit: shape, poses and, where a fit moves them, cameras, clothing and the scale of a scan.
+"""One state and one solver for every fit: shape, poses and, where a fit moves them, cameras,
+clothing and the scale of a scan.
 
-A state holds deviations from an `Origin` in units of their expected size, so that zeros are the origin, solvers take steps of
-one length in all directions, and the square of a number is its prior.
+A state holds deviations from an `Origin` in units of their expected size, so that zeros are the
+origin, solvers take steps of one length in all directions, and the square of a number is its prior.
 
-    keypoints    betas, the pose of every frame               origin: the mean shape in its usual pose
+    keypoints    betas, the pose of every frame               origin: the mean shape in its usual
+                                                              pose
     scan         betas, one pose, log_scale                   origin: likewise
     refinement   betas, poses, cameras, clothing              origin: a capture
 
-The root turns by global_orient after the origin's rotation, because sums of rotation vectors near half a turn are no measure of
-small turns.
+The root turns by global_orient after the origin's rotation, because sums of rotation vectors near
+half a turn are no measure of small turns.
 
-The prior of poses is here, too: the usual rotation of every joint, its standard deviation, and its limits, as rotation vectors of
-SMPL-X's joints by name, in radians about the axes of the T-pose: x to the person's left, y up, z forward. Limits are boxes of
-rotation vectors, generous where axes mix (hips, shoulders). Written for the left side; the right is its mirror image (x, -y, -z).
-A knee bends about +x, the left elbow about -y, left fingers about -z; the left arm hangs at z = -1.4.
+The prior of poses is here, too: the usual rotation of every joint, its standard deviation, and its
+limits, as rotation vectors of SMPL-X's joints by name, in radians about the axes of the T-pose: x
+to the person's left, y up, z forward. Limits are boxes of rotation vectors, generous where axes mix
+(hips, shoulders). Written for the left side; the right is its mirror image (x, -y, -z). A knee
+bends about +x, the left elbow about -y, left fingers about -z; the left arm hangs at z = -1.4.
 
-The solver minimises half the square sum of residuals over a pytree of numbers of about unit size; robust losses enter as
-residuals whose squares they are:
+The solver minimises half the square sum of residuals over a pytree of numbers of about unit size;
+robust losses enter as residuals whose squares they are:
 
-    lbfgs   many unknowns, cheap under vmap; works through the renderer, which has a backward rule only
+    lbfgs   many unknowns, cheap under vmap; works through the renderer, which has a backward rule
+            only
     lm      Levenberg and Marquardt by normal equations: few unknowns, quadratic near the solution
 """
 
@@ -50,9 +54,11 @@ def half_squares(tree: PyTree) -> Float[Array, ""]:
 
 
 def robust(errors: Float[Array, "*n d"], scale: Float[Array, ""] | float) -> Float[Array, "*n d"]:
-    """Residuals whose square is Geman and McClure's loss of the length of the errors: e c / sqrt(c^2 + |e|^2), c the scale.
+    """Residuals whose square is Geman and McClure's loss of the length of the errors: e c /
+    sqrt(c^2 + |e|^2), c the scale.
 
-    Like e near 0, and no longer than c far off: a keypoint on another person pulls no harder than one that is a little off.
+    Like e near 0, and no longer than c far off: a keypoint on another person pulls no harder than
+    one that is a little off.
     """
     return errors * (
         scale / jnp.sqrt(scale * scale + jnp.sum(jnp.square(errors), axis=-1, keepdims=True))
@@ -70,9 +76,10 @@ def solve(
 ) -> tuple[T, Float[Array, ""]]:
     """Minimise from a start.
 
-    Arguments: residuals: any pytree. steps: at most. tolerance: of the unknowns and, relatively, of the loss. free: pytree of
-    booleans like start; the others stay.
-    Returns: the solution, or the start where that is no worse, and so finite numbers; and half its square sum.
+    Arguments: residuals: any pytree. steps: at most. tolerance: of the unknowns and, relatively, of
+    the loss. free: pytree of booleans like start; the others stay.
+    Returns: the solution, or the start where that is no worse, and so finite numbers; and half its
+    square sum.
     """
     import lineax
     import optimistix
@@ -155,12 +162,17 @@ RANGES = {
     **{f"left_{finger}1": _KNUCKLE for finger in FINGERS if finger != "thumb"},
     **{f"left_{finger}{k}": _FINGER for finger in FINGERS if finger != "thumb" for k in (2, 3)},
 }
-"""Ranges of everyday movement; wider than measured joint angles, because components of a rotation vector are not joint angles."""
+"""Ranges of everyday movement; wider than measured joint angles, because components of a rotation
+vector are not joint angles.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosePrior:
-    """Arrays (j, 3) in the order of a body's joints, radians. The root's are not used: every orientation is as likely."""
+    """Arrays (j, 3) in the order of a body's joints, radians.
+
+    The root's are not used: every orientation is as likely.
+    """
 
     mean: Float[np.ndarray, "j 3"]
     std: Float[np.ndarray, "j 3"]
@@ -169,7 +181,9 @@ class PosePrior:
 
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
-    """The prior of a body. Joints with other names than SMPL-X's have mean 0, std 0.3 rad and no limits."""
+    """The prior of a body. Joints with other names than SMPL-X's have mean 0, std 0.3 rad and no
+    limits.
+    """
     rows = []
     for name in joint_names:
         row = np.asarray(RANGES.get(name.replace("right_", "left_", 1), _UNKNOWN))
@@ -195,15 +209,19 @@ LOG_SCALE_STD = 0.05
 RADIANS = math.pi / 180
 """Per degree."""
 SAME = 1e-4
-"""Relative difference of focal lengths, and radians and metres of cameras, below which two are the same."""
+"""Relative difference of focal lengths, and radians and metres of cameras, below which two are the
+same.
+"""
 
 
 @pytree_dataclass
 class StateStd:
-    """Expected size of the deviations, standard deviations. Numbers, or arrays () where a program is compiled for all of them.
+    """Expected size of the deviations, standard deviations. Numbers, or arrays () where a program
+    is compiled for all of them.
 
-    focal: share. camera_rotation, global_orient, body_pose (each joint): degrees, by axis. camera_center, transl: metres, by
-    axis. betas: of coefficients. clothing: thickness of clothes and hair on each segment of the body, metres.
+    focal: share. camera_rotation, global_orient, body_pose (each joint): degrees, by axis.
+    camera_center, transl: metres, by axis. betas: of coefficients. clothing: thickness of clothes
+    and hair on each segment of the body, metres.
     """
 
     focal: Float[Array, ""] | float = 0.05
@@ -217,12 +235,17 @@ class StateStd:
 
 
 FREE = StateStd(global_orient=math.degrees(0.3), transl=0.1, betas=1.0)
-"""Without a start: steps of the solver for orientation and position, which have no prior then, and the shape's own std."""
+"""Without a start: steps of the solver for orientation and position, which have no prior then, and
+the shape's own std.
+"""
 
 
 @pytree_dataclass
 class CameraState:
-    """Deviations of c cameras with g focal lengths. rotations, centers: (c, 3). log_focals: (g,)."""
+    """Deviations of c cameras with g focal lengths. rotations, centers: (c, 3).
+
+    log_focals: (g,).
+    """
 
     rotations: Float[Array, "c 3"]
     centers: Float[Array, "c 3"]
@@ -233,9 +256,10 @@ class CameraState:
 class FitState:
     """What a fit moves, in units of `StateStd`; parts that it does not move are None.
 
-    betas: (s,). global_orient, transl: (3,), or (m, 3) of m frames. body_pose: (a, 3) or (m, a, 3) of a free joints.
-    clothing: (a + 1,) of the segments of the root and the free joints. log_scale: () of the metres per unit of a scan. places:
-    (g, 3) of the landmarks, see `LandmarkModel.moved`.
+    betas: (s,). global_orient, transl: (3,), or (m, 3) of m frames. body_pose: (a, 3) or (m, a, 3)
+    of a free joints.
+    clothing: (a + 1,) of the segments of the root and the free joints. log_scale: () of the metres
+    per unit of a scan. places: (g, 3) of the landmarks, see `LandmarkModel.moved`.
     """
 
     betas: Float[Array, " s"]
@@ -250,7 +274,10 @@ class FitState:
 
 @pytree_dataclass
 class CameraOrigin:
-    """v views. K: (v, 3, 3). cam_from_world: (v, 4, 4). camera, focal, frame: (v,) which ones of the state a view has."""
+    """v views. K: (v, 3, 3). cam_from_world: (v, 4, 4).
+
+    camera, focal, frame: (v,) which ones of the state a view has.
+    """
 
     K: Float[Array, "v 3 3"]
     cam_from_world: Float[Array, "v 4 4"]
@@ -263,9 +290,9 @@ class CameraOrigin:
 class Origin:
     """Where zeros are, and the unit of each number.
 
-    betas: (s,). pose: of one frame or a batch of m. body_pose_std: (a, 3) radians. segment: (j,) which number of
-    `FitState.clothing` covers what a joint moves. std: of what moves. Static: joints, the a free ones besides the root
-    (joint 0).
+    betas: (s,). pose: of one frame or a batch of m. body_pose_std: (a, 3) radians. segment: (j,)
+    which number of `FitState.clothing` covers what a joint moves. std: of what moves. Static:
+    joints, the a free ones besides the root (joint 0).
     """
 
     betas: Float[Array, " s"]
@@ -322,7 +349,10 @@ def betas_of(origin: Origin, state: FitState) -> Float[Array, " s"]:
 
 
 def pose_of(origin: Origin, state: FitState) -> BodyPose:
-    """The pose, or the batch of poses; differentiable everywhere. Joints that are not free are as in the origin."""
+    """The pose, or the batch of poses; differentiable everywhere.
+
+    Joints that are not free are as in the origin.
+    """
     rotations = origin.pose.rotations
     rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(
         origin.body_pose_std * state.body_pose
@@ -335,7 +365,10 @@ def pose_of(origin: Origin, state: FitState) -> BodyPose:
 
 
 def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitState:
-    """The state of a shape and a pose, whose other joints are taken to be as in the origin. No cameras, clothing or scale."""
+    """The state of a shape and a pose, whose other joints are taken to be as in the origin.
+
+    No cameras, clothing or scale.
+    """
     joints, start = np.asarray(origin.joints, int), origin.pose
     conjugate = quaternion.from_axis_angle(-start.rotations[..., 0, :])
     turn = quaternion.multiply(quaternion.from_axis_angle(pose.rotations[..., 0, :]), conjugate)
@@ -351,9 +384,11 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
 def cameras_of(
     origin: Origin, state: FitState
 ) -> tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]]:
-    """K and cam_from_world of every view: a camera turns about its centre, in its own axes, and the centre moves.
+    """K and cam_from_world of every view: a camera turns about its centre, in its own axes, and the
+    centre moves.
 
-    A state without cameras leaves them where they are. Raises: ValueError if the origin is without cameras.
+    A state without cameras leaves them where they are. Raises: ValueError if the origin is without
+    cameras.
     """
     start, moved, std = origin.views, state.cameras, origin.std
     if moved is None:
@@ -376,7 +411,9 @@ def cameras_of(
 def clothing_thickness(
     origin: Origin, state: FitState, weights: Float[Array, "*p j"]
 ) -> Float[Array, "*p"]:
-    """Metres by which masks reach beyond the body, at points with these skinning weights; 0 without clothing."""
+    """Metres by which masks reach beyond the body, at points with these skinning weights; 0 without
+    clothing.
+    """
     if origin.segment is None or state.clothing is None:
         return jnp.zeros(weights.shape[:-1])
     return origin.std.clothing * jnp.matmul(
@@ -390,7 +427,9 @@ def scale_of(state: FitState) -> Float[Array, ""]:
 
 
 def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarray, " j"]:
-    """(j,) 0 for the root, 1 + i for joint `joints[i]`, and for other joints the number of their nearest such ancestor."""
+    """(j,) 0 for the root, 1 + i for joint `joints[i]`, and for other joints the number of their
+    nearest such ancestor.
+    """
     number = {joint: i + 1 for i, joint in enumerate(joints)} | {parents.index(-1): 0}
     found = []
     for joint in range(len(parents)):
@@ -413,7 +452,9 @@ def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigi
 def camera_numbers(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], same: float
 ) -> Int[np.ndarray, " v"]:
-    """(v,) from 0, equal for views of one camera that stood still. same: largest difference, see below."""
+    """(v,) from 0, equal for views of one camera that stood still. same: largest difference, see
+    below.
+    """
     focal, flat = K[:, :1, 0], lambda values: values.reshape(len(K), -1)
     return _numbered(np.concatenate([np.log(focal), flat(K) / focal, flat(matrices)], axis=1), same)
 

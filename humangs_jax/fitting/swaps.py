@@ -1,16 +1,18 @@
 """Bookkeeping errors that keypoints reveal: exchanged sides, or exchanged cameras.
 
-Views of one frame that are right agree: the rays of a landmark meet. Exchanges that people and detectors make are undone on
-trial; while the views then agree clearly better, the clearest is kept. Cameras are reported in this order, then sides by view:
+Views of one frame that are right agree: the rays of a landmark meet. Exchanges that people and
+detectors make are undone on trial; while the views then agree clearly better, the clearest is kept.
+Cameras are reported in this order, then sides by view:
 
-    sides     left and right of the keypoints of one view; needs two views, of which either may be the wrong one
+    sides     left and right of the keypoints of one view; needs two views, of which either may be
+              the wrong one
     cameras   of two views, which is the same as their photos; needs three views
     hands     left and right keypoints of the hands alone, in one view
 
 Left and right exchanged in all views agree as well: that is not found.
 
-A view agrees with a landmark by how near its keypoint is to the best of the points that pairs of views propose
-(`triangulation.triangulate_robustly`), so that outliers count little.
+A view agrees with a landmark by how near its keypoint is to the best of the points that pairs of
+views propose (`triangulation.triangulate_robustly`), so that outliers count little.
 """
 
 import dataclasses
@@ -30,25 +32,34 @@ from humangs_jax.fitting.state import camera_numbers
 from humangs_jax.fitting.triangulation import agreement, triangulate_robustly
 
 LEAST_GAIN, CHANCE = 0.1, 0.8
-"""Agreement of n keypoints has to grow by LEAST_GAIN + CHANCE / sqrt(n) of what is attainable. By chance, without an exchange, 17
-keypoints with 20 % of outliers and three times the expected noise gain up to 0.26; 67 keypoints gain nothing.
+"""Agreement of n keypoints has to grow by LEAST_GAIN + CHANCE / sqrt(n) of what is attainable. By
+chance, without an exchange, 17 keypoints with 20 % of outliers and three times the expected noise
+gain up to 0.26; 67 keypoints gain nothing.
 """
 MANY = 5
-"""With this many views or more the right ones outvote an exchange: only exchanges that look better at once are tried."""
+"""With this many views or more the right ones outvote an exchange: only exchanges that look better
+at once are tried.
+"""
 ALIKE = 0.9
-"""Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras several are equivalent."""
+"""Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras
+several are equivalent.
+"""
 HANDS_SHARE = 0.3
-"""Hands are exchanged if their roots are nearer to the other wrists than this share of the distance from their own."""
+"""Hands are exchanged if their roots are nearer to the other wrists than this share of the distance
+from their own.
+"""
 SAME_CAMERA = 1e-3
-"""Share of the focal length, and metres, by which a camera that stands still may differ between frames."""
+"""Share of the focal length, and metres, by which a camera that stands still may differ between
+frames.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
     """One exchange that explains a disagreement; `str()` is a sentence about it.
 
-    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a and b"). frames: for cameras,
-    in how many; the views are those of the first.
+    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a
+    and b"). frames: for cameras, in how many; the views are those of the first.
     """
 
     kind: Literal["sides", "cameras", "hands"]
@@ -58,11 +69,17 @@ class Swap:
 
     def __str__(self) -> str:
         if self.kind == "hands":
-            return f"view {self.views[0]}: the keypoints of the hands seem exchanged: each lies at the other wrist"
+            return (
+                f"view {self.views[0]}: the keypoints of the hands seem exchanged: each lies at the"
+                " other wrist"
+            )
         if self.kind == "cameras":
             frames = f", as in {self.frames} frames" if self.frames > 1 else ""
             other = f" (or those of {' or '.join(self.instead)} instead)" if self.instead else ""
-            return f"the cameras (or the photos) of views {' and '.join(self.views)} seem exchanged{other}{frames}"
+            return (
+                f"the cameras (or the photos) of views {' and '.join(self.views)} seem"
+                f" exchanged{other}{frames}"
+            )
         other = f" (or in {' and '.join(self.instead)} instead)" if self.instead else ""
         return f"view {self.views[0]}: left and right of the keypoints seem exchanged{other}"
 
@@ -73,9 +90,11 @@ def find_swaps(
     views: Int[np.ndarray, "m c"],
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
-    """Exchanged cameras, the clearest first, and then sides by view. Frames need two views for sides and three for cameras.
+    """Exchanged cameras, the clearest first, and then sides by view. Frames need two views for
+    sides and three for cameras.
 
-    Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none, see `group_by_frame`.
+    Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none,
+    see `group_by_frame`.
     """
     mirror, cameras = np.asarray(kind.mirror), _camera_numbers(observations, views)
     order, exchanges = given(*views.shape), []
@@ -96,7 +115,9 @@ def find_swaps(
 
 
 def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
-    """Views in which the hands' keypoints are at each other's wrists, as hand detectors on exchanged crops leave them."""
+    """Views in which the hands' keypoints are at each other's wrists, as hand detectors on
+    exchanged crops leave them.
+    """
     wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
     if not set(wanted) <= set(keypoints.set.names):
         return ()
@@ -107,13 +128,15 @@ def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[
     return tuple(Swap("hands", (names[view],)) for view in np.flatnonzero(exchanged))
 
 
-# How well views agree --------------------------------------------------------------------------------------------------
+# How well views agree
+# --------------------------------------------------------------------------------------------------
 
 
 class Order(NamedTuple):
     """Which keypoints the c cameras of m frames get.
 
-    source: (m, c) camera that they come from. mirrored: (m, c) by source, whether left and right are exchanged.
+    source: (m, c) camera that they come from. mirrored: (m, c) by source, whether left and right
+    are exchanged.
     """
 
     source: Int[np.ndarray, "m c"]
@@ -125,7 +148,9 @@ class Order(NamedTuple):
         a: Int[np.ndarray, " e"],
         b: Int[np.ndarray, " e"] | None,
     ) -> "Order":
-        """The order with the keypoints of cameras a and b exchanged in some frames, or without b left and right of camera a's."""
+        """The order with the keypoints of cameras a and b exchanged in some frames, or without b
+        left and right of camera a's.
+        """
         source, mirrored = self.source.copy(), self.mirrored.copy()
         if b is None:
             mirrored[frames, source[frames, a]] ^= True
@@ -148,7 +173,8 @@ def arranged(
     pick = lambda values: jnp.asarray(
         np.asarray(values)[rows[..., None], order.source[..., None], columns]
     )
-    # where left and right are exchanged the detector may have seen the body turned round: its depths say nothing then
+    # where left and right are exchanged the detector may have seen the body turned round: its
+    # depths say nothing then
     world = None if observations.world is None or order.mirrored.any() else pick(observations.world)
     return replace(
         observations,
@@ -159,10 +185,11 @@ def arranged(
 
 
 class Agreement(NamedTuple):
-    """How well c views agree with the points that they agree on best: confidences summed over keypoints, less for larger errors.
+    """How well c views agree with the points that they agree on best: confidences summed over
+    keypoints, less for larger errors.
 
-    own: (c,) with the keypoints as they are. crossed: (c, c) if the first view had the second's keypoints, and mirrored: (c,)
-    with left and right exchanged, both without new triangulation.
+    own: (c,) with the keypoints as they are. crossed: (c, c) if the first view had the second's
+    keypoints, and mirrored: (c,) with left and right exchanged, both without new triangulation.
     """
 
     own: Float[Array, " c"]
@@ -174,7 +201,9 @@ class Agreement(NamedTuple):
 def _agreements(
     observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]
 ) -> Agreement:
-    """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror image."""
+    """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror
+    image.
+    """
 
     def of_frame(seen):
         points, counts, weights = triangulate_robustly(seen)
@@ -198,11 +227,14 @@ def _agreements(
     return jax.lax.map(of_frame, observations)
 
 
-# Trials --------------------------------------------------------------------------------------------------------------
+# Trials
+# --------------------------------------------------------------------------------------------------
 
 
 class _Trial(NamedTuple):
-    """An exchange in some frames, of cameras a and b, or of the sides of camera a if b is None. gain: agreement that it adds."""
+    """An exchange in some frames, of cameras a and b, or of the sides of camera a if b is None.
+    gain: agreement that it adds.
+    """
 
     gain: float
     frames: Int[np.ndarray, " e"]
@@ -213,8 +245,8 @@ class _Trial(NamedTuple):
 class _Search:
     """Keypoints in an order, how well the views agree, and what exchanges would add.
 
-    cameras: (m, c) equal numbers for one camera that stands still, -1: no view. total: (m,) agreement. views: (m, c) with
-    keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
+    cameras: (m, c) equal numbers for one camera that stands still, -1: no view. total: (m,)
+    agreement. views: (m, c) with keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
     """
 
     def __init__(
@@ -254,7 +286,9 @@ class _Search:
         return (np.asarray(own).sum(-1) - self.total)[frames]
 
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
-        """Whether an exchange of the keypoints `of` gains enough: attainable is that all agree that another view sees."""
+        """Whether an exchange of the keypoints `of` gains enough: attainable is that all agree that
+        another view sees.
+        """
         seen = (self.confidences > 0) & of
         shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
         slots = [slot for slot in (trial.a, trial.b) if slot is not None]
@@ -321,7 +355,9 @@ def _cameras(
 def _sides(
     observations: Observations, views: Int[np.ndarray, "m c"], order: Order, names: Sequence[str]
 ) -> list[Swap]:
-    """A swap for each view whose sides are exchanged; if these are half of the views, it may be the other half."""
+    """A swap for each view whose sides are exchanged; if these are half of the views, it may be the
+    other half.
+    """
     found = []
     seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)
     for own, mirrored, exists in zip(views, order.mirrored, seen, strict=True):

@@ -1,12 +1,15 @@
-"""Points in space from several views, similarities between points, and which people in several views are the same person.
+"""Points in space from several views, similarities between points, and which people in several
+views are the same person.
 
-A pixel is a ray. The point with the least weighted sum of squared distances to the rays solves 3 x 3 equations. Weights of
-focal length over distance turn metres into pixels (Hartley and Zisserman, Multiple View Geometry, 12.2). Robustly: from the pair
-of views that most views agree with. Similarities are in float64 on the host.
+A pixel is a ray. The point with the least weighted sum of squared distances to the rays solves 3 x
+3 equations. Weights of focal length over distance turn metres into pixels (Hartley and Zisserman,
+Multiple View Geometry, 12.2). Robustly: from the pair of views that most views agree with.
+Similarities are in float64 on the host.
 
-Landmarks of one person triangulate: seen from other cameras they fall on that person's landmarks, within a few hundredths of the
-person's size. Those of two people do not, nor do those of a person whose left and right one view takes for each other. Every pair
-of people in two views proposes points, as they are and with the sides of the second exchanged; the others join where they agree.
+Landmarks of one person triangulate: seen from other cameras they fall on that person's landmarks,
+within a few hundredths of the person's size. Those of two people do not, nor do those of a person
+whose left and right one view takes for each other. Every pair of people in two views proposes
+points, as they are and with the sides of the second exchanged; the others join where they agree.
 """
 
 import dataclasses
@@ -29,7 +32,9 @@ RIDGE = 1e-6
 REWEIGHTED = 3
 """Iterations that weight the rays by the distance of the last point."""
 PAIRS_AT_ONCE = 16
-"""Pairs of views whose proposals are compared with all views at once: memory does not grow with the number of pairs."""
+"""Pairs of views whose proposals are compared with all views at once: memory does not grow with the
+number of pairs.
+"""
 MARGIN = 6.0
 """A view agrees with a point within this many standard deviations of the noise."""
 
@@ -60,8 +65,8 @@ def triangulate_robustly(
 ) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
     """Points (k, 3), how many views agree with each (k,), and those views' weights (c, k).
 
-    Every pair of views proposes a point; the proposal that the views agree with most is improved from those views alone. A
-    point that fewer than two views agree with has weights of 0.
+    Every pair of views proposes a point; the proposal that the views agree with most is improved
+    from those views alone. A point that fewer than two views agree with has weights of 0.
     """
     views = observations.points.shape[0]
     if views < 2:
@@ -75,7 +80,8 @@ def triangulate_robustly(
         points = triangulate(observations, observations.confidences * pair)[0]
         return points, jnp.sum(agreement(observations, points), axis=0)
 
-    # of all pairs only their points are kept: with 48 views there are 1128 pairs, each with an agreement of every view
+    # of all pairs only their points are kept: with 48 views there are 1128 pairs, each with an
+    # agreement of every view
     proposals, agreed = jax.lax.map(propose, jnp.asarray(chosen), batch_size=PAIRS_AT_ONCE)
     best = jnp.argmax(agreed, axis=0)
     weights = agreement(
@@ -87,7 +93,9 @@ def triangulate_robustly(
 
 
 def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
-    """How well the views agree with points: their confidences, less for larger errors, 0 beyond the margin."""
+    """How well the views agree with points: their confidences, less for larger errors, 0 beyond the
+    margin.
+    """
     errors = reprojection_errors(observations, points)
     return observations.confidences * jnp.maximum(
         1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0
@@ -97,7 +105,9 @@ def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[
 def reprojection_errors(
     observations: Observations, points: Float[Array, "k 3"]
 ) -> Float[Array, "c k"]:
-    """Distance in pixels between points as the views would show them and the detections; huge behind a camera."""
+    """Distance in pixels between points as the views would show them and the detections; huge
+    behind a camera.
+    """
     seen = in_cameras(observations, points)
     depth = seen[..., 2]
     before = depth > 0.01
@@ -130,7 +140,8 @@ def _nearest(
     return jnp.linalg.solve(matrix, vector[..., None])[..., 0] + center
 
 
-# Similarities ----------------------------------------------------------------------------------------------------------
+# Similarities
+# --------------------------------------------------------------------------------------------------
 
 ITERATIONS = 10
 """They reweight the points by their distances."""
@@ -170,7 +181,8 @@ def align_points(
     target: Float[np.ndarray, "k 3"],
     weights: Float[np.ndarray, " k"],
 ) -> Similarity:
-    """The similarity from source to target whose weighted square distances are least (Umeyama 1991, eq. 40 to 43).
+    """The similarity from source to target whose weighted square distances are least (Umeyama 1991,
+    eq. 40 to 43).
 
     Raises: ValueError if fewer than three points have a weight, or they lie on a line.
     """
@@ -193,7 +205,8 @@ def align_robustly(
     weights: Float[np.ndarray, " k"],
     std: float,
 ) -> Similarity:
-    """The same with Cauchy weights: points farther off than `std`, in units of the target, count less.
+    """The same with Cauchy weights: points farther off than `std`, in units of the target, count
+    less.
 
     Raises: see `align_points`.
     """
@@ -204,23 +217,31 @@ def align_robustly(
     return found
 
 
-# Who is who ------------------------------------------------------------------------------------------------------------
+# Who is who
+# --------------------------------------------------------------------------------------------------
 
 AGREE = 0.06
-"""Median distance of landmarks from the triangulated points, a share of the person's size in the photo, up to which a view shows
-the same person. Cameras that are off by a degree make 0.02 of it."""
+"""Median distance of landmarks from the triangulated points, a share of the person's size in the
+photo, up to which a view shows the same person. Cameras that are off by a degree make 0.02 of it.
+"""
 CLEARLY, RATHER = 0.5, 0.8
-"""Sides are exchanged if the distance is then less than this share of what it is without; the second where it does not agree
-without."""
+"""Sides are exchanged if the distance is then less than this share of what it is without; the
+second where it does not agree without."""
 FARTHEST = 1.0
-"""Metres between a person's places in two frames that follow each other, where several views show where they are."""
+"""Metres between a person's places in two frames that follow each other, where several views show
+where they are.
+"""
 SHORTER, FAR = 0.3, 3.0
-"""Of the longest way: how much shorter the ways of people between two frames have to be than if two of them were exchanged; and
-from where on all ways count as equally long."""
+"""Of the longest way: how much shorter the ways of people between two frames have to be than if two
+of them were exchanged; and from where on all ways count as equally long."""
 NEAR = 0.5
-"""A share of a person's size in the photo: how far they go in the photo of one camera from one frame to the next."""
+"""A share of a person's size in the photo: how far they go in the photo of one camera from one
+frame to the next.
+"""
 RESIZED = 1.5
-"""The most by which a person's size in the photo of one camera changes from one frame to the next, a factor."""
+"""The most by which a person's size in the photo of one camera changes from one frame to the next,
+a factor.
+"""
 STILL_DEGREES, STILL_METRES = 10.0, 0.3
 """A view that has turned and moved by no more than this since the last frame is one camera's."""
 PLAIN = 0.1
@@ -232,7 +253,10 @@ SEEN, FEWEST = 0.3, 6
 
 
 class Seen(NamedTuple):
-    """People of a view. K: (3, 3). cam_from_world: (4, 4). people: each (k, 3) pixels and visibility."""
+    """People of a view. K: (3, 3). cam_from_world: (4, 4).
+
+    people: each (k, 3) pixels and visibility.
+    """
 
     K: Float[np.ndarray, "3 3"]
     cam_from_world: Float[np.ndarray, "4 4"]
@@ -244,9 +268,10 @@ Key = tuple[int, int]
 
 
 class Match(NamedTuple):
-    """One person. members: for each view the index of its person, None where it has none. mirrored: for each view whether left
-    and right are exchanged. error: median distance of the landmarks from the triangulated points over the person's size; infinite
-    for a person of one view. center: the median of the points, metres; NaN for a person of one view.
+    """One person. members: for each view the index of its person, None where it has none. mirrored:
+    for each view whether left and right are exchanged. error: median distance of the landmarks from
+    the triangulated points over the person's size; infinite for a person of one view. center: the
+    median of the points, metres; NaN for a person of one view.
     """
 
     members: tuple[int | None, ...]
@@ -256,7 +281,8 @@ class Match(NamedTuple):
 
 
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
-    """The people of some views of one moment, those seen by most views first; those whom no other view shows come last.
+    """The people of some views of one moment, those seen by most views first; those whom no other
+    view shows come last.
 
     Arguments: mirror: for each landmark the index of its mirror image.
     """
@@ -296,7 +322,9 @@ def _gathered(
     points: Float[np.ndarray, "k 3"],
     known: Bool[np.ndarray, " k"],
 ) -> tuple[dict[Key, bool], float]:
-    """A pair, {(view, person): exchanged}, with the people of the other views who agree with its points; and the error."""
+    """A pair, {(view, person): exchanged}, with the people of the other views who agree with its
+    points; and the error.
+    """
     group, errors = dict(pair), [error]
     for v in set(range(len(views))) - {v for v, _ in pair}:
         trials = []
@@ -315,7 +343,9 @@ def _gathered(
 
 
 def _is_exchanged(plain: float, exchanged: float) -> bool:
-    """From two errors. Of a small or thin person left and right hardly differ: then nothing is exchanged."""
+    """From two errors. Of a small or thin person left and right hardly differ: then nothing is
+    exchanged.
+    """
     return exchanged < (CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain))
 
 
@@ -364,7 +394,9 @@ def _error(
     points: Float[np.ndarray, "k 3"],
     known: Bool[np.ndarray, " k"],
 ) -> float:
-    """Median distance of landmarks from points over the size of the person; infinite behind the camera or with few in common."""
+    """Median distance of landmarks from points over the size of the person; infinite behind the
+    camera or with few in common.
+    """
     seen = known & (row[:, 2] >= SEEN)
     if seen.sum() < FEWEST:
         return float("inf")
@@ -389,12 +421,12 @@ def in_order_of_time(
 ) -> list[list[Match | None]]:
     """The matches of frames that follow each other, so that the i-th of each is one person.
 
-    The ways of all together are the shortest, in space and, of those whom space does not tell, in the photos of one camera.
-    Where others are nearly as short, nobody is linked.
+    The ways of all together are the shortest, in space and, of those whom space does not tell, in
+    the photos of one camera. Where others are nearly as short, nobody is linked.
 
     Arguments: shown: the views of each frame; None: people are followed in space alone.
-    Returns: for each frame a match for each person, None where the frame does not have the person. Whoever is linked to nobody
-    is added at the end: that may be one of the others all the same.
+    Returns: for each frame a match for each person, None where the frame does not have the person.
+    Whoever is linked to nobody is added at the end: that may be one of the others all the same.
     """
     people: list[list[Match | None]] = []
     for f, matches in enumerate(frames):
@@ -429,7 +461,9 @@ def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
 
 
 def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tuple[int, int]]:
-    """People and their matches: those with the shortest ways of all together, where any others are plainly longer."""
+    """People and their matches: those with the shortest ways of all together, where any others are
+    plainly longer.
+    """
     ways = np.fmin(
         ways, FAR * longest
     )  # longer ones, and those that are not known, are all as unlikely
@@ -452,7 +486,8 @@ def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tu
 def _moved_in_photos(
     before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match
 ) -> float:
-    """How far one person would have gone in the photos of all cameras that show both, at the most, a share of the size.
+    """How far one person would have gone in the photos of all cameras that show both, at the most,
+    a share of the size.
 
     Infinite if no camera does, or if the size in a photo changed too much.
     """
@@ -483,7 +518,9 @@ def _stands_still(before: Seen, now: Seen) -> bool:
 
 
 def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
-    """The middle of the landmarks that are seen, pixels, and the longer side of the box around them."""
+    """The middle of the landmarks that are seen, pixels, and the longer side of the box around
+    them.
+    """
     seen = row[row[:, 2] >= SEEN, :2]
     seen = seen if len(seen) else row[:, :2]
     return np.median(seen, axis=0), float(np.ptp(seen, axis=0).max())
@@ -492,9 +529,11 @@ def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
 def match_colors(
     first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]
 ) -> tuple[int, ...] | None:
-    """For each of m people of a photo which of n >= m of another one has the same colors; None if that is not plain.
+    """For each of m people of a photo which of n >= m of another one has the same colors; None if
+    that is not plain.
 
-    It is plain if any other order of people leaves larger differences at whatever exposure suits that order best.
+    It is plain if any other order of people leaves larger differences at whatever exposure suits
+    that order best.
 
     Arguments: colors in [0, 1] of k parts of the body; NaN for parts that are not seen.
     """

@@ -1,6 +1,7 @@
 """Pinhole cameras in the OpenCV convention: x right, y down, z forward; pixel centres at +0.5.
 
-A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. No lens distortion.
+A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. No
+lens distortion.
 """
 
 import math
@@ -17,9 +18,13 @@ from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static
 from humangs_jax.geometry import transform
 
 RIGID_TOLERANCE = 1e-3
-"""Calibrations are stored with few digits: R R^T may be this far from the identity before a camera is refused."""
+"""Calibrations are stored with few digits: R R^T may be this far from the identity before a camera
+is refused.
+"""
 LARGEST_NUMBER = 1e7
-"""Pixels of a focal length, metres of a translation: larger ones are faults, and their products no numbers in float32."""
+"""Pixels of a focal length, metres of a translation: larger ones are faults, and their products no
+numbers in float32.
+"""
 
 
 RIGHT_ANGLE = np.pi / 2 + 1e-6
@@ -28,7 +33,8 @@ RIGHT_ANGLE = np.pi / 2 + 1e-6
 
 @pytree_dataclass
 class Camera(Batchable):
-    """A pinhole camera, or a batch of cameras of one image size (leading axes on K and cam_from_world).
+    """A pinhole camera, or a batch of cameras of one image size (leading axes on K and
+    cam_from_world).
 
     A batch can be indexed and iterated over: `for camera in cameras`.
 
@@ -47,12 +53,15 @@ class Camera(Batchable):
 
     @classmethod
     def from_opencv(cls, K: object, cam_from_world: object, width: int, height: int) -> "Camera":
-        """A camera from array-likes (3, 3) and (4, 4), checked. Under `jit`, `vmap` and `grad` only shapes are.
+        """A camera from array-likes (3, 3) and (4, 4), checked. Under `jit`, `vmap` and `grad` only
+        shapes are.
 
-        Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have it.
+        Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have
+        it.
 
-        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive, the rotation not
-        orthonormal and right-handed (to 1e-3), the image empty, or its sides no whole numbers.
+        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive,
+        the rotation not orthonormal and right-handed (to 1e-3), the image empty, or its sides no
+        whole numbers.
         """
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((K, cam_from_world)))
         array = jnp.asarray if traced else np.asarray
@@ -87,7 +96,8 @@ class Camera(Batchable):
             or np.linalg.det(rotation) < 0
         ):
             raise ValueError(
-                "cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and det R = 1)"
+                "cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and"
+                " det R = 1)"
             )
         if not np.allclose(cam_from_world[3], [0, 0, 0, 1]):
             raise ValueError(
@@ -106,7 +116,10 @@ class Camera(Batchable):
         return self.world_from_cam[..., :3, 3]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same camera for the image resampled to another size. Raises: ValueError for sides that are no whole numbers."""
+        """The same camera for the image resampled to another size.
+
+        Raises: ValueError for sides that are no whole numbers.
+        """
         width, height = _pixels(width, height)
         scale = jnp.asarray([width / self.width, height / self.height, 1.0], self.K.dtype)
         return replace(self, K=self.K * scale[:, None], width=width, height=height)
@@ -118,7 +131,10 @@ class Camera(Batchable):
 
 
 def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
-    """The sides of an image as integers. Raises: ValueError for an empty image and for parts of pixels."""
+    """The sides of an image as integers.
+
+    Raises: ValueError for an empty image and for parts of pixels.
+    """
     if not (width >= 1 and height >= 1):
         raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if width % 1 or height % 1 or math.inf in (width, height):
@@ -129,7 +145,9 @@ def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
 
 
 def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values]]:
-    """What `core.checks.check_values` needs to check one camera or a batch; they are few numbers, read on the host."""
+    """What `core.checks.check_values` needs to check one camera or a batch; they are few numbers,
+    read on the host.
+    """
     K, cam_from_world = cameras.K, cameras.cam_from_world
     if isinstance(K, Tracer) or isinstance(cam_from_world, Tracer):
         return {"camera.K": (K, FINITE), "camera.cam_from_world": (cam_from_world, FINITE)}
@@ -143,7 +161,10 @@ def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values
 
 @checked_arguments
 def stack_cameras(cameras: list[Camera]) -> Camera:
-    """A batch from cameras of one image size. Raises ValueError if sizes differ or the list is empty."""
+    """A batch from cameras of one image size.
+
+    Raises ValueError if sizes differ or the list is empty.
+    """
     if not cameras:
         raise ValueError("no cameras to stack")
     if len({(c.width, c.height) for c in cameras}) > 1:
@@ -154,7 +175,10 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
 def project(
     camera: Camera, points: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
-    """World points of one camera -> pixel positions and depths z (metres). No guard at z = 0: see `rendering.projection`."""
+    """World points of one camera -> pixel positions and depths z (metres).
+
+    No guard at z = 0: see `rendering.projection`.
+    """
     p = transform.apply(camera.cam_from_world, points)
     depth = p[..., 2]
     uv = (
@@ -171,8 +195,9 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
     """
     if not isinstance(vertical_fov, Tracer) and not 0 < float(vertical_fov) < np.pi:
         raise ValueError(
-            f"intrinsics_from_fov: vertical_fov {float(vertical_fov):.6g}: expected radians between 0 and pi; "
-            f"{float(vertical_fov):.6g} degrees are np.deg2rad({float(vertical_fov):.6g})"
+            f"intrinsics_from_fov: vertical_fov {float(vertical_fov):.6g}: expected radians between"
+            f" 0 and pi; {float(vertical_fov):.6g} degrees are"
+            f" np.deg2rad({float(vertical_fov):.6g})"
         )
     tan = jnp.tan if isinstance(vertical_fov, Tracer) else np.tan
     focal = 0.5 * height / tan(0.5 * vertical_fov)
@@ -197,7 +222,8 @@ def look_at(
         One camera.
 
     Examples:
-        >>> camera = hg.look_at(jnp.array([0.0, 1.0, 3.0]), jnp.array([0.0, 0.9, 0.0]), jnp.array([0.0, 1.0, 0.0]), K, 512, 512)
+        >>> eye, target = jnp.array([0.0, 1.0, 3.0]), jnp.array([0.0, 0.9, 0.0])
+        >>> camera = hg.look_at(eye, target, jnp.array([0.0, 1.0, 0.0]), K, 512, 512)
     """
     forward = safe_normalize(target - eye, jnp.asarray([0.0, 0.0, 1.0]))
     right = safe_normalize(jnp.cross(forward, up), jnp.asarray([1.0, 0.0, 0.0]))
@@ -239,7 +265,8 @@ def orbit(
         ValueError: for elevations beyond a right angle.
 
     Examples:
-        >>> cameras = hg.orbit(jnp.array([0.0, 0.9, 0.0]), 3.0, jnp.linspace(0, 2 * jnp.pi, 8), 0.1, K, 512, 512)
+        >>> target, azimuths = jnp.array([0.0, 0.9, 0.0]), jnp.linspace(0, 2 * jnp.pi, 8)
+        >>> cameras = hg.orbit(target, 3.0, azimuths, 0.1, K, 512, 512)
     """
     azimuths = jnp.asarray(azimuths)
     azimuths = azimuths.astype(
@@ -265,7 +292,9 @@ def orbit(
 
 
 def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]]:
-    """Camera centre and unit directions through the pixel centres (x + 0.5, y + 0.5) of one camera."""
+    """Camera centre and unit directions through the pixel centres (x + 0.5, y + 0.5) of one
+    camera.
+    """
     x = (jnp.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     y = (jnp.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     x, y = jnp.meshgrid(x, y)
@@ -279,7 +308,9 @@ def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]
 
 
 def plucker_rays(camera: Camera) -> Float[Array, "h w 6"]:
-    """Moment, then direction, of every pixel's ray (reference: HumanGS, after Sitzmann et al., Light Field Networks)."""
+    """Moment, then direction, of every pixel's ray (reference: HumanGS, after Sitzmann et al.,
+    Light Field Networks).
+    """
     origin, directions = pixel_rays(camera)
     moments = jnp.cross(jnp.broadcast_to(origin, directions.shape), directions)
     return jnp.concatenate([moments, directions], axis=-1)

@@ -8,7 +8,9 @@ from humangs_jax.core.array_types import Bool, Float, Int
 def face_crosses(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "f 3"]:
-    """The normal of each face, twice its area long; outwards where corners go round counter-clockwise."""
+    """The normal of each face, twice its area long; outwards where corners go round
+    counter-clockwise.
+    """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
@@ -30,7 +32,10 @@ def vertex_areas(
 def vertex_crosses(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """The sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of it. 0 where there is no face."""
+    """The sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of it.
+
+    0 where there is no face.
+    """
     around = np.tile(face_crosses(vertices, faces), (3, 1))
     return np.stack(
         [np.bincount(faces.T.ravel(), around[:, i], len(vertices)) for i in range(3)], axis=-1
@@ -40,7 +45,9 @@ def vertex_crosses(
 def mesh_edges(
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
-    """Undirected edges (e, 2), and which of them each side, corner i to i + 1, of each face is (f, 3)."""
+    """Undirected edges (e, 2), and which of them each side, corner i to i + 1, of each face is (f,
+    3).
+    """
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
     edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
     return edges, index.reshape(faces.shape)
@@ -52,7 +59,9 @@ def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
 
 
 def directions_around(count: int, turned: float = 0.5) -> Float[np.ndarray, "d 3"]:
-    """Unit vectors, evenly spread over the sphere (a Fibonacci lattice), the first turned by `turned` golden angles."""
+    """Unit vectors, evenly spread over the sphere (a Fibonacci lattice), the first turned by
+    `turned` golden angles.
+    """
     i = np.arange(count)
     y, turn = 1 - 2 * (i + 0.5) / count, np.pi * (3 - np.sqrt(5)) * (i + turned)
     radius = np.sqrt(1 - y * y)
@@ -66,7 +75,9 @@ def in_front(
     cell: float,
     behind: float,
 ) -> Bool[np.ndarray, " q"]:
-    """Which of some points are at most `behind` behind the nearest of all points in their cell of a grid across `forward`."""
+    """Which of some points are at most `behind` behind the nearest of all points in their cell of a
+    grid across `forward`.
+    """
     right = np.linalg.svd(forward[None])[2][1]
     frame = np.stack([right, np.cross(forward, right), forward])
     own, others = (frame @ vectors.T for vectors in (some, points))
@@ -82,7 +93,8 @@ def in_front(
 def smallest_turns(
     a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], opposite: float = 1e-6
 ) -> Float[np.ndarray, "*n 3 3"]:
-    """The rotation matrices that turn unit vectors a into b by the smallest angle; none where one is zero.
+    """The rotation matrices that turn unit vectors a into b by the smallest angle; none where one
+    is zero.
 
     Where 1 + a.b is less than `opposite`, it is half a turn about some axis across a.
     """

@@ -1,7 +1,8 @@
 """Rotations: quaternions (w, x, y, z), axis-angle vectors and matrices.
 
-q = w + xi + yj + zk acts on column vectors by v' = q v q*. Axis-angle is the rotation vector theta * axis, in radians.
-Quaternions q and -q are the same rotation. At the end: singular vectors of 3x3 matrices.
+q = w + xi + yj + zk acts on column vectors by v' = q v q*. Axis-angle is the rotation vector theta
+* axis, in radians. Quaternions q and -q are the same rotation. At the end: singular vectors of 3x3
+matrices.
 """
 
 import jax.numpy as jnp
@@ -11,13 +12,18 @@ from humangs_jax.core.numerics import safe_normalize
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 SMALL_ANGLE_SQUARED = 1e-4
-"""Below this the Taylor series of sin(t)/t and (1-cos t)/t^2, cut after t^4, are exact to float32 rounding (t^6/5040 < 2e-16)."""
+"""Below this the Taylor series of sin(t)/t and (1-cos t)/t^2, cut after t^4, are exact to float32
+rounding (t^6/5040 < 2e-16).
+"""
 
 SMALLEST_SQUARE = 1e-30
-"""Of a sine: below it the sine is the angle, and derivatives of its root would overflow in float32."""
+"""Of a sine: below it the sine is the angle, and derivatives of its root would overflow in float32.
+"""
 
 OPPOSITE = 1e-12
-"""Unit vectors whose product is less than this above -1 count as opposite: their cross product is rounding."""
+"""Unit vectors whose product is less than this above -1 count as opposite: their cross product is
+rounding.
+"""
 
 
 def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -41,7 +47,9 @@ def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array,
 
 
 def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, "*b 4"]:
-    """The shortest rotation from one unit vector to another; half a turn across `a` where they are opposite."""
+    """The shortest rotation from one unit vector to another; half a turn across `a` where they are
+    opposite.
+    """
     real = jnp.sum(jnp.square(a + b), axis=-1, keepdims=True) / 2  # 1 + a.b without cancellation
     across = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a), axis=-1)])
     opposite = real < OPPOSITE
@@ -50,7 +58,10 @@ def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, 
 
 
 def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
-    """Rotation matrix of a unit quaternion. For |q| != 1 the polynomial is used as it is (see `normalize`)."""
+    """Rotation matrix of a unit quaternion.
+
+    For |q| != 1 the polynomial is used as it is (see `normalize`).
+    """
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -65,8 +76,8 @@ def candidates_from_matrix(
 ) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
     """The four quaternions that a rotation matrix can be read as, and how well conditioned each is.
 
-    q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, 0.1). Of a rotation
-    they are all the same; of another matrix they are not.
+    q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, 0.1). Of
+    a rotation they are all the same; of another matrix they are not.
     """
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squared = jnp.stack(
@@ -91,10 +102,11 @@ def candidates_from_matrix(
 
 
 def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
-    """Quaternion of a rotation matrix, by the best conditioned of the four candidates (see `candidates_from_matrix`).
+    """Quaternion of a rotation matrix, by the best conditioned of the four candidates (see
+    `candidates_from_matrix`).
 
-    A matrix that is no rotation is not repaired: the result then has |q| != 1, as in the published network ("rotation"
-    skinning).
+    A matrix that is no rotation is not repaired: the result then has |q| != 1, as in the published
+    network ("rotation" skinning).
     """
     candidates, q_abs = candidates_from_matrix(m)
     best = jnp.argmax(q_abs, axis=-1)[..., None, None]
@@ -137,7 +149,9 @@ def from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
 
 
 def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
-    """The rotation vector, no longer than pi, of a unit quaternion, with exact derivatives at the zero rotation."""
+    """The rotation vector, no longer than pi, of a unit quaternion, with exact derivatives at the
+    zero rotation.
+    """
     q = jnp.where(q[..., :1] < 0, -q, q)
     squared = jnp.sum(jnp.square(q[..., 1:]), axis=-1, keepdims=True)
     turned = squared > SMALLEST_SQUARE
@@ -148,28 +162,32 @@ def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
 def interpolate(
     a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"], share: Float[Array, "*#b"]
 ) -> Float[Array, "*b 3"]:
-    """The rotation vector that many shares of the shortest way from a to b: spherical linear interpolation (Shoemake 1985,
-    https://doi.org/10.1145/325165.325242).
+    """The rotation vector that many shares of the shortest way from a to b: spherical linear
+    interpolation (Shoemake 1985, https://doi.org/10.1145/325165.325242).
     """
     start = from_axis_angle(a)
     turn = to_axis_angle(multiply(from_axis_angle(-a), from_axis_angle(b)))
     return to_axis_angle(multiply(start, from_axis_angle(share[..., None] * turn)))
 
 
-# Singular vectors: LAPACK decomposes small matrices one by one; this runs on planes of the whole batch, on any backend. Working
-# on the matrix itself, never on its Gram matrix, keeps small singular values accurate (Demmel & Veselić 1992,
-# https://doi.org/10.1137/0613074).
+# Singular vectors: LAPACK decomposes small matrices one by one; this runs on planes of the whole
+# batch, on any backend. Working on the matrix itself, never on its Gram matrix, keeps small
+# singular values accurate (Demmel & Veselić 1992, https://doi.org/10.1137/0613074).
 
 SWEEPS = 6
-"""Cyclic Jacobi converges quadratically; 3x3 matrices reach float64 rounding after five sweeps (tests), float32 after four."""
+"""Cyclic Jacobi converges quadratically; 3x3 matrices reach float64 rounding after five sweeps
+(tests), float32 after four.
+"""
 
 
 def left_singular_vectors(
     m: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3"]]:
-    """Rotations U (det +1) and singular values s >= 0, in no particular order, with m m^T = U diag(s)^2 U^T.
+    """Rotations U (det +1) and singular values s >= 0, in no particular order, with m m^T = U
+    diag(s)^2 U^T.
 
-    Not meant to be differentiated: U is not unique where singular values coincide. A zero column is completed to a rotation.
+    Not meant to be differentiated: U is not unique where singular values coincide. A zero column is
+    completed to a rotation.
     """
     columns = [m[..., :, i] for i in range(3)]
     for _ in range(SWEEPS):
@@ -186,7 +204,8 @@ def _orthogonalize(
     aa, bb, ab = (jnp.sum(x * y, axis=-1, keepdims=True) for x, y in ((a, a), (b, b), (a, b)))
     needed = ab != 0
     ratio = (bb - aa) / (2 * jnp.where(needed, ab, 1))
-    # the smaller root of t^2 + 2 ratio t - 1, in the form that neither cancels nor overflows for large ratios
+    # the smaller root of t^2 + 2 ratio t - 1, in the form that neither cancels nor overflows for
+    # large ratios
     tangent = jnp.where(ratio >= 0, 1, -1) / (
         jnp.abs(ratio) + jnp.hypot(jnp.ones_like(ratio), ratio)
     )
@@ -199,7 +218,9 @@ def _orthogonalize(
 def _complete_to_rotation(
     columns: Float[Array, "*b 3 3"], norms: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3 3"]:
-    """Normalise the two longest columns and take their cross product as the third: proper even where columns vanish."""
+    """Normalise the two longest columns and take their cross product as the third: proper even
+    where columns vanish.
+    """
     order = jnp.argsort(-norms, axis=-1)
     first = jnp.take_along_axis(columns, order[..., None, 0:1], axis=-1)[..., 0]
     second = jnp.take_along_axis(columns, order[..., None, 1:2], axis=-1)[..., 0]
@@ -218,6 +239,7 @@ def _complete_to_rotation(
     sorted_basis = jnp.stack([u0, u1, u2], axis=-1)
     back = jnp.argsort(order, axis=-1)
     basis = jnp.take_along_axis(sorted_basis, back[..., None, :], axis=-1)
-    # a permutation of the columns may be odd: flip one column's sign, which leaves U diag(s)^2 U^T as it is
+    # a permutation of the columns may be odd: flip one column's sign, which leaves U diag(s)^2 U^T
+    # as it is
     sign = jnp.sign(jnp.linalg.det(basis))[..., None]
     return basis.at[..., :, 2].multiply(sign)

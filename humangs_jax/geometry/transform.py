@@ -1,6 +1,8 @@
-"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b. Order of points in space.
+"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b.
+Order of points in space.
 
-Products ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, which is millimetres.
+Products ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, which
+is millimetres.
 """
 
 import jax
@@ -46,7 +48,9 @@ BITS = 10
 
 
 def along_curve(positions: Float[Array, "n 3"], reach: float) -> Int[Array, " n"]:
-    """Rank of each position along the curve of the cube from -reach to reach; outside of it, that of its border."""
+    """Rank of each position along the curve of the cube from -reach to reach; outside of it, that
+    of its border.
+    """
     cells = 2**BITS
     at = jnp.floor((positions / (2 * reach) + 0.5) * cells).astype(jnp.int32)
     at, bits = jnp.clip(at, 0, cells - 1), jnp.arange(BITS)

@@ -1,6 +1,8 @@
-"""Arrays of files: whether they are what they should be, their checksums, and npz archives, read without pickle.
+"""Arrays of files: whether they are what they should be, their checksums, and npz archives, read
+without pickle.
 
-Raises: Refused, see `io.reading`; `ArrayFile` knows its file, and every fault is one line with file and key.
+Raises: Refused, see `io.reading`; `ArrayFile` knows its file, and every fault is one line with file
+and key.
 """
 
 import hashlib
@@ -106,7 +108,9 @@ def check_array(
     low: float = -math.inf,
     high: float = math.inf,
 ) -> None:
-    """Real numbers in [low, high] that are finite in float32, of a shape in which None is any size."""
+    """Real numbers in [low, high] that are finite in float32, of a shape in which None is any
+    size.
+    """
     if not _fits(array, shape):
         raise Refused(f"{name}: expected shape {_in_words(shape)}, got {array.shape}")
     if array.dtype.kind not in "fiu":
@@ -191,12 +195,15 @@ def check_checksum(recorded: Any, found: str) -> None:
     """Whether a file records this checksum. None: a file of a version that wrote none."""
     if recorded not in (None, found):
         raise Refused(
-            f"damaged: its contents have the checksum {found[:12]}, recorded is {str(recorded)[:12]}"
+            f"damaged: its contents have the checksum {found[:12]}, recorded is"
+            f" {str(recorded)[:12]}"
         )
 
 
 class ArrayFile:
-    """Named arrays of a file. error: the class of what is raised for a value that is not what it should be."""
+    """Named arrays of a file. error: the class of what is raised for a value that is not what it
+    should be.
+    """
 
     def __init__(
         self,
@@ -214,10 +221,12 @@ class ArrayFile:
         error: type[FileError] = FileError,
         wanted: Callable[[str], bool] | None = None,
     ) -> "ArrayFile":
-        """An npz archive, by suffix or content, or else a pickle (read without running anything in it).
+        """An npz archive, by suffix or content, or else a pickle (read without running anything in
+        it).
 
         Arguments: wanted: which arrays of an archive to read; None: all.
-        Raises: `error` if the file is damaged or larger than the limits allow; for a missing file see `reading`.
+        Raises: `error` if the file is damaged or larger than the limits allow; for a missing file
+        see `reading`.
         """
         with reading(path, "file of arrays", error):
             with open_file(path) as file:
@@ -264,18 +273,22 @@ class ArrayFile:
         return array
 
 
-# npz archives ----------------------------------------------------------------------------------------------------------
+# npz archives
+# --------------------------------------------------------------------------------------------------
 
 
 _ONE_AT_A_TIME = threading.Lock()
-"""numpy reads the header of an array through Python's syntax trees, and CPython 3.11 counts the depth of these for all
-threads together: two at once are rarely, but then "AST constructor recursion depth mismatch" (python/cpython#106905)."""
+"""numpy reads the header of an array through Python's syntax trees, and CPython 3.11 counts the
+depth of these for all threads together: two at once are rarely, but then "AST constructor recursion
+depth mismatch" (python/cpython#106905)."""
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 LONGEST_HEADER = 512
-"""Characters; that of a plain array takes some hundred, and longer ones can exhaust Python's parser."""
+"""Characters; that of a plain array takes some hundred, and longer ones can exhaust Python's
+parser.
+"""
 PLAIN_KINDS = "biufcSU"
 """Kinds of dtypes that are read: numbers and strings, no objects, no records."""
 
@@ -283,10 +296,12 @@ PLAIN_KINDS = "biufcSU"
 def read_npz(
     path: str | Path, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """The arrays of an npz archive by name, and the names of the entries that are pickled objects (never read).
+    """The arrays of an npz archive by name, and the names of the entries that are pickled objects
+    (never read).
 
     Arguments: wanted: which names to read; None: all.
-    Raises: FileNotFoundError; FileError if the file is no npz archive, is damaged, or is larger than the limits allow.
+    Raises: FileNotFoundError; FileError if the file is no npz archive, is damaged, or is larger
+    than the limits allow.
     """
     arrays, pickled = {}, []
     with reading(path, "npz archive"), open_file(path) as file:
@@ -339,7 +354,10 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
 
 
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order (columns first?) and type of an npy array, whose bytes follow in the file. Raises: Refused."""
+    """Shape, order (columns first?) and type of an npy array, whose bytes follow in the file.
+
+    Raises: Refused.
+    """
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
         raise Refused(f"version {version} of the npy format is not read")
@@ -348,7 +366,10 @@ def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def _read_array(member: Any, size: int) -> np.ndarray | None:
-    """The array of a member of `size` bytes; None for pickled objects. Nothing is made before its size is checked."""
+    """The array of a member of `size` bytes; None for pickled objects.
+
+    Nothing is made before its size is checked.
+    """
     shape, columns_first, dtype = read_header(member)
     if dtype.hasobject:
         return None
@@ -376,7 +397,9 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
 def write_npz(
     path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True
 ) -> None:
-    """Write an npz archive of array-likes by name, under any suffix; it appears whole or not at all. Raises: OSError."""
+    """Write an npz archive of array-likes by name, under any suffix; it appears whole or not at
+    all. Raises: OSError.
+    """
     save = np.savez_compressed if compressed else np.savez
     converted: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
 

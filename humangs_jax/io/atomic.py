@@ -1,7 +1,9 @@
-"""Files and folders that appear whole or not at all: written under a temporary name beside their place, then renamed.
+"""Files and folders that appear whole or not at all: written under a temporary name beside their
+place, then renamed.
 
-Temporary names are unique, so several processes may write at once. What a killed process left behind is removed when a
-later process writes to the same place; an old folder that it had already moved aside is put back.
+Temporary names are unique, so several processes may write at once. What a killed process left
+behind is removed when a later process writes to the same place; an old folder that it had already
+moved aside is put back.
 """
 
 import contextlib
@@ -22,9 +24,13 @@ from humangs_jax.core.processes import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
-"""A temporary file of another machine (on a shared disk) is abandoned when it was not touched for this long."""
+"""A temporary file of another machine (on a shared disk) is abandoned when it was not touched for
+this long.
+"""
 MOVE_AWAY = "move it away, or choose another folder"
-"""What can be done where a file that was not written here has the name of one that is to be written."""
+"""What can be done where a file that was not written here has the name of one that is to be
+written.
+"""
 TOLD = 12
 """Entries of a folder that are named before it is deleted; the others are counted."""
 _TEMPORARY = re.compile(
@@ -38,7 +44,10 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a file in UTF-8, but for names of files whose bytes are no UTF-8: these stay. Raises: OSError."""
+    """Write a file in UTF-8, but for names of files whose bytes are no UTF-8: these stay.
+
+    Raises: OSError.
+    """
     write_bytes(path, encoded(text))
 
 
@@ -66,9 +75,11 @@ def replace_file(path: str | os.PathLike[str], write: Callable[[Path], object]) 
 
 
 def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], object]]) -> None:
-    """Calls write(temporary) for each path, which makes that file; then all are renamed to their paths at once.
+    """Calls write(temporary) for each path, which makes that file; then all are renamed to their
+    paths at once.
 
-    If one of them cannot be written, none appears. Temporary names have the same suffix. Folders that do not exist are made.
+    If one of them cannot be written, none appears. Temporary names have the same suffix. Folders
+    that do not exist are made.
 
     Raises: OSError, naming the path, if it cannot be written; what `write` raises.
     """
@@ -109,12 +120,16 @@ def _made_folder(folder: Path) -> Generator[None]:
 def replace_folder(
     folder: str | os.PathLike[str], write: Callable[[Path], object], *, mark: str
 ) -> None:
-    """Calls write(temporary), which makes that folder, and renames it to `folder`; an existing one is replaced.
+    """Calls write(temporary), which makes that folder, and renames it to `folder`; an existing one
+    is replaced.
 
-    The existing folder is moved aside first and deleted last, so its contents are never lost. Parents are made.
+    The existing folder is moved aside first and deleted last, so its contents are never lost.
+    Parents are made.
 
-    Arguments: mark: a file that all folders of this kind hold; a filled folder without it is not replaced.
-    Raises: ValueError, see `check_replaceable`; OSError, naming `folder`, if it cannot be written; whatever `write` raises.
+    Arguments: mark: a file that all folders of this kind hold; a filled folder without it is not
+    replaced.
+    Raises: ValueError, see `check_replaceable`; OSError, naming `folder`, if it cannot be written;
+    whatever `write` raises.
     """
     folder = Path(folder)
     check_replaceable(folder, mark=mark)
@@ -134,7 +149,9 @@ _being_written: set[Path] = set()
 
 @contextlib.contextmanager
 def _unfinished(temporary: Path) -> Generator[None]:
-    """Removes a temporary file or folder at the end, if it is still there, or when the process is ended."""
+    """Removes a temporary file or folder at the end, if it is still there, or when the process is
+    ended.
+    """
     _being_written.add(temporary.absolute())
     try:
         yield
@@ -153,13 +170,19 @@ def _remove(path: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """Removes the temporary files that this process is still writing, just before it is ended. Final files are not touched."""
+    """Removes the temporary files that this process is still writing, just before it is ended.
+
+    Final files are not touched.
+    """
     for temporary in tuple(_being_written):
         _remove(temporary)
 
 
 def _exchange(folder: Path, temporary: Path, aside: Path) -> None:
-    """Rename `folder` to `aside` and `temporary` to `folder`. Where another process is faster, its folder is replaced too."""
+    """Rename `folder` to `aside` and `temporary` to `folder`.
+
+    Where another process is faster, its folder is replaced too.
+    """
     while True:
         with contextlib.suppress(FileNotFoundError):
             folder.rename(aside)
@@ -183,10 +206,11 @@ def check_replaceable(
 ) -> None:
     """Whether a folder can be replaced, to be asked before the work begins.
 
-    Arguments: mark: a file that all folders of this kind hold. Then the folder has to be empty or, with `overwrite`, of this
-    kind. inputs: what the work reads (None is left out); it may not lie in the folder, which would delete it.
-    Raises: ValueError for one of these, and for a symbolic link, a file, the working folder or one above it, a mount point, or a
-    folder beside which nothing can be written.
+    Arguments: mark: a file that all folders of this kind hold. Then the folder has to be empty or,
+    with `overwrite`, of this kind. inputs: what the work reads (None is left out); it may not lie
+    in the folder, which would delete it.
+    Raises: ValueError for one of these, and for a symbolic link, a file, the working folder or one
+    above it, a mount point, or a folder beside which nothing can be written.
     """
     folder = Path(folder)
     if folder.is_symlink():
@@ -231,7 +255,9 @@ def check_replaceable(
 
 
 def contents(folder: str | os.PathLike[str]) -> str:
-    """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is nothing."""
+    """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is
+    nothing.
+    """
     entries = _entries(folder)
     told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
     return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
@@ -245,7 +271,9 @@ def _told(entry: Path) -> str:
 
 
 def _entries(folder: str | os.PathLike[str]) -> list[str]:
-    """Names in a folder, sorted; none if it does not exist (any more: another process may be replacing it)."""
+    """Names in a folder, sorted; none if it does not exist (any more: another process may be
+    replacing it).
+    """
     try:
         return sorted(os.listdir(folder))
     except (FileNotFoundError, NotADirectoryError):
@@ -262,17 +290,21 @@ def add_files(
     first: str | os.PathLike[str] | None = None,
     ours: Callable[[Path], bool] | None = None,
 ) -> None:
-    """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
+    """Calls write(temporary folder), then moves its files to the same places in `folder`; other
+    files there stay.
 
-    The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at once, so that a kill seldom
-    falls between two, and those of two processes do not mix. The folder may be a mount point or the working folder.
+    The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at
+    once, so that a kill seldom falls between two, and those of two processes do not mix. The folder
+    may be a mount point or the working folder.
 
-    Arguments: without: files in the folder that are out of date; those that are not replaced are deleted after the last move.
+    Arguments: without: files in the folder that are out of date; those that are not replaced are
+    deleted after the last move.
     invalid: files that must never lie beside the new ones; they are deleted before the first move.
-    last: the file that is moved last: where it was not there before, it says that all others are in place. first: the one that
-    is moved first: it says that the others are ours. ours: whether a file that is there may be replaced or deleted; None: all.
-    Raises: ValueError for a file that is there and not ours, see `check_ours`; OSError, naming `folder`, if it cannot be written;
-        whatever `write` raises.
+    last: the file that is moved last: where it was not there before, it says that all others are in
+    place. first: the one that is moved first: it says that the others are ours. ours: whether a
+    file that is there may be replaced or deleted; None: all.
+    Raises: ValueError for a file that is there and not ours, see `check_ours`; OSError, naming
+        `folder`, if it cannot be written; whatever `write` raises.
     """
     folder = Path(folder)
     inside = (
@@ -311,7 +343,8 @@ def add_files(
 def check_ours(
     files: Iterable[Path], ours: Callable[[Path], bool], advice: str = MOVE_AWAY
 ) -> None:
-    """Whether files can be written without losing what others wrote there, to be asked before the work, too.
+    """Whether files can be written without losing what others wrote there, to be asked before the
+    work, too.
 
     Arguments: ours: whether a file that is there may be replaced. advice: what the user can do.
     Raises: ValueError, naming the first that may not.
@@ -324,12 +357,15 @@ def check_ours(
 
 @contextlib.contextmanager
 def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Generator[None]:
-    """Keeps other processes out of a folder that one writes to for long. The lock ends with the process, however that ends.
+    """Keeps other processes out of a folder that one writes to for long. The lock ends with the
+    process, however that ends.
 
     Where there are no locks (Windows, some network disks), nothing is checked.
 
-    Arguments: replaced: the work makes or replaces the folder: what is locked is a file beside it, there until the work ends.
-    Raises: BlockingIOError, an OSError, if another process holds the folder; OSError, naming it, if it cannot be locked.
+    Arguments: replaced: the work makes or replaces the folder: what is locked is a file beside it,
+    there until the work ends.
+    Raises: BlockingIOError, an OSError, if another process holds the folder; OSError, naming it, if
+    it cannot be locked.
     """
     folder = Path(folder)
     if not replaced:
@@ -343,7 +379,9 @@ def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Ge
 
 
 def remove_abandoned_lock(folder: str | os.PathLike[str]) -> None:
-    """Remove the lock that a killed process left beside a folder; one that a process holds stays."""
+    """Remove the lock that a killed process left beside a folder; one that a process holds
+    stays.
+    """
     lock = _lock_of(Path(folder))
     if not lock.is_file():
         return
@@ -382,7 +420,9 @@ def _locked(folder: Path, wait: bool, lock: Path | None = None) -> Generator[Non
 
 @contextlib.contextmanager
 def _naming(path: Path, temporary: Path) -> Generator[None]:
-    """A full or read-only disk and other errors of the temporary file or folder become errors of `path`."""
+    """A full or read-only disk and other errors of the temporary file or folder become errors of
+    `path`.
+    """
     try:
         yield
     except OSError as error:
@@ -395,9 +435,11 @@ def _naming(path: Path, temporary: Path) -> Generator[None]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Whether a file, or a folder with all above it, can be made, to be asked before the work begins.
+    """Whether a file, or a folder with all above it, can be made, to be asked before the work
+    begins.
 
-    Tried, because permissions do not tell of full, read-only and network disks. Raises: OSError, naming `path`.
+    Tried, because permissions do not tell of full, read-only and network disks. Raises: OSError,
+    naming `path`.
     """
     path = Path(path)
     place = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
@@ -414,7 +456,10 @@ def _tag() -> str:
 
 @functools.cache
 def _sweep(parent: Path) -> None:
-    """Remove what killed processes left in a folder. Once per process: folders may have very many files."""
+    """Remove what killed processes left in a folder.
+
+    Once per process: folders may have very many files.
+    """
     with contextlib.suppress(OSError):  # another process sweeps too, or the folder cannot be listed
         for entry in list(parent.iterdir()):
             found = _TEMPORARY.fullmatch(entry.name)

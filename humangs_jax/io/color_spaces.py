@@ -1,8 +1,10 @@
-"""Colors as a file encodes them -> sRGB: ICC profiles, the code points of ITU-T H.273, and gamma with chromaticities.
+"""Colors as a file encodes them -> sRGB: ICC profiles, the code points of ITU-T H.273, and gamma
+with chromaticities.
 
-All that is read here is three steps: a curve from levels to light, a matrix from the primaries of the file to those of sRGB, and
-the curve of sRGB. Profiles that are tables (of printers, scanners, CMYK) are left to Little CMS. Of high dynamic range the white
-of a sheet of paper becomes 1, and what is brighter is compressed.
+All that is read here is three steps: a curve from levels to light, a matrix from the primaries of
+the file to those of sRGB, and the curve of sRGB. Profiles that are tables (of printers, scanners,
+CMYK) are left to Little CMS. Of high dynamic range the white of a sheet of paper becomes 1, and
+what is brighter is compressed.
 """
 
 import io
@@ -29,10 +31,13 @@ class Encoding(NamedTuple):
     bright: bool = False
     """Whether light may be far beyond white."""
     camera: bool = False
-    """Whether light is that before a camera: it is encoded as cameras do (BT.709), not as screens show it."""
+    """Whether light is that before a camera: it is encoded as cameras do (BT.709), not as screens
+    show it.
+    """
 
 
-# Curves -----------------------------------------------------------------------------------------------------------------
+# Curves
+# --------------------------------------------------------------------------------------------------
 
 
 def srgb_to_light(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -87,7 +92,8 @@ def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return light * np.where(largest > KNEE, (1 - (1 - KNEE) * np.exp(-beyond)) / largest, 1)
 
 
-# Primaries ----------------------------------------------------------------------------------------------------------------
+# Primaries
+# --------------------------------------------------------------------------------------------------
 
 D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
 BRADFORD = np.asarray(
@@ -98,7 +104,10 @@ PRIMARIES = {
     9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
 }
-"""Chromaticities of red, green and blue, by their code point (H.273): BT.2020 and Display P3. All others are close to sRGB's."""
+"""Chromaticities of red, green and blue, by their code point (H.273): BT.2020 and Display P3.
+
+All others are close to sRGB's.
+"""
 CURVES: dict[int, Curve] = {
     4: _power(2.2),
     5: _power(2.8),
@@ -127,7 +136,9 @@ FROM_XYZ = np.linalg.inv(_to_xyz(SRGB, D65))
 
 
 def of_code_points(primaries: int, transfer: int) -> Encoding | None:
-    """The encoding that numbers of H.273 name (PNG's cICP, nclx of HEIC and AVIF, videos); None where that is sRGB's."""
+    """The encoding that numbers of H.273 name (PNG's cICP, nclx of HEIC and AVIF, videos); None
+    where that is sRGB's.
+    """
     if primaries not in PRIMARIES and transfer not in CURVES:
         return None
     matrix = FROM_XYZ @ _to_xyz(PRIMARIES.get(primaries, SRGB), D65)
@@ -136,11 +147,15 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
 
 
 GAMMA_OF_SRGB, GAMMA_SLACK = 1 / 2.2, 0.06
-"""What PNG files say of sRGB; and within it what programs write of videos (1 / 1.96), which are shown as sRGB, too."""
+"""What PNG files say of sRGB; and within it what programs write of videos (1 / 1.96), which are
+shown as sRGB, too.
+"""
 
 
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
-    """The encoding of PNG's gAMA and cHRM (white, red, green, blue: x and y of each); None where that is sRGB's."""
+    """The encoding of PNG's gAMA and cHRM (white, red, green, blue: x and y of each); None where
+    that is sRGB's.
+    """
     curve, matrix = srgb_to_light, np.eye(3)
     if gamma is not None and 0.1 < gamma < 10 and abs(gamma - GAMMA_OF_SRGB) > GAMMA_SLACK:
         curve = _power(1 / gamma)
@@ -168,7 +183,8 @@ def is_srgb(encoding: Encoding) -> bool:
     return bool(np.abs(in_srgb(grid, encoding) - grid).max() < SAME)
 
 
-# To sRGB ------------------------------------------------------------------------------------------------------------------
+# To sRGB
+# --------------------------------------------------------------------------------------------------
 
 
 def in_srgb(levels: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.ndarray, "n 3"]:
@@ -197,7 +213,9 @@ BLOCK = 1 << 20
 def pixels_in_srgb(
     levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding
 ) -> Float[np.ndarray, "h w 3"]:
-    """Colors in sRGB, in [0, 1], of whole levels from 0 to `most`, of one channel (grey) or three."""
+    """Colors in sRGB, in [0, 1], of whole levels from 0 to `most`, of one channel (grey) or
+    three.
+    """
     height, width, channels = levels.shape
     curves = encoding.curves * (3 // len(encoding.curves))
     tables = [curve(np.arange(most + 1) / most).astype(np.float32) for curve in curves]
@@ -225,13 +243,16 @@ def cube(encoding: Encoding, side: int = 49) -> str:
     )
 
 
-# ICC profiles -------------------------------------------------------------------------------------------------------------
+# ICC profiles
+# --------------------------------------------------------------------------------------------------
 
 PROFILE_BYTES = 4 << 20
 """Of a profile that is looked at; those of presses have up to 3 MB."""
 MOST_TAGS = 200
 CLASSES = (b"mntr", b"scnr", b"prtr", b"spac")
-"""Profiles of monitors, scanners, printers and color spaces: others (links, names, effects) describe no photo."""
+"""Profiles of monitors, scanners, printers and color spaces: others (links, names, effects)
+describe no photo.
+"""
 SPACES = {b"RGB ": "colors", b"GRAY": "greys", b"CMYK": "CMYK"}
 WHITE_SLACK = 0.1
 """By which the sum of the primaries of a profile differs from white."""
@@ -272,7 +293,9 @@ def read_profile(data: bytes) -> Profile:
 
 
 def _within_white(curve: Curve) -> Curve:
-    """A curve of a file, whose formula may leave [0, 1], or numbers, between the levels that were looked at."""
+    """A curve of a file, whose formula may leave [0, 1], or numbers, between the levels that were
+    looked at.
+    """
 
     def bounded(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
         with np.errstate(all="ignore"):
@@ -304,7 +327,9 @@ def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
 
 
 def _curve(tag: bytes) -> Curve:
-    """The curve of a tag "curv" (a table, or an exponent) or "para" (numbers g, a to f of a formula)."""
+    """The curve of a tag "curv" (a table, or an exponent) or "para" (numbers g, a to f of a
+    formula).
+    """
     if tag[:4] == b"curv":
         count = int.from_bytes(tag[8:12], "big")
         table = np.frombuffer(tag[12 : 12 + 2 * count], ">u2")
@@ -334,7 +359,10 @@ def _curve(tag: bytes) -> Curve:
 
 
 def by_tables(image: Any, profile: bytes) -> Any:
-    """A PIL.Image in sRGB, of one whose profile is tables. Raises: Refused for one that cannot be used."""
+    """A PIL.Image in sRGB, of one whose profile is tables.
+
+    Raises: Refused for one that cannot be used.
+    """
     from PIL import ImageCms
 
     try:

@@ -1,7 +1,8 @@
-"""What a photo says before it is decoded: a JPEG's scans, a WebP's size, an ISO file's kind, a PNG's chunks, EXIF's frame.
+"""What a photo says before it is decoded: a JPEG's scans, a WebP's size, an ISO file's kind, a
+PNG's chunks, EXIF's frame.
 
-Phones put more behind a JPEG (a video, a map of gains, depth) and inside of its segments (thumbnails, EXIF, C2PA). Only the
-marks of the picture itself count.
+Phones put more behind a JPEG (a video, a map of gains, depth) and inside of its segments
+(thumbnails, EXIF, C2PA). Only the marks of the picture itself count.
 """
 
 import re
@@ -21,7 +22,9 @@ PALETTE = 3
 FRAME_TAGS = (0xA002, 0xA003)
 """EXIF's width and height of the photo as it was taken."""
 SAME_SHAPE = 0.01
-"""Share by which a photo that was made smaller has other sides than EXIF says; and besides a pixel, by rounding."""
+"""Share by which a photo that was made smaller has other sides than EXIF says; and besides a pixel,
+by rounding.
+"""
 LARGEST_SIDE = 1 << 24
 """Pixels; sensors have less."""
 MARKED_BRANDS = 16
@@ -29,12 +32,16 @@ MARKED_BRANDS = 16
 
 JPEG_START = b"\xff\xd8"
 JPEG_MARKER = re.compile(rb"\xff([^\x00\xff])")
-"""FF 00 is a byte FF of the compressed data, and before the last FF there may be any number of others."""
+"""FF 00 is a byte FF of the compressed data, and before the last FF there may be any number of
+others.
+"""
 END, SCAN = 0xD9, 0xDA
 WITH_LENGTH = frozenset(
     (*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE)
 )
-"""Markers that two bytes of length follow, as libjpeg reads them; all others stand alone, or libjpeg ends there."""
+"""Markers that two bytes of length follow, as libjpeg reads them; all others stand alone, or
+libjpeg ends there.
+"""
 
 
 def jpeg_scans(data: bytes) -> int:
@@ -59,7 +66,9 @@ def is_webp(data: bytes) -> bool:
 
 
 def webp_size(data: bytes) -> tuple[int, int]:
-    """Width and height of the canvas of a WebP, for which Pillow takes memory as soon as it opens one. Raises: Refused."""
+    """Width and height of the canvas of a WebP, for which Pillow takes memory as soon as it opens
+    one. Raises: Refused.
+    """
     kind, body = data[12:16], data[20:30]
     if len(body) == 10 and kind == b"VP8X":
         return 1 + int.from_bytes(body[4:7], "little"), 1 + int.from_bytes(body[7:10], "little")
@@ -102,7 +111,9 @@ NCLX = b"colrnclx"
 
 
 def nclx_colors(data: bytes) -> tuple[int, int] | None:
-    """Code points (H.273) of the primaries and the curve of an AVIF, of the first box that has some."""
+    """Code points (H.273) of the primaries and the curve of an AVIF, of the first box that has
+    some.
+    """
     at = data.find(NCLX)
     numbers = data[at + len(NCLX) : at + len(NCLX) + 4]
     if at < 0 or len(numbers) < 4:
@@ -111,7 +122,9 @@ def nclx_colors(data: bytes) -> tuple[int, int] | None:
 
 
 def check_png_chunks(data: bytes) -> None:
-    """Whether a PNG file is whole: Pillow decodes some that are damaged, and pixels of a palette that is not there."""
+    """Whether a PNG file is whole: Pillow decodes some that are damaged, and pixels of a palette
+    that is not there.
+    """
     at, names = 8, set()
     while at < len(data) and b"IEND" not in names:
         length, name = struct.unpack(">I4s", data[at : at + 8])
@@ -127,7 +140,9 @@ def check_png_chunks(data: bytes) -> None:
 
 
 def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
-    """Width and height in EXIF's tags if a photo of this size was cut out of such a frame, else None."""
+    """Width and height in EXIF's tags if a photo of this size was cut out of such a frame, else
+    None.
+    """
     width, height = (tags.get(tag) for tag in FRAME_TAGS)
     if not isinstance(width, int) or not isinstance(height, int):
         return None

@@ -1,10 +1,12 @@
-"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel), JPEG, WebP and AVIF, in sRGB.
+"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel), JPEG, WebP and AVIF,
+in sRGB.
 
-Photos say how their colors are encoded (an ICC profile, or numbers in their header), and colors are converted to sRGB; those of
-files that say nothing, or sRGB, are values as stored. Masks are values as stored, too.
-With the extra `heic`, HEIC photos of phones too (libheif, by pi-heif). The content decides, not the name: no other format is
-looked at. Pixels come as stored, whatever the orientation flag says that phones write into JPEG files (EXIF): `orientation` reads
-it, `oriented` obeys it, and who imports photos decides. HEIC photos come upright: their format turns them, not the flag.
+Photos say how their colors are encoded (an ICC profile, or numbers in their header), and colors are
+converted to sRGB; those of files that say nothing, or sRGB, are values as stored. Masks are values
+as stored, too. With the extra `heic`, HEIC photos of phones too (libheif, by pi-heif). The content
+decides, not the name: no other format is looked at. Pixels come as stored, whatever the orientation
+flag says that phones write into JPEG files (EXIF): `orientation` reads it, `oriented` obeys it, and
+who imports photos decides. HEIC photos come upright: their format turns them, not the flag.
 """
 
 import contextlib
@@ -57,7 +59,9 @@ GREY_SLACK = 16 / 255
 GREY_MASK = "grey from 0 (background) to 255 (person)"
 ORIENTATION_TAG, EXIF_TAGS, FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
 DIAGONAL_35MM = 43.27
-"""Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle along the diagonal."""
+"""Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle
+along the diagonal.
+"""
 EXIF_MARKS = (
     b"Exif",
     b"eXIf",
@@ -67,13 +71,20 @@ EXIF_MARKS = (
     b"adobe.com/xap",
     b"com.adobe.xmp",
 )
-"""A file without any of these has no EXIF; looking further would decode a PNG. An AVIF may be turned without it."""
+"""A file without any of these has no EXIF; looking further would decode a PNG.
+
+An AVIF may be turned without it.
+"""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
-"""Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
+"""Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it
+reads in full).
+"""
 MARK_KEY = "Software"
 DRAWN, MASK = "humangs_jax", "humangs_jax mask"
-"""Values of the text `Software` in PNG files: of pictures that show results, which are never photos, and of masks."""
+"""Values of the text `Software` in PNG files: of pictures that show results, which are never
+photos, and of masks.
+"""
 MARK_HEAD = 1024
 """Bytes of a PNG file in which the text stands: it is written before the pixels."""
 GREY_AND_ALPHA = 4
@@ -83,11 +94,13 @@ GREY_AND_ALPHA = 4
 def read_image(
     path: str | Path,
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
-    """Colors in sRGB and, where the file has an alpha channel, alpha. Grey images become three equal channels.
+    """Colors in sRGB and, where the file has an alpha channel, alpha. Grey images become three
+    equal channels.
 
     A color profile that cannot be used is warned of, and the values are taken as stored.
 
-    Raises: FileNotFoundError; FileError if the file cannot be read as a photo or has more pixels than the limit.
+    Raises: FileNotFoundError; FileError if the file cannot be read as a photo or has more pixels
+    than the limit.
     """
     return _colors_and_alpha(_read_pixels(path))
 
@@ -104,12 +117,13 @@ def _colors_and_alpha(
 def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """A mask, coverage in [0, 1]: a grey image, or what else segmentation tools write.
 
-    A palette or colors: 1 where the image has the one label (of a palette) or the one color that is not the background. The
-    background is black, and label 0 if there is one. Several greys of a palette are those of a grey image. An alpha channel is
-    the mask if the colors are those of a photo, all alike, or the same mask.
+    A palette or colors: 1 where the image has the one label (of a palette) or the one color that is
+    not the background. The background is black, and label 0 if there is one. Several greys of a
+    palette are those of a grey image. An alpha channel is the mask if the colors are those of a
+    photo, all alike, or the same mask.
 
-    Raises: as `read_image`; FileError for several labels or colors, for a label 0 that is not black, for no black, and for alpha
-    and greys that differ: which is the person?
+    Raises: as `read_image`; FileError for several labels or colors, for a label 0 that is not
+    black, for no black, and for alpha and greys that differ: which is the person?
     """
     with open_image(path) as (image, data):
         if image.format == "PNG":
@@ -163,7 +177,8 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
         else "0 is not black: which is the background"
     )
     raise Refused(
-        f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or {GREY_MASK}"
+        f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or"
+        f" {GREY_MASK}"
     )
 
 
@@ -178,17 +193,21 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def orientation(path: str | Path) -> int:
-    """The EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see `oriented`. Raises: as `open_image`."""
+    """The EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see `oriented`.
+
+    Raises: as `open_image`.
+    """
     with open_image(path) as (image, data):
         flag = _exif(image, data).get(ORIENTATION_TAG, 1)
         return flag if flag in range(2, 9) else 1
 
 
 def focal_length(path: str | Path) -> float | None:
-    """Focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the photo; None where that is missing or 0.
+    """Focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the photo; None
+    where that is missing or 0.
 
-    equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. Of a photo that was cut out of what EXIF describes,
-    see `cropped_from`, it is not known. Raises: as `open_image`.
+    equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. Of a photo that was cut out
+    of what EXIF describes, see `cropped_from`, it is not known. Raises: as `open_image`.
     """
     with open_image(path) as (image, data):
         tags = _exif(image, data, EXIF_TAGS)
@@ -203,7 +222,8 @@ def focal_length(path: str | Path) -> float | None:
 
 
 def cropped_from(path: str | Path) -> tuple[int, int] | None:
-    """Width and height that EXIF says if the photo has another shape: it was cut out of that. Else None.
+    """Width and height that EXIF says if the photo has another shape: it was cut out of that. Else
+    None.
 
     Photos that were made smaller or turned have the shape that EXIF says. Raises: as `open_image`.
     """
@@ -212,7 +232,9 @@ def cropped_from(path: str | Path) -> tuple[int, int] | None:
 
 
 def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
-    """EXIF tags, of the photo or of a folder in them; none where they are damaged: nobody obeys these."""
+    """EXIF tags, of the photo or of a folder in them; none where they are damaged: nobody obeys
+    these.
+    """
     if any(mark in data for mark in EXIF_MARKS):
         with warnings.catch_warnings(), contextlib.suppress(Exception):
             warnings.simplefilter("ignore")
@@ -222,7 +244,9 @@ def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
 
 
 def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
-    """Pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on height and width are exchanged."""
+    """Pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on height and
+    width are exchanged.
+    """
     pixels = np.swapaxes(pixels, 0, 1) if flag >= 5 else pixels
     rows, columns = ((3, 4, 7, 8), (2, 3, 6, 7))  # that are reversed
     return pixels[:: -1 if flag in rows else 1, :: -1 if flag in columns else 1]
@@ -234,12 +258,14 @@ def write_png(
     compress_level: int = 6,
     mark: str | None = None,
 ) -> None:
-    """Write colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
+    """Write colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside
+    are clipped.
 
     A fourth channel is alpha. The file appears whole or not at all.
 
-    Arguments: compress_level: of zlib; 1 takes a third of the time and a sixth more room. mark: DRAWN for a picture that shows
-    results and is not to be taken for a photo, MASK for a mask; see `mark_of`. None: a photo.
+    Arguments: compress_level: of zlib; 1 takes a third of the time and a sixth more room. mark:
+    DRAWN for a picture that shows results and is not to be taken for a photo, MASK for a mask; see
+    `mark_of`. None: a photo.
     Raises: OSError if it cannot be written.
     """
     write_bytes(path, png_bytes(image, compress_level, mark))
@@ -265,7 +291,9 @@ def png_bytes(
 
 
 def mark_of(path: str | Path) -> str | None:
-    """The mark with which `write_png` wrote a file; None for other files, and for those that cannot be read."""
+    """The mark with which `write_png` wrote a file; None for other files, and for those that cannot
+    be read.
+    """
     with contextlib.suppress(OSError, ValueError), open_file(path, "image_bytes") as file:
         head = file.read(MARK_HEAD)
         for mark in (DRAWN, MASK):
@@ -277,12 +305,17 @@ def mark_of(path: str | Path) -> str | None:
 
 
 def is_own_picture(path: str | Path) -> bool:
-    """Whether a file is a picture that shows results: a sheet, a rendering, a texture. Photos and masks are none."""
+    """Whether a file is a picture that shows results: a sheet, a rendering, a texture.
+
+    Photos and masks are none.
+    """
     return mark_of(path) == DRAWN
 
 
 def is_own_output(path: str | Path) -> bool:
-    """Whether a new output may replace a file of the same name: an own picture, or what is no picture of anybody."""
+    """Whether a new output may replace a file of the same name: an own picture, or what is no
+    picture of anybody.
+    """
     if Path(path).suffix.lower() != ".png" or is_own_picture(path):
         return True
     try:
@@ -312,7 +345,10 @@ def to_uint8(
 
 
 def named_color(name: str) -> tuple[float, float, float]:
-    """Red, green and blue in [0, 1] of a CSS name or "#rrggbb". Raises: ValueError for what is no opaque color."""
+    """Red, green and blue in [0, 1] of a CSS name or "#rrggbb".
+
+    Raises: ValueError for what is no opaque color.
+    """
     from PIL import ImageColor
 
     try:
@@ -327,10 +363,11 @@ def named_color(name: str) -> tuple[float, float, float]:
 def resized(
     image: Float[np.ndarray, "h w *c"] | UInt[np.ndarray, "h w *c"], width: int, height: int
 ) -> Float[np.ndarray, "height width *c"]:
-    """A float32 image at another size: an axis that becomes shorter is averaged by area, one that becomes longer is bicubic.
+    """A float32 image at another size: an axis that becomes shorter is averaged by area, one that
+    becomes longer is bicubic.
 
-    The average is exact for every ratio; it is how the photos that the shipped weights have seen were made. No value leaves the
-    range of the image's own.
+    The average is exact for every ratio; it is how the photos that the shipped weights have seen
+    were made. No value leaves the range of the image's own.
     """
     h, w, *rest = image.shape
     found = image.astype(np.float32, copy=False)
@@ -362,7 +399,8 @@ def _axis_weights(old: int, new: int) -> Any:
 
 @contextlib.contextmanager
 def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
-    """A photo as a PIL.Image that is not decoded yet but within the limits, and the bytes of its file.
+    """A photo as a PIL.Image that is not decoded yet but within the limits, and the bytes of its
+    file.
 
     Raises: FileNotFoundError; FileError, also for whatever goes wrong inside.
     """
@@ -379,7 +417,10 @@ def is_heic(path: str | Path) -> bool:
 
 
 def _formats(data: bytes) -> tuple[str, ...]:
-    """The formats of Pillow, which knows them from now on, that a file with these bytes may have. Raises: Refused."""
+    """The formats of Pillow, which knows them from now on, that a file with these bytes may have.
+
+    Raises: Refused.
+    """
     kind = iso_kind(data)
     if kind == "HEIF":
         try:
@@ -393,7 +434,8 @@ def _formats(data: bytes) -> tuple[str, ...]:
 
         if not features.check("avif"):
             raise Refused(
-                "an AVIF photo, which this Pillow cannot read: expected PNG or JPEG, or pip install -U Pillow"
+                "an AVIF photo, which this Pillow cannot read: expected PNG or JPEG, or pip install"
+                " -U Pillow"
             )
     elif is_webp(data):
         kind = "WEBP"
@@ -431,7 +473,8 @@ def _check_size(width: int, height: int) -> None:
 
 
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
-    """((width, height), whether there is an alpha channel). PNG files are checked by their checksums, others by decoding.
+    """((width, height), whether there is an alpha channel). PNG files are checked by their
+    checksums, others by decoding.
 
     Raises: as `open_image`.
     """
@@ -448,7 +491,9 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray, "h w c"]:
-    """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels; colors in sRGB, or as stored."""
+    """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels; colors in sRGB, or
+    as stored.
+    """
     with open_image(path) as (image, data):
         levels, most = _levels(image, data)
         colors = None if as_stored else _colors_in_srgb(path, image, data, levels, most)
@@ -472,7 +517,9 @@ def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
 
 
 def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
-    """The pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it decodes the lower ones, too."""
+    """The pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it decodes
+    the lower ones, too.
+    """
     if data[26:28] != b"\0\0" or data[28] > 1:
         raise Refused("not a readable image: a PNG header with unknown methods")
     if data[25] == GREY_AND_ALPHA:
@@ -489,7 +536,8 @@ def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
         return np.asarray(image).astype(np.uint16)
 
 
-# Colors -----------------------------------------------------------------------------------------------------------------
+# Colors
+# --------------------------------------------------------------------------------------------------
 
 
 def _colors_in_srgb(
@@ -517,7 +565,9 @@ PROFILE_OF_MODE = {"CMYK": ("CMYK",), "RGB": ("colors",), "RGBA": ("colors",), "
 
 
 def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
-    """What stands in a photo's header besides an ICC profile, and before it: the newest of PNG's ways goes first."""
+    """What stands in a photo's header besides an ICC profile, and before it: the newest of PNG's
+    ways goes first.
+    """
     if image.format == "PNG":
         chunks = png_chunks(data)
         if len(points := chunks.get(b"cICP", b"")) >= 2:
@@ -536,7 +586,9 @@ def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
 def _by_tables(
     image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones are added as they are."""
+    """Colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones are added
+    as they are.
+    """
     from PIL import Image
 
     if levels.shape[-1] == 1:

@@ -1,9 +1,11 @@
-"""Meshes: GLB, the binary form of glTF 2.0, parsed within limits and written; OBJ, PLY, STL and OFF of other programs by trimesh.
+"""Meshes: GLB, the binary form of glTF 2.0, parsed within limits and written; OBJ, PLY, STL and OFF
+of other programs by trimesh.
 
 GLB is JSON that describes arrays, and one block of their bytes
-(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification). What trimesh would trust is checked
-before. A file's textures are read if they are asked for, lie in its folder or in the file itself, and are PNG or JPEG; a texture
-that cannot be read is left out, with a warning.
+(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification). What
+trimesh would trust is checked before. A file's textures are read if they are asked for, lie in its
+folder or in the file itself, and are PNG or JPEG; a texture that cannot be read is left out, with a
+warning.
 """
 
 import io
@@ -45,7 +47,8 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
     """The JSON of a GLB file and the bytes that it describes.
 
     Arguments: limit: of the JSON. That of scans is low, because trimesh, which loads them, is slow.
-    Raises: Refused, KeyError, TypeError, ... for sizes that do not fit the file or are more than the limits allow.
+    Raises: Refused, KeyError, TypeError, ... for sizes that do not fit the file or are more than
+    the limits allow.
     """
     start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
     if start != GLB_START or kind != JSON_CHUNK:
@@ -84,7 +87,8 @@ def count_of(accessor: dict[str, Any]) -> int:
 
 
 def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
-    """The array (count, columns) of an accessor; integers that stand for numbers up to 1 are converted.
+    """The array (count, columns) of an accessor; integers that stand for numbers up to 1 are
+    converted.
 
     Raises: Refused, KeyError, TypeError, ... for what does not fit the file.
     """
@@ -119,7 +123,8 @@ def _width(accessor: dict[str, Any]) -> int:
     return COLUMNS[accessor["type"]] * np.dtype(COMPONENTS[accessor["componentType"]]).itemsize
 
 
-# Writing ----------------------------------------------------------------------------------------------------------------
+# Writing
+# --------------------------------------------------------------------------------------------------
 
 
 class GlbWriter:
@@ -141,7 +146,8 @@ class GlbWriter:
     ) -> int:
         """Index of the accessor of an array: float32 unless it has unsigned integers.
 
-        Arguments: kind: as in COLUMNS. bounds: also tell the least and the largest of each column, as positions and times must.
+        Arguments: kind: as in COLUMNS. bounds: also tell the least and the largest of each column,
+        as positions and times must.
         """
         values = np.ascontiguousarray(values, values.dtype if values.dtype.kind == "u" else "<f4")
         component = next(
@@ -160,7 +166,10 @@ class GlbWriter:
         return len(self.accessors) - 1
 
     def write(self, path: str | os.PathLike[str], document: dict[str, Any]) -> None:
-        """Write the file with a glTF document to which arrays, buffer and `asset` are added. It appears whole or not at all."""
+        """Write the file with a glTF document to which arrays, buffer and `asset` are added.
+
+        It appears whole or not at all.
+        """
         self.data += bytes(-len(self.data) % 4)
         document = {"asset": {"version": "2.0", "generator": "humangs_jax"}} | document
         document |= {
@@ -182,12 +191,14 @@ TYPES = ("obj", "ply", "glb", "stl", "off")
 
 
 def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = False) -> list[Any]:
-    """The triangle meshes of a file in its common coordinates, as trimesh.Trimesh; empty if it has none.
+    """The triangle meshes of a file in its common coordinates, as trimesh.Trimesh; empty if it has
+    none.
 
-    Arguments: textures: with materials and textures. colors: with colors of the vertices instead, painted or from a texture;
-    grey where they are not known. Materials and textures that the file names but that cannot be read are left out, which is
-    logged.
-    Raises: FileNotFoundError; FileError if it is damaged, of another format, or asks for more than the limits allow.
+    Arguments: textures: with materials and textures. colors: with colors of the vertices instead,
+    painted or from a texture; grey where they are not known. Materials and textures that the file
+    names but that cannot be read are left out, which is logged.
+    Raises: FileNotFoundError; FileError if it is damaged, of another format, or asks for more than
+    the limits allow.
     """
     import trimesh
 
@@ -196,7 +207,8 @@ def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = Fals
         kind = path.suffix.lower().removeprefix(".")
         if kind not in TYPES:
             raise Refused(
-                f"not a mesh that can be read: expected {', '.join(TYPES)}, got {path.suffix or 'no suffix'}"
+                f"not a mesh that can be read: expected {', '.join(TYPES)}, got"
+                f" {path.suffix or 'no suffix'}"
             )
         data, painted = read_bytes(path, "mesh_bytes"), textures or colors
         stream: Any = io.BytesIO(data)
@@ -243,12 +255,14 @@ def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = Fals
         for part in parts:
             if part.vertices.shape[1:] != (3,) or part.faces.shape[1:] != (3,):
                 raise Refused(
-                    f"vertices {part.vertices.shape}, faces {part.faces.shape}: expected three numbers for each"
+                    f"vertices {part.vertices.shape}, faces {part.faces.shape}: expected three"
+                    " numbers for each"
                 )
             low, high = int(part.faces.min()), int(part.faces.max())
             if low < 0 or high >= len(part.vertices):
                 raise Refused(
-                    f"a face has the corner {low if low < 0 else high}, but there are {len(part.vertices)}"
+                    f"a face has the corner {low if low < 0 else high}, but there are"
+                    f" {len(part.vertices)}"
                 )
         return parts
 
@@ -261,8 +275,9 @@ _GROUPS = re.compile(r"^(?:usemtl|o|g|s)\b.*\n?", re.MULTILINE)
 
 
 def _grouped(text: str, materials: bool) -> str:
-    """An OBJ file with the faces of each material together, at its end. Without materials, and for objects and groups, all faces
-    are one: trimesh takes longer than linear for each change, even for one that it finds in a comment.
+    """An OBJ file with the faces of each material together, at its end. Without materials, and for
+    objects and groups, all faces are one: trimesh takes longer than linear for each change, even
+    for one that it finds in a comment.
     """
     text = text.replace("\r\n", "\n").replace("\\\n", "")
     begin, *changes = _MATERIAL.split(text) if materials else (_GROUPS.sub("", text),)
@@ -287,7 +302,10 @@ def _grouped(text: str, materials: bool) -> str:
 
 
 class _Folder:
-    """What trimesh asks for the files that a mesh names: materials and textures beside it. It goes on without those refused."""
+    """What trimesh asks for the files that a mesh names: materials and textures beside it.
+
+    It goes on without those refused.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.read, self.faults = folder, {}, {}

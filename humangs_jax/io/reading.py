@@ -1,12 +1,14 @@
-"""Reading files that nobody trusts: one set of limits, one error line for every kind of damage. See docs/security.md.
+"""Reading files that nobody trusts: one set of limits, one error line for every kind of damage. See
+docs/security.md.
 
 Readers open files through `open_file` or `read_bytes` and work inside `reading`:
 
     with reading(path, "npz archive"):
         ...
 
-Whatever is raised in there becomes one `FileError` line that names the file: `me.npz: not a readable npz archive: ...`. A helper
-that does not know the file raises `Refused`, whose text follows the name of the file as it is.
+Whatever is raised in there becomes one `FileError` line that names the file: `me.npz: not a
+readable npz archive: ...`. A helper that does not know the file raises `Refused`, whose text
+follows the name of the file as it is.
 """
 
 import contextlib
@@ -42,21 +44,28 @@ LONGEST_LINE, LONGEST_REASON = 1000, 300
 class Limits:
     """What a file may cost. Each error line that a limit causes names it.
 
-    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the JSON in a scan (GLB), whose
-        readers are slow. mesh_bytes: of a scan; image_bytes: of a photo before it is decoded.
-    array_bytes: all arrays of an archive unpacked, or of an EXR file. Below it a file may always unpack to plain_bytes, and
-        beyond that to `ratio` times its size. plain_bytes also bounds a sparse matrix made dense.
+    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the
+        JSON in a scan (GLB), whose readers are slow. mesh_bytes: of a scan; image_bytes: of a photo
+        before it is decoded.
+    array_bytes: all arrays of an archive unpacked, or of an EXR file. Below it a file may always
+        unpack to plain_bytes, and beyond that to `ratio` times its size. plain_bytes also bounds a
+        sparse matrix made dense.
     members: entries of an archive. opcodes: instructions of a pickle. nesting: of JSON and YAML.
     pixels, side: of a photo, and along one of its sides. scans: passes of a progressive JPEG.
-    corners: of the triangles of a scan, every instance counted. joints: of a body. gaussians: of a file.
+    corners: of the triangles of a scan, every instance counted. joints: of a body. gaussians: of a
+    file.
     photos_outside: whether photos and masks of a capture may lie outside of its folder.
 
     What a command may cost, checked before it begins:
-    capture_pixels: of all photos that are read together, or textures of a scan. video_pixels: of the frames of videos.
-    views: photos that are read together; network_views: that the network looks at together; views_per_photo: that name it.
-    frames: of a motion or a capture, read or written; frames_per_photo: of a capture that has no poses yet, shown or not.
+    capture_pixels: of all photos that are read together, or textures of a scan. video_pixels: of
+    the frames of videos.
+    views: photos that are read together; network_views: that the network looks at together;
+    views_per_photo: that name it.
+    frames: of a motion or a capture, read or written; frames_per_photo: of a capture that has no
+    poses yet, shown or not.
     rate: frames per second of a motion. people: in keypoint files, and their images.
-    parts: materials of an OBJ file, solids of an STL file, parts of meshes of a GLB file. entries: of a folder that is searched.
+    parts: materials of an OBJ file, solids of an STL file, parts of meshes of a GLB file. entries:
+    of a folder that is searched.
     """
 
     file_bytes: int = 16 << 30
@@ -94,7 +103,8 @@ _current: Limits | None = None
 
 
 def limits() -> Limits:
-    """The limits in force: those of `set_limits`, else the default ones changed by the environment variable HUMANGS_LIMITS.
+    """The limits in force: those of `set_limits`, else the default ones changed by the environment
+    variable HUMANGS_LIMITS.
 
     Raises: ValueError for a variable that is not understood.
     """
@@ -126,7 +136,8 @@ def _limits_of_text(text: str) -> Limits:
     return Limits(**changes)
 
 
-# Errors --------------------------------------------------------------------------------------------------------------
+# Errors
+# --------------------------------------------------------------------------------------------------
 
 
 class _Shown(reprlib.Repr):
@@ -144,7 +155,9 @@ class _Shown(reprlib.Repr):
         return repr(x) if abs(x) < SHOWN_INTEGER else f"an integer of {x.bit_length():,} bits"
 
     def repr_instance(self, x: object, level: int) -> str:
-        """Of other types: those of numpy that are Python's too as these, else the name of the type."""
+        """Of other types: those of numpy that are Python's too as these, else the name of the
+        type.
+        """
         if isinstance(x, str):
             return self.repr_str(str(x), level)
         return (
@@ -155,7 +168,10 @@ class _Shown(reprlib.Repr):
 
 
 def shown(value: object) -> str:
-    """A value of a file for an error line: its beginning. The parts of a list may be the list itself, or a million others."""
+    """A value of a file for an error line: its beginning.
+
+    The parts of a list may be the list itself, or a million others.
+    """
     return _SHOWN.repr(value)
 
 
@@ -170,7 +186,10 @@ def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
 
 
 class FileError(ValueError):
-    """Something is wrong with a file; the message is one line: file, field, and what was expected. Empty parts are left out."""
+    """Something is wrong with a file; the message is one line: file, field, and what was expected.
+
+    Empty parts are left out.
+    """
 
     def __init__(self, file: object, field: str, problem: object):
         parts = [str(part) for part in (file, field, problem) if part]
@@ -183,14 +202,17 @@ def is_unread(error: BaseException) -> bool:
 
 
 class Refused(ValueError):
-    """What is wrong with the file that is being read, said by a function that does not know its name."""
+    """What is wrong with the file that is being read, said by a function that does not know its
+    name.
+    """
 
 
 @contextlib.contextmanager
 def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Generator[None]:
     """Whatever goes wrong inside becomes one line that names the file.
 
-    Arguments: path: the file, for the message. kind: what it should be, as in "npz archive". raises: the class of the error.
+    Arguments: path: the file, for the message. kind: what it should be, as in "npz archive".
+    raises: the class of the error.
     Raises: `raises`; FileNotFoundError for a missing file where that is FileError.
     """
     try:
@@ -231,7 +253,9 @@ def _why(kind: str, error: Exception) -> str:
 
 
 def check_limit(name: str, amount: float | int, unit: str) -> None:
-    """Raises: Refused, naming the limit and how it is raised, if that much is more than it allows."""
+    """Raises: Refused, naming the limit and how it is raised, if that much is more than it
+    allows.
+    """
     if amount > (most := getattr(limits(), name)):
         raised, found = "", f"more than {LARGEST_AMOUNT:,}"
         if amount <= LARGEST_AMOUNT:
@@ -242,7 +266,8 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
         raise Refused(f"{found} {unit}: the limit {name} is {most:,} ({raised}docs/security.md)")
 
 
-# Opening -------------------------------------------------------------------------------------------------------------
+# Opening
+# --------------------------------------------------------------------------------------------------
 
 
 def open_file(path: str | os.PathLike[str], limit: str = "file_bytes") -> BinaryIO:
@@ -268,10 +293,12 @@ def read_bytes(path: str | os.PathLike[str], limit: str = "file_bytes") -> bytes
 def walk(
     folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda folder: False
 ) -> Generator[Path]:
-    """The files in a folder and in the folders in it, but for names that begin with a dot and folders to `skip`.
+    """The files in a folder and in the folders in it, but for names that begin with a dot and
+    folders to `skip`.
 
-    Each folder is looked at once, however many links lead to it. Links that lead out are not followed, unless the limit
-    `photos_outside` allows it; the first of them is logged. Raises: Refused beyond the limit `entries`; OSError.
+    Each folder is looked at once, however many links lead to it. Links that lead out are not
+    followed, unless the limit `photos_outside` allows it; the first of them is logged. Raises:
+    Refused beyond the limit `entries`; OSError.
     """
     seen: set[tuple[int, int]] = set()
     waiting, links, count, told = [Path(folder)], [], 0, False
@@ -315,15 +342,17 @@ def check_unpacked(size: int, unpacked: int) -> None:
     check_limit("array_bytes", unpacked, "bytes unpacked")
     if unpacked > max(most.plain_bytes, most.ratio * size):
         raise Refused(
-            f"{size:,} bytes unpack to {unpacked:,}: the limits plain_bytes {most.plain_bytes:,} and ratio {most.ratio} "
-            "(docs/security.md)"
+            f"{size:,} bytes unpack to {unpacked:,}: the limits plain_bytes {most.plain_bytes:,}"
+            f" and ratio {most.ratio} (docs/security.md)"
         )
 
 
 def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Path:
-    """The path `folder / name` that a file in the folder names, if it lies in there after symbolic links are followed.
+    """The path `folder / name` that a file in the folder names, if it lies in there after symbolic
+    links are followed.
 
-    Arguments: photo: it is one of a photo or mask, which the limit `photos_outside` lets lie elsewhere.
+    Arguments: photo: it is one of a photo or mask, which the limit `photos_outside` lets lie
+    elsewhere.
     Raises: Refused.
     """
     path = Path(folder) / name
@@ -388,7 +417,10 @@ def check_nesting(value: Any) -> None:
 
 
 def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
-    """A configuration of class `cls` from its JSON, see `core.configuration`. Raises: FileNotFoundError; FileError."""
+    """A configuration of class `cls` from its JSON, see `core.configuration`.
+
+    Raises: FileNotFoundError; FileError.
+    """
     with reading(path, "configuration"):
         try:
             return config_from_json(cls, read_text(path))
@@ -397,7 +429,10 @@ def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:
-    """Write a JSON file, whole or not at all. Raises: TypeError for what JSON cannot hold; OSError."""
+    """Write a JSON file, whole or not at all.
+
+    Raises: TypeError for what JSON cannot hold; OSError.
+    """
     write_text(path, json_text(value, indent))
 
 

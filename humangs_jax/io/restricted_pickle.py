@@ -1,12 +1,13 @@
 """Pickles of arrays, without running anything in them.
 
-A pickle is a program: it names functions and classes, and calls them. `RestrictedUnpickler` runs Python's own unpickler, the one
-written in Python, without most of its instructions. A name becomes what a table says, which knows nothing but inert stand-ins;
-calls go to these alone, and only they take a state. Instructions are counted, keys of dicts are plain, and no instruction makes
-something larger than what the file holds.
+A pickle is a program: it names functions and classes, and calls them. `RestrictedUnpickler` runs
+Python's own unpickler, the one written in Python, without most of its instructions. A name becomes
+what a table says, which knows nothing but inert stand-ins; calls go to these alone, and only they
+take a state. Instructions are counted, keys of dicts are plain, and no instruction makes something
+larger than what the file holds.
 
-For body models and motions the table has numpy's arrays, scipy's sparse matrices and chumpy's arrays. numpy itself sees a type
-and bytes in the end, when `as_array` makes an array of numbers.
+For body models and motions the table has numpy's arrays, scipy's sparse matrices and chumpy's
+arrays. numpy itself sees a type and bytes in the end, when `as_array` makes an array of numbers.
 """
 
 import io
@@ -39,7 +40,9 @@ LONGEST_LIST = 1 << 24
 
 
 class Call(NamedTuple):
-    """What a name of a pickle may stand for: a function of this module, with no way to change it."""
+    """What a name of a pickle may stand for: a function of this module, with no way to change
+    it.
+    """
 
     function: Callable[..., Any]
 
@@ -60,7 +63,8 @@ class StandIn:
 class RestrictedUnpickler(
     pickle._Unpickler
 ):  # the one without C: nothing in it is hidden from this class
-    """Reads one pickle. names: what the (module, name) of a pickle stands for; what is in no table is refused.
+    """Reads one pickle. names: what the (module, name) of a pickle stands for; what is in no table
+    is refused.
 
     purpose: ends the message of a refusal. Strings of Python 2 are taken for latin1.
     """
@@ -188,7 +192,8 @@ _OURS = {
 }
 
 
-# Arrays --------------------------------------------------------------------------------------------------------------
+# Arrays
+# --------------------------------------------------------------------------------------------------
 
 
 class _Dtype(StandIn):
@@ -260,7 +265,9 @@ def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Arra
 
 
 class _Joblib(StandIn):
-    """What joblib writes for an array, whose bytes follow it in the file: behind a count of others that align them, or none."""
+    """What joblib writes for an array, whose bytes follow it in the file: behind a count of others
+    that align them, or none.
+    """
 
     def read(self, read: Callable[[int], bytes]) -> "_Array":
         shape, dtype = self.state.get("shape"), self.state.get("dtype")
@@ -284,14 +291,19 @@ def _encode(text: Any = "", encoding: Any = "latin1", *_: Any) -> str:
 
 
 def _numbers(value: Any) -> np.ndarray:
-    """A part of a sparse or chumpy array. Never one of these again: shared ones could be nested to any size."""
+    """A part of a sparse or chumpy array.
+
+    Never one of these again: shared ones could be nested to any size.
+    """
     if not isinstance(value, _Array):
         raise ValueError(f"expected an array, got {type(value).__name__}")
     return value.to_array()
 
 
 class _Sparse(StandIn):
-    """A matrix by the coordinates of its entries, or compressed along one axis, whose entries are counted."""
+    """A matrix by the coordinates of its entries, or compressed along one axis, whose entries are
+    counted.
+    """
 
     axis: int | None = None
 
@@ -405,7 +417,9 @@ def _instance(cls: Any) -> StandIn:
 
 
 def objects(value: Any) -> Any:
-    """The list in an array of Python objects, or the one that it holds; everything else as it is."""
+    """The list in an array of Python objects, or the one that it holds; everything else as it
+    is.
+    """
     held = value.state.get("data") if isinstance(value, _Array) else None
     if not isinstance(held, list):
         return value
@@ -413,7 +427,9 @@ def objects(value: Any) -> Any:
 
 
 def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of the machine's byte order from bytes of a file, which may hold what numpy itself never writes."""
+    """An array of the machine's byte order from bytes of a file, which may hold what numpy itself
+    never writes.
+    """
     array = np.frombuffer(data, dtype).reshape(shape) if dtype.itemsize else np.zeros(shape, dtype)
     if dtype.kind == "b":
         return array.view(np.uint8) != 0
@@ -428,7 +444,8 @@ def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarra
 
 
 def as_array(value: Any) -> np.ndarray:
-    """A full array from what `read_pickle` returned: array, number, list of numbers or stand-in (with a method `to_array`).
+    """A full array from what `read_pickle` returned: array, number, list of numbers or stand-in
+    (with a method `to_array`).
 
     Raises: ValueError for anything else.
     """
@@ -451,14 +468,17 @@ def as_array(value: Any) -> np.ndarray:
 
 
 def _check_leaves(value: Any) -> None:
-    """Refuses lists that are large, deep or hold other things than numbers; in pickles one list may stand in many places."""
+    """Refuses lists that are large, deep or hold other things than numbers; in pickles one list may
+    stand in many places.
+    """
     waiting, left = [(value, 0)], LONGEST_LIST
     while waiting:
         items, depth = waiting.pop()
         left -= len(items)
         if depth > 8 or left < 0:
             raise ValueError(
-                f"expected an array, got lists that are nested too deeply or of more than {LONGEST_LIST:,}"
+                "expected an array, got lists that are nested too deeply or of more than"
+                f" {LONGEST_LIST:,}"
             )
         for item in items:
             if isinstance(item, list | tuple):
@@ -470,7 +490,8 @@ def _check_leaves(value: Any) -> None:
 def read_pickle(path: str | Path) -> dict[str, Any]:
     """The dict in a pickle (of Python 2 or 3), its arrays still to be passed through `as_array`.
 
-    Raises: FileNotFoundError; FileError, naming the file, if it is no pickle of a dict or names anything that arrays do not need.
+    Raises: FileNotFoundError; FileError, naming the file, if it is no pickle of a dict or names
+    anything that arrays do not need.
     """
     with reading(path, "pickle"):
         data = io.BytesIO(read_bytes(path, "array_bytes"))

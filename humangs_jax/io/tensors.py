@@ -1,13 +1,16 @@
-"""Named tensors of a file: safetensors, or either format of `torch.save`, without torch and without running anything in it.
+"""Named tensors of a file: safetensors, or either format of `torch.save`, without torch and without
+running anything in it.
 
-The first bytes of a file decide; its name does not matter. For torch's formats the unpickler (`restricted_pickle`) knows the
-calls which rebuild the tensors of a state dict and refuses every other name. What those calls return is immutable, so that no
-later instruction of the pickle can change it. A tensor comes out as a description: a view of a storage, whose numbers lie
-elsewhere in the file. Only the storages of wanted tensors are read.
+The first bytes of a file decide; its name does not matter. For torch's formats the unpickler
+(`restricted_pickle`) knows the calls which rebuild the tensors of a state dict and refuses every
+other name. What those calls return is immutable, so that no later instruction of the pickle can
+change it. A tensor comes out as a description: a view of a storage, whose numbers lie elsewhere in
+the file. Only the storages of wanted tensors are read.
 
-Since torch 1.6 a file is a zip archive of the pickle and one member per storage. Before (and in what the lpips wheel ships) it is
-a stream: three pickles of a magic number, a version and the byte order; the pickle itself; a pickled list of the storages' names;
-then of each storage the count of its numbers and the numbers.
+Since torch 1.6 a file is a zip archive of the pickle and one member per storage. Before (and in
+what the lpips wheel ships) it is a stream: three pickles of a magic number, a version and the byte
+order; the pickle itself; a pickled list of the storages' names; then of each storage the count of
+its numbers and the numbers.
 """
 
 import functools
@@ -49,7 +52,9 @@ COMPRESSED = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b")
 LARGEST_RATIO = 16
 """Members may unpack to this many times the size of the file: torch does not compress at all."""
 LARGEST_SHARE = 4
-"""Tensors may take this many times the size of the file: bfloat16 is widened, and weights may be tied."""
+"""Tensors may take this many times the size of the file: bfloat16 is widened, and weights may be
+tied.
+"""
 MOST_AXES = 32
 
 Wanted = Callable[[str], bool]
@@ -67,10 +72,13 @@ STORAGE_DTYPES = {
     "BoolStorage": np.dtype("?"),
 }
 STATE_DICTS = ("model", "state_dict")
-"""Keys under which training scripts keep the state dict; what lies under others (the optimizer's state) is never read."""
+"""Keys under which training scripts keep the state dict; what lies under others (the optimizer's
+state) is never read.
+"""
 
 
-# The pickle -----------------------------------------------------------------------------------------------------------
+# The pickle
+# --------------------------------------------------------------------------------------------------
 
 
 class _StorageType(NamedTuple):
@@ -80,7 +88,9 @@ class _StorageType(NamedTuple):
 
 
 class _Storage(NamedTuple):
-    """A run of stored numbers: their type, the name of the storage, the position of the first, and what reads its bytes."""
+    """A run of stored numbers: their type, the name of the storage, the position of the first, and
+    what reads its bytes.
+    """
 
     kind: str
     name: str
@@ -148,7 +158,8 @@ def _ordered_dict(*arguments: Any) -> dict:
             "an ordered dict that is made of something else than pairs of a name and a value"
         )
     made = {key: value for key, value in pairs}
-    pairs.clear()  # a pickle may name one list many times: each of its instructions makes one item, no more
+    # a pickle may name one list many times: each of its instructions makes one item, no more
+    pairs.clear()
     return made
 
 
@@ -172,7 +183,9 @@ _NAMES: dict[tuple[str, str], Any] = {
 
 
 class _TorchUnpickler(RestrictedUnpickler):
-    """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it met."""
+    """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it
+    met.
+    """
 
     def __init__(
         self, file: Any, names: Mapping = _NAMES, read: Callable[[str], bytes] | None = None
@@ -186,7 +199,9 @@ class _TorchUnpickler(RestrictedUnpickler):
         self.read_storage = functools.cache(read or {}.__getitem__)
 
     def persistent_load(self, pid: Any) -> _Storage:
-        """A storage. The older format adds None, or says which part of another storage this one is."""
+        """A storage. The older format adds None, or says which part of another storage this one
+        is.
+        """
         known = type(pid) is tuple and len(pid) in (5, 6) and pid[0] == "storage"
         if not (known and isinstance(pid[1], _StorageType) and isinstance(pid[2], str)):
             raise Refused("refused to load a persistent object that is no storage")
@@ -200,7 +215,8 @@ class _TorchUnpickler(RestrictedUnpickler):
         return _Storage(pid[1].name, pid[2], part[1], self.read_storage)
 
 
-# Both formats ---------------------------------------------------------------------------------------------------------
+# Both formats
+# --------------------------------------------------------------------------------------------------
 
 
 def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
@@ -263,8 +279,8 @@ def read_torch_file(
     """The tensors of the state dict in a file whose name is wanted, and how many others there are.
 
     bfloat16 comes as float32, everything else as it is stored.
-    Raises: FileNotFoundError; FileError if the file is no checkpoint or a damaged one, if its pickle asks for more than
-    tensors, or if a storage is missing or too short, naming it.
+    Raises: FileNotFoundError; FileError if the file is no checkpoint or a damaged one, if its
+    pickle asks for more than tensors, or if a storage is missing or too short, naming it.
     """
     with reading(path, "torch file"), open_file(path) as file:
         size = os.path.getsize(path)
@@ -282,8 +298,8 @@ def read_torch_file(
 def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
     """The wanted tensors of the state dict in what was unpickled, and how many others it has.
 
-    The state dict is what lies under one of `STATE_DICTS`, or else the content itself. What tensors take together is bounded by
-    the size of the file. Raises: Refused.
+    The state dict is what lies under one of `STATE_DICTS`, or else the content itself. What tensors
+    take together is bounded by the size of the file. Raises: Refused.
     """
     label = next(
         (
@@ -329,9 +345,11 @@ def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
 
 
 def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:
-    """The tensors whose name is wanted, and how many others the file has. Nothing in the file is run.
+    """The tensors whose name is wanted, and how many others the file has. Nothing in the file is
+    run.
 
-    Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for more than tensors.
+    Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for
+    more than tensors.
     """
     return (
         read_safetensors(path, wanted)[:2]
@@ -341,7 +359,9 @@ def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> t
 
 
 def is_safetensors(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins as safetensors files do: with the length of a JSON object, and its brace."""
+    """Whether a file begins as safetensors files do: with the length of a JSON object, and its
+    brace.
+    """
     with reading(path, "file of tensors"), open_file(path) as file:
         start = file.read(9)
     return start[8:] == b"{" and struct.unpack("<Q", start[:8])[0] < 1 << 32
@@ -350,7 +370,8 @@ def is_safetensors(path: str | os.PathLike[str]) -> bool:
 def read_safetensors(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int, dict[str, str]]:
-    """The tensors whose name is wanted, how many others the file has, and the strings in its header.
+    """The tensors whose name is wanted, how many others the file has, and the strings in its
+    header.
 
     Raises: FileNotFoundError; FileError.
     """
@@ -368,7 +389,8 @@ def read_safetensors(
 
 
 def read_values(path: str | os.PathLike[str]) -> Any:
-    """What a pickle, a file of joblib or `torch.save`, or an npy of an object holds: dicts, lists and what `as_array` takes.
+    """What a pickle, a file of joblib or `torch.save`, or an npy of an object holds: dicts, lists
+    and what `as_array` takes.
 
     Nothing in the file is run. Raises: FileNotFoundError; FileError as `read_pickle`.
     """

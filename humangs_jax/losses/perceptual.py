@@ -1,8 +1,10 @@
-"""Losses that compare the features of frozen convolutional networks: LPIPS and the published perceptual loss.
+"""Losses that compare the features of frozen convolutional networks: LPIPS and the published
+perceptual loss.
 
-A network is a tuple of slices, a slice a tuple of layers; the map after the last layer of each slice is a feature that is
-compared. Layers carry torchvision's numbers in its `features` list as names ("0", "3.squeeze"). Every convolution has a
-bias and is followed by a ReLU; a fire module is a 1x1 convolution whose output a 1x1 and a 3x3 convolution share.
+A network is a tuple of slices, a slice a tuple of layers; the map after the last layer of each
+slice is a feature that is compared. Layers carry torchvision's numbers in its `features` list as
+names ("0", "3.squeeze"). Every convolution has a bias and is followed by a ReLU; a fire module is a
+1x1 convolution whose output a 1x1 and a 3x3 convolution share.
 
 All is for ONE image in [0, 1]; batch with `jax.vmap`. `losses.loss_networks` reads the weights.
 """
@@ -45,7 +47,9 @@ class Conv(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Largest or mean value of a window; without `ceil`, rows and columns that fill no window are ignored."""
+    """Largest or mean value of a window; without `ceil`, rows and columns that fill no window are
+    ignored.
+    """
 
     size: int = 3
     stride: int = 2
@@ -77,7 +81,9 @@ Slices = tuple[tuple[Layer, ...], ...]
 
 
 def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
-    """A VGG whose block b has `depths[b]` convolutions, of which the one numbered `feature[b]` (from 1) is compared."""
+    """A VGG whose block b has `depths[b]` convolutions, of which the one numbered `feature[b]`
+    (from 1) is compared.
+    """
     slices: list[tuple[Layer, ...]] = []
     layers: list[Layer] = []
     index, inputs = 0, 3
@@ -160,17 +166,19 @@ def feature_maps(
     image: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> list[tuple[Float[Array, "y x c"], Int[Array, "2"] | None]]:
-    """The compared maps of an image whose colors are scaled as the network expects them, each with its size.
+    """The compared maps of an image whose colors are scaled as the network expects them, each with
+    its size.
 
-    size: the image's own height and width, where it was padded below and right so that images of several sizes share a program.
-    The maps are then those of the image without padding, padded with zeros, and their sizes say where they end. Without it the
-    sizes are None.
-    Computed in the dtype of the weights. Raises: ValueError for an image that is too small for the network.
+    size: the image's own height and width, where it was padded below and right so that images of
+    several sizes share a program. The maps are then those of the image without padding, padded with
+    zeros, and their sizes say where they end. Without it the sizes are None. Computed in the dtype
+    of the weights. Raises: ValueError for an image that is too small for the network.
     """
     height, width, _ = image.shape
     if min(height, width) < (least := smallest_side(slices)):
         raise ValueError(
-            f"an image of {width} x {height} is too small for this network: {least} pixels a side needed"
+            f"an image of {width} x {height} is too small for this network: {least} pixels a side"
+            " needed"
         )
     maps, x = [], _cleared(image.astype(weights["0"].kernel.dtype), size)
     for part in slices:
@@ -194,9 +202,10 @@ def _apply(
     if isinstance(layer, Fire):
         first, *expand = layer.convolutions
         x, size = _apply(weights, first, x, size)
-        return jnp.concatenate(
-            [_apply(weights, part, x, size)[0] for part in expand], axis=-1
-        ), size
+        return (
+            jnp.concatenate([_apply(weights, part, x, size)[0] for part in expand], axis=-1),
+            size,
+        )
     # values are not negative, so a zero beyond the map changes no maximum of a pool
     x = _pool(layer, x) if isinstance(layer, Pool) else _convolve(weights[layer.name], layer, x)
     size = None if size is None else _size_after(layer, size)
@@ -216,7 +225,9 @@ def _convolve(weights: Convolution, layer: Conv, x: Float[Array, "y x c"]) -> Fl
 
 
 def _pool(layer: Pool, x: Float[Array, "y x c"]) -> Float[Array, "i j c"]:
-    """Columns, then rows, by strided slices: seven times as fast on a CPU as a windowed reduction and its gradient."""
+    """Columns, then rows, by strided slices: seven times as fast on a CPU as a windowed reduction
+    and its gradient.
+    """
     if layer.ceil:
         missing = [-(side - layer.size) % layer.stride for side in x.shape[:2]]
         x = jnp.pad(x, [(0, missing[0]), (0, missing[1]), (0, 0)], constant_values=-jnp.inf)
@@ -243,7 +254,9 @@ EPSILON = 1e-10
 
 @pytree_dataclass
 class Lpips:
-    """A backbone's convolutions, the weight of each channel of its compared maps, and which of `BACKBONES` it is."""
+    """A backbone's convolutions, the weight of each channel of its compared maps, and which of
+    `BACKBONES` it is.
+    """
 
     backbone: Weights
     heads: tuple[Float[Array, " _"], ...]
@@ -266,7 +279,10 @@ def lpips_distances(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Float[Array, " _"]:
-    """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze. See `lpips`."""
+    """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze.
+
+    See `lpips`.
+    """
     images = at_least_float32((predicted, target))
     slices = BACKBONES[weights.net]
     maps = [feature_maps(weights.backbone, slices, _scaled(image), size) for image in images]
@@ -286,13 +302,14 @@ def lpips(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Scalar:
-    """LPIPS (Zhang et al., 2018, version 0.1): distances of unit-length features, weighed per channel by learned heads.
+    """LPIPS (Zhang et al., 2018, version 0.1): distances of unit-length features, weighed per
+    channel by learned heads.
 
         d = sum over slices of the mean over pixels of sum_c w_c (x_c / |x| - y_c / |y|)^2
 
-    size: height and width of the images where both were padded below and right, see `feature_maps`: the distance is that of the
-    images without padding. Raises: ValueError for images that are too small (16 pixels a side for vgg, 31 for alex, 25 for
-    squeeze).
+    size: height and width of the images where both were padded below and right, see `feature_maps`:
+    the distance is that of the images without padding. Raises: ValueError for images that are too
+    small (16 pixels a side for vgg, 31 for alex, 25 for squeeze).
     """
     return jnp.sum(lpips_distances(weights, predicted, target, size))
 
@@ -300,11 +317,13 @@ def lpips(
 def vgg16_loss(
     weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Scalar:
-    """Mean absolute difference of the features of VGG-16, relative to the mean of the target's, averaged over five depths.
+    """Mean absolute difference of the features of VGG-16, relative to the mean of the target's,
+    averaged over five depths.
 
-    weights: of LPIPS "vgg"; its heads are not used. Where `perceptual_loss` wants the weights of the original VGG-19, this one
-    works with those of the extra `lpips`, and where LPIPS compares directions of features, it compares their sizes, too. No
-    gradient flows into the target. Raises: ValueError for images under 16 pixels a side, and for another network.
+    weights: of LPIPS "vgg"; its heads are not used. Where `perceptual_loss` wants the weights of
+    the original VGG-19, this one works with those of the extra `lpips`, and where LPIPS compares
+    directions of features, it compares their sizes, too. No gradient flows into the target. Raises:
+    ValueError for images under 16 pixels a side, and for another network.
     """
     if weights.net != "vgg":
         raise ValueError(f"vgg16_loss: expected LPIPS vgg, got {weights.net}")
@@ -325,7 +344,9 @@ DIVISORS = (1.0, 2.6, 4.8, 3.7, 5.6, 0.15)
 
 @pytree_dataclass
 class Vgg19:
-    """The convolutions of VGG-19 that the perceptual loss looks at (14 of 16), by torchvision's numbers."""
+    """The convolutions of VGG-19 that the perceptual loss looks at (14 of 16), by torchvision's
+    numbers.
+    """
 
     weights: Weights
 
@@ -333,11 +354,13 @@ class Vgg19:
 def perceptual_errors(
     vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Float[Array, "6"]:
-    """Mean absolute differences of the pixels in [0, 255] and of the features of VGG-19, with average pooling, at five depths.
+    """Mean absolute differences of the pixels in [0, 255] and of the features of VGG-19, with
+    average pooling, at five depths.
 
-    Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the original VGG-19 expect (those of
-    MatConvNet's file and of the released checkpoint; torchvision's expect other scales and make another loss of it). The
-    features are those after the second ReLU of each block. No gradient flows into the target.
+    Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the
+    original VGG-19 expect (those of MatConvNet's file and of the released checkpoint; torchvision's
+    expect other scales and make another loss of it). The features are those after the second ReLU
+    of each block. No gradient flows into the target.
     Raises: ValueError for images under 16 pixels a side.
     """
     target = jax.lax.stop_gradient(target)

@@ -1,6 +1,8 @@
-"""The configuration of a network, in three: what its weights are, what they were trained with, and how it runs.
+"""The configuration of a network, in three: what its weights are, what they were trained with, and
+how it runs.
 
-Weights files record `Architecture` and `Conventions`. `Runtime` belongs to the user and the machine.
+Weights files record `Architecture` and `Conventions`. `Runtime` belongs to the user and the
+machine.
 """
 
 import dataclasses
@@ -18,7 +20,10 @@ from humangs_jax.network.vertex_decoder import VertexDecoder
 
 @configuration
 class Architecture:
-    """What the weights are: the parts of the network with their sizes. It fixes the shape of every tensor."""
+    """What the weights are: the parts of the network with their sizes.
+
+    It fixes the shape of every tensor.
+    """
 
     encoder: Encoder = PatchTransformer()
     reader: Reader = PixelAlignedReader()
@@ -32,7 +37,8 @@ class Architecture:
         if isinstance(reader, PixelAlignedReader) and isinstance(decoder, VertexDecoder):
             if decoder.residual_color and not reader.sample_rgb:
                 raise ValueError(
-                    "decoder.residual_color needs reader.sample_rgb: there is no photo color to correct"
+                    "decoder.residual_color needs reader.sample_rgb: there is no photo color to"
+                    " correct"
                 )
             if reader.shells and decoder.frame != "normal":
                 raise ValueError(
@@ -45,7 +51,9 @@ class Architecture:
 
     @property
     def surface_map(self) -> Any:
-        """The map of the body's surface that parts work on, see `network.parts`; None: they work on none."""
+        """The map of the body's surface that parts work on, see `network.parts`; None: they work on
+        none.
+        """
         return next(iter(self._surface_maps), None)
 
     @property
@@ -57,7 +65,10 @@ class Architecture:
 def paper_parts(
     architecture: Architecture,
 ) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
-    """The three parts of the paper's network. Raises: ValueError if one has been exchanged, naming its class."""
+    """The three parts of the paper's network.
+
+    Raises: ValueError if one has been exchanged, naming its class.
+    """
     encoder, reader, decoder = architecture.encoder, architecture.reader, architecture.decoder
     if (
         isinstance(encoder, PatchTransformer)
@@ -72,14 +83,19 @@ def paper_parts(
 @jax.tree_util.register_static
 @configuration
 class HumanGSConfig:
-    """A network: see `Architecture`, `Conventions`, `Runtime`, and `network.presets`. For JAX a pytree without leaves."""
+    """A network: see `Architecture`, `Conventions`, `Runtime`, and `network.presets`.
+
+    For JAX a pytree without leaves.
+    """
 
     architecture: Architecture = dataclasses.field(default_factory=Architecture)
     conventions: Conventions = dataclasses.field(default_factory=Conventions)
     runtime: Runtime = dataclasses.field(default_factory=Runtime)
 
     def __post_init__(self):
-        """Raises ValueError for photos that the encoder cannot cut into patches, and for fields of other types."""
+        """Raises ValueError for photos that the encoder cannot cut into patches, and for fields of
+        other types.
+        """
         patch = self.architecture.encoder.patch_size
         for size in (self.conventions.image_size, self.image_size):
             if size % patch:

@@ -1,8 +1,9 @@
-"""The authors' released checkpoint to our variables and back: names, layouts, and the configuration behind the shapes.
+"""The authors' released checkpoint to our variables and back: names, layouts, and the configuration
+behind the shapes.
 
 Files are read by `io.tensors`, without torch. Layouts: linear (out, in) -> (in, out); convolution
-(out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed convolution
-(in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
+(out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed
+convolution (in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
 """
 
 import dataclasses
@@ -35,7 +36,9 @@ from humangs_jax.network.weights import (
 LOSS_PREFIX = "loss_computer."
 """The release also saves its frozen loss networks; they are not part of the network."""
 SKINNING_WEIGHTS = "tpose_lbs_weights"
-"""(n, j) of the body that the network was trained with; carried along, the network has no use for them."""
+"""(n, j) of the body that the network was trained with; carried along, the network has no use for
+them.
+"""
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
 """Marks a variant of the network (canonical target maps) that does not exist here."""
 COUNTER = "num_batches_tracked"
@@ -48,7 +51,8 @@ StateDict = dict[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """Variables and their configuration; skinning_weights: (n, j) of the body that the checkpoint was made for.
+    """Variables and their configuration; skinning_weights: (n, j) of the body that the checkpoint
+    was made for.
 
     skipped: how many tensors of the frozen loss networks were left out.
     """
@@ -140,7 +144,8 @@ def release_name(path: str) -> tuple[str, Layout]:
 
 
 def to_release(variables: Variables) -> StateDict:
-    """Variables as the state dict that the release would have of them (without the body's skinning weights).
+    """Variables as the state dict that the release would have of them (without the body's skinning
+    weights).
 
     Raises: KeyError for a part of a network that the release does not have.
     """
@@ -154,7 +159,9 @@ def to_release(variables: Variables) -> StateDict:
 
 
 def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
-    """Shapes of the state dict that the release has for a configuration, without the body's skinning weights."""
+    """Shapes of the state dict that the release has for a configuration, without the body's
+    skinning weights.
+    """
     empty = jax.tree.map(
         lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), expected_variables(config)
     )
@@ -162,7 +169,8 @@ def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
-    """Tensors of a checkpoint in any format of `io.tensors`, and how many of the loss networks were skipped.
+    """Tensors of a checkpoint in any format of `io.tensors`, and how many of the loss networks were
+    skipped.
 
     Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
     """
@@ -172,11 +180,12 @@ def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
 
 
 def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:
-    """The configuration whose sizes are those of the tensors; what shapes do not tell is taken from `presets.published`.
+    """The configuration whose sizes are those of the tensors; what shapes do not tell is taken from
+    `presets.published`.
 
-    head_width: of a network without normalised queries and keys, where no shape tells it. Of the Gaussians of a vertex
-    one counts as tight. Raises: ValueError for a variant that is not supported, or if a tensor that tells a size is
-    missing or has another number of axes.
+    head_width: of a network without normalised queries and keys, where no shape tells it. Of the
+    Gaussians of a vertex one counts as tight. Raises: ValueError for a variant that is not
+    supported, or if a tensor that tells a size is missing or has another number of axes.
     """
     if UNSUPPORTED in state:
         raise ValueError(
@@ -195,7 +204,8 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     patch = max(1, round((patch_numbers / per_pixel) ** 0.5))
     if patch * patch * per_pixel != patch_numbers:
         raise ValueError(
-            f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels"
+            f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of"
+            f" {per_pixel} channels"
         )
     upsampler, output_width = None, None
     if has("upsampler."):
@@ -250,7 +260,8 @@ def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
     if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
         if head_width is None:
             raise ValueError(
-                "no tensor 'transformer_blocks.0.attn.q_norm.weight' tells the width of a head: give it"
+                "no tensor 'transformer_blocks.0.attn.q_norm.weight' tells the width of a head:"
+                " give it"
             )
         if head_width < 1:
             raise ValueError(f"the width of a head must be at least 1, got {head_width}")
@@ -258,23 +269,28 @@ def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
     (found,) = _shape(state, "transformer_blocks.0.attn.q_norm.weight", 1)
     if head_width not in (None, found):
         raise ValueError(
-            f"tensor 'transformer_blocks.0.attn.q_norm.weight' says heads of {found}, not {head_width}"
+            f"tensor 'transformer_blocks.0.attn.q_norm.weight' says heads of {found}, not"
+            f" {head_width}"
         )
     return {"head_width": found, "qk_norm": True}
 
 
 def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
-    """Raises ValueError, in the release's names, unless the tensors are exactly those expected, and finite."""
+    """Raises ValueError, in the release's names, unless the tensors are exactly those expected, and
+    finite.
+    """
     if missing := sorted(set(expected) - set(state)):
         raise ValueError(f"tensor {missing[0]!r} is missing ({len(missing)} in all)")
     if unknown := sorted(set(state) - set(expected)):
         raise ValueError(
-            f"tensor {unknown[0]!r} is not part of the published network ({len(unknown)} such tensors)"
+            f"tensor {unknown[0]!r} is not part of the published network ({len(unknown)} such"
+            " tensors)"
         )
     if wrong := [key for key, shape in expected.items() if state[key].shape != shape]:
         found, wanted = state[wrong[0]].shape, expected[wrong[0]]
         raise ValueError(
-            f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted} ({len(wrong)} such tensors)"
+            f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted}"
+            f" ({len(wrong)} such tensors)"
         )
     if bad := [
         key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()
@@ -287,8 +303,9 @@ def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
 def load_checkpoint(path: str | os.PathLike[str], head_width: int | None = None) -> Converted:
     """A released checkpoint as float32 variables, with the configuration that its shapes tell.
 
-    head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file cannot be read or
-    asks for more than tensors, or if a tensor of the network is missing, unknown, of the wrong shape or not finite.
+    head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file
+    cannot be read or asks for more than tensors, or if a tensor of the network is missing, unknown,
+    of the wrong shape or not finite.
     """
     with reading(path, "checkpoint of the published network"):
         return _load_checkpoint(path, head_width)

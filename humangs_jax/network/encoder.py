@@ -1,11 +1,13 @@
 """Photos -> patches -> tokens of all views -> transformer -> feature maps and a global token.
 
-Channel order of a pixel: 2 rgb - 1 (3), moment (3), direction (3), texture planes xy, xz, yz. Channels run fastest
-inside a pixel, pixels row-major inside a patch, patches row-major inside a view, views in their order.
+Channel order of a pixel: 2 rgb - 1 (3), moment (3), direction (3), texture planes xy, xz, yz.
+Channels run fastest inside a pixel, pixels row-major inside a patch, patches row-major inside a
+view, views in their order.
 
-The neural texture is three feature planes over the canonical body, read at canonical positions. The first named axis of a plane
-is the horizontal texture coordinate. Positions in [-1, 1] span a plane from the centre of its first texel to the centre of its
-last one (`align_corners=True`); outside are zeros.
+The neural texture is three feature planes over the canonical body, read at canonical positions. The
+first named axis of a plane is the horizontal texture coordinate. Positions in [-1, 1] span a plane
+from the centre of its first texel to the centre of its last one (`align_corners=True`); outside are
+zeros.
 """
 
 import functools
@@ -63,7 +65,9 @@ def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixel
 
 
 def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
-    """Indices of the foreground patches in a static number of slots; those beyond the capacity are left out."""
+    """Indices of the foreground patches in a static number of slots; those beyond the capacity are
+    left out.
+    """
     indices = jnp.nonzero(foreground, size=capacity, fill_value=foreground.shape[0])[0]
     return Packing(indices, jnp.minimum(jnp.sum(foreground), capacity))
 
@@ -80,7 +84,9 @@ def unpack_tokens(
 
 
 class Tokenizer(nn.Module):
-    """Patches of pixels (l, pixels, 12: rgb, rays, canonical position) -> tokens (l, d); owns the neural texture."""
+    """Patches of pixels (l, pixels, 12: rgb, rays, canonical position) -> tokens (l, d); owns the
+    neural texture.
+    """
 
     width: int
     texture: TriplaneConfig
@@ -101,13 +107,15 @@ class Tokenizer(nn.Module):
 
 @part
 class PatchTransformer(Encoder):
-    """The paper's encoder: one token per patch of every view, attention over all of them, an upsampler."""
+    """The paper's encoder: one token per patch of every view, attention over all of them, an
+    upsampler.
+    """
 
     patch_size: Patch = 8
     """Side of a token's patch, pixels."""
     geometry: Literal["rays_and_positions", "place"] = "rays_and_positions"
-    """What a pixel knows besides its color: its ray and the canonical position seen there, or only its place in the photo, for
-    systems whose photos have neither cameras nor poses."""
+    """What a pixel knows besides its color: its ray and the canonical position seen there, or only
+    its place in the photo, for systems whose photos have neither cameras nor poses."""
     texture: TriplaneConfig = TriplaneConfig()
     transformer: TransformerConfig = TransformerConfig()
     upsampler: UpsamplerConfig | None = knob(
@@ -128,7 +136,10 @@ class PatchTransformer(Encoder):
 
     @nn.compact
     def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
-        """See `parts.Encoder`. Raises: ValueError if images and cameras differ in size, or are not made of whole patches."""
+        """See `parts.Encoder`.
+
+        Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
+        """
         see = encoder_pixels if self.geometry == "rays_and_positions" else photo_pixels
         patches = patchify(see(inputs, run), self.patch_size)
         views, height, width = (
@@ -182,7 +193,8 @@ def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]
     height, width = inputs.images.shape[1:3]
     if (inputs.cameras.width, inputs.cameras.height) != (width, height):
         raise ValueError(
-            f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}"
+            f"images are {width} x {height} but their cameras say {inputs.cameras.width} x"
+            f" {inputs.cameras.height}"
         )
     unit = subject_unit(inputs.canonical_vertices)
     cameras = inputs.cameras.in_units(unit)
@@ -194,8 +206,8 @@ def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]
 
 
 def photo_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
-    """What an encoder without cameras and poses sees of every pixel: rgb, then its place (x, y) in [-1, 1] and waves of it where
-    rays would be, and zeros for the canonical position.
+    """What an encoder without cameras and poses sees of every pixel: rgb, then its place (x, y) in
+    [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
     """
     height, width = inputs.images.shape[1:3]
     at = lambda size: (jnp.arange(size, dtype=inputs.images.dtype) + 0.5) * (2 / size) - 1
@@ -218,7 +230,10 @@ def touched_patches(
 def needed_tokens(
     foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int
 ) -> Int[Array, ""]:
-    """The token capacity that photos need: patches that the foreground touches. Of a batch, the largest."""
+    """The token capacity that photos need: patches that the foreground touches.
+
+    Of a batch, the largest.
+    """
     count = lambda *subject: jnp.sum(touched_patches(*subject, patch_size), dtype=jnp.int32)
     batched = foreground.ndim == 4
     return (

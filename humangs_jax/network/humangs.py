@@ -4,8 +4,9 @@
     read     feature maps -> features of every body vertex
     decode   features -> K Gaussians per vertex of the canonical body
 
-Each is a part that the configuration chooses (`network.parts`); the pass itself is written here and nowhere else. Everything is
-written for ONE subject; batch with `jax.vmap` over `inputs` (variables unbatched). Callers jit, with `config` static.
+Each is a part that the configuration chooses (`network.parts`); the pass itself is written here and
+nowhere else. Everything is written for ONE subject; batch with `jax.vmap` over `inputs` (variables
+unbatched). Callers jit, with `config` static.
 """
 
 import functools
@@ -38,7 +39,8 @@ from humangs_jax.network.parts import (
 class HumanGS(nn.Module):
     """The parts as one module: its variables are theirs, by their names here.
 
-    For Linen's own means to look inside, as `intermediates` and interceptors. The driver is no part of the pass.
+    For Linen's own means to look inside, as `intermediates` and interceptors. The driver is no part
+    of the pass.
     """
 
     encoder: Encoder
@@ -73,11 +75,12 @@ def apply_humangs(
 ) -> tuple[HumanGSOutputs, Parameters]:
     """The whole network for one subject: outputs and batch statistics.
 
-    train: normalise by this subject's statistics and return updated running ones. Under a vmap over subjects give the
-    vmap's `axis_name` to share the statistics over the batch; without it each subject has its own, to be averaged.
+    train: normalise by this subject's statistics and return updated running ones. Under a vmap over
+    subjects give the vmap's `axis_name` to share the statistics over the batch; without it each
+    subject has its own, to be averaged.
 
-    Raises: ValueError if images and cameras differ in size, the patch size does not divide it, or inputs lack normals that the
-    configuration needs.
+    Raises: ValueError if images and cameras differ in size, the patch size does not divide it, or
+    inputs lack normals that the configuration needs.
     """
     statistics, run = variables.get("batch_stats", {}), config.run(train, axis_name)
     if not (train and statistics):
@@ -93,7 +96,9 @@ def apply_humangs(
 def intermediates(
     variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> dict[str, Any]:
-    """What every module of the pass returns, by its path, as "encoder.transformer.block_0", in the order of the pass."""
+    """What every module of the pass returns, by its path, as "encoder.transformer.block_0", in the
+    order of the pass.
+    """
     found = {}
 
     def keep(run, arguments, named, context):
@@ -117,8 +122,8 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
         config: of the network.
 
     Returns:
-        {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}; a part without parameters or
-        running statistics is absent.
+        {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}; a part
+        without parameters or running statistics is absent.
 
     Examples:
         >>> variables = hg.init_humangs(jax.random.key(0), config)
@@ -173,7 +178,9 @@ def read(
 def decode(
     variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """The third part of `apply_humangs`: canonical Gaussians, metric; `dropped_tokens` is 0 (it belongs to the encoding)."""
+    """The third part of `apply_humangs`: canonical Gaussians, metric; `dropped_tokens` is 0 (it
+    belongs to the encoding).
+    """
     own = part_variables(variables, "decoder")
     return cast(
         HumanGSOutputs, config.architecture.decoder.apply(own, features, inputs, config.run())

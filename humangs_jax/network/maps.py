@@ -1,21 +1,25 @@
 """Feature maps: sampling at fractional positions, and 3x3 convolutions; both with zeros outside.
 
-Positions are texel indices (x, y): (0, 0) is the CENTRE of the first texel, x runs along the width. Two conventions
-lead there from pixels u in [0, W] (pixel centres at +0.5) of an image that a w-texel grid covers:
+Positions are texel indices (x, y): (0, 0) is the CENTRE of the first texel, x runs along the width.
+Two conventions lead there from pixels u in [0, W] (pixel centres at +0.5) of an image that a
+w-texel grid covers:
 
 - half-pixel (correct): texels are areas, index = u * w / W - 0.5;
-- mixed (published): u / W * 2 - 1 treats pixels as areas, then `align_corners=True` treats texels as points,
-  index = u / W * (w - 1). The two differ by up to half a texel, zero in the middle.
+- mixed (published): u / W * 2 - 1 treats pixels as areas, then `align_corners=True` treats texels
+  as points, index = u / W * (w - 1). The two differ by up to half a texel, zero in the middle.
 
-Convolving a grid and then sampling it bilinearly is linear, so the two may change places: sample the 3x3 neighbourhood,
-then apply the kernel, once per position instead of once per texel. With K_ab the kernel's taps, x the grid (zeros
-outside) and w the bilinear weights of the four texels c around a position (none for texels that do not exist),
+Convolving a grid and then sampling it bilinearly is linear, so the two may change places: sample
+the 3x3 neighbourhood, then apply the kernel, once per position instead of once per texel. With K_ab
+the kernel's taps, x the grid (zeros outside) and w the bilinear weights of the four texels c around
+a position (none for texels that do not exist),
 
-    sum_c w_c (bias + sum_ab K_ab x[c + (a, b) - 1])  =  bias * sum_c w_c  +  sum_ab K_ab (sum_c w_c x[c + (a, b) - 1]).
+    sum_c w_c (bias + sum_ab K_ab x[c + (a, b) - 1])
+        = bias * sum_c w_c + sum_ab K_ab (sum_c w_c x[c + (a, b) - 1]).
 
-XLA's CPU backend turns the two convolutions of a convolution's gradient into ones that its library knows, but looks for
-them outside of loops only. In a loop, as over the subjects of a batch, they ran thirty times slower. Here they are
-written as the library wants them: batch, two axes of space, channels.
+XLA's CPU backend turns the two convolutions of a convolution's gradient into ones that its library
+knows, but looks for them outside of loops only. In a loop, as over the subjects of a batch, they
+ran thirty times slower. Here they are written as the library wants them: batch, two axes of space,
+channels.
 """
 
 from typing import Any, Literal
@@ -41,7 +45,9 @@ def texel_indices(
     grid_size: tuple[int, int],
     convention: PixelGrid,
 ) -> Float[Array, "*p 2"]:
-    """Positions in pixels of an image -> texel indices of a grid that covers it; sizes are (width, height)."""
+    """Positions in pixels of an image -> texel indices of a grid that covers it; sizes are (width,
+    height).
+    """
     image, grid = jnp.asarray(image_size, pixels.dtype), jnp.asarray(grid_size, pixels.dtype)
     if convention == "half_pixel":
         return pixels * (grid / image) - 0.5
@@ -53,9 +59,9 @@ def sample_bilinear(
 ) -> Float[Array, "*p c"]:
     """Bilinear interpolation between texel centres; texels outside of the grid count as zeros.
 
-    origin: the texel index, in both axes, that `indices` are relative to; counted from the middle, float32 positions
-    keep more digits of their fractions. Positions that are outside by a texel or more, infinite or NaN give zero with
-    zero gradient.
+    origin: the texel index, in both axes, that `indices` are relative to; counted from the middle,
+    float32 positions keep more digits of their fractions. Positions that are outside by a texel or
+    more, infinite or NaN give zero with zero gradient.
     """
     height, width, channels = grid.shape
     size = jnp.asarray([width, height], indices.dtype)
@@ -94,10 +100,11 @@ def sample_nearest(grid: Float[Array, "h w"], indices: Float[Array, "*p 2"]) -> 
 def sample_neighborhoods(
     grid: Float[Array, "h w c"], indices: Float[Array, "p 2"]
 ) -> tuple[Float[Array, "p 3*3*c"], Float[Array, " p"]]:
-    """(neighbourhoods, coverage): the two sums over c above, taps row-major with channels fastest, and sum_c w_c.
+    """(neighbourhoods, coverage): the two sums over c above, taps row-major with channels fastest,
+    and sum_c w_c.
 
-    indices: texel indices (x, y), see `network.maps`. Positions that are outside by a texel or more, infinite or
-    NaN give zeros with zero gradient.
+    indices: texel indices (x, y), see `network.maps`. Positions that are outside by a texel or
+    more, infinite or NaN give zeros with zero gradient.
     """
     height, width, channels = grid.shape
     size = jnp.asarray([width, height], indices.dtype)
@@ -133,8 +140,8 @@ def convolve_neighborhoods(
     bias: Float[Array, " d"],
     dtype: Any = None,
 ) -> Float[Array, "n d"]:
-    """The sum above for all n positions, or for means of several: the products in `dtype`, the result in that of the
-    coverages.
+    """The sum above for all n positions, or for means of several: the products in `dtype`, the
+    result in that of the coverages.
     """
     x, kernel = promote_dtype(neighborhoods, kernel, dtype=dtype)
     products = jnp.matmul(
@@ -175,7 +182,8 @@ def _backward(
 ) -> tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]]:
     x, kernel = residuals
     x_gradient = _convolve(cotangent, jnp.swapaxes(kernel[::-1, ::-1], 2, 3))
-    # channels of x are the batch, views are what is contracted, the cotangent's pixels are the window
+    # channels of x are the batch, views are what is contracted, the cotangent's pixels are the
+    # window
     maps, window = jnp.transpose(x, (3, 1, 2, 0)), jnp.transpose(cotangent, (1, 2, 0, 3))
     kernel_gradient = lax.conv_general_dilated(
         maps, window, (1, 1), [(1, 1), (1, 1)], dimension_numbers=LAYOUT
@@ -187,7 +195,9 @@ _convolve_on_cpu.defvjp(_forward, _backward)
 
 
 class Convolution(nn.Module):
-    """3x3 convolution with a bias: (v, h, w, c) -> (v, h, w, features); the parameters are those of `nn.Conv`."""
+    """3x3 convolution with a bias: (v, h, w, c) -> (v, h, w, features); the parameters are those of
+    `nn.Conv`.
+    """
 
     features: int
     kernel_init: nn.initializers.Initializer

@@ -1,18 +1,22 @@
-"""What an encoder, a reader, a decoder and a driver are, so that each can be exchanged, and what passes between them.
+"""What an encoder, a reader, a decoder and a driver are, so that each can be exchanged, and what
+passes between them.
 
-    encoding = encoder(photos)        features = reader(encoding)        Gaussians = decoder(features)
+    encoding = encoder(photos)
+    features = reader(encoding)
+    Gaussians = decoder(features)
 
-A part is a Linen module: its fields are its configuration, which weights files record by the name of the class. It gets what the
-part before it has made, the inputs, and how this pass runs; it knows no other part. A new part is a new file with a class that
-derives from `Encoder`, `Reader`, `Decoder` or `Driver` and has the decorator `core.configuration.part`, and one line of a preset
-that names it: see `experiments/systems`.
+A part is a Linen module: its fields are its configuration, which weights files record by the name
+of the class. It gets what the part before it has made, the inputs, and how this pass runs; it knows
+no other part. A new part is a new file with a class that derives from `Encoder`, `Reader`,
+`Decoder` or `Driver` and has the decorator `core.configuration.part`, and one line of a preset that
+names it: see `experiments/systems`.
 
-A part that works on a map of the body's surface has it in a field `surface_map`: its `shape`, and `texels(body)`, which
-`data.views.gaussian_body` asks for; the inputs carry them. A driver for bodies of one number of joints says so in a field
-`joints`.
+A part that works on a map of the body's surface has it in a field `surface_map`: its `shape`, and
+`texels(body)`, which `data.views.gaussian_body` asks for; the inputs carry them. A driver for
+bodies of one number of joints says so in a field `joints`.
 
-Lengths inside the network are normalised units: metres divided by s = (height of the canonical body) / 1.8, so that every body is
-1.8 high. Means and scales are multiplied by s at the end.
+Lengths inside the network are normalised units: metres divided by s = (height of the canonical
+body) / 1.8, so that every body is 1.8 high. Means and scales are multiplied by s at the end.
 """
 
 import dataclasses
@@ -46,13 +50,15 @@ TARGET_HEIGHT = 1.8
 class HumanGSInputs:
     """The photos of one subject, and the posed body in each of them.
 
-    images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices: (v, n, 3) metric,
-    the body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose. position_maps: (v, h, w, 3) canonical
-    position of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1
-    on background. foreground: (v, h, w) pixels of the person (used where tokens are "foreground"). view_count: the number of
-    real views, which come first; the others are padding and change nothing. None: all are real. posed_normals: (v, n, 3)
-    unit, used with shells. canonical_normals: (n, 3) unit, used where the decoder's frame is "normal". spacing: (n,) distance
-    between vertices relative to the mesh that the weights were trained with; None: 1. skinning_weights: (n, j) of the body, and
+    images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices:
+    (v, n, 3) metric, the body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose.
+    position_maps: (v, h, w, 3) canonical position of each pixel, normalised units, 1 on background.
+    depth_maps: (v, h, w) rasterized z, normalised units, -1 on background. foreground: (v, h, w)
+    pixels of the person (used where tokens are "foreground"). view_count: the number of real views,
+    which come first; the others are padding and change nothing. None: all are real. posed_normals:
+    (v, n, 3) unit, used with shells. canonical_normals: (n, 3) unit, used where the decoder's frame
+    is "normal". spacing: (n,) distance between vertices relative to the mesh that the weights were
+    trained with; None: 1. skinning_weights: (n, j) of the body, and
     texels: the map of its surface, for decoders whose Gaussians are not those of vertices.
     """
 
@@ -84,10 +90,11 @@ def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
 
 
 class Pass(NamedTuple):
-    """How one pass of the network runs: all that a part knows besides its own fields. See `HumanGSConfig.run`.
+    """How one pass of the network runs: all that a part knows besides its own fields. See
+    `HumanGSConfig.run`.
 
-    train: batch norms use this subject's statistics and update the running ones. axis_name: vmap axes over which those are
-    shared.
+    train: batch norms use this subject's statistics and update the running ones. axis_name: vmap
+    axes over which those are shared.
     """
 
     conventions: Conventions
@@ -105,7 +112,8 @@ class Pass(NamedTuple):
 class Packing:
     """Which patches became tokens.
 
-    indices: (l,) of the kept patches, in their order; the number of patches itself where a token is padding.
+    indices: (l,) of the kept patches, in their order; the number of patches itself where a token is
+    padding.
     count: number of real tokens, which come first; the rest is padding.
     """
 
@@ -117,8 +125,9 @@ class Packing:
 class Encoding:
     """What an encoder makes of the photos.
 
-    maps: (v, h', w', d) features. global_token: (e,), or None. dropped_tokens: foreground patches for which the token
-    capacity had no room. packing: the patches of which the maps know something; None: all. patch_size: side of a patch, pixels.
+    maps: (v, h', w', d) features. global_token: (e,), or None. dropped_tokens: foreground patches
+    for which the token capacity had no room. packing: the patches of which the maps know something;
+    None: all. patch_size: side of a patch, pixels.
     """
 
     maps: Float[Array, "v h w d"]
@@ -132,10 +141,11 @@ class Encoding:
 class Shells:
     """What the photos show at the s points along the normal of each vertex.
 
-    distances: (s,). colors: (n, s, 3) mean photo color over the views in which the point is visible and in the foreground,
-    weighted by how much the posed normal faces them; grey without such a view. seen: (n, s) the sum of those weights over the
-    number of views. inside: (n, s) mean mask at the point over the views that contain it. hull: (n, s) the minimum of the same, 0
-    outside of the visual hull. A view that does not contain the point is ignored; without any view both are 1.
+    distances: (s,). colors: (n, s, 3) mean photo color over the views in which the point is visible
+    and in the foreground, weighted by how much the posed normal faces them; grey without such a
+    view. seen: (n, s) the sum of those weights over the number of views. inside: (n, s) mean mask
+    at the point over the views that contain it. hull: (n, s) the minimum of the same, 0 outside of
+    the visual hull. A view that does not contain the point is ignored; without any view both are 1.
     """
 
     distances: Float[Array, " s"]
@@ -149,7 +159,8 @@ class Shells:
 class VertexFeatures:
     """What the photos show of each vertex.
 
-    local: (n, d) pooled feature. global_token: (e,) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
+    local: (n, d) pooled feature. global_token: (e,) or None. photo_colors: (n, 3) and
+    visible_fraction: (n,), or None.
     shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
     """
 
@@ -165,12 +176,14 @@ class VertexFeatures:
 class HumanGSOutputs:
     """Canonical Gaussians of one subject.
 
-    gaussians: metric. Without `skinning_weights` g = n * k of them, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from
-    the vertex, or of each Gaussian from where it belongs, normalised units (for the tightness loss, which is 0 for None).
-    skinning_offsets: (n * k, j) logits of the skinning head, or None (see `vertex_decoder.corrected_skinning_weights`).
-    dropped_tokens: foreground patches for which the token capacity had no room. skinning_weights: (g, j), rows of sum 1, of
-    Gaussians that do not belong to one vertex each; None: the body's. scene: what a driver works from for every target: the
-    features, unless a decoder sets it.
+    gaussians: metric. Without `skinning_weights` g = n * k of them, vertex-major, k fastest.
+    tight_offsets: (n, k_tight, 3) from the vertex, or of each Gaussian from where it belongs,
+    normalised units (for the tightness loss, which is 0 for None).
+    skinning_offsets: (n * k, j) logits of the skinning head, or None (see
+    `vertex_decoder.corrected_skinning_weights`).
+    dropped_tokens: foreground patches for which the token capacity had no room. skinning_weights:
+    (g, j), rows of sum 1, of Gaussians that do not belong to one vertex each; None: the body's.
+    scene: what a driver works from for every target: the features, unless a decoder sets it.
     """
 
     gaussians: Gaussians
@@ -191,8 +204,9 @@ class HumanGSOutputs:
 class Target(NamedTuple):
     """What a driver knows of a target.
 
-    vertices: (n, 3) of the posed body, metres. pixels: (h, w, 9) of every pixel the ray (moment, direction) and the canonical
-    position of the body there (1 on background), normalised units, for drivers that make images; else None.
+    vertices: (n, 3) of the posed body, metres. pixels: (h, w, 9) of every pixel the ray (moment,
+    direction) and the canonical position of the body there (1 on background), normalised units, for
+    drivers that make images; else None.
     """
 
     pose: BodyPose
@@ -203,8 +217,9 @@ class Target(NamedTuple):
 class Drawn(NamedTuple):
     """Images of the v targets of one subject, and what losses compare besides.
 
-    spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight. opacities: (g,), tight_offsets: of the
-    Gaussians that were drawn; opacities None: there were none, and no alpha or depth either.
+    spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight. opacities:
+    (g,), tight_offsets: of the Gaussians that were drawn; opacities None: there were none, and no
+    alpha or depth either.
     """
 
     rendering: Rendering
@@ -214,7 +229,8 @@ class Drawn(NamedTuple):
 
 
 class Encoder(Part, nn.Module):
-    """Photos -> `Encoding`. Alone among parts it may have running statistics, in the collection "batch_stats".
+    """Photos -> `Encoding`. Alone among parts it may have running statistics, in the collection
+    "batch_stats".
 
     patch_size: field; the side of photos is a multiple of it, pixels.
     """
@@ -243,7 +259,9 @@ class Decoder(Part, nn.Module):
 
 
 class Driver(Part, nn.Module):
-    """A part that runs again for every target and draws it; without one, canonical Gaussians move by skinning alone."""
+    """A part that runs again for every target and draws it; without one, canonical Gaussians move
+    by skinning alone.
+    """
 
     has_alpha = True
     """Whether its images can be put on any background; else they are on white."""
@@ -263,7 +281,9 @@ class Driver(Part, nn.Module):
         backgrounds: Float[Array, "v 3"],
         config: PyTree,
     ) -> Drawn:
-        """The targets (`SubjectViews`) of one subject as a `TrainConfig` has them; `training.forward.draw_targets` for others."""
+        """The targets (`SubjectViews`) of one subject as a `TrainConfig` has them;
+        `training.forward.draw_targets` for others.
+        """
         raise NotImplementedError
 
     @nn.nowrap
@@ -275,14 +295,16 @@ class Driver(Part, nn.Module):
         targets: PyTree,
         background: float,
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-        """Images and alpha of the person of one capture in the views of another, for evaluations. variables, config: the
-        network's.
+        """Images and alpha of the person of one capture in the views of another, for evaluations.
+        variables, config: the network's.
         """
         raise NotImplementedError
 
 
 class Watched(nn.Module):
-    """What `stage` calls: each entry of the dict that it returns is a stage of its own if `apart`."""
+    """What `stage` calls: each entry of the dict that it returns is a stage of its own if
+    `apart`.
+    """
 
     apart: bool = False
 
@@ -292,7 +314,8 @@ class Watched(nn.Module):
 
 
 def stage(name: str, function: Callable[..., T], *learned: Any, apart: bool = False) -> T:
-    """function(*learned), a step beside the network: Linen's interceptors see it as they see the network's modules.
+    """function(*learned), a step beside the network: Linen's interceptors see it as they see the
+    network's modules.
 
     learned: the arguments that depend on parameters.
     """

@@ -1,4 +1,6 @@
-"""Named configurations: `published` runs the released weights, `paper` is as described, `small` is what we ship."""
+"""Named configurations: `published` runs the released weights, `paper` is as described, `small` is
+what we ship.
+"""
 
 from humangs_jax.core.configuration import Presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
@@ -70,7 +72,9 @@ def small() -> HumanGSConfig:
 
 
 def tiny() -> HumanGSConfig:
-    """The published parts with the conventions of `small`, for tests: every stage in the smallest sizes."""
+    """The published parts with the conventions of `small`, for tests: every stage in the smallest
+    sizes.
+    """
     decoder = paper_parts(small().architecture)[2]
     return HumanGSConfig(
         Architecture(

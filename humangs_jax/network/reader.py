@@ -1,9 +1,11 @@
 """The paper's reader: posed vertices projected into the photos, features read there, views pooled.
 
-Vertices can also read the photos themselves, at the surface and on shells: points off the body's surface, looked up in all
-photos, where loose clothes and hair are, and their color. Each vertex has one point at every distance of a list along its posed
-normal. Where a photo shows the background, the point is not part of the person. Points that all photos show on the person are in
-the visual hull (Laurentini 1994). Lengths of functions here are normalised units: cameras, vertices and depth maps alike.
+Vertices can also read the photos themselves, at the surface and on shells: points off the body's
+surface, looked up in all photos, where loose clothes and hair are, and their color. Each vertex has
+one point at every distance of a list along its posed normal. Where a photo shows the background,
+the point is not part of the person. Points that all photos show on the person are in the visual
+hull (Laurentini 1994). Lengths of functions here are normalised units: cameras, vertices and depth
+maps alike.
 """
 
 import itertools
@@ -41,7 +43,9 @@ from humangs_jax.network.upsampler import KAIMING
 DEPTH_EPSILON = 1e-6
 """Added to z before the division, as published."""
 DEPTH_TOLERANCE = 0.05
-"""A vertex counts as seen when it lies less than this behind the rasterized surface (normalised units)."""
+"""A vertex counts as seen when it lies less than this behind the rasterized surface (normalised
+units).
+"""
 COUNT_EPSILON = 1e-8
 """Added to the number of pooled views, as published: no view at all gives zeros."""
 UNSEEN_COLOR = 0.5
@@ -57,11 +61,17 @@ class PixelAlignedReader(Reader):
     """What vertices read."""
 
     output_width: Width | None = 768
-    """Features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the maps are read as they are."""
+    """Features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the
+    maps are read as they are.
+    """
     sample_rgb: bool = False
-    """Also read the photo color at each vertex, averaged over the views that see it, and their fraction."""
+    """Also read the photo color at each vertex, averaged over the views that see it, and their
+    fraction.
+    """
     shells: tuple[Spread, ...] = ()
-    """Ascending distances along the vertex normals, normalised units, at which the photos are read too; (): none."""
+    """Ascending distances along the vertex normals, normalised units, at which the photos are read
+    too; (): none.
+    """
 
     def __post_init__(self):
         """Raises ValueError for distances that are not ascending."""
@@ -129,7 +139,9 @@ def project_and_test(
     present: Bool[Array, " v"],
     grid: PixelGrid,
 ) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
-    """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees none."""
+    """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees
+    none.
+    """
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
     see = lambda p, z, surface: visible_vertices(
         p, z, surface, (cameras.width, cameras.height), grid
@@ -140,7 +152,9 @@ def project_and_test(
 def project_vertices(
     camera: Camera, vertices: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
-    """Pixel positions and depths z of one camera; finite, also in gradients, for vertices in its plane or behind."""
+    """Pixel positions and depths z of one camera; finite, also in gradients, for vertices in its
+    plane or behind.
+    """
     p = transform.apply(camera.cam_from_world, vertices)
     depth = p[:, 2]
     divisor = depth + DEPTH_EPSILON
@@ -156,9 +170,11 @@ def visible_vertices(
     image_size: tuple[int, int],
     grid: PixelGrid,
 ) -> Bool[Array, " n"]:
-    """Which projected vertices lie inside the image, in front of the camera and not behind the rasterized surface.
+    """Which projected vertices lie inside the image, in front of the camera and not behind the
+    rasterized surface.
 
-    depth_map: rasterized z, -1 on background, so that a vertex over background is unseen. image_size: (width, height).
+    depth_map: rasterized z, -1 on background, so that a vertex over background is unseen.
+    image_size: (width, height).
     """
     height, width = depth_map.shape
     indices = texel_indices(pixels, image_size, (width, height), grid)
@@ -173,7 +189,8 @@ def sum_over_views(
     indices: Float[Array, "v n 2"],
     weights: Float[Array, "v n"],
 ) -> PyTree:
-    """Sum over views of weight * read(map of the view, texel indices), one view after the other: memory for one.
+    """Sum over views of weight * read(map of the view, texel indices), one view after the other:
+    memory for one.
 
     read: (h, w, c), (n, 2) -> a pytree of (n, ...).
     """
@@ -204,7 +221,9 @@ def photo_colors(
 
 
 def on_the_person(shells: Shells) -> Bool[Array, " n"]:
-    """Whether any photo shows the person at any distance along the normal of a vertex; true for what no photo contains."""
+    """Whether any photo shows the person at any distance along the normal of a vertex; true for
+    what no photo contains.
+    """
     return jnp.any(shells.inside > 0, axis=1)
 
 
@@ -221,8 +240,10 @@ def sample_shells(
 ) -> Shells:
     """Sample every view that is `present` at the points at `distances` from the posed vertices.
 
-    images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the body, -1 on background.
-    cameras, vertices: normalised units. normals: unit, of the posed body. distances: ascending, normalised units.
+    images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the
+    body, -1 on background.
+    cameras, vertices: normalised units. normals: unit, of the posed body. distances: ascending,
+    normalised units.
     """
     steps = jnp.asarray(distances, vertices.dtype)
     count = vertices.shape[1]

@@ -1,4 +1,6 @@
-"""How the network runs, which weights files do not record (`Runtime`), and what the weights were trained with."""
+"""How the network runs, which weights files do not record (`Runtime`), and what the weights were
+trained with.
+"""
 
 from typing import Any, Literal
 
@@ -33,22 +35,27 @@ class Runtime:
         gain="5 x in time at a foreground share of 0.2",
         measured=MEASURED,
     )
-    """Patches that become tokens: "all", those that the "foreground" touches, or None: as the weights were trained."""
+    """Patches that become tokens: "all", those that the "foreground" touches, or None: as the
+    weights were trained.
+    """
     token_capacity: Room = knob(
         0,
         cost="tokens beyond it are dropped and counted",
         gain="time and memory",
         measured=MEASURED,
     )
-    """Slots for foreground tokens over all views, 0: room for all patches. `reconstruct` and `stack_captures` fit it to the
-    photos; in training it is for the largest number of photos, see `training.forward.token_share`."""
+    """Slots for foreground tokens over all views, 0: room for all patches. `reconstruct` and
+    `stack_captures` fit it to the photos; in training it is for the largest number of photos, see
+    `training.forward.token_share`."""
     dtype: ComputeType = knob(
         "float32",
         cost="bfloat16: 1e-2 of relative error; float16: 1e-3, not for training",
         gain="time on accelerators; none on CPUs",
         measured="stability.md",
     )
-    """Of the encoder's products; parameters, norms, softmax statistics and the decoder stay float32 at least."""
+    """Of the encoder's products; parameters, norms, softmax statistics and the decoder stay float32
+    at least.
+    """
     attention: Literal["auto"] | AttentionKernel = knob(
         "auto",
         cost="none",
@@ -62,48 +69,58 @@ class Runtime:
         gain="compile time on TPU and GPU",
         measured=MEASURED,
     )
-    """Run the blocks as one compiled loop. Their parameters are copied side by side in every call (12 layers of 768: 340 MB)."""
+    """Run the blocks as one compiled loop.
+
+    Their parameters are copied side by side in every call (12 layers of 768: 340 MB).
+    """
     remat: Literal["none", "full", "dots"] = knob(
         "none", cost="a third more arithmetic", gain="memory of training", measured=MEASURED
     )
-    """What a block recomputes in the backward pass instead of keeping it: nothing, all ("full"), or all but the results of
-    attention and of products with weights ("dots"). On a CPU only a `scan` recomputes: XLA merges what is computed twice
-    outside of loops."""
+    """What a block recomputes in the backward pass instead of keeping it: nothing, all ("full"), or
+    all but the results of attention and of products with weights ("dots"). On a CPU only a `scan`
+    recomputes: XLA merges what is computed twice outside of loops."""
     longest_edge: Edge | None = knob(
         None,
         cost="three times the Gaussians at 0.017",
         gain="detail where photos have more than the vertices of the body",
         measured="refinement.md",
     )
-    """Metres to which edges of the body are split beyond what the weights were trained with, None for no more."""
+    """Metres to which edges of the body are split beyond what the weights were trained with, None
+    for no more.
+    """
     body_vertices: Vertices | None = knob(
         None,
         cost="detail of the body",
         gain="Gaussians and the time of a frame in proportion",
         measured=TRADE,
     )
-    """Vertices to which the body is decimated, fewer than the weights were trained with, None for no fewer. Gaussians shrink or
-    grow with the distance between vertices, so that they cover as much as before."""
+    """Vertices to which the body is decimated, fewer than the weights were trained with, None for
+    no fewer. Gaussians shrink or grow with the distance between vertices, so that they cover as
+    much as before."""
     image_size: InputSide | None = knob(
         None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE
     )
-    """Side of the photos in pixels, a multiple of the patch size; None: as the weights were trained."""
+    """Side of the photos in pixels, a multiple of the patch size; None: as the weights were
+    trained.
+    """
     crop: bool = knob(
         False,
         cost="0.15 dB in the foreground for one of four people",
         gain="pixels of the person in place of background: 0.3 dB in the foreground on average",
         measured=EVALUATION,
     )
-    """Photos are cut to the square around the person's mask before they are brought to that size."""
+    """Photos are cut to the square around the person's mask before they are brought to that size.
+    """
     displacement: bool | None = knob(
         None,
         cost="half a second where the body does not fit the masks, 1.2 s for a skirt, else 0.1 s",
         gain="boundaries and hems of bodies that are a centimetre off, and skirts",
         measured="benchmarks/quality.md",
     )
-    """The body is moved to the edges of the masks first (`data.body_and_masks`), for weights that look at the pixels of the
-    "person". None: where a part of it sticks out of the masks; True: always, which costs PSNR where the body is right. False:
-    never; a capture's own displacement, which else comes first, and a skirt (`data.skirt`) are left out, too."""
+    """The body is moved to the edges of the masks first (`data.body_and_masks`), for weights that
+    look at the pixels of the "person". None: where a part of it sticks out of the masks; True:
+    always, which costs PSNR where the body is right. False: never; a capture's own displacement,
+    which else comes first, and a skirt (`data.skirt`) are left out, too."""
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""
 
@@ -115,7 +132,10 @@ class Runtime:
 
 @configuration
 class Conventions:
-    """What the weights were trained with. No tensor's shape depends on it; with other values the results are worse."""
+    """What the weights were trained with.
+
+    No tensor's shape depends on it; with other values the results are worse.
+    """
 
     image_size: InputSide = knob(
         512,
@@ -127,13 +147,14 @@ class Conventions:
     tokens: TokenSelection = "all"
     """Patches that became tokens."""
     pixels: Literal["all", "person"] = "all"
-    """Of "person": where there are masks, only their pixels count. No photo then sees the body where it covers the background,
-    and Gaussians of vertices that lie off the person in all photos are dropped."""
+    """Of "person": where there are masks, only their pixels count. No photo then sees the body
+    where it covers the background, and Gaussians of vertices that lie off the person in all photos
+    are dropped."""
     position_map: Literal["plain", "gouraud"] = "plain"
     """Its shading."""
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
-    """The release divides camera centres by s, and the ray origins taken from them once more, so that the moments of its rays
-    ("twice_normalized") fit no camera."""
+    """The release divides camera centres by s, and the ray origins taken from them once more, so
+    that the moments of its rays ("twice_normalized") fit no camera."""
     pool: Literal["visible", "all"] = "visible"
     """Average over the views that see a vertex (paper) or over all (release)."""
     pixel_grid: PixelGrid = "half_pixel"
@@ -143,13 +164,14 @@ class Conventions:
     rendering: Literal["exact", "inria"] = "exact"
     """How they are drawn."""
     skinning_reach: Length | None = None
-    """Gaussians between the legs farther than this from their vertex, metres, move with both (`body.model.spread_weights`);
+    """Gaussians between the legs farther than this from their vertex, metres, move with both
+    (`body.model.spread_weights`);
     None: all with their vertex."""
     light: bool = False
     """Other poses are drawn in the light of the photos (`Avatar.light`)."""
     low_pass: Length | None = None
-    """Metres that a pixel of the training images shows of the person, if their low-pass is to be part of the scales
-    (`Gaussians.low_pass`); None: it stays with the renderer."""
+    """Metres that a pixel of the training images shows of the person, if their low-pass is to be
+    part of the scales (`Gaussians.low_pass`); None: it stays with the renderer."""
     body_vertices: Vertices | None = knob(
         None,
         cost="detail of the body",

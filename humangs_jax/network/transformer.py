@@ -1,20 +1,23 @@
-"""Pre-norm transformer over all tokens of all views; position is in the tokens themselves (rays and pose features).
+"""Pre-norm transformer over all tokens of all views; position is in the tokens themselves (rays and
+pose features).
 
     x += attention(norm1(x));  x += mlp(norm2(x))
 
-LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and softmax run in float32
-at least, and so does the residual stream; products run in `dtype`.
-Attention over the tokens of all views is softmax(q k^T / sqrt(e)) v per head, with normalised q and k. Tokens that are padding
-stand at the end; the first `count` ones are attended to. Three exact implementations:
+LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and
+softmax run in float32 at least, and so does the residual stream; products run in `dtype`. Attention
+over the tokens of all views is softmax(q k^T / sqrt(e)) v per head, with normalised q and k. Tokens
+that are padding stand at the end; the first `count` ones are attended to. Three exact
+implementations:
 
-- "chunked": matrix products over blocks of one head's queries, recomputed in the backward pass, so that memory grows
-  with L and not with L^2;
+- "chunked": matrix products over blocks of one head's queries, recomputed in the backward pass, so
+  that memory grows with L and not with L^2;
 - "xla": `jax.nn.dot_product_attention`, which materialises L x L logits;
 - "cudnn": its fused flash attention (NVIDIA, half precision only).
 
-"auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens (not in float64: its
-softmax is always float32), and "chunked" otherwise. On a CPU of two cores, 4,097 tokens and 12 heads of 64, "xla" needs
-2.6 s of processor time and 7.9 with its gradient, "chunked" 0.8 and 2.9 (measured when it was written).
+"auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens
+(not in float64: its softmax is always float32), and "chunked" otherwise. On a CPU of two cores,
+4,097 tokens and 12 heads of 64, "xla" needs 2.6 s of processor time and 7.9 with its gradient,
+"chunked" 0.8 and 2.9 (measured when it was written).
 """
 
 from typing import Any, cast
@@ -34,7 +37,9 @@ PRODUCT = "product"
 QUERIES = 1024
 """At once, in "chunked"."""
 XLA_TOKENS = 8192
-"""Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3 GB a layer)."""
+"""Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3
+GB a layer).
+"""
 
 
 def resolve_implementation(implementation: str, tokens: int, dtype: Any) -> AttentionKernel:
@@ -55,7 +60,9 @@ def chunked_attention(
     count: Int[Array, ""] | None,
     query_chunk: int = QUERIES,
 ) -> Float[Array, "m h e"]:
-    """Exact attention, head by head and one block of queries after the other; softmax statistics in float32 at least."""
+    """Exact attention, head by head and one block of queries after the other; softmax statistics in
+    float32 at least.
+    """
     length, heads, width = q.shape
     blocks = -(-length // query_chunk)
     block = -(-length // blocks)
@@ -196,7 +203,9 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each (l, d)."""
+    """Tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each
+    (l, d).
+    """
 
     config: TransformerConfig
     runtime: Runtime
@@ -227,7 +236,9 @@ class Transformer(nn.Module):
     def _scan_blocks(
         self, x: Float[Array, "l d"], count: Int[Array, ""] | None, quarters: tuple[int, ...]
     ) -> tuple[Float[Array, "l d"], list[Float[Array, "l d"]]]:
-        """The blocks as one loop over their stacked parameters: (output, outputs at the quarters)."""
+        """The blocks as one loop over their stacked parameters: (output, outputs at the
+        quarters).
+        """
         config, remat = self.config, self.runtime.remat
         block = Block(config, self.runtime, 0, parent=None)
         blocks = [self.variables["params"][f"block_{index}"] for index in range(config.layers)]

@@ -1,11 +1,11 @@
 """Feature aggregation: token maps of several depths fused and upsampled four times.
 
-With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4 transposed
-convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (-> H, norm, LeakyReLU; -> out,
-bare). Maps are (v, h, w, c).
+With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4
+transposed convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (->
+H, norm, LeakyReLU; -> out, bare). Maps are (v, h, w, c).
 
-The last convolution is half of that arithmetic, and only body vertices read what it computes, from positions between
-its pixels. So the reader applies it to what the vertices have read of its input.
+The last convolution is half of that arithmetic, and only body vertices read what it computes, from
+positions between its pixels. So the reader applies it to what the vertices have read of its input.
 """
 
 from typing import Annotated, Any, Literal
@@ -21,7 +21,9 @@ from humangs_jax.network.maps import Convolution
 
 SLOPE = 0.2
 MOMENTUM = 0.9
-"""Momentum of the running statistics; torch calls it 0.1, and takes the unbiased variance: larger by one part in v * h * w."""
+"""Momentum of the running statistics; torch calls it 0.1, and takes the unbiased variance: larger
+by one part in v * h * w.
+"""
 KAIMING = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
 """torch counts the fan-out of a transposed convolution over its input channels."""
@@ -34,16 +36,19 @@ class UpsamplerConfig:
     hidden: Annotated[int, Range(2, 16_384)] = 256
     """Width."""
     features: Literal["intermediate", "final"] = "intermediate"
-    """All four depths are aggregated ("intermediate"), or the last is upsampled alone ("final", an ablation)."""
+    """All four depths are aggregated ("intermediate"), or the last is upsampled alone ("final", an
+    ablation).
+    """
 
 
 class UpConvolution(nn.Module):
     """4x4 transposed convolution, stride 2, padding 1: (v, h, w, c) -> (v, 2h, 2w, features).
 
-    An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i, i + 1 under 2, 0;
-    columns likewise. So one matrix product of all 2x2 neighbourhoods to 4 * features channels, interleaved, does it: as
-    a dilated convolution (or a 2x2 one) its backward pass on a CPU is twenty times slower. The kernel (4, 4, c,
-    features) is stored unflipped: input pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).
+    An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i,
+    i + 1 under 2, 0; columns likewise. So one matrix product of all 2x2 neighbourhoods to 4 *
+    features channels, interleaved, does it: as a dilated convolution (or a 2x2 one) its backward
+    pass on a CPU is twenty times slower. The kernel (4, 4, c, features) is stored unflipped: input
+    pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).
     """
 
     features: int

@@ -1,8 +1,9 @@
 """From features of a body vertex to its K Gaussians.
 
-Input of a vertex: pooled local feature, global token, positional encoding of the canonical position, and optionally its
-photo color, the fraction of views that see it, and what the photos show at distances along its normal. The first
-`tight` Gaussians of a vertex are those whose offsets a loss keeps small.
+Input of a vertex: pooled local feature, global token, positional encoding of the canonical
+position, and optionally its photo color, the fraction of views that see it, and what the photos
+show at distances along its normal. The first `tight` Gaussians of a vertex are those whose offsets
+a loss keeps small.
 """
 
 from typing import Annotated, Literal
@@ -35,13 +36,20 @@ LAST_STD = 0.001
 INITIAL_OPACITY = -1.0
 """Before the sigmoid."""
 COLOR_MARGIN = 0.01
-"""Photo colors are pulled this far inside (0, 1) before the inverse sigmoid: white stays correctable."""
+"""Photo colors are pulled this far inside (0, 1) before the inverse sigmoid: white stays
+correctable.
+"""
 WEIGHT_EPSILON = 1e-9
 """Added to skinning weights before their logarithm, as published."""
 THINNER = 1.2
-"""Subtracted from the bias of the scale along the normal: a third of the thickness, so that silhouettes are sharp."""
+"""Subtracted from the bias of the scale along the normal: a third of the thickness, so that
+silhouettes are sharp.
+"""
 OBLIQUE = (0.36, 0.48, 0.8)
-"""A unit vector along no axis of a body. Where normals are opposite to it, frames turn quickly between vertices."""
+"""A unit vector along no axis of a body.
+
+Where normals are opposite to it, frames turn quickly between vertices.
+"""
 INITIAL_SHELL = 4.0
 """Logit of the nearest shell, of 0 elsewhere: Gaussians start near the surface."""
 
@@ -50,8 +58,8 @@ INITIAL_SHELL = 4.0
 class VertexDecoder(Decoder):
     """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
 
-    It computes in float32 at least: it is a thousandth of the published network's arithmetic, and bfloat16 here would double the
-    error of its Gaussians.
+    It computes in float32 at least: it is a thousandth of the published network's arithmetic, and
+    bfloat16 here would double the error of its Gaussians.
     """
 
     hidden: Width = 256
@@ -68,12 +76,14 @@ class VertexDecoder(Decoder):
     skinning_joints: Few | None = None
     """Joints of the head that corrects skinning weights, None without it."""
     offset_scale: Spread | None = None
-    """Offsets are bounded to it by tanh (normalised units; what shells add is not), None leaves them unbounded as published."""
+    """Offsets are bounded to it by tanh (normalised units; what shells add is not), None leaves
+    them unbounded as published.
+    """
     initial_log_scale: Bias = -3.0
     """Initial bias of the scales, before the softplus."""
     frame: Literal["canonical", "normal"] = "canonical"
-    """Axes of offsets and rotations: those of the canonical body (published), or ones whose z is the vertex's normal, along which
-    Gaussians start `THINNER`."""
+    """Axes of offsets and rotations: those of the canonical body (published), or ones whose z is
+    the vertex's normal, along which Gaussians start `THINNER`."""
     residual_color: bool = False
     """Colors are predicted relative to the photo color."""
 
@@ -92,7 +102,10 @@ class VertexDecoder(Decoder):
     def __call__(
         self, features: VertexFeatures, inputs: HumanGSInputs, run: Pass
     ) -> HumanGSOutputs:
-        """Gaussians of the n vertices, vertex-major, metres. Raises ValueError for features that lack the normals."""
+        """Gaussians of the n vertices, vertex-major, metres.
+
+        Raises ValueError for features that lack the normals.
+        """
         if self.frame == "normal" and features.normals is None:
             raise ValueError(
                 'decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`'
@@ -158,8 +171,8 @@ class VertexDecoder(Decoder):
 class RawGaussians:
     """Heads before their activations.
 
-    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) color, opacity. skinning: (n, k, j) logits or
-    None. shells: (n, k, s) logits or None.
+    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) color, opacity. skinning:
+    (n, k, j) logits or None. shells: (n, k, s) logits or None.
     """
 
     geometry: Float[Array, "n k 10"]
@@ -172,8 +185,8 @@ class RawGaussians:
 class VertexGaussians:
     """K Gaussians of every vertex, lengths in normalised units.
 
-    offsets: (n, k, 3) from the vertex. quats: (n, k, 4) wxyz, unit. scales: (n, k, 3). opacities: (n, k). colors: (n,
-    k, 3).
+    offsets: (n, k, 3) from the vertex. quats: (n, k, 4) wxyz, unit. scales: (n, k, 3). opacities:
+    (n, k). colors: (n, k, 3).
     """
 
     offsets: Float[Array, "n k 3"]
@@ -190,8 +203,8 @@ def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
-    """What is configured of: local feature, global token, encoded position, photo color as 2 rgb - 1, visible fraction,
-    normal, shells; in this order.
+    """What is configured of: local feature, global token, encoded position, photo color as 2 rgb -
+    1, visible fraction, normal, shells; in this order.
     """
     vertices = canonical.shape[0]
     parts = [features.local]
@@ -216,7 +229,9 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
 
 
 def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
-    """Rotations that take z to each normal, smooth in the normal but for the direction opposite to `OBLIQUE`."""
+    """Rotations that take z to each normal, smooth in the normal but for the direction opposite to
+    `OBLIQUE`.
+    """
     oblique = jnp.asarray(OBLIQUE, normals.dtype)
     upright = quaternion.between(jnp.asarray([0.0, 0.0, 1.0], normals.dtype), oblique)
     return quaternion.multiply(quaternion.between(oblique, normals), upright)
@@ -225,10 +240,11 @@ def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
 def activate(
     raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None
 ) -> VertexGaussians:
-    """Quaternion normalised, scale softplus, color and opacity sigmoid, offset bounded if so configured.
+    """Quaternion normalised, scale softplus, color and opacity sigmoid, offset bounded if so
+    configured.
 
-    With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along the normal and the mean
-    photo color are what its own offset and color correct.
+    With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along
+    the normal and the mean photo color are what its own offset and color correct.
     """
     offsets, quats, scales = jnp.split(raw.geometry, (3, 7), axis=-1)
     quats = quaternion.normalize(quats)
@@ -262,14 +278,18 @@ def activate(
 
 
 def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[Array, "n k"]:
-    """(n, k) means of (s,) values under weights (n, k, s): metres, that an accelerator may not round to 8 bits."""
+    """(n, k) means of (s,) values under weights (n, k, s): metres, that an accelerator may not
+    round to 8 bits.
+    """
     return jnp.matmul(weights, values, precision=EXACT)
 
 
 def corrected_skinning_weights(
     weights: Float[Array, "n j"], offsets: Float[Array, "g j"] | None, gaussians_per_vertex: int
 ) -> Float[Array, "g j"]:
-    """Skinning weights of every Gaussian: its vertex's, or softmax(log(w + 1e-9) + offsets) with a skinning head."""
+    """Skinning weights of every Gaussian: its vertex's, or softmax(log(w + 1e-9) + offsets) with a
+    skinning head.
+    """
     weights = jnp.repeat(weights, gaussians_per_vertex, axis=0)
     if offsets is None:
         return weights

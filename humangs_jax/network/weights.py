@@ -1,8 +1,10 @@
-"""Weights on disk: one safetensors file, tensors under their path in the variables, their description in its header.
+"""Weights on disk: one safetensors file, tensors under their path in the variables, their
+description in its header.
 
-Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
-"version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. float16 halves
-the file (and rounds to 11 bits); loading gives float32.
+Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format":
+"humangs-weights", "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256};
+the first files have no checksum. float16 halves the file (and rounds to 11 bits); loading gives
+float32.
 """
 
 import os
@@ -57,7 +59,8 @@ def save_weights(
         dtype: of the stored numbers; float16 halves the file.
 
     Raises:
-        ValueError: naming its key, if a tensor does not fit the configuration, is not finite, or overflows float16.
+        ValueError: naming its key, if a tensor does not fit the configuration, is not finite, or
+            overflows float16.
 
     Examples:
         >>> hg.save_weights("mine.safetensors", variables, config, "float16")
@@ -95,8 +98,8 @@ def load_weights(path: str | os.PathLike[str] | None = None) -> tuple[Variables,
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming file and key: no weights file of this package; a tensor is missing, unknown, of the wrong shape
-            or not finite; the contents are not those of the checksum.
+        ValueError: naming file and key: no weights file of this package; a tensor is missing,
+            unknown, of the wrong shape or not finite; the contents are not those of the checksum.
 
     Examples:
         >>> variables, config = hg.load_weights()
@@ -137,7 +140,9 @@ def _load_weights(path: str | os.PathLike[str]) -> tuple[Variables, HumanGSConfi
 def variables_from_tensors(
     tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str
 ) -> Variables:
-    """Float32 variables from flat tensors keyed by path; ValueError naming the key unless they are exactly those."""
+    """Float32 variables from flat tensors keyed by path; ValueError naming the key unless they are
+    exactly those.
+    """
     expected = expected_variables(config)
     arrays = _check(tensors, expected, where)
     return jax.tree.unflatten(
@@ -146,20 +151,24 @@ def variables_from_tensors(
 
 
 def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
-    """The tensors as numpy arrays, in the order of the variables' leaves, if they are exactly those."""
+    """The tensors as numpy arrays, in the order of the variables' leaves, if they are exactly
+    those.
+    """
     expected = flatten_variables(variables)
     if missing := sorted(set(expected) - set(tensors)):
         raise ValueError(f"{where}: tensor {missing[0]!r} is missing ({len(missing)} in all)")
     if unknown := sorted(set(tensors) - set(expected)):
         raise ValueError(
-            f"{where}: tensor {unknown[0]!r} is unknown to this configuration ({len(unknown)} in all)"
+            f"{where}: tensor {unknown[0]!r} is unknown to this configuration ({len(unknown)} in"
+            " all)"
         )
     arrays = {}
     for key, leaf in expected.items():
         array = np.asarray(tensors[key])
         if array.shape != leaf.shape:
             raise ValueError(
-                f"{where}: tensor {key!r} has shape {array.shape}, the configuration wants {leaf.shape}"
+                f"{where}: tensor {key!r} has shape {array.shape}, the configuration wants"
+                f" {leaf.shape}"
             )
         if not np.isfinite(array).all():
             raise ValueError(f"{where}: tensor {key!r} holds numbers that are not finite")

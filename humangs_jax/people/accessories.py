@@ -44,7 +44,9 @@ SIDEWAYS, UP, FORWARD = np.eye(3)
 def build(
     rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float
 ) -> list[tuple[Surface, Material]]:
-    """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk, metres."""
+    """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk,
+    metres.
+    """
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
     hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
     if kind in ("glasses", "sunglasses"):
@@ -98,7 +100,9 @@ def neck_ring(anatomy: Anatomy, lift: float) -> Ring:
 
 
 def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> Ring:
-    """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed line."""
+    """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed
+    line.
+    """
     x, _, z = anatomy.skin.template[near].T
     points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
     apart = np.abs((azimuths[None] - AZIMUTH[:, None] + np.pi) % (2 * np.pi) - np.pi)
@@ -117,7 +121,9 @@ def _followed(
     columns: int,
     closed: bool = True,
 ) -> Surface:
-    """A swept tube that moves with the skin nearest to it; its template coordinates are its own, around its middle."""
+    """A swept tube that moves with the skin nearest to it; its template coordinates are its own,
+    around its middle.
+    """
     (x, y, _), (vertices, faces) = (
         anatomy.skin.template.T,
         sweep(path, across, widths, columns, closed),
@@ -202,7 +208,9 @@ def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points)
 
 
 def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
-    """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat outwards."""
+    """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat
+    outwards.
+    """
     template, size, closed = (
         anatomy.skin.template,
         garment.sizes["brim"],
@@ -298,7 +306,9 @@ def necklace(anatomy: Anatomy, length: float) -> Surface:
 
 
 def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
-    """A rounded box on the back, or a flat one at the hip, that moves as the skin near it does on average."""
+    """A rounded box on the back, or a flat one at the hip, that moves as the skin near it does on
+    average.
+    """
     x, y, z = anatomy.skin.template.T
     size = garment.sizes["size"]
     if garment.kind == "backpack":
@@ -328,7 +338,9 @@ def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
 
 
 def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
-    """Both shoes. height: of the shaft above the floor; sole: its thickness; ease: metres between foot and leather."""
+    """Both shoes. height: of the shaft above the floor; sole: its thickness; ease: metres between
+    foot and leather.
+    """
     return join([_shoe(anatomy, side, height, sole, ease) for side in (0, 1)])
 
 

@@ -1,8 +1,10 @@
-"""Joints, their limits, rotations as numpy arrays (float64), kinematics forward, and of legs inverse; the body under clothes.
+"""Joints, their limits, rotations as numpy arrays (float64), kinematics forward, and of legs
+inverse; the body under clothes.
 
-Joints in SMPL-X order, T-pose at rest, the person faces +z with the left side at +x. Angles in radians, about the axes of the
-parent joint at rest. Cuts (hems, necklines, hairlines) and paint are given in TEMPLATE coordinates: the T-pose of the mean body,
-metres. A vertex keeps them for every shape of the person, so one number fits all people. Draping uses the person's rest vertices.
+Joints in SMPL-X order, T-pose at rest, the person faces +z with the left side at +x. Angles in
+radians, about the axes of the parent joint at rest. Cuts (hems, necklines, hairlines) and paint are
+given in TEMPLATE coordinates: the T-pose of the mean body, metres. A vertex keeps them for every
+shape of the person, so one number fits all people. Draping uses the person's rest vertices.
 """
 
 import dataclasses
@@ -45,21 +47,28 @@ LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST 
 LEFT_EYE, RIGHT_EYE, LEFT_HAND, RIGHT_HAND, JOINTS = 23, 24, 25, 40, 55
 
 FINGER_LIMIT = 1.5
-LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9, 0.9, 0.5, 0.35, 0.35, 0.5, 2.3, 2.3, 2.4, 2.4,
-                     0.8, 0.8, 0, 0, 0, *[FINGER_LIMIT] * 30])  # fmt: skip
+LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
+                     0.9, 0.5, 0.35, 0.35, 0.5, 2.3, 2.3, 2.4, 2.4, 0.8, 0.8,
+                     0, 0, 0, *[FINGER_LIMIT] * 30])  # fmt: skip
 """Largest rotation angle of each joint in the prior; jaw and eyes stay at rest."""
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation (left and right exchanged)."""
 BALL_HEIGHT, HEEL_BACK = 0.0112, 0.064
-"""Of the shipped body, in lengths of a leg: the joint at the ball of the foot above the sole; the heel behind the ankle."""
+"""Of the shipped body, in lengths of a leg: the joint at the ball of the foot above the sole; the
+heel behind the ankle.
+"""
 REACH = 0.998
-"""Largest stretch of a leg as a share of its length: a straight leg leaves the knee's direction undefined."""
+"""Largest stretch of a leg as a share of its length: a straight leg leaves the knee's direction
+undefined.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """A body as the prior needs it: rest joints (j, 3), parents, and radii in metres of its clothed parts."""
+    """A body as the prior needs it: rest joints (j, 3), parents, and radii in metres of its clothed
+    parts.
+    """
 
     joints: Rotations
     parents: tuple[int, ...]
@@ -105,7 +114,10 @@ def between(
 
 
 def turned(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Matrix:
-    """The rotation about (x, y, z) by its length. About x: legs and feet swing backwards, heels up; about y: to the left."""
+    """The rotation about (x, y, z) by its length.
+
+    About x: legs and feet swing backwards, heels up; about y: to the left.
+    """
     return rotation_matrix(np.asarray([x, y, z], float))
 
 
@@ -138,8 +150,9 @@ def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
 class Foot:
     """Position of a foot, given by the point that a flat sole would touch.
 
-    x, z: the point below the ball, metres. yaw: its heading. pitch: positive rolls it onto the toes, which stay flat where
-    they are, negative onto the heel. lift: of all of it above the ground, metres.
+    x, z: the point below the ball, metres. yaw: its heading. pitch: positive rolls it onto the
+    toes, which stay flat where they are, negative onto the heel. lift: of all of it above the
+    ground, metres.
     """
 
     x: float
@@ -158,7 +171,10 @@ LEGS = (
 
 
 def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
-    """Position of the ankle, the ground at y = 0, and orientation of the foot. side: 0 left, 1 right."""
+    """Position of the ankle, the ground at y = 0, and orientation of the foot.
+
+    side: 0 left, 1 right.
+    """
     _, _, ankle, ball = LEGS[side]
     a, b = build.joints[ankle], build.joints[ball]
     turn, orientation = turned(y=foot.yaw), turned(y=foot.yaw) @ turned(x=foot.pitch)
@@ -173,7 +189,9 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
 def highest_pelvis(
     build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = REACH
 ) -> float:
-    """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach their feet."""
+    """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach
+    their feet.
+    """
     heights = []
     for side, foot in enumerate(feet):
         hip = turn @ (build.joints[LEGS[side][0]] - build.joints[PELVIS])
@@ -184,10 +202,11 @@ def highest_pelvis(
 
 
 def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -> float:
-    """Set hips, knees, ankles and toes (in place) so that the feet are at their targets; the pelvis's rotation stays.
+    """Set hips, knees, ankles and toes (in place) so that the feet are at their targets; the
+    pelvis's rotation stays.
 
-    pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle is from its place,
-    which is 0 unless a leg is too short.
+    pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle
+    is from its place, which is 0 unless a leg is too short.
     """
     turn = rotation_matrix(rotations[PELVIS])
     missed = []
@@ -224,21 +243,26 @@ def _knee_angle(thigh: Vector, shin: Vector, distance: float) -> float:
 
 
 def _frame(direction: Vector, across: Vector) -> Matrix:
-    """Orthonormal columns: the direction, what of `across` is orthogonal to it, and their product."""
+    """Orthonormal columns: the direction, what of `across` is orthogonal to it, and their
+    product.
+    """
     u = direction / np.linalg.norm(direction)
     s = across - (across @ u) * u
     s = s / np.linalg.norm(s)
     return np.stack([u, s, np.cross(u, s)], axis=1)
 
 
-# The body under clothes -----------------------------------------------------------------------------------------------
+# The body under clothes
+# -----------------------------------------------------------------------------------------------
 
 
 BODY = ("makehuman", 13380)
 """The body that the cuts below were measured on: its name and number of vertices."""
 WAIST, CROTCH, ANKLE, FLOOR = -0.2, -0.425, -1.159, -1.2285
 ARM_HEIGHT, SHOULDER, WRIST = 0.096, 0.171, 0.651
-"""Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template coordinates."""
+"""Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template
+coordinates.
+"""
 ARMHOLE = 0.185
 """Distance from the middle at which sleeves are sewn on."""
 TRUNK_GIRTH, LEG_GIRTH, ARM_GIRTH = 0.16, 0.08, 0.06
@@ -249,10 +273,12 @@ SAME_GIRTH = 1e-4
 
 @dataclasses.dataclass(frozen=True)
 class Anatomy:
-    """skin: the whole body at rest, with attributes `template` (n, 3), `normals` (n, 3), `cloth` (n, 4).
+    """skin: the whole body at rest, with attributes `template` (n, 3), `normals` (n, 3), `cloth`
+    (n, 4).
 
     joints: (j, 3) at rest. parents: of the joints. arm, leg: (n,) membership in [0, 1].
-    trunk: silhouettes of trunk and thighs across y. legs, arms: silhouettes of the left and right limb, across y and across |x|.
+    trunk: silhouettes of trunk and thighs across y. legs, arms: silhouettes of the left and right
+    limb, across y and across |x|.
     """
 
     skin: Surface
@@ -278,9 +304,11 @@ def leg_membership(template: np.ndarray) -> np.ndarray:
 
 
 def cloth_coordinates(template: np.ndarray) -> np.ndarray:
-    """(n, 4) x, y, z around the axis of trunk or leg, and the girth radius that turns angles into metres.
+    """(n, 4) x, y, z around the axis of trunk or leg, and the girth radius that turns angles into
+    metres.
 
-    The angle atan2(x, z) is 0 in front. Arms go on as the trunk does; `sewn_coordinates` gives them their own.
+    The angle atan2(x, z) is 0 in front. Arms go on as the trunk does; `sewn_coordinates` gives them
+    their own.
     """
     x, y, z = template.T
     trunk = np.stack([x, y, z - 0.02, np.full_like(x, TRUNK_GIRTH)], -1)
@@ -289,7 +317,9 @@ def cloth_coordinates(template: np.ndarray) -> np.ndarray:
 
 
 def leg_coordinates(template: np.ndarray) -> np.ndarray:
-    """(n, 4) cloth coordinates around the axis of the nearer leg, from the waist down: trousers, sewn along the middle."""
+    """(n, 4) cloth coordinates around the axis of the nearer leg, from the waist down: trousers,
+    sewn along the middle.
+    """
     x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])
     leg = np.stack(
@@ -299,10 +329,12 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
 
 
 def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
-    """Cloth coordinates (n, 4) with those of arms and legs replaced by coordinates around the limb that the point is on.
+    """Cloth coordinates (n, 4) with those of arms and legs replaced by coordinates around the limb
+    that the point is on.
 
-    They are sharp at seams (armholes; the middle of trousers). Arms are turned down, so that y runs along every limb. Only cloth
-    with the trunk's girth has sleeves, only cloth with the legs' girth has legs.
+    They are sharp at seams (armholes; the middle of trousers). Arms are turned down, so that y runs
+    along every limb. Only cloth with the trunk's girth has sleeves, only cloth with the legs' girth
+    has legs.
     """
     x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)

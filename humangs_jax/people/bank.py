@@ -1,13 +1,17 @@
-"""Dressed people as textured meshes, for renderers that know no materials, and as scans; and banks of them, ready for a device.
+"""Dressed people as textured meshes, for renderers that know no materials, and as scans; and banks
+of them, ready for a device.
 
-Texels between charts repeat the nearest chart, so that bilinear lookups and smaller copies of the texture stay clean at seams.
-Folds that are painted into the normals become a second texture. Skinning is cut down to a few joints per vertex.
+Texels between charts repeat the nearest chart, so that bilinear lookups and smaller copies of the
+texture stay clean at seams. Folds that are painted into the normals become a second texture.
+Skinning is cut down to a few joints per vertex.
 
-A scan is such a mesh, lit, in a folder, like a scanner's: scan.obj with material.mtl and material_0.png, scan.glb, and scan.json
-with seed, shape and pose. Metres, y up, texture coordinates with v up; a vertex is written once per chart that it is in.
+A scan is such a mesh, lit, in a folder, like a scanner's: scan.obj with material.mtl and
+material_0.png, scan.glb, and scan.json with seed, shape and pose. Metres, y up, texture coordinates
+with v up; a vertex is written once per chart that it is in.
 
-A bank is made on the host once, all of one shape, and used by `on_the_fly_example`. It holds people of ONE range of seeds (see
-`subject.SPLITS`), so no key of a training bank makes a person of the test range. About 3 MB a person at 512 texels a side.
+A bank is made on the host once, all of one shape, and used by `on_the_fly_example`. It holds people
+of ONE range of seeds (see `subject.SPLITS`), so no key of a training bank makes a person of the
+test range. About 3 MB a person at 512 texels a side.
 """
 
 import dataclasses
@@ -48,11 +52,14 @@ from humangs_jax.people.surfaces import vertex_normals
 from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
 
-# Baking ---------------------------------------------------------------------------------------------------------------
+# Baking
+# --------------------------------------------------------------------------------------------------
 
 
 JOINTS_PER_VERTEX = 6
-"""Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a millimetre in any pose."""
+"""Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a
+millimetre in any pose.
+"""
 SLOPE_STEP, SLOPE_ZERO = 1 / 100, 128
 """One step of the slope texture's bytes: slopes up to 1.27; byte of no slope."""
 FACE_DENSITY = 2.0
@@ -66,7 +73,8 @@ class BakedSubject:
     """The textures of a person at rest.
 
     atlas: texture coordinates. albedo: (t, t, 3) bytes, 255 is 1, row 0 on top (v = 1).
-    slopes: (t, t, 3) bytes, gradients of painted folds, `SLOPE_ZERO` + steps of `SLOPE_STEP`, axes of `Spots.cloth`.
+    slopes: (t, t, 3) bytes, gradients of painted folds, `SLOPE_ZERO` + steps of `SLOPE_STEP`, axes
+    of `Spots.cloth`.
     """
 
     atlas: Atlas
@@ -77,7 +85,8 @@ class BakedSubject:
 def bake_subject(
     subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1
 ) -> BakedSubject:
-    """The textures of a subject, texture_size texels a side, each the mean of samples x samples points.
+    """The textures of a subject, texture_size texels a side, each the mean of samples x samples
+    points.
 
     No chart of the atlas is across two materials; faces (of people) are in finer detail.
     Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
@@ -108,7 +117,9 @@ def bake_subject(
 def strongest_joints(
     weights: Float[np.ndarray, "n j"], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` joints (n, k) of most weight of each vertex, strongest first, and their weights (n, k) scaled to sum 1."""
+    """The `count` joints (n, k) of most weight of each vertex, strongest first, and their weights
+    (n, k) scaled to sum 1.
+    """
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
     return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)
@@ -119,7 +130,10 @@ SCAN, PARAMETERS = "scan", "scan.json"
 
 
 def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 2048) -> None:
-    """Write a posed subject as a mesh whose texture carries its light, whole or not at all. An existing folder is replaced."""
+    """Write a posed subject as a mesh whose texture carries its light, whole or not at all.
+
+    An existing folder is replaced.
+    """
     import trimesh
     from PIL import Image
     from trimesh.visual import TextureVisuals
@@ -163,14 +177,17 @@ def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "
     return np.round(255 * fill_gaps(colors, known)).astype(np.uint8)
 
 
-# Banks ----------------------------------------------------------------------------------------------------------------
+# Banks
+# --------------------------------------------------------------------------------------------------
 
 
 FORMAT, VERSION = "humangs-people", 2
 POSE_STREAM = 20
 """Stream of a seed that draws the poses of the bank; others than the ones of written sets."""
 SILHOUETTES, SILHOUETTE_SIDE, SILHOUETTE_STREAM = 4, 960, 23
-"""Views that a body is displaced to, their pixels a side, and the stream of a seed that places their cameras."""
+"""Views that a body is displaced to, their pixels a side, and the stream of a seed that places
+their cameras.
+"""
 UV_STEPS = 65535
 """Texture coordinates are stored in steps of one part of this."""
 PAD_VERTICES, PAD_FACES = 1024, 2048
@@ -180,18 +197,23 @@ MOST_MATERIALS = 32
 
 @pytree_dataclass
 class PeopleBank:
-    """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and stacked.
+    """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and
+    stacked.
 
-    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts: (p,) without padding.
-    vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n, k).
-    faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`, v DOWN.
-    face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of one number are dyed
-    alike, dyeable (p, m): 1 where a piece is cloth that may have another color.
+    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts: (p,) without
+    padding.
+    vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n,
+    k).
+    faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`,
+    v DOWN.
+    face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of
+    one number are dyed alike, dyeable (p, m): 1 where a piece is cloth that may have another color.
     texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `BakedSubject`).
     rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
-    displacements: (p, b, 3) of a body's vertices to the silhouettes of the dressed person (`data.body_and_masks`), metres;
-    b is 0 in a bank without.
-    Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds; generator: `GENERATOR_VERSION`.
+    displacements: (p, b, 3) of a body's vertices to the silhouettes of the dressed person
+    (`data.body_and_masks`), metres; b is 0 in a bank without.
+    Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds;
+    generator: `GENERATOR_VERSION`.
     """
 
     seeds: Int[Array, " p"]
@@ -236,10 +258,13 @@ def build_bank(
 ) -> PeopleBank:
     """The people of some seeds, which must all lie in the range `split` of `subject.SPLITS`.
 
-    texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of 512.
+    texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of
+    512.
     displaced: the body to displace, one of `data.views.gaussian_body`; None: none.
-    processes: how many work at once; more than one use the CPU and load the shipped body themselves.
-    Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the package's own.
+    processes: how many work at once; more than one use the CPU and load the shipped body
+    themselves.
+    Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the
+    package's own.
     """
     seeds = list(seeds)
     if not seeds:
@@ -300,7 +325,8 @@ def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
         for dimension, size in zip(dimensions, arrays[name].shape, strict=True):
             if sizes.setdefault(dimension, int(dimension) if dimension.isdigit() else size) != size:
                 raise Refused(
-                    f"{name}: expected {dimension} = {sizes[dimension]}, got shape {arrays[name].shape}"
+                    f"{name}: expected {dimension} = {sizes[dimension]}, got shape"
+                    f" {arrays[name].shape}"
                 )
         check_array(name, arrays[name], arrays[name].shape)
     bounds = {
@@ -378,16 +404,20 @@ def _person(
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
         "nearest": np.argmin(away + 1e9 * np.eye(pose_count), axis=1).astype(np.int32),
-        "displacements": np.zeros((0, 3), np.float16)
-        if displaced is None
-        else to_silhouettes(subject, displaced, rotations[0]),
+        "displacements": (
+            np.zeros((0, 3), np.float16)
+            if displaced is None
+            else to_silhouettes(subject, displaced, rotations[0])
+        ),
     }
 
 
 def to_silhouettes(
     subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, "b 3"]:
-    """The displacement of a body to what `SILHOUETTES` cameras around the dressed person see in a pose, metres."""
+    """The displacement of a body to what `SILHOUETTES` cameras around the dressed person see in a
+    pose, metres.
+    """
     rng, nowhere = np.random.default_rng([subject.seed, SILHOUETTE_STREAM]), np.zeros(3, np.float32)
     vertices = subject.posed_vertices(rotations, nowhere)
     cameras = cameras_around(rng, vertices, spread_azimuths(rng, SILHOUETTES), SILHOUETTE_SIDE)

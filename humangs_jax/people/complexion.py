@@ -1,4 +1,6 @@
-"""Skin, face, eyes and hair colors, painted in template coordinates so that they sit on the features of every shape."""
+"""Skin, face, eyes and hair colors, painted in template coordinates so that they sit on the
+features of every shape.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,10 +15,13 @@ from humangs_jax.people.surfaces import Field, Points, Ripples, lattice
 EYE_X, EYE_Y, MOUTH_Y, HAND_Y = 0.029, 0.330, 0.2629, 0.085
 """Places in template coordinates; the last parts the backs of the hands from the palms."""
 HAIR = {
-    "black": (0.07, 0.3, (0.05, 0.12)), "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
-    "blond": ((0.09, 0.13), (0.35, 0.6), (0.5, 0.76)), "red": ((0.03, 0.06), (0.6, 0.8), (0.35, 0.6)),
-    "grey": (0.1, 0.05, (0.3, 0.66)), "dyed": ((0, 1), 0.55, 0.55),
-}  # fmt: skip
+    "black": (0.07, 0.3, (0.05, 0.12)),
+    "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
+    "blond": ((0.09, 0.13), (0.35, 0.6), (0.5, 0.76)),
+    "red": ((0.03, 0.06), (0.6, 0.8), (0.35, 0.6)),
+    "grey": (0.1, 0.05, (0.3, 0.66)),
+    "dyed": ((0, 1), 0.55, 0.55),
+}
 """Hue, saturation and value of hair, or their ranges."""
 Face = tuple[Field, Field, Field, Points]
 """Distances from the middle, heights, how far in front they are in [0, 1], and the points."""
@@ -30,7 +35,8 @@ FAIR_ODDS, DARK_ODDS = np.asarray(
 class Complexion:
     """Colors (3,) of skin, lips, hair and iris; the rest are strengths in [0, 1].
 
-    brow: of the brows. freckles. wrinkles: of age. shadow: make-up on the lids, with its color. liner: around the eyes.
+    brow: of the brows. freckles. wrinkles: of age. shadow: make-up on the lids, with its color.
+    liner: around the eyes.
     blush: on the cheeks. tan: of arms and face against the rest.
     """
 
@@ -111,14 +117,21 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
 
 
 FEATURES = {
-    "brow_thickness": (0.0024, 0.0056), "brow_arch": (0.2, 1.7), "brow_height": (-0.0025, 0.0025), "lip_width": (0.9, 1.14),
-    "lip_fullness": (0.65, 1.25), "eye_opening": (0.85, 1.15), "nose": (0.85, 1.25),
-}  # fmt: skip
+    "brow_thickness": (0.0024, 0.0056),
+    "brow_arch": (0.2, 1.7),
+    "brow_height": (-0.0025, 0.0025),
+    "lip_width": (0.9, 1.14),
+    "lip_fullness": (0.65, 1.25),
+    "eye_opening": (0.85, 1.15),
+    "nose": (0.85, 1.25),
+}
 """Ranges of what is painted on a face: metres, or factors around 1."""
 
 
 def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut) -> Material:
-    """Skin with lips, cheeks, brows, lids, nostrils, stubble, knuckles, freckles, and tones that vary over the body."""
+    """Skin with lips, cheeks, brows, lids, nostrils, stubble, knuckles, freckles, and tones that
+    vary over the body.
+    """
     cloud, blotches = Ripples(rng, 0.07), Ripples(rng, 0.25)
     features = {name: rng.uniform(*limits) for name, limits in FEATURES.items()}
     seed = int(rng.integers(1 << 20))
@@ -228,7 +241,9 @@ def _mouth_and_brows(
     face: Face,
     seed: int,
 ) -> Points:
-    """Lips, nostrils, brows; roots of hair and beard, which also soften the edges of what grows there."""
+    """Lips, nostrils, brows; roots of hair and beard, which also soften the edges of what grows
+    there.
+    """
     x, y, front, template = face
     width, ahead = 0.026 * features["lip_width"], template[:, 2] > 0.08
     corner = np.clip(1 - (x / width) ** 2, 0, 1)
@@ -295,7 +310,9 @@ def eye_material(tones: Complexion) -> Material:
 
 
 def hair_material(rng: np.random.Generator, base: np.ndarray, haircut: Haircut) -> Material:
-    """Strands that run down from the crown: fine and coarse streaks, a bright ring, darker roots."""
+    """Strands that run down from the crown: fine and coarse streaks, a bright ring, darker
+    roots.
+    """
     seed = int(rng.integers(1 << 20))
     tips = base * rng.uniform(0.75, 1.35)
     curls = haircut.cut in ("curly", "afro")

@@ -1,8 +1,9 @@
 """Fabrics and materials: colors of points on a surface.
 
-A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT]. It is evaluated per pixel or texel, so it is
-crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed). What else is random about it is drawn anew from its seed
-whenever it is asked for colors. Periods of patterns are metres on the cloth; the finest is a few millimetres.
+A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT]. It is evaluated per
+pixel or texel, so it is crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed). What
+else is random about it is drawn anew from its seed whenever it is asked for colors. Periods of
+patterns are metres on the cloth; the finest is a few millimetres.
 """
 
 import colorsys
@@ -24,9 +25,11 @@ ALBEDO_LIMIT = 0.88
 
 @dataclasses.dataclass(frozen=True)
 class Spots:
-    """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3) template coordinates.
+    """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3)
+    template coordinates.
 
-    Coordinates of sleeves and trouser legs are recomputed, so that they are sharp at seams, where patterns meet.
+    Coordinates of sleeves and trouser legs are recomputed, so that they are sharp at seams, where
+    patterns meet.
     """
 
     cloth: Float[np.ndarray, "n 4"]
@@ -37,7 +40,9 @@ class Spots:
 
     @property
     def around(self) -> Field:
-        """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the middle, back and front apart."""
+        """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the
+        middle, back and front apart.
+        """
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
         flat = (
@@ -49,7 +54,9 @@ class Spots:
 
     @property
     def along(self) -> Field:
-        """(n,) metres along the trunk or limb: height, but towards the shoulders the way up to their ridge."""
+        """(n,) metres along the trunk or limb: height, but towards the shoulders the way up to
+        their ridge.
+        """
         rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
         return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - SHOULDER_RIDGE)
 
@@ -63,7 +70,9 @@ class Spots:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """albedo: Spots -> (n, 3). wrinkles: of the normals, strength; draped: they run down. sheen: soft highlight in [0, 1]."""
+    """albedo: Spots -> (n, 3). wrinkles: of the normals, strength; draped: they run down. sheen:
+    soft highlight in [0, 1].
+    """
 
     albedo: Callable[[Spots], np.ndarray]
     wrinkles: float = 0.0
@@ -85,7 +94,9 @@ DYES = {
     "earth": (0.11, (0.05, 0.12), (0.3, 0.7), (0.2, 0.7)),
     "navy": (0.11, (0.56, 0.66), (0.4, 0.8), (0.12, 0.45)),
 }
-"""Kinds of dyes: odds; hue, saturation and value, each a range or a choice of more than two numbers."""
+"""Kinds of dyes: odds; hue, saturation and value, each a range or a choice of more than two
+numbers.
+"""
 
 
 def _color_of(rng: np.random.Generator, ranges: Iterable[Sequence[float | int]]) -> Vector:
@@ -112,7 +123,9 @@ def accent(rng: np.random.Generator, base: Vector) -> Vector:
 
 
 def mix(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Field) -> Points:
-    """Colors, of points (n, 3) or one for all (3,): `a` where amount (n,) is 0, `b` where it is 1."""
+    """Colors, of points (n, 3) or one for all (3,): `a` where amount (n,) is 0, `b` where it is
+    1.
+    """
     return a + (b - a) * amount[:, None]
 
 
@@ -125,7 +138,10 @@ def band(
 
 @dataclasses.dataclass(frozen=True)
 class Fabric:
-    """pattern: key of PATTERNS. base, other: (3,) dyes. seed: of everything else about it (periods, prints, buttons)."""
+    """pattern: key of PATTERNS. base, other: (3,) dyes.
+
+    seed: of everything else about it (periods, prints, buttons).
+    """
 
     pattern: str
     base: Vector
@@ -143,24 +159,41 @@ class Fabric:
 
 LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
 USUAL = {
-    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)), "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
-    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)), "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
-}  # fmt: skip
+    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)),
+    "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
+    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)),
+    "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
+}
 """Hue, saturation and value of usual cloths."""
 CLOTHS = {
-    "jeans": ("denim", 0.85), "denim_jacket": ("denim", 0.9), "chinos": ("cotton", 0.6), "cargo": ("cotton", 0.65),
-    "slim": ("suit", 0.5), "blazer": ("suit", 0.6), "coat": ("suit", 0.35), "flats": ("leather", 0.75),
-    "boots": ("leather", 0.75), "ankle_boots": ("leather", 0.75), "belt": ("leather", 0.9), "sandals": ("leather", 0.7),
-    "shoulder_bag": ("leather", 0.5), "watch": ("leather", 0.6), "glasses": ("leather", 0.6),
-    "sunglasses": ("leather", 0.85), "track": ("suit", 0.5), "leggings": ("suit", 0.6), "wide": ("cotton", 0.4),
-}  # fmt: skip
+    "jeans": ("denim", 0.85),
+    "denim_jacket": ("denim", 0.9),
+    "chinos": ("cotton", 0.6),
+    "cargo": ("cotton", 0.65),
+    "slim": ("suit", 0.5),
+    "blazer": ("suit", 0.6),
+    "coat": ("suit", 0.35),
+    "flats": ("leather", 0.75),
+    "boots": ("leather", 0.75),
+    "ankle_boots": ("leather", 0.75),
+    "belt": ("leather", 0.9),
+    "sandals": ("leather", 0.7),
+    "shoulder_bag": ("leather", 0.5),
+    "watch": ("leather", 0.6),
+    "glasses": ("leather", 0.6),
+    "sunglasses": ("leather", 0.85),
+    "track": ("suit", 0.5),
+    "leggings": ("suit", 0.6),
+    "wide": ("cotton", 0.4),
+}
 """Usual cloth of a kind of garment, and how often it is of that color."""
 COLORS = (
     (("shirt", "socks", "sneakers"), 0.45, ((0, 1), (0, 0.05), (0.72, 0.87))),
     (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
     (("sneakers", *LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
 )
-"""Kinds of garments, how often they are (if of no color so far) of these colors; otherwise any dye."""
+"""Kinds of garments, how often they are (if of no color so far) of these colors; otherwise any dye.
+"""
 PATTERN_RULES = (
     (("jeans", "denim_jacket"), "denim", 1, ()),
     (("cargo", "hooded_jacket", "shorts"), "camouflage", 0.25, ()),
@@ -168,11 +201,15 @@ PATTERN_RULES = (
     (("cap", "brim_hat"), "plain", 1, ("camouflage", "melange", "checks", "herringbone")),
     (("sneakers", *LEATHER_SHOES, "belt", "watch", "necklace", "glasses"), "plain", 1, ()),
 )
-"""Kinds of garments, the pattern that they get instead of a random one, how often, and patterns that they keep."""
+"""Kinds of garments, the pattern that they get instead of a random one, how often, and patterns
+that they keep.
+"""
 
 
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
-    """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly so."""
+    """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly
+    so.
+    """
     plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
     odds = (
         plain_ones
@@ -307,12 +344,15 @@ def denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> P
     )
 
 
-CAMOUFLAGES = np.asarray([
-    [[0.24, 0.26, 0.14], [0.10, 0.12, 0.07], [0.33, 0.24, 0.15], [0.52, 0.47, 0.32]],
-    [[0.68, 0.58, 0.42], [0.52, 0.42, 0.29], [0.40, 0.32, 0.22], [0.78, 0.70, 0.56]],
-    [[0.45, 0.46, 0.47], [0.14, 0.14, 0.15], [0.28, 0.29, 0.30], [0.72, 0.73, 0.74]],
-    [[0.14, 0.20, 0.32], [0.06, 0.08, 0.14], [0.24, 0.33, 0.46], [0.45, 0.54, 0.62]],
-], np.float32)  # fmt: skip
+CAMOUFLAGES = np.asarray(
+    [
+        [[0.24, 0.26, 0.14], [0.10, 0.12, 0.07], [0.33, 0.24, 0.15], [0.52, 0.47, 0.32]],
+        [[0.68, 0.58, 0.42], [0.52, 0.42, 0.29], [0.40, 0.32, 0.22], [0.78, 0.70, 0.56]],
+        [[0.45, 0.46, 0.47], [0.14, 0.14, 0.15], [0.28, 0.29, 0.30], [0.72, 0.73, 0.74]],
+        [[0.14, 0.20, 0.32], [0.06, 0.08, 0.14], [0.24, 0.33, 0.46], [0.45, 0.54, 0.62]],
+    ],
+    np.float32,
+)
 """Four colors each: earth, sand, town, sea."""
 
 
@@ -392,10 +432,21 @@ def color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector
 
 
 PATTERNS: dict[str, tuple[float, Callable]] = {
-    "plain": (0.05, plain), "stripes": (0.2, stripes), "upright": (0.08, functools.partial(stripes, upright=True)),
-    "checks": (0.17, checks), "dots": (0.06, dots), "flowers": (0.09, flowers), "mottled": (0.05, mottled),
-    "camouflage": (0.05, camouflage), "melange": (0.03, melange), "blocks": (0.09, color_blocks),
-    "herringbone": (0.03, herringbone), "argyle": (0.03, argyle), "dip_dye": (0.04, dip_dye),
-    "cable_knit": (0.03, cable_knit), "tweed": (0.0, tweed), "denim": (0.0, denim),
-}  # fmt: skip
+    "plain": (0.05, plain),
+    "stripes": (0.2, stripes),
+    "upright": (0.08, functools.partial(stripes, upright=True)),
+    "checks": (0.17, checks),
+    "dots": (0.06, dots),
+    "flowers": (0.09, flowers),
+    "mottled": (0.05, mottled),
+    "camouflage": (0.05, camouflage),
+    "melange": (0.03, melange),
+    "blocks": (0.09, color_blocks),
+    "herringbone": (0.03, herringbone),
+    "argyle": (0.03, argyle),
+    "dip_dye": (0.04, dip_dye),
+    "cable_knit": (0.03, cable_knit),
+    "tweed": (0.0, tweed),
+    "denim": (0.0, denim),
+}
 """Odds among fabrics that are not plain, and the pattern."""

@@ -1,6 +1,8 @@
-"""Haircuts and beards: how they are drawn, and their shells, tubes, buns and tails; also knitted caps.
+"""Haircuts and beards: how they are drawn, and their shells, tubes, buns and tails; also knitted
+caps.
 
-A hairline is a template height for each azimuth around the skull (0 in front, pi at the nape), the same on both sides.
+A hairline is a template height for each azimuth around the skull (0 in front, pi at the nape), the
+same on both sides.
 """
 
 import dataclasses
@@ -36,11 +38,19 @@ from humangs_jax.people.surfaces import (
 from humangs_jax.people.tailoring import finished, nearest_weights
 
 CUTS = {
-    "cropped": (0.22, 0.03, (0.005, 0.010)), "short": (0.26, 0.10, (0.012, 0.022)), "quiff": (0.10, 0.01, (0.010, 0.016)),
-    "curly": (0.08, 0.12, (0.024, 0.045)), "afro": (0.05, 0.05, (0.045, 0.085)), "buzz": (0.09, 0.01, 0.008),
-    "bald": (0.07, 0.004, 0.008), "bob": (0.012, 0.17, (0.012, 0.024)), "long": (0.025, 0.25, (0.010, 0.022)),
-    "ponytail": (0.02, 0.11, 0.008), "bun": (0.03, 0.08, 0.008), "braid": (0.01, 0.05, 0.008),
-}  # fmt: skip
+    "cropped": (0.22, 0.03, (0.005, 0.010)),
+    "short": (0.26, 0.10, (0.012, 0.022)),
+    "quiff": (0.10, 0.01, (0.010, 0.016)),
+    "curly": (0.08, 0.12, (0.024, 0.045)),
+    "afro": (0.05, 0.05, (0.045, 0.085)),
+    "buzz": (0.09, 0.01, 0.008),
+    "bald": (0.07, 0.004, 0.008),
+    "bob": (0.012, 0.17, (0.012, 0.024)),
+    "long": (0.025, 0.25, (0.010, 0.022)),
+    "ponytail": (0.02, 0.11, 0.008),
+    "bun": (0.03, 0.08, 0.008),
+    "braid": (0.01, 0.05, 0.008),
+}
 """Odds for men and women, thickness (metres, or their range)."""
 NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
 """Cuts that no headwear fits over."""
@@ -51,7 +61,9 @@ SHELLS = {
     "quiff": (0.2, 0.05, 1),
     "short": (0.22, 0.035, 1),
 }
-"""Of hair on the scalp: height of its bumps as a share of the thickness, their width in metres, 1 if it is parted."""
+"""Of hair on the scalp: height of its bumps as a share of the thickness, their width in metres, 1
+if it is parted.
+"""
 TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
 """Range of their lengths; distance of the knots, metres."""
 FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
@@ -62,9 +74,11 @@ BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full"
 
 @dataclasses.dataclass(frozen=True)
 class Haircut:
-    """cut: one of CUTS. fringe: one of FRINGES. side: +1 or -1, of parting and braid. thickness in metres.
+    """cut: one of CUTS. fringe: one of FRINGES. side: +1 or -1, of parting and braid. thickness in
+    metres.
 
-    bottom: template height where long hair ends. wave: height of its waves, metres. receding: shift of the hairline upwards.
+    bottom: template height where long hair ends. wave: height of its waves, metres. receding: shift
+    of the hairline upwards.
     beard: one of BEARDS; beard_length in metres. grain: contrast of strands.
     """
 
@@ -123,25 +137,36 @@ SHORT_LINE = (
     [0.0, 0.55, 0.95, 1.2, 1.36, 1.42, 1.86, 1.95, 2.3, 3.15],
     [0.392, 0.388, 0.368, 0.325, 0.312, 0.353, 0.353, 0.275, 0.234, 0.226],
 )
-"""Azimuths and heights: forehead, temple, sideburn before the ear, above and behind the ear, nape."""
+"""Azimuths and heights: forehead, temple, sideburn before the ear, above and behind the ear, nape.
+"""
 CAP_LINE = ([0.0, 0.8, 1.5, 2.2, 3.15], [0.375, 0.37, 0.345, 0.325, 0.315])
 TUBE_COLUMNS = 60
 
 FRINGE_LINES = {
-    "straight": ([-3.15, -1.2, -1.12, -0.9, -0.5, 0.0, 0.5, 0.9, 1.12, 1.2, 3.15],
-                 [-9.0, -9.0, 0.30, 0.362, 0.384, 0.388, 0.384, 0.362, 0.30, -9.0, -9.0]),
-    "parted": ([-3.15, -1.16, -1.08, -0.85, -0.5, -0.1, 0.0, 0.1, 0.5, 0.85, 1.08, 1.16, 3.15],
-               [-9.0, -9.0, 0.30, 0.35, 0.388, 0.414, 0.419, 0.414, 0.388, 0.35, 0.30, -9.0, -9.0]),
-    "side": ([-3.15, -1.2, -1.1, -0.8, -0.3, 0.25, 0.55, 0.75, 0.95, 1.1, 1.18, 3.15],
-             [-9.0, -9.0, 0.30, 0.352, 0.374, 0.402, 0.415, 0.405, 0.37, 0.30, -9.0, -9.0]),
-}  # fmt: skip
-"""Signed azimuths and heights above which longer hair covers the face: blunt, parted in the middle, combed to the right."""
+    "straight": (
+        [-3.15, -1.2, -1.12, -0.9, -0.5, 0.0, 0.5, 0.9, 1.12, 1.2, 3.15],
+        [-9.0, -9.0, 0.30, 0.362, 0.384, 0.388, 0.384, 0.362, 0.30, -9.0, -9.0],
+    ),
+    "parted": (
+        [-3.15, -1.16, -1.08, -0.85, -0.5, -0.1, 0.0, 0.1, 0.5, 0.85, 1.08, 1.16, 3.15],
+        [-9.0, -9.0, 0.30, 0.35, 0.388, 0.414, 0.419, 0.414, 0.388, 0.35, 0.30, -9.0, -9.0],
+    ),
+    "side": (
+        [-3.15, -1.2, -1.1, -0.8, -0.3, 0.25, 0.55, 0.75, 0.95, 1.1, 1.18, 3.15],
+        [-9.0, -9.0, 0.30, 0.352, 0.374, 0.402, 0.415, 0.405, 0.37, 0.30, -9.0, -9.0],
+    ),
+}
+"""Signed azimuths and heights above which longer hair covers the face: blunt, parted in the middle,
+combed to the right.
+"""
 
 
 def style(
     rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0
 ) -> list[Surface]:
-    """The surfaces of a haircut, beard included, over clothes that are `over` metres from the skin."""
+    """The surfaces of a haircut, beard included, over clothes that are `over` metres from the
+    skin.
+    """
     kind, parts = haircut.cut, []
     if kind in LONG_CUTS:
         opening, wave = fringe(rng, haircut), haircut.wave
@@ -170,7 +195,8 @@ def style(
 
 
 Opening = Callable[[Field, Field], Field]
-"""Azimuths in (-pi, pi] and template heights -> positive where hair or cloth leaves the face free."""
+"""Azimuths in (-pi, pi] and template heights -> positive where hair or cloth leaves the face free.
+"""
 
 
 def fringe(rng: np.random.Generator, haircut: Haircut) -> Opening:
@@ -217,10 +243,13 @@ def scalp_shell(
     quiff: float = 0.0,
     side: float | int = 0,
 ) -> Surface:
-    """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
+    """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the
+    hairline.
 
-    bumps: share of the thickness, `size` metres wide. crown, quiff: metres that the top and the front rise above that.
-    side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge that stands off.
+    bumps: share of the thickness, `size` metres wide. crown, quiff: metres that the top and the
+    front rise above that.
+    side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge
+    that stands off.
     """
     template = anatomy.skin.template
     above, rim = (
@@ -261,10 +290,11 @@ def falling_tube(
     ends: float | None = None,
     over: float = 0.0,
 ) -> Surface:
-    """Long hair, a hood or a headscarf: the skull's silhouette scaled up, then falling to the height `bottom` at the back.
+    """Long hair, a hood or a headscarf: the skull's silhouette scaled up, then falling to the
+    height `bottom` at the back.
 
-    ends: height at which it ends in front; None: hair, which ends on the shoulders at the sides. over: metres between skin
-    and what is worn below it.
+    ends: height at which it ends in front; None: hair, which ends on the shoulders at the sides.
+    over: metres between skin and what is worn below it.
     """
     skin, template = anatomy.skin, anatomy.skin.template
     to_rest, center = _skull(anatomy)
@@ -322,7 +352,9 @@ def bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
 
 
 def tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float) -> Surface:
-    """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres apart."""
+    """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres
+    apart.
+    """
     start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[HEAD, 2] - 0.105])
     rows, columns = 40 if knots else 16, 14
     t = np.linspace(0, 1, rows)
@@ -368,13 +400,17 @@ def beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: st
 
 
 def _painted(surface: Surface) -> Surface:
-    """Template and cloth coordinates of hair that does not come from the scalp: its own position."""
+    """Template and cloth coordinates of hair that does not come from the scalp: its own
+    position.
+    """
     flat = surface.vertices - surface.vertices.mean(0)
     return surface.painted(flat + SKULL, flat, 0.09)
 
 
 def eyeballs(anatomy: Anatomy) -> Surface:
-    """Two balls in the sockets; their `template` attribute is the unit direction from the ball's middle."""
+    """Two balls in the sockets; their `template` attribute is the unit direction from the ball's
+    middle.
+    """
     parts, (directions, faces) = [], surfaces.ball(14, 22)
     directions = directions.astype(np.float32)
     for joint in (LEFT_EYE, RIGHT_EYE):
@@ -386,7 +422,9 @@ def eyeballs(anatomy: Anatomy) -> Surface:
 
 
 def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
-    """Template heights of head and neck -> rest heights of the person; the skull's middle (3,) at rest."""
+    """Template heights of head and neck -> rest heights of the person; the skull's middle (3,) at
+    rest.
+    """
     neck = anatomy.joints[NECK, 1]
     factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
     to_rest = lambda y: neck + (y - NECK_HEIGHT) * factor

@@ -1,8 +1,10 @@
-"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to learn from; its `Source`.
+"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to
+learn from; its `Source`.
 
-A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
-person's own), light and cameras. The same key gives the same bits on the same platform. Differences from
-`subject.render_view`: colors come from baked textures, normals are skinned, vertices follow a few joints each.
+A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two
+similar poses of the person's own), light and cameras. The same key gives the same bits on the same
+platform. Differences from `subject.render_view`: colors come from baked textures, normals are
+skinned, vertices follow a few joints each.
 
     bank = load_bank("people.npz")
     example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
@@ -38,11 +40,15 @@ from humangs_jax.rendering.mesh.rasterizer import Fragments, rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
 
 POSES, MIXING = 2, 0.5
-"""Of an example; largest share of the way to the nearest pose: the other half of the way is reached from that pose."""
+"""Of an example; largest share of the way to the nearest pose: the other half of the way is reached
+from that pose.
+"""
 DYED_SHARE, CLOSE_SHARE = 0.7, 0.2
 """Of examples whose clothes get other colors; of close cameras among the targets."""
 DISPLACED, COUNTED = 1, 2
-"""They make the keys that decide whether the body is displaced and how many views there are from that of an example."""
+"""They make the keys that decide whether the body is displaced and how many views there are from
+that of an example.
+"""
 Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
 """Of views: numbers for cameras, azimuths, poses, shares of close cameras."""
 BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
@@ -54,15 +60,17 @@ class OnTheFlyConfig:
 
     input_views: Few = 4
     view_counts: tuple[Few, ...] = ()
-    """If given, how many of the `input_views` an example has, one of these at random. The last one is repeated after them, so
-    that one program serves all numbers (`SubjectViews.view_count`)."""
+    """If given, how many of the `input_views` an example has, one of these at random. The last one
+    is repeated after them, so that one program serves all numbers (`SubjectViews.view_count`)."""
     target_views: Few = 3
     input_size: Side = 256
     """Pixels a side."""
     target_size: Side = 256
     """Pixels a side."""
     mixed_pose_share: Share = 0.3
-    """Of examples whose inputs show any of the `POSES` too, each, as targets do; otherwise all show the first."""
+    """Of examples whose inputs show any of the `POSES` too, each, as targets do; otherwise all show
+    the first.
+    """
     jitter: Spread = 0.7
     """See `surroundings.azimuths_from`."""
     scattered_share: Share = 0.2
@@ -70,7 +78,9 @@ class OnTheFlyConfig:
     mirrored_share: Share = 0.5
     """Of examples."""
     displaced_share: Share = 0.0
-    """Of examples: their body is displaced to the silhouettes of the clothes, and they are not mirrored."""
+    """Of examples: their body is displaced to the silhouettes of the clothes, and they are not
+    mirrored.
+    """
     depths: bool = False
     """Also of every view."""
     views_at_once: Few = knob(
@@ -96,8 +106,10 @@ ON_THE_FLY = OnTheFlyConfig()
 class Scene:
     """What all views of an example share: a person in several poses o, dyes and light.
 
-    person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3) metres.
-    corners: (o, f, 15) of every face's corners normal, openness and share of the key light that arrives.
+    person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3)
+    metres.
+    corners: (o, f, 15) of every face's corners normal, openness and share of the key light that
+    arrives.
     dyes: (m, 3, 3) color matrix of every piece. lights.
     """
 
@@ -116,13 +128,15 @@ def on_the_fly_example(
     config: OnTheFlyConfig = ON_THE_FLY,
     person: Int[Array, ""] | int | None = None,
 ) -> Example:
-    """Views of a person of the bank: inputs and targets. person: its number in the bank; None: the key chooses.
+    """Views of a person of the bank: inputs and targets. person: its number in the bank; None: the
+    key chooses.
 
     Raises: ValueError for a `displaced_share` of a bank that has none.
     """
     if config.displaced_share and not bank.displacements.shape[1]:
         raise ValueError(
-            "displaced_share: the bank has no displacements: expected one of build_bank(displaced=body)"
+            "displaced_share: the bank has no displacements: expected one of"
+            " build_bank(displaced=body)"
         )
     numbers = _draw_numbers(bank, key, config)
     if person is not None:
@@ -211,7 +225,9 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
 def pose_person(
     bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
-    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the translation (3,)."""
+    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the
+    translation (3,).
+    """
     nowhere = jnp.zeros(3, rotations.dtype)
     transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[
         :, :3
@@ -240,7 +256,8 @@ def pose_person(
 def _plans(
     numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None
 ) -> tuple[Plan, Plan]:
-    """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,).
+    """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares
+    of close cameras (v,).
 
     count: of the inputs; after them the last one is repeated. None: all.
     """
@@ -295,8 +312,8 @@ def draw_view(
     camera: Camera,
     config: OnTheFlyConfig = ON_THE_FLY,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
-    """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1], and (h, w) mean z of what
-    is covered, metres, 0 in the background.
+    """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1], and
+    (h, w) mean z of what is covered, metres, 0 in the background.
     """
     fine = camera.resized(camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
@@ -312,7 +329,9 @@ def draw_view(
 
 
 def _box_average(samples: Float[Array, "samples c"], camera: Camera) -> Float[Array, "h w c"]:
-    """Means of s x s samples of each pixel; added one by one: XLA's CPU backend reduces two axes slowly."""
+    """Means of s x s samples of each pixel; added one by one: XLA's CPU backend reduces two axes
+    slowly.
+    """
     s = SUPERSAMPLING
     samples = samples.reshape(camera.height, s, camera.width, s, -1)
     return jnp.asarray(sum(samples[:, i, :, j] for i in range(s) for j in range(s))) / (s * s)
@@ -326,13 +345,16 @@ def _light_pixels(
     fragments: Fragments,
     step: int,
 ) -> Float[Array, "hw 3"]:
-    """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at a time."""
+    """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at
+    a time.
+    """
     ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
     covered = ids >= 0
     count = ids.shape[0]
     step = min(step, count)
     place = jnp.where(covered, cumsum(covered.astype(jnp.int32)) - 1, count)
-    # the numbers of the covered pixels in order; steps may reach beyond their end, where "no pixel" is
+    # the numbers of the covered pixels in order; steps may reach beyond their end, where "no pixel"
+    # is
     listed = (
         jnp.full(-(-count // step) * step, count, jnp.int32)
         .at[place]
@@ -364,7 +386,9 @@ def _color_points(
     weights: Float[Array, "p 3"],
     behind: Bool[Array, " p"],
 ) -> Float[Array, "p 3"]:
-    """(p, 3) colors of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3); inner sides (p,)."""
+    """(p, 3) colors of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3);
+    inner sides (p,).
+    """
     person = scene.person
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
     uv = bank.uvs[person, faces].astype(weights.dtype)
@@ -397,7 +421,10 @@ def _sample(
 
 
 def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
-    """The views of a world with left and right exchanged; joints: each one's mirror image. Batched cameras."""
+    """The views of a world with left and right exchanged; joints: each one's mirror image.
+
+    Batched cameras.
+    """
     flip = jnp.asarray(MIRROR, views.images.dtype)
     side = jnp.asarray([-1.0, 1.0, 1.0], views.images.dtype)
     camera = views.cameras
@@ -420,11 +447,15 @@ MakeExample = Callable[[Key, int], Example]
 
 @dataclasses.dataclass(frozen=True)
 class GeneratedSource:
-    """Examples that `make` computes from keys; all keys are of people of one split (`subject.SPLITS`).
+    """Examples that `make` computes from keys; all keys are of people of one split
+    (`subject.SPLITS`).
 
-    make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see `ViewSampling`.
-    on_host: bring the arrays to the host, where they mix with those of files and are divided among devices.
-    person_of: called as person_of(key, input_count), gives the seed of the person whom `make` shows; None: that of the key.
+    make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see
+    `ViewSampling`.
+    on_host: bring the arrays to the host, where they mix with those of files and are divided among
+    devices.
+    person_of: called as person_of(key, input_count), gives the seed of the person whom `make`
+    shows; None: that of the key.
 
     Raises: ValueError if there is no such split.
     """
@@ -448,7 +479,9 @@ class GeneratedSource:
         return len(SPLITS[self.split])
 
     def drawn_key(self, seed: int, index: int) -> Key:
-        """The key of the index-th example of a run: a random subject of the split, in its index-th appearance."""
+        """The key of the index-th example of a run: a random subject of the split, in its index-th
+        appearance.
+        """
         return subject_key(self._person(seed, index), index)
 
     def _person(self, seed: int, index: int) -> int:
@@ -476,7 +509,9 @@ def _described(person: int, appearance: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class EachPerson:
-    """Each person of a bank once, in order: people to compare on. input_counts, on_host: see `GeneratedSource`."""
+    """Each person of a bank once, in order: people to compare on. input_counts, on_host: see
+    `GeneratedSource`.
+    """
 
     bank: PeopleBank
     config: OnTheFlyConfig
@@ -508,7 +543,9 @@ class EachPerson:
 def jitted_example(
     bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: int | None = None
 ) -> Example:
-    """`on_the_fly_example`, compiled once per configuration and shape of the bank; with `CPU_COMPILER_OPTIONS` on a CPU."""
+    """`on_the_fly_example`, compiled once per configuration and shape of the bank; with
+    `CPU_COMPILER_OPTIONS` on a CPU.
+    """
     return _compiled()(bank, key, config=config, person=person)
 
 
@@ -532,9 +569,11 @@ def on_the_fly_source(
     on_host: bool = False,
     each_once: bool = False,
 ) -> GeneratedSource | EachPerson:
-    """Examples of a bank for `Loader` and `Mixture`: random people of it, or each of them once, in order.
+    """Examples of a bank for `Loader` and `Mixture`: random people of it, or each of them once, in
+    order.
 
-    input_counts replace `config.input_views`; each is compiled once. on_host: see `GeneratedSource`.
+    input_counts replace `config.input_views`; each is compiled once. on_host: see
+    `GeneratedSource`.
     """
     if each_once:
         return EachPerson(bank, config, input_counts, on_host)

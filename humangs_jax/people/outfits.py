@@ -1,8 +1,10 @@
-"""What people wear, as choices: kinds of garments, their lengths and widths, their fabrics. No geometry.
+"""What people wear, as choices: kinds of garments, their lengths and widths, their fabrics. No
+geometry.
 
-Lengths are in template coordinates (see `anatomy`): heights y for hems, |x| for the ends of sleeves. The tables below hold
-specifications of random numbers, see `drawn`. All rows of a table are drawn, whichever is used: a new row changes what every
-seed makes, so raise `subject.GENERATOR_VERSION` with it.
+Lengths are in template coordinates (see `anatomy`): heights y for hems, |x| for the ends of
+sleeves. The tables below hold specifications of random numbers, see `drawn`. All rows of a table
+are drawn, whichever is used: a new row changes what every seed makes, so raise
+`subject.GENERATOR_VERSION` with it.
 """
 
 import dataclasses
@@ -50,7 +52,9 @@ KINDS = TOPS + OUTER + BOTTOMS + SKIRTS + DRESSES + HEADWEAR + SHOES + EXTRAS
 
 @dataclasses.dataclass(frozen=True)
 class Garment:
-    """One piece of clothing. kind: one of KINDS. fabric. sizes: what its builder needs. details: features that it has."""
+    """One piece of clothing. kind: one of KINDS. fabric. sizes: what its builder needs. details:
+    features that it has.
+    """
 
     kind: str
     fabric: Fabric
@@ -63,10 +67,11 @@ Odds = Mapping[str, float | int]
 
 @dataclasses.dataclass(frozen=True)
 class Style:
-    """Clothes that go together. men, women: odds of the style. tops, bottoms, coats, shoes: odds of kinds of garments.
+    """Clothes that go together. men, women: odds of the style. tops, bottoms, coats, shoes: odds of
+    kinds of garments.
 
-    The rest are probabilities of something over the others, of a top tucked in, of a skirt, a scarf, kinds of headwear and of
-    no sunglasses.
+    The rest are probabilities of something over the others, of a top tucked in, of a skirt, a
+    scarf, kinds of headwear and of no sunglasses.
     """
 
     men: float
@@ -87,37 +92,104 @@ class Style:
 
 STYLES = {
     "casual": Style(
-        0.36, 0.27,
-        {"tee": 4, "longsleeve": 2, "shirt": 2.5, "sweater": 2, "hoodie": 2, "polo": 1, "turtleneck": 0.6},
-        {"jeans": 5, "chinos": 2, "slim": 1.5, "wide": 1, "cropped": 0.6, "cargo": 0.8, "shorts": 0.6},
+        0.36,
+        0.27,
+        {
+            "tee": 4,
+            "longsleeve": 2,
+            "shirt": 2.5,
+            "sweater": 2,
+            "hoodie": 2,
+            "polo": 1,
+            "turtleneck": 0.6,
+        },
+        {
+            "jeans": 5,
+            "chinos": 2,
+            "slim": 1.5,
+            "wide": 1,
+            "cropped": 0.6,
+            "cargo": 0.8,
+            "shorts": 0.6,
+        },
         {"sneakers": 5, "ankle_boots": 1.5, "flats": 1.5, "boots": 0.4},
-        {"jacket": 3, "denim_jacket": 2, "cardigan": 2, "hooded_jacket": 1.5, "vest": 0.7, "blazer": 0.7},
-        outer=0.28, skirt=0.22),
+        {
+            "jacket": 3,
+            "denim_jacket": 2,
+            "cardigan": 2,
+            "hooded_jacket": 1.5,
+            "vest": 0.7,
+            "blazer": 0.7,
+        },
+        outer=0.28,
+        skirt=0.22,
+    ),
     "formal": Style(
-        0.16, 0.1, {"shirt": 6, "blouse": 2, "turtleneck": 1, "sweater": 1}, {"chinos": 4, "slim": 2, "wide": 1.3, "jeans": 1},
-        {"flats": 6, "ankle_boots": 2}, {"blazer": 6, "coat": 1.5, "cardigan": 1, "vest": 1},
-        outer=0.6, tucked=0.7, skirt=0.4, headwear={"brim_hat": 0.1}),
+        0.16,
+        0.1,
+        {"shirt": 6, "blouse": 2, "turtleneck": 1, "sweater": 1},
+        {"chinos": 4, "slim": 2, "wide": 1.3, "jeans": 1},
+        {"flats": 6, "ankle_boots": 2},
+        {"blazer": 6, "coat": 1.5, "cardigan": 1, "vest": 1},
+        outer=0.6,
+        tucked=0.7,
+        skirt=0.4,
+        headwear={"brim_hat": 0.1},
+    ),
     "sport": Style(
-        0.14, 0.1, {"tee": 3, "tank": 2, "jersey": 2.5, "hoodie": 1.5, "longsleeve": 1},
-        {"track": 3, "shorts": 3, "leggings": 2}, {"sneakers": 1}, tucked=0.05, scarf=0.03, headwear={"cap": 0.35}),
+        0.14,
+        0.1,
+        {"tee": 3, "tank": 2, "jersey": 2.5, "hoodie": 1.5, "longsleeve": 1},
+        {"track": 3, "shorts": 3, "leggings": 2},
+        {"sneakers": 1},
+        tucked=0.05,
+        scarf=0.03,
+        headwear={"cap": 0.35},
+    ),
     "winter": Style(
-        0.16, 0.14, {"sweater": 3, "turtleneck": 2, "longsleeve": 2, "shirt": 2, "hoodie": 1.5},
-        {"jeans": 4, "chinos": 2, "slim": 2, "wide": 0.7, "cargo": 0.7}, {"ankle_boots": 3, "boots": 2.5, "sneakers": 1.5},
+        0.16,
+        0.14,
+        {"sweater": 3, "turtleneck": 2, "longsleeve": 2, "shirt": 2, "hoodie": 1.5},
+        {"jeans": 4, "chinos": 2, "slim": 2, "wide": 0.7, "cargo": 0.7},
+        {"ankle_boots": 3, "boots": 2.5, "sneakers": 1.5},
         {"coat": 4, "puffer": 3, "jacket": 1.5, "hooded_jacket": 1.5},
-        outer=0.9, scarf=0.4, headwear={"beanie": 0.4, "brim_hat": 0.06}),
+        outer=0.9,
+        scarf=0.4,
+        headwear={"beanie": 0.4, "brim_hat": 0.06},
+    ),
     "summer": Style(
-        0.12, 0.12, {"tee": 4, "tank": 3, "shirt": 2, "polo": 1.5, "blouse": 1},
-        {"shorts": 5, "cropped": 1.5, "wide": 1, "jeans": 1.5}, {"sneakers": 3, "sandals": 3, "flats": 1.5},
-        skirt=0.35, scarf=0.03, headwear={"cap": 0.2, "brim_hat": 0.22}, no_sunglasses=0.85),
+        0.12,
+        0.12,
+        {"tee": 4, "tank": 3, "shirt": 2, "polo": 1.5, "blouse": 1},
+        {"shorts": 5, "cropped": 1.5, "wide": 1, "jeans": 1.5},
+        {"sneakers": 3, "sandals": 3, "flats": 1.5},
+        skirt=0.35,
+        scarf=0.03,
+        headwear={"cap": 0.2, "brim_hat": 0.22},
+        no_sunglasses=0.85,
+    ),
     "street": Style(
-        0.06, 0.04, {"hoodie": 4, "tee": 4, "jersey": 2, "shirt": 1},
-        {"jeans": 3, "cargo": 3, "wide": 2, "track": 2, "shorts": 1}, {"sneakers": 5, "ankle_boots": 1},
+        0.06,
+        0.04,
+        {"hoodie": 4, "tee": 4, "jersey": 2, "shirt": 1},
+        {"jeans": 3, "cargo": 3, "wide": 2, "track": 2, "shorts": 1},
+        {"sneakers": 5, "ankle_boots": 1},
         {"jacket": 2, "denim_jacket": 2, "hooded_jacket": 2, "puffer": 1},
-        outer=0.5, tucked=0.05, headwear={"cap": 0.35, "beanie": 0.2}, no_sunglasses=0.85),
+        outer=0.5,
+        tucked=0.05,
+        headwear={"cap": 0.35, "beanie": 0.2},
+        no_sunglasses=0.85,
+    ),
     "dressed": Style(
-        0.0, 0.25, {}, {}, {"flats": 3, "sandals": 2, "boots": 1.2, "ankle_boots": 1.2, "sneakers": 1},
-        {"cardigan": 3, "blazer": 1.5, "coat": 1.5, "denim_jacket": 1.5}, outer=0.2),
-}  # fmt: skip
+        0.0,
+        0.25,
+        {},
+        {},
+        {"flats": 3, "sandals": 2, "boots": 1.2, "ankle_boots": 1.2, "sneakers": 1},
+        {"cardigan": 3, "blazer": 1.5, "coat": 1.5, "denim_jacket": 1.5},
+        outer=0.2,
+    ),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +201,8 @@ class OneOf:
 
 
 def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
-    """A random value: of (low, high) a uniform number, of a dict of odds a name, of `OneOf` an option, of a name a given value.
+    """A random value: of (low, high) a uniform number, of a dict of odds a name, of `OneOf` an
+    option, of a name a given value.
 
     Numbers stand for themselves.
     """
@@ -145,21 +218,33 @@ def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
 
 
 def row(rng: np.random.Generator, table: Mapping[str, Any], kind: str, **named: float) -> Any:
-    """The value of a kind of garment in a table of specifications, or that of "other"; all rows are drawn."""
+    """The value of a kind of garment in a table of specifications, or that of "other"; all rows are
+    drawn.
+    """
     values = {name: drawn(rng, specification, **named) for name, specification in table.items()}
     return values.get(kind, values.get("other"))
 
 
 SLEEVES = {
-    "tank": (0.122, 0.15), "tee": "short", "polo": (0.30, 0.38), "jersey": OneOf(("short", (0.125, 0.15)), (0.7, 0.3)),
-    "shirt": OneOf(("long", (0.3, 0.4), (0.44, 0.55)), (0.62, 0.23, 0.15)), "blouse": OneOf(("long", (0.25, 0.55))),
+    "tank": (0.122, 0.15),
+    "tee": "short",
+    "polo": (0.30, 0.38),
+    "jersey": OneOf(("short", (0.125, 0.15)), (0.7, 0.3)),
+    "shirt": OneOf(("long", (0.3, 0.4), (0.44, 0.55)), (0.62, 0.23, 0.15)),
+    "blouse": OneOf(("long", (0.25, 0.55))),
     "other": OneOf(("long", (0.42, 0.6)), (0.78, 0.22)),
-}  # fmt: skip
+}
 NECKS = {
-    "tee": {"crew": 6, "vee": 2.5, "scoop": 1.5}, "tank": "scoop", "jersey": {"crew": 1, "vee": 1}, "shirt": "collar",
-    "polo": "collar", "blouse": {"collar": 2, "vee": 2, "crew": 1}, "turtleneck": "high", "hoodie": "crew",
+    "tee": {"crew": 6, "vee": 2.5, "scoop": 1.5},
+    "tank": "scoop",
+    "jersey": {"crew": 1, "vee": 1},
+    "shirt": "collar",
+    "polo": "collar",
+    "blouse": {"collar": 2, "vee": 2, "crew": 1},
+    "turtleneck": "high",
+    "hoodie": "crew",
     "other": {"crew": 6, "vee": 2, "scoop": 0.6},
-}  # fmt: skip
+}
 MENS_NECKS = NECKS | {"other": {"crew": 6, "vee": 2, "scoop": 0}}
 PLAIN_TOPS = {
     "tee": 0.5,
@@ -171,31 +256,54 @@ PLAIN_TOPS = {
 }
 """How often tops are in one dye; the others: 0.35."""
 TOP_DETAILS = (
-    ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5), ("number", ("jersey",), 1), ("zip", ("hoodie",), 0.4),
-    ("hood_up", ("hoodie",), 0.18), ("ribbed", ("sweater", "turtleneck", "hoodie", "longsleeve"), 1),
-    ("pocket", ("shirt", "polo", "blouse"), 0.5), ("open", ("shirt",), 0.2),
-)  # fmt: skip
+    ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5),
+    ("number", ("jersey",), 1),
+    ("zip", ("hoodie",), 0.4),
+    ("hood_up", ("hoodie",), 0.18),
+    ("ribbed", ("sweater", "turtleneck", "hoodie", "longsleeve"), 1),
+    ("pocket", ("shirt", "polo", "blouse"), 0.5),
+    ("open", ("shirt",), 0.2),
+)
 """Feature, kinds that can have it, how often they do."""
 LEG_ENDS = {"shorts": (-0.77, -0.56), "cropped": (-1.1, -0.93), "other": (-1.172, -1.14)}
 LEG_WIDTHS = {
-    "wide": (0.025, 0.065), "cargo": (0.015, 0.04), "track": (0.004, 0.03), "jeans": OneOf(((0.0, 0.01), (0.01, 0.035))),
-    "chinos": (0.004, 0.02), "shorts": (0.002, 0.04), "slim": 0.002, "leggings": 0.0, "other": (0.004, 0.025),
-}  # fmt: skip
+    "wide": (0.025, 0.065),
+    "cargo": (0.015, 0.04),
+    "track": (0.004, 0.03),
+    "jeans": OneOf(((0.0, 0.01), (0.01, 0.035))),
+    "chinos": (0.004, 0.02),
+    "shorts": (0.002, 0.04),
+    "slim": 0.002,
+    "leggings": 0.0,
+    "other": (0.004, 0.025),
+}
 LEG_LOOSENESS = {"leggings": 0.0, "slim": 0.1, "wide": 0.9, "cargo": 0.9, "other": (0.2, 0.7)}
 COAT_OPEN = {"puffer": 0.4, "coat": 0.5, "cardigan": 0.85, "vest": 0.5}
 """How often coats are open; the others: 0.75."""
 COAT_ENDS = {
-    "coat": (-0.9, -0.6), "blazer": (-0.43, -0.38), "denim_jacket": (-0.34, -0.28), "puffer": (-0.42, -0.3),
-    "vest": (-0.34, -0.27), "other": (-0.42, -0.31),
-}  # fmt: skip
+    "coat": (-0.9, -0.6),
+    "blazer": (-0.43, -0.38),
+    "denim_jacket": (-0.34, -0.28),
+    "puffer": (-0.42, -0.3),
+    "vest": (-0.34, -0.27),
+    "other": (-0.42, -0.31),
+}
 COAT_DETAILS = {
-    "jacket": {"collar", "pockets"}, "denim_jacket": {"collar", "pockets"}, "coat": {"pockets"}, "vest": {"pockets"},
-    "puffer": {"pockets"}, "hooded_jacket": {"hood"}, "blazer": {"lapels"},
-}  # fmt: skip
+    "jacket": {"collar", "pockets"},
+    "denim_jacket": {"collar", "pockets"},
+    "coat": {"pockets"},
+    "vest": {"pockets"},
+    "puffer": {"pockets"},
+    "hooded_jacket": {"hood"},
+    "blazer": {"lapels"},
+}
 SHAFTS = {
-    "sneakers": OneOf((0.09, (0.11, 0.14)), (0.8, 0.2)), "flats": (0.068, 0.085), "sandals": 0.07,
-    "ankle_boots": (0.13, 0.17), "boots": (0.24, 0.40),
-}  # fmt: skip
+    "sneakers": OneOf((0.09, (0.11, 0.14)), (0.8, 0.2)),
+    "flats": (0.068, 0.085),
+    "sandals": 0.07,
+    "ankle_boots": (0.13, 0.17),
+    "boots": (0.24, 0.40),
+}
 SOLES = {"sneakers": (0.02, 0.036), "flats": (0.008, 0.02), "other": (0.015, 0.035)}
 
 

@@ -1,8 +1,10 @@
-"""A pose prior: plausible standing, striding, crouching and reaching people, within joint limits, their soles on the ground.
+"""A pose prior: plausible standing, striding, crouching and reaching people, within joint limits,
+their soles on the ground.
 
-Stances place the feet and the pelvis. An arm draws many candidates within its limits and keeps the one whose wrist comes nearest
-to a goal, among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few
-gestures. `anatomy` has the joints, their limits and the conventions.
+Stances place the feet and the pelvis. An arm draws many candidates within its limits and keeps the
+one whose wrist comes nearest to a goal, among those whose forearm and hand stay out of the trunk,
+the head, the legs and the other arm. Hands blend a few gestures. `anatomy` has the joints, their
+limits and the conventions.
 """
 
 import dataclasses
@@ -15,9 +17,12 @@ from humangs_jax.people import anatomy as kin
 from humangs_jax.people.surfaces import choice
 
 TRIES = 20
-"""Stances tried until one is within the limits of the joints; after that the person stands upright."""
+"""Stances tried until one is within the limits of the joints; after that the person stands upright.
+"""
 BOTH_ARMS, ATTEMPTS = 0.45, 3
-"""Share of people whose arms have the same goal; how many goals are tried for an arm that cannot keep clear of the body."""
+"""Share of people whose arms have the same goal; how many goals are tried for an arm that cannot
+keep clear of the body.
+"""
 CANDIDATES = 400
 HAND_LENGTH = 0.6
 """From the wrist to the knuckles and a little beyond, in lengths of the forearm."""
@@ -32,10 +37,12 @@ Capsule = tuple[kin.Vector, kin.Vector, float]
 
 @dataclasses.dataclass(frozen=True)
 class Stance:
-    """Feet and pelvis before the person is turned. Lengths in legs, x to the left of the pelvis, z in front of it.
+    """Feet and pelvis before the person is turned. Lengths in legs, x to the left of the pelvis, z
+    in front of it.
 
-    feet: left, right. sink: how much lower the pelvis is than it could be, in legs. tilt: of the pelvis forward. roll: of the
-    pelvis, left side up. lean: how far forward the trunk bends to keep the balance.
+    feet: left, right. sink: how much lower the pelvis is than it could be, in legs. tilt: of the
+    pelvis forward. roll: of the pelvis, left side up. lean: how far forward the trunk bends to keep
+    the balance.
     """
 
     feet: kin.Feet
@@ -63,7 +70,9 @@ def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rot
 def take_stance(
     build: kin.Build, rotations: kin.Rotations, heading: float, stance: Stance
 ) -> tuple[kin.Vector, float]:
-    """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error of the two feet, metres."""
+    """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error
+    of the two feet, metres.
+    """
     turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
     feet = in_world(stance.feet, build.leg, heading)
@@ -211,11 +220,19 @@ def _tiptoe(rng: np.random.Generator, width: float) -> Stance:
 
 
 STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]] = {
-    "stand": (0.26, _stand), "contrapposto": (0.2, _contrapposto), "stride": (0.22, _stride), "wide": (0.08, _wide),
-    "squat": (0.06, _squat), "lunge": (0.05, _lunge), "side lunge": (0.04, _side_lunge), "one leg": (0.07, _one_leg),
+    "stand": (0.26, _stand),
+    "contrapposto": (0.2, _contrapposto),
+    "stride": (0.22, _stride),
+    "wide": (0.08, _wide),
+    "squat": (0.06, _squat),
+    "lunge": (0.05, _lunge),
+    "side lunge": (0.04, _side_lunge),
+    "one leg": (0.07, _one_leg),
     "tiptoe": (0.02, _tiptoe),
-}  # fmt: skip
-"""Name -> probability, and a function of a generator and the distance of a hip from the middle in legs."""
+}
+"""Name -> probability, and a function of a generator and the distance of a hip from the middle in
+legs.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +240,8 @@ class Goal:
     """Target of a wrist. odds: of being drawn.
 
     place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
-    raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the front. flexed: of the elbow.
+    raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the
+    front. flexed: of the elbow.
     collar: how much the collar is raised.
     """
 
@@ -269,9 +287,11 @@ def bend_arm(
     side: int,
     other_arm: bool = False,
 ) -> float:
-    """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk, head and legs must be set.
+    """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk,
+    head and legs must be set.
 
-    other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it is not).
+    other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it
+    is not).
     """
     matrix, vector = kin.rotation_matrix, kin.rotation_vector
     collar, shoulder, elbow, wrist = ARMS[side]
@@ -315,7 +335,9 @@ def bend_arm(
 
 
 def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
-    """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
+    """How far (metres) both forearms and hands are from the body and each other; negative if one is
+    inside.
+    """
     world, positions = kin.joint_positions(build, rotations)
     body, worst = _body_capsules(build, world, positions), np.inf
     for side, (_, _, elbow, wrist) in enumerate(ARMS):
@@ -372,23 +394,31 @@ def _along(
 
 
 FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
-"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share of its spread."""
+"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share
+of its spread.
+"""
 BONE_SHARE = (0.85, 1.0, 0.7)
 """Share of a finger's curl at each knuckle, from the palm outwards."""
 
 
 GESTURES = {
-    "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25), "flat": (0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
-    "spread": (0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3), "fist": (0.12, (1.3, 1.35, 1.35, 1.35), 0.0, 1.0),
-    "point": (0.06, (0.02, 1.2, 1.3, 1.3), 0.0, 0.8), "two": (0.03, (0.02, 0.02, 1.3, 1.3), 0.12, 0.9),
-    "thumb up": (0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4), "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
-}  # fmt: skip
-"""Odds; curl of index, middle, ring and pinky, radians a knuckle; angle between fingers; how far the thumb lies across the palm,
-0 beside it, 1 across."""
+    "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
+    "flat": (0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
+    "spread": (0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3),
+    "fist": (0.12, (1.3, 1.35, 1.35, 1.35), 0.0, 1.0),
+    "point": (0.06, (0.02, 1.2, 1.3, 1.3), 0.0, 0.8),
+    "two": (0.03, (0.02, 0.02, 1.3, 1.3), 0.12, 0.9),
+    "thumb up": (0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4),
+    "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
+}
+"""Odds; curl of index, middle, ring and pinky, radians a knuckle; angle between fingers; how far
+the thumb lies across the palm, 0 beside it, 1 across."""
 
 
 def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:
-    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
+    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a
+    random gesture.
+    """
     first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
     goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
     blends = (
@@ -410,7 +440,9 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
 
 
 def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotations:
-    """(j, 3) rotation vectors of a random plausible pose; the lowest points of planted feet are at one height."""
+    """(j, 3) rotation vectors of a random plausible pose; the lowest points of planted feet are at
+    one height.
+    """
     rotations = np.zeros((kin.JOINTS, 3))
     rotations[kin.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
     stance = sample_stance(rng, build, rotations)
@@ -431,7 +463,8 @@ def bend_trunk(
 ) -> None:
     """Set spine, neck and head in `rotations`.
 
-    lean: how far the trunk bends forward, about. roll: of the pelvis, left side up, which the spine evens out.
+    lean: how far the trunk bends forward, about. roll: of the pelvis, left side up, which the spine
+    evens out.
     """
     bowed = rng.random() < 0.08
     lean = lean + rng.normal(0.03, 0.07) + (rng.uniform(0.2, 0.7) if bowed else 0.0)

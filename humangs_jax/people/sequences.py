@@ -1,8 +1,10 @@
-"""Smooth motions: walking along curves, turning on the spot, reaching for things. Soles on the ground stay where they are.
+"""Smooth motions: walking along curves, turning on the spot, reaching for things. Soles on the
+ground stay where they are.
 
-Walks and turns are footprints along a path; feet roll from heel to toe on each and swing to the next, the pelvis goes along
-and as high as the legs let it, legs are solved for (`anatomy.place_feet`). Reaches keep both feet planted and move from
-pose to pose. World as everywhere: y up, metres, the ground at y = 0 where the soles are those of the bare body.
+Walks and turns are footprints along a path; feet roll from heel to toe on each and swing to the
+next, the pelvis goes along and as high as the legs let it, legs are solved for
+(`anatomy.place_feet`). Reaches keep both feet planted and move from pose to pose. World as
+everywhere: y up, metres, the ground at y = 0 where the soles are those of the bare body.
 """
 
 import dataclasses
@@ -29,11 +31,17 @@ from humangs_jax.people.surfaces import choice
 FPS, LONG_STEP = 30.0, 0.75
 """Frames a second; a long step in lengths of a leg."""
 STANCE_SHARE, FLAT_FROM, FLAT_UNTIL = 0.62, 0.15, 0.55
-"""Share of a stride during which a foot is on the ground; shares of that between which the sole is flat."""
+"""Share of a stride during which a foot is on the ground; shares of that between which the sole is
+flat.
+"""
 HEEL_STRIKE, TOE_OFF = 0.28, 0.85
-"""Pitch of the foot, radians, when it comes down on the heel and leaves from the toes, at a long stride."""
+"""Pitch of the foot, radians, when it comes down on the heel and leaves from the toes, at a long
+stride.
+"""
 SMOOTHING, SPARE = 4, 0.995
-"""Frames to both sides over which the pelvis's height is smoothed; share of the legs' reach that it uses."""
+"""Frames to both sides over which the pelvis's height is smoothed; share of the legs' reach that it
+uses.
+"""
 TRIES = 12
 """Goals tried for an arm until the way to one is clear."""
 
@@ -50,7 +58,10 @@ KeyPose = tuple[kin.Rotations, kin.Vector, float]
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """rotations: (m, j, 3) axis-angle. translations: (m, 3) metres. planted: (m, 2) feet that are on the ground. kind, fps."""
+    """rotations: (m, j, 3) axis-angle. translations: (m, 3) metres.
+
+    planted: (m, 2) feet that are on the ground. kind, fps.
+    """
 
     kind: str
     rotations: Float[np.ndarray, "m j 3"]
@@ -78,8 +89,9 @@ def sample_sequence(
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres of a foot from the
-    line. lift: metres that a swinging foot is raised. turn_out: of the feet. swing: of the arms, radians.
+    """cadence: strides a second. step: metres forward per step. bend: radians turned per step.
+    width: metres of a foot from the line. lift: metres that a swinging foot is raised. turn_out: of
+    the feet. swing: of the arms, radians.
     """
 
     cadence: float
@@ -160,7 +172,9 @@ def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: G
 
 
 def _path(heading: Heading, stride: float, first: float, last: float) -> Track:
-    """A function from the phase to the body's position (3,) on its path: the integral of the heading."""
+    """A function from the phase to the body's position (3,) on its path: the integral of the
+    heading.
+    """
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
     along = cumulative_trapezoid(direction, grid, axis=0, initial=0)
@@ -172,7 +186,9 @@ def _path(heading: Heading, stride: float, first: float, last: float) -> Track:
 def _foot_at(
     build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, phase: float
 ) -> kin.Foot:
-    """The foot of a side at a phase (strides); the left one comes down at whole phases, the right one half a stride later."""
+    """The foot of a side at a phase (strides); the left one comes down at whole phases, the right
+    one half a stride later.
+    """
     number, share = divmod(phase + 0.5 * side, 1.0)
     down = number - 0.5 * side
     here, there = (_footprint(build, gait, heading, track, side, down + k) for k in (0, 1))
@@ -203,7 +219,9 @@ def _foot_at(
 def _footprint(
     build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, down: float
 ) -> kin.Foot:
-    """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in mid-stance."""
+    """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in
+    mid-stance.
+    """
     middle = down + 0.5 * STANCE_SHARE
     yaw, sign = float(heading(middle)), 1 - 2 * side
     ahead = (
@@ -220,7 +238,9 @@ def _swing_arms(
     phase: Float[np.ndarray, " m"],
     gait: Gait,
 ) -> None:
-    """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of the shoulders."""
+    """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of
+    the shoulders.
+    """
     stood = rotations[0].copy()
     stood[[joint for leg in kin.LEGS for joint in leg]] = 0
     for side in (0, 1):
@@ -287,7 +307,9 @@ def _key_pose(
     feet: kin.Feet,
     before: KeyPose | None,
 ) -> KeyPose:
-    """(rotations, place of the pelvis on the ground plane, how much lower it is than it could be)."""
+    """(rotations, place of the pelvis on the ground plane, how much lower it is than it could
+    be).
+    """
     rotations = np.zeros((kin.JOINTS, 3))
     sink = stance.sink * build.leg + (
         rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0
@@ -327,7 +349,9 @@ def _key_pose(
 
 
 def _clear_of(build: kin.Build, rotations: kin.Rotations, side: int) -> float:
-    """`arm_clearance`; while the left arm (side 0) is placed, the right one is held out of the way."""
+    """`arm_clearance`; while the left arm (side 0) is placed, the right one is held out of the
+    way.
+    """
     if side == 0:
         rotations = rotations.copy()
         rotations[list(ARMS[1])] = 0
@@ -341,7 +365,9 @@ def _ride(
     feet: list[kin.Feet],
     sinks: Float[np.ndarray, " m"] | None = None,
 ) -> Float[np.ndarray, "m 3"]:
-    """Positions of the pelvis (m, 3) above the centers: smooth heights that the legs allow, minus `sinks`."""
+    """Positions of the pelvis (m, 3) above the centers: smooth heights that the legs allow, minus
+    `sinks`.
+    """
     heights = np.asarray([
         kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
         for turn, center, both in zip(turns, centers, feet, strict=True)

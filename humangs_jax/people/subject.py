@@ -1,12 +1,15 @@
-"""A synthetic person from a seed: who it is (`describe`), and its mesh, materials, lights and build (`make_subject`).
+"""A synthetic person from a seed: who it is (`describe`), and its mesh, materials, lights and build
+(`make_subject`).
 
 Also its views in a pose: rasterized at twice the size, shaded per pixel, box-averaged.
 
-A description is a few numbers and takes milliseconds; thousands can be counted without building any geometry.
+A description is a few numbers and takes milliseconds; thousands can be counted without building any
+geometry.
 
-Seeds and keys are for training, validation, test and documentation; the ranges share no person. A seed names a person. Written
-people are made from the seed by numpy; people made on the fly from its keys, whose words are (appearance, seed), so that the
-person, and the split, can be read off every key.
+Seeds and keys are for training, validation, test and documentation; the ranges share no person. A
+seed names a person. Written people are made from the seed by numpy; people made on the fly from its
+keys, whose words are (appearance, seed), so that the person, and the split, can be read off every
+key.
 """
 
 import dataclasses
@@ -46,12 +49,13 @@ from humangs_jax.people.surfaces import (
 from humangs_jax.people.surroundings import Lights, sample_lights
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
-# Seeds ----------------------------------------------------------------------------------------------------------------
+# Seeds
+# --------------------------------------------------------------------------------------------------
 
 
 GENERATOR_VERSION = 2
-"""Raised whenever the same seed makes another person, pose or image. Manifests record it; sets of different versions are not
-mixed in one folder."""
+"""Raised whenever the same seed makes another person, pose or image. Manifests record it; sets of
+different versions are not mixed in one folder."""
 
 TRAIN = range(0, 1_000_000)
 VALIDATION = range(1_000_000, 1_001_000)
@@ -65,8 +69,13 @@ TRADEOFF = range(5_000_000, 5_001_000)
 """People that the presets of speed and accuracy are chosen on."""
 
 SPLITS = {
-    "train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO, "fitting": FITTING, "tradeoff": TRADEOFF,
-}  # fmt: skip
+    "train": TRAIN,
+    "validation": VALIDATION,
+    "test": TEST,
+    "demo": DEMO,
+    "fitting": FITTING,
+    "tradeoff": TRADEOFF,
+}
 
 KEY_KIND = "threefry2x32"
 """Implementation of all keys of people: the words of such a key are its seed."""
@@ -83,11 +92,15 @@ def split_of(seed: int) -> str:
 
 
 def seeds_of(split: str, first: int, count: int) -> range:
-    """`count` seeds of a split from its `first`-th on. Raises ValueError if they reach beyond the split."""
+    """`count` seeds of a split from its `first`-th on.
+
+    Raises ValueError if they reach beyond the split.
+    """
     people = SPLITS[split]
     if first < 0 or count < 1 or first + count > len(people):
         raise ValueError(
-            f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has {len(people)}"
+            f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has"
+            f" {len(people)}"
         )
     return people[first : first + count]
 
@@ -102,11 +115,14 @@ def subject_key(seed: int, appearance: int = 0) -> Key:
     return jax.random.wrap_key_data(jnp.asarray(words), impl=KEY_KIND)
 
 
-# People ---------------------------------------------------------------------------------------------------------------
+# People
+# --------------------------------------------------------------------------------------------------
 
 
 SHAPE_STD = 0.55
-"""Standard deviation of the shape coefficients without a rule of their own; values are clipped at twice that."""
+"""Standard deviation of the shape coefficients without a rule of their own; values are clipped at
+twice that.
+"""
 HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
 """Mean and standard deviation of the stature in metres of men (True) and women."""
 HEIGHT_RANGE, TALLEST_WOMAN = (1.42, 2.08), 1.95
@@ -118,9 +134,11 @@ LENGTHS = ("height", "leg_length", "torso_length")
 
 @dataclasses.dataclass(frozen=True)
 class Person:
-    """seed; betas: (s,) shape coefficients; male: dressed as a man; years; stature in metres, without shoes.
+    """seed; betas: (s,) shape coefficients; male: dressed as a man; years; stature in metres,
+    without shoes.
 
-    complexion: colors of skin, hair, eyes. haircut: hair and beard. garments: clothes, shoes and accessories, innermost first.
+    complexion: colors of skin, hair, eyes. haircut: hair and beard. garments: clothes, shoes and
+    accessories, innermost first.
     lights: what the person stands in.
     """
 
@@ -181,9 +199,11 @@ def sample_shape(
 class SyntheticSubject:
     """A dressed person.
 
-    seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`, `cloth`. face_materials: (f,)
-    indices into materials. lights. build: what the pose prior knows. person: what all of this was built from.
-    cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on everything else.
+    seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`,
+    `cloth`. face_materials: (f,) indices into materials. lights. build: what the pose prior knows.
+    person: what all of this was built from.
+    cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on
+    everything else.
     """
 
     seed: int
@@ -210,9 +230,11 @@ _shape = jax.jit(shape_body)
 
 
 def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> SyntheticSubject:
-    """The person of a seed. person: another description than that of the seed, such as one in other clothes.
+    """The person of a seed. person: another description than that of the seed, such as one in other
+    clothes.
 
-    Raises: ValueError if the body is not the package's own: cuts and paint are given in its coordinates.
+    Raises: ValueError if the body is not the package's own: cuts and paint are given in its
+    coordinates.
     """
     if (body.name, len(body.template)) != BODY:
         raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
@@ -260,7 +282,10 @@ def _host_arrays(
 ) -> tuple[
     Points, Int[np.ndarray, "f 3"], Float[np.ndarray, "n j"], float, Float[np.ndarray, " s"]
 ]:
-    """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds. Kept for the body used last."""
+    """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds.
+
+    Kept for the body used last.
+    """
     if id(body) not in _HOST:
         template, faces, weights = (
             np.asarray(a) for a in (body.template, body.faces, body.skinning_weights)
@@ -321,12 +346,15 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
     return Build(anatomy.joints.astype(np.float64), anatomy.parents, *radii)
 
 
-# Posed and rendered ---------------------------------------------------------------------------------------------------
+# Posed and rendered
+# --------------------------------------------------------------------------------------------------
 
 
 SUPERSAMPLING = 2
 VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
-"""Sizes of meshes are padded to multiples of these, and points are colored in steps of that length: few shapes are compiled."""
+"""Sizes of meshes are padded to multiples of these, and points are colored in steps of that length:
+few shapes are compiled.
+"""
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 
@@ -343,7 +371,8 @@ Values = Float[np.ndarray, "m 3"]
 
 @dataclasses.dataclass(frozen=True)
 class PosedSubject:
-    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,).
+    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n,
+    3), openness (n,).
 
     lit: (n,) share of the key light that arrives.
     """
@@ -408,9 +437,11 @@ def light_points(
     slopes: Values,
     eye: Array | None = None,
 ) -> Values:
-    """Colors (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the weights of the corners.
+    """Colors (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the
+    weights of the corners.
 
-    eye: camera centre (3,), which decides whether the inner side of cloth is seen; None: everything is seen from outside.
+    eye: camera centre (3,), which decides whether the inner side of cloth is seen; None: everything
+    is seen from outside.
     """
     subject, faces = posed.subject, posed.subject.surface.faces
     values = np.concatenate([posed.normals, posed.openness[:, None], posed.lit[:, None]], axis=1)
@@ -447,7 +478,9 @@ def spots_at(subject: SyntheticSubject, face_ids: Ids, weights: Values) -> Spots
 
 
 def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Values, Values]:
-    """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted folds."""
+    """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted
+    folds.
+    """
     material_ids = subject.face_materials[face_ids]
     albedo, slope = (
         np.empty((len(face_ids), 3), np.float32),

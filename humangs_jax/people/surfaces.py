@@ -1,12 +1,16 @@
-"""Triangle surfaces on the host: cuts along a level set, smoothing, hems, tubes; and convex silhouettes of body parts.
+"""Triangle surfaces on the host: cuts along a level set, smoothing, hems, tubes; and convex
+silhouettes of body parts.
 
-A `Surface` carries per-vertex attributes through every operation: a garment cut out of the body keeps its skinning weights,
-its cloth coordinates and the skin point below it. Metres; faces counter-clockwise seen from outside; float32.
+A `Surface` carries per-vertex attributes through every operation: a garment cut out of the body
+keeps its skinning weights, its cloth coordinates and the skin point below it. Metres; faces
+counter-clockwise seen from outside; float32.
 
-`Boundaries` say what taut cloth around a part of the body measures. The part is cut across an axis into slices; the silhouette of
-a slice is its radius around the slice's centre at `ANGLES` angles, angle 0 at +z and growing towards +x (for slices across y).
+`Boundaries` say what taut cloth around a part of the body measures. The part is cut across an axis
+into slices; the silhouette of a slice is its radius around the slice's centre at `ANGLES` angles,
+angle 0 at +z and growing towards +x (for slices across y).
 
-Also random choices, and smooth random functions of position: plane waves (cheap, band-limited), lattice noise (irregular).
+Also random choices, and smooth random functions of position: plane waves (cheap, band-limited),
+lattice noise (irregular).
 """
 
 import dataclasses
@@ -26,7 +30,9 @@ def choice(rng: np.random.Generator, odds: Mapping[str, float | int]) -> str:
 
 
 class Ripples:
-    """A random band-limited function of points with features of a wavelength: a sum of plane waves, of unit amplitude or so."""
+    """A random band-limited function of points with features of a wavelength: a sum of plane waves,
+    of unit amplitude or so.
+    """
 
     def __init__(self, rng: np.random.Generator, wavelength: float, waves: int = 6):
         direction = rng.normal(size=(3, waves))
@@ -47,7 +53,8 @@ def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> 
 
 
 class Folds:
-    """Creases of cloth: ridges in a few directions, each in patches of its own. The same object is the same function always.
+    """Creases of cloth: ridges in a few directions, each in patches of its own. The same object is
+    the same function always.
 
     upright: all of them run along y.
     """
@@ -87,7 +94,9 @@ class Folds:
 
 
 def lattice(points: np.ndarray, seed: int) -> np.ndarray:
-    """(n,) value noise in [0, 1] of (n, d) points: random values on the integer lattice, blended smoothly; d = 1, 2 or 3."""
+    """(n,) value noise in [0, 1] of (n, d) points: random values on the integer lattice, blended
+    smoothly; d = 1, 2 or 3.
+    """
     base = np.floor(points)
     t = (points - base).astype(np.float32)
     t = t * t * (3 - 2 * t)
@@ -115,7 +124,8 @@ def hashed(cells: np.ndarray, seed: int) -> np.ndarray:
     ) / np.float32(1 << 24)
 
 
-# Surfaces -------------------------------------------------------------------------------------------------------------
+# Surfaces
+# --------------------------------------------------------------------------------------------------
 
 
 Field = Float[np.ndarray, " n"]
@@ -124,7 +134,10 @@ Values = Float[np.ndarray, "n c"]
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """vertices: (n, 3) metres at rest. faces: (f, 3). weights: (n, j) skinning weights. attributes: name -> (n, ...)."""
+    """vertices: (n, 3) metres at rest. faces: (f, 3). weights: (n, j) skinning weights.
+
+    attributes: name -> (n, ...).
+    """
 
     vertices: Points
     faces: Faces
@@ -152,7 +165,9 @@ class Surface:
         return dataclasses.replace(self, attributes={**self.attributes, **attributes})
 
     def painted(self, template: Points, cloth: Points, girth: float) -> "Surface":
-        """The same surface with template and cloth coordinates; girth: radius that turns angles into metres."""
+        """The same surface with template and cloth coordinates; girth: radius that turns angles
+        into metres.
+        """
         cloth = np.concatenate([cloth, np.full((len(cloth), 1), girth)], 1).astype(np.float32)
         return self.with_attributes(template=np.asarray(template, np.float32), cloth=cloth)
 
@@ -189,9 +204,11 @@ def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
 
 
 def smooth(values: Values, faces: Faces, iterations: int, keep_hems: bool = False) -> Values:
-    """Laplacian smoothing of vertex values (n, c): each step moves a vertex halfway towards the mean of its neighbours.
+    """Laplacian smoothing of vertex values (n, c): each step moves a vertex halfway towards the
+    mean of its neighbours.
 
-    keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems stay crisp and do not shrink.
+    keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems
+    stay crisp and do not shrink.
     """
     count = len(values)
     edges = edges_of(faces)
@@ -269,7 +286,9 @@ def join(surfaces: list[Surface]) -> Surface:
 
 
 def turn_in_hems(surface: Surface, depth: float) -> Surface:
-    """A strip folded inwards along every boundary, `depth` metres against the normal: cloth seen edge-on has a thickness."""
+    """A strip folded inwards along every boundary, `depth` metres against the normal: cloth seen
+    edge-on has a thickness.
+    """
     hems = boundary_edges(surface.faces)
     if len(hems) == 0:
         return surface
@@ -283,7 +302,8 @@ def turn_in_hems(surface: Surface, depth: float) -> Surface:
 
 
 def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
-    """Triangles of a (rows, columns) grid of vertices, row-major; `closed`: the last column joins the first.
+    """Triangles of a (rows, columns) grid of vertices, row-major; `closed`: the last column joins
+    the first.
 
     Counter-clockwise seen from the side where columns run to the right and rows run down.
     """
@@ -325,8 +345,10 @@ def sweep(
 ) -> tuple[Points, Faces]:
     """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
 
-    across: (3,) or (m, 3) along the first half axis, made normal to the path. widths: half axes, metres; one, or (m, 1 or 2).
-    closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
+    across: (3,) or (m, 3) along the first half axis, made normal to the path. widths: half axes,
+    metres; one, or (m, 1 or 2).
+    closed: the path's end joins its start; otherwise the ends are open (let the widths run out to
+    close them).
     """
     tangent = (
         unit(np.roll(path, -1, 0) - np.roll(path, 1, 0))
@@ -351,7 +373,9 @@ def circle(count: int) -> Field:
 def around(
     radius: Field | float | int, angle: Field, height: Field, center: np.ndarray | tuple = (0, 0)
 ) -> Points:
-    """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x, z)."""
+    """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x,
+    z).
+    """
     return np.stack(
         [center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1
     )
@@ -367,7 +391,10 @@ _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
 
 @dataclasses.dataclass(frozen=True)
 class Boundaries:
-    """levels: (l,) increasing positions along the axis. centers: (l, 2) across it. radii: (l, ANGLES). Metres."""
+    """levels: (l,) increasing positions along the axis. centers: (l, 2) across it.
+
+    radii: (l, ANGLES). Metres.
+    """
 
     levels: np.ndarray
     centers: np.ndarray
@@ -402,7 +429,8 @@ def boundaries(
 ) -> Boundaries:
     """Silhouettes of the points with position `along` (n,) on the axis and (n, 2) across it.
 
-    levels: (l,) increasing. centers: (l, 2), or None for the middle of each slice. window: half thickness of a slice, metres.
+    levels: (l,) increasing. centers: (l, 2), or None for the middle of each slice. window: half
+    thickness of a slice, metres.
     """
     directions = np.stack([np.sin(_GRID), np.cos(_GRID)])
     support = np.full((len(levels), ANGLES), EMPTY)
@@ -434,7 +462,9 @@ def blurred(shape: Boundaries, times: int = 1) -> Boundaries:
 
 
 def hanging(shape: Boundaries, slope: float) -> Boundaries:
-    """Cloth that hangs: it keeps the largest radius of the slices above it, less `slope` metres per metre."""
+    """Cloth that hangs: it keeps the largest radius of the slices above it, less `slope` metres per
+    metre.
+    """
     radii = shape.radii.copy()
     for i in range(len(radii) - 2, -1, -1):
         radii[i] = np.maximum(

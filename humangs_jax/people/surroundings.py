@@ -1,8 +1,10 @@
-"""What is around a person: cameras and light, for written people from a numpy generator, for those made on the fly on the device.
+"""What is around a person: cameras and light, for written people from a numpy generator, for those
+made on the fly on the device.
 
-Cameras like those of the published protocol: around the person, vertical field of view 60 degrees, near the horizon. Soft light:
-sky and ground, three wide lights, occlusion and soft shadows; a point has one color from wherever it is seen. Occlusion and the
-shadow of the key light are per vertex, from a voxel grid that holds the posed person.
+Cameras like those of the published protocol: around the person, vertical field of view 60 degrees,
+near the horizon. Soft light: sky and ground, three wide lights, occlusion and soft shadows; a point
+has one color from wherever it is seen. Occlusion and the shadow of the key light are per vertex,
+from a voxel grid that holds the posed person.
 """
 
 import functools
@@ -24,12 +26,16 @@ from humangs_jax.people.surfaces import Points, choice
 
 VERTICAL_FOV, ELEVATION = np.deg2rad(60.0), np.deg2rad(np.asarray([-5.0, 15.0]))
 DISTANCE_FACTOR, CLOSE_FACTOR = (1.8, 2.2), (0.8, 1.7)
-"""Distance in bounding radii: nearer than 1.7 the frame cuts heads and feet. Close views show parts of the person."""
+"""Distance in bounding radii: nearer than 1.7 the frame cuts heads and feet.
+
+Close views show parts of the person.
+"""
 CLOSE_SPREAD, CLEARANCE = 0.85, 0.3
-"""Close cameras look at points up to this share of the way from the middle of the person to its surface, and come no nearer to a
-point of it than this (metres)."""
+"""Close cameras look at points up to this share of the way from the middle of the person to its
+surface, and come no nearer to a point of it than this (metres)."""
 FRAME = 0.98
-"""Share of the half frame that the person may reach; a camera that is too near for it steps back."""
+"""Share of the half frame that the person may reach; a camera that is too near for it steps back.
+"""
 POINT_STEP = 4096
 """Points are padded to a multiple of this: few shapes are compiled."""
 JITTER, CAMERA_NUMBERS = 0.3, 5
@@ -47,7 +53,9 @@ def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
 
 
 def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
-    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `JITTER` of the spacing."""
+    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `JITTER` of
+    the spacing.
+    """
     spacing = 2 * np.pi / count
     return rng.uniform(0, spacing) + spacing * (
         np.arange(count) + rng.uniform(-JITTER, JITTER, count)
@@ -57,7 +65,9 @@ def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
 def cameras_around(
     rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
 ) -> Camera:
-    """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's ranges."""
+    """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's
+    ranges.
+    """
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
     elevations = rng.uniform(*ELEVATION, len(azimuths))
@@ -74,7 +84,9 @@ def cameras_around(
 def close_cameras(
     rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
 ) -> Camera:
-    """A batch of cameras that see parts: `CLOSE_FACTOR` bounding radii away from points between middle and surface."""
+    """A batch of cameras that see parts: `CLOSE_FACTOR` bounding radii away from points between
+    middle and surface.
+    """
     center, radius = bounding_sphere(vertices)
     count = len(azimuths)
     towards = vertices[rng.integers(len(vertices), size=count)]
@@ -120,7 +132,8 @@ def camera_from(
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
 
-    u: (5,) in [0, 1). count: vertices that are no padding. close: probability of a close camera; others see all of the person.
+    u: (5,) in [0, 1). count: vertices that are no padding. close: probability of a close camera;
+    others see all of the person.
     """
     is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)
@@ -146,7 +159,9 @@ def camera_from(
 def _nearest_distance(
     ahead: Float[Array, " n"], above: Float[Array, " n"], aside: Float[Array, " n"]
 ) -> Scalar:
-    """Least distance from the origin at which a camera that looks at it has all points in its square frame."""
+    """Least distance from the origin at which a camera that looks at it has all points in its
+    square frame.
+    """
     return jnp.max(
         jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead
     )
@@ -179,7 +194,9 @@ def _axes(azimuth: Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3
 def _along_axes(
     points: Float[Array, "n 3"], azimuth: Number, elevation: Scalar
 ) -> tuple[Float[Array, " n"], ...]:
-    """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and TPU."""
+    """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and
+    TPU.
+    """
     return tuple(jnp.sum(points * axis, -1) for axis in _axes(azimuth, elevation))
 
 
@@ -189,7 +206,8 @@ def azimuths_from(
     scattered_share: float,
     count: Int[Array, ""] | None = None,
 ) -> Float[Array, " v"]:
-    """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing; or anywhere.
+    """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing;
+    or anywhere.
 
     u: 2 + 2 v numbers in [0, 1). count: how many go around once; None: all.
     """
@@ -205,23 +223,27 @@ def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]
     return jnp.minimum((u * count).astype(jnp.int32), count - 1)
 
 
-# Light -----------------------------------------------------------------------------------------------------------------
+# Light
+# --------------------------------------------------------------------------------------------------
 
 
 CELL, GRID, MARGIN = 0.025, (112, 104, 80), 6
-"""Edge of a voxel of the occupancy grid, metres; voxels along x, y and z, more than any pose takes (what lies outside casts no
-shadow); empty voxels around the person."""
+"""Edge of a voxel of the occupancy grid, metres; voxels along x, y and z, more than any pose takes
+(what lies outside casts no shadow); empty voxels around the person."""
 REACH, LIFT = (0.045, 0.11), 0.03
-"""Distances from the surface at which the grid is sampled for openness; height above it at which the way to the light begins."""
+"""Distances from the surface at which the grid is sampled for openness; height above it at which
+the way to the light begins.
+"""
 STRIDES = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
 """Distances towards the key light at which the grid is sampled for shadows, metres."""
 SHADOW_DENSITY, DARKEST = 2.2, 0.4
-"""Extinction per unit of what the samples find, and the least share of the key light that arrives."""
+"""Extinction per unit of what the samples find, and the least share of the key light that arrives.
+"""
 SHOULDER, WHITEST = 0.72, 0.97
 """Brightness from which highlights are compressed, and the one that they approach."""
 WRAP, GLOSS, INSIDE_SHADE = 0.25, 0.12, 0.45
-"""Cosine by which a wide light reaches beyond the terminator; strength of highlights on the glossiest material; brightness of the
-inner side of cloth."""
+"""Cosine by which a wide light reaches beyond the terminator; strength of highlights on the
+glossiest material; brightness of the inner side of cloth."""
 LIGHT_NUMBERS = 28
 WARM = np.asarray([1.0, 0.0, -1.0])
 
@@ -232,8 +254,9 @@ SCENES = {
     "room": (0.16, (-2.0, 2.0), (0.8, 1.35), (0.4, 0.7), (0.1, 0.3), (0.6, 0.78), 0.12, 0.78),
     "window": (0.08, (0.9, 1.9), (0.1, 0.5), (0.8, 1.1), (0.04, 0.15), (0.5, 0.66), -0.08, 0.8),
 }
-"""Kinds of light: odds; azimuth and elevation of the key light (radians), its strength, that of the fill, the sky's; how much
-warmer the key is than the sky; and the ground's brightness against the sky's."""
+"""Kinds of light: odds; azimuth and elevation of the key light (radians), its strength, that of the
+fill, the sky's; how much warmer the key is than the sky; and the ground's brightness against the
+sky's."""
 _SCENES = np.asarray([np.hstack(row) for row in SCENES.values()], np.float32)
 
 
@@ -245,7 +268,8 @@ Values = Float[Array, "*p"]
 class Lights:
     """directions: (k, 3) towards the lights, the key light first. strengths: (k, 3).
 
-    sky, ground: (3,) ambient from above and below. gain: (3,) exposure and white balance of the camera.
+    sky, ground: (3,) ambient from above and below. gain: (3,) exposure and white balance of the
+    camera.
     """
 
     directions: Float[Array, "k 3"]
@@ -256,7 +280,9 @@ class Lights:
 
 
 def sample_lights(rng: np.random.Generator) -> Lights:
-    """A studio, an overcast or a sunny day, a lit room or a window; exposed and balanced by a camera that errs."""
+    """A studio, an overcast or a sunny day, a lit room or a window; exposed and balanced by a
+    camera that errs.
+    """
     scene = SCENES[choice(rng, {name: row[0] for name, row in SCENES.items()})]
     _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
     azimuth = rng.uniform(*azimuths) * rng.choice([-1, 1])
@@ -338,10 +364,12 @@ def shaded_vertices(
     direction: Float[Array, "3"],
     faces: Int[Array, "f 3"] | None = None,
 ) -> tuple[Values, Values]:
-    """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in [DARKEST, 1].
+    """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in
+    [DARKEST, 1].
 
-    faces: where they are given, as for training on the fly, their middles fill the grid as well (meshes may have edges longer
-    than a voxel), and the way to the light is sampled at the nearest voxels, which takes an eighth of the lookups.
+    faces: where they are given, as for training on the fly, their middles fill the grid as well
+    (meshes may have edges longer than a voxel), and the way to the light is sampled at the nearest
+    voxels, which takes an eighth of the lookups.
     """
     low = vertices.min(0) - MARGIN * CELL
     points, towards_light = vertices, _trilinear
@@ -360,7 +388,9 @@ def shaded_vertices(
 
 
 def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
-    """Means over 3 x 3 x 3 voxels, twice; by banded matrices, which XLA does not unroll into one huge expression."""
+    """Means over 3 x 3 x 3 voxels, twice; by banded matrices, which XLA does not unroll into one
+    huge expression.
+    """
     for axis, size in enumerate(GRID):
         apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
         weights = jnp.asarray(np.maximum(3 - apart, 0) / 9, grid.dtype)
@@ -371,7 +401,9 @@ def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
 
 
 def _nearest(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Grid values (n,) at the voxels nearest to fractional indices (n, 3), 0 outside of the grid."""
+    """Grid values (n,) at the voxels nearest to fractional indices (n, 3), 0 outside of the
+    grid.
+    """
     x, y, z = jnp.round(at).astype(jnp.int32).T
     size = jnp.asarray(GRID)
     index = (x * GRID[1] + y) * GRID[2] + z
@@ -380,7 +412,9 @@ def _nearest(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Arra
 
 
 def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Grid values (n,) at fractional indices (n, 3); outside of the grid those of its border, which is empty."""
+    """Grid values (n,) at fractional indices (n, 3); outside of the grid those of its border, which
+    is empty.
+    """
     base = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, jnp.asarray(GRID) - 2)
     t = jnp.clip(at - base, 0, 1)
     index = (base[:, 0] * GRID[1] + base[:, 1]) * GRID[2] + base[:, 2]
@@ -413,7 +447,8 @@ def light_points(
 ) -> Vectors:
     """Colors (p, 3) of points on faces.
 
-    corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's face. weights: of the corners.
+    corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's
+    face. weights: of the corners.
     behind: (p,) whether the inner side is seen. albedo, slopes, sheen: of the material there.
     """
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
@@ -429,7 +464,9 @@ def light_points(
 def shade(
     lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, lit: Values, sheen: Values
 ) -> Vectors:
-    """Colors in [0, 1] of points; normals are unit, `lit` is the share of the key light that arrives."""
+    """Colors in [0, 1] of points; normals are unit, `lit` is the share of the key light that
+    arrives.
+    """
     up = 0.5 + 0.5 * normals[..., 1:2]
     light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
     half = jnp.sqrt(openness)
@@ -445,7 +482,9 @@ def shade(
 
 
 def rolled_off(colors: Vectors) -> Vectors:
-    """Colors from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
+    """Colors from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns
+    out at once.
+    """
     reach = WHITEST - SHOULDER
     colors = jnp.maximum(colors, 0)
     return jnp.minimum(colors, SHOULDER) + reach * (
@@ -462,8 +501,8 @@ def dyes_from(
 ) -> Float[Array, "m 3 3"]:
     """(m, 3, 3) matrices that recolor each piece: hue, saturation and brightness of cloth.
 
-    Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half of the pieces,
-    brightness changes for all.
+    Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half
+    of the pieces, brightness changes for all.
     """
     turned, turn, pale, bright = u
     hue = jnp.where(turned < 0.5, 2 * np.pi * (turn - 0.5), 0.0)

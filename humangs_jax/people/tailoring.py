@@ -1,8 +1,9 @@
-"""How clothes are cut and draped: cuts, shells of cloth around the body, tubes (skirts) around hips and legs.
+"""How clothes are cut and draped: cuts, shells of cloth around the body, tubes (skirts) around hips
+and legs.
 
-A cut is a field over template coordinates (n, 3), see `anatomy`, positive where there is cloth. A shell starts on the skin, is
-smoothed (cloth does not follow navels), moved outwards to the convex silhouettes of trunk and limbs, and never comes nearer to
-the skin than its ease.
+A cut is a field over template coordinates (n, 3), see `anatomy`, positive where there is cloth. A
+shell starts on the skin, is smoothed (cloth does not follow navels), moved outwards to the convex
+silhouettes of trunk and limbs, and never comes nearer to the skin than its ease.
 """
 
 import dataclasses
@@ -37,9 +38,15 @@ from humangs_jax.people.surfaces import (
 TRUNK_HALF_WIDTH = 0.25
 """In T-pose everything further out than this is an arm."""
 NECKLINES = {
-    "crew": (0.0, 0.085), "vee": (0.0, 0.085), "scoop": (-0.012, 0.115), "high": (0.052, 0.085), "collar": (0.012, 0.085),
-}  # fmt: skip
-"""Lift of the neckline's plane, and distance from the neck's axis beyond which the shoulder is always covered."""
+    "crew": (0.0, 0.085),
+    "vee": (0.0, 0.085),
+    "scoop": (-0.012, 0.115),
+    "high": (0.052, 0.085),
+    "collar": (0.012, 0.085),
+}
+"""Lift of the neckline's plane, and distance from the neck's axis beyond which the shoulder is
+always covered.
+"""
 HEM_MARGIN = 0.012
 """Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
 UNDER_A_HEM = 0.009
@@ -66,7 +73,9 @@ def neckline(template: Points, style: str, depth: float) -> Field:
 
 
 def sleeves(template: Points, end: float) -> Field:
-    """Positive inside of |x| = end; for sleeveless tops (end < 0.2) an armhole down to the armpit."""
+    """Positive inside of |x| = end; for sleeveless tops (end < 0.2) an armhole down to the
+    armpit.
+    """
     x, y = np.abs(template[:, 0]), template[:, 1]
     return (
         end + 1.6 * np.maximum(0.03 - y, 0) - x if end < 0.2 else np.where(y > -0.1, end - x, 0.5)
@@ -85,14 +94,18 @@ def trousers(template: Points, top: float, end: float) -> Field:
 
 
 def front_opening(template: Points, gap: float, spread: float) -> Field:
-    """Positive outside of a gap in front, |x| < gap at the chest, wider by `spread` (m/m) downwards and at the neck."""
+    """Positive outside of a gap in front, |x| < gap at the chest, wider by `spread` (m/m) downwards
+    and at the neck.
+    """
     x, y, z = template.T
     wide = gap + spread * np.maximum(-0.05 - y, 0) + 0.25 * np.maximum(y - 0.04, 0) * (y < 0.25)
     return np.maximum(np.abs(x) - wide, 0.03 - z)
 
 
 def collar(template: Points, low: float, high: float, gap: float = 0.012) -> Field:
-    """Positive on a band around the neck between two heights (of the neckline's plane), open in front."""
+    """Positive on a band around the neck between two heights (of the neckline's plane), open in
+    front.
+    """
     x, y, z = template.T
     radial, plane = np.sqrt(x * x + (z + 0.005) ** 2), y + 0.42 * z
     return np.minimum.reduce(
@@ -111,7 +124,9 @@ def lapel(template: Points, gap: float, spread: float, bottom: float) -> Field:
 
 
 def hips_and_legs(template: Points, top: float, bottom: float) -> Field:
-    """Positive on what a tube around hips and legs hides, down to two hands above its hem: they may be seen from below."""
+    """Positive on what a tube around hips and legs hides, down to two hands above its hem: they may
+    be seen from below.
+    """
     x, y, _ = template.T
     return np.minimum.reduce([top - 0.03 - y, y - bottom - 0.16, TRUNK_HALF_WIDTH - np.abs(x)])
 
@@ -129,7 +144,9 @@ def straps(template: Points, low_front: float, low_back: float) -> Field:
 
 
 def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Field:
-    """Positive on a strip across the trunk from one shoulder (x = shoulder, at the top) to the other hip (x = hip)."""
+    """Positive on a strip across the trunk from one shoulder (x = shoulder, at the top) to the
+    other hip (x = hip).
+    """
     x, y, _ = template.T
     along = np.asarray([hip - shoulder, -0.30 - 0.17])
     along = along / np.linalg.norm(along)
@@ -142,7 +159,9 @@ def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Fi
 
 
 def necktie(template: Points, length: float, width: float) -> Field:
-    """Positive on a strip down the chest that widens downwards and ends in a point; a knot on top."""
+    """Positive on a strip down the chest that widens downwards and ends in a point; a knot on
+    top.
+    """
     x, y, z = template.T
     top, bottom = 0.137 - 0.42 * z, 0.1 - length
     knot = 0.007 * np.exp(-(((y - top + 0.012) / 0.014) ** 2))
@@ -167,10 +186,13 @@ def sandal_straps(template: Points) -> tuple[Field, Field]:
 class Fit:
     """How a shell hangs. Metres.
 
-    ease: distance from skin (at least) and from the silhouettes. hang: slope by which hanging cloth may narrow downwards (metres
-    per metre; large clings). sleeve, leg: width added at the end of the limb. fold: height of the folds. hem: depth of the hem.
-    quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this (what is worn below).
-    calm: height above which there are no folds. skirted: below the hips it goes around both legs (tops), not around each.
+    ease: distance from skin (at least) and from the silhouettes. hang: slope by which hanging cloth
+    may narrow downwards (metres per metre; large clings). sleeve, leg: width added at the end of
+    the limb. fold: height of the folds. hem: depth of the hem.
+    quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this
+    (what is worn below).
+    calm: height above which there are no folds. skirted: below the hips it goes around both legs
+    (tops), not around each.
     """
 
     ease: float
@@ -189,7 +211,9 @@ class Fit:
 def shell(
     rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit
 ) -> Surface:
-    """A garment that covers the skin where all fields (n,) over the body's vertices are positive."""
+    """A garment that covers the skin where all fields (n,) over the body's vertices are
+    positive.
+    """
     skin = anatomy.skin
     surface = skin.with_attributes(
         skin_point=skin.vertices,
@@ -203,7 +227,9 @@ def shell(
 
 
 def finished(surface: Surface, iterations: int, hem: float) -> Surface:
-    """A surface with smoothed weights, hems turned in by a depth (metres), and no attributes but `template` and `cloth`."""
+    """A surface with smoothed weights, hems turned in by a depth (metres), and no attributes but
+    `template` and `cloth`.
+    """
     weights = smooth_weights(surface.weights, surface.faces, iterations)
     kept = {name: surface.attributes[name] for name in ("template", "cloth")}
     return surfaces.turn_in_hems(Surface(surface.vertices, surface.faces, weights, kept), hem)
@@ -273,7 +299,9 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
 def _fold_heights(
     rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm: Field, leg: Field, fit: Fit
 ) -> Field:
-    """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints and cuffs gather cloth."""
+    """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints
+    and cuffs gather cloth.
+    """
     along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
     heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
     if fit.fold == 0:
@@ -304,7 +332,9 @@ def _push(
     ease: float,
     extra: Field,
 ) -> Points:
-    """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,) on it; across: other axes."""
+    """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,)
+    on it; across: other axes.
+    """
     center, axes = boundary.center(along), list(across)
     angle, radius = polar(points[:, axes], center)
     missing = np.maximum(boundary.radius(along, angle) + ease + extra - radius, 0)
@@ -325,10 +355,12 @@ def skirt(
     spread: float = 0.0,
     cling: float = 0.0,
 ) -> Surface:
-    """A tube around the hips and both legs between two template heights (top, bottom), `ease` metres wider than they are.
+    """A tube around the hips and both legs between two template heights (top, bottom), `ease`
+    metres wider than they are.
 
-    flare: metres added per metre further down. pleats: number, depth. gap: half width of an opening in front, metres, negative
-    for none; it widens by `spread` metres per metre downwards. cling: metres from the top over which it does not flare.
+    flare: metres added per metre further down. pleats: number, depth. gap: half width of an opening
+    in front, metres, negative for none; it widens by `spread` metres per metre downwards. cling:
+    metres from the top over which it does not flare.
     """
     top, bottom = heights
     rows = max(3, int(np.ceil((top - bottom) / TUBE_STEP)) + 1)
@@ -372,7 +404,9 @@ def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
 def _skirt_weights(
     anatomy: Anatomy, vertices: Points, template_y: Field
 ) -> Float[np.ndarray, "n j"]:
-    """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's side further down."""
+    """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's
+    side further down.
+    """
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.2) & (y < 0.0) & (y > -0.4))[::2]
     trunk = nearest_weights(anatomy, vertices, near)
@@ -386,7 +420,9 @@ def _skirt_weights(
 
 
 def nearest_weights(anatomy: Anatomy, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """(n, j) mean skinning weights of the body vertices nearest to each point, among candidate vertex indices."""
+    """(n, j) mean skinning weights of the body vertices nearest to each point, among candidate
+    vertex indices.
+    """
     body = anatomy.skin.vertices[candidates]
     squared = np.sum(points**2, -1)[:, None] - 2 * points @ body.T + np.sum(body**2, -1)[None]
     nearest = np.argpartition(squared, 6, axis=1)[:, :6]

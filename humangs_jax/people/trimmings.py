@@ -1,7 +1,9 @@
-"""What is sewn on or printed on a fabric: prints, buttons, zips, seams, pockets, ribs, bands, stripes, laces.
+"""What is sewn on or printed on a fabric: prints, buttons, zips, seams, pockets, ribs, bands,
+stripes, laces.
 
-`sewn` is the fabric of a garment with all of that, by the table `SEWN_ON`. Its trimmings take colors (n, 3) at points, the
-points, random numbers and the garment, and return other colors. Words are set in a 5 x 7 alphabet of the package's own.
+`sewn` is the fabric of a garment with all of that, by the table `SEWN_ON`. Its trimmings take
+colors (n, 3) at points, the points, random numbers and the garment, and return other colors. Words
+are set in a 5 x 7 alphabet of the package's own.
 """
 
 from collections.abc import Callable
@@ -23,18 +25,26 @@ ROWS, ADVANCE = 7, 6
 """Cells of a letter: rows, and columns from one letter to the next."""
 
 _ALPHABET = {
-    "A": "0E11111F111111", "B": "1E11111E11111E", "C": "0E11101010110E", "D": "1E11111111111E", "E": "1F10101E10101F",
-    "F": "1F10101E101010", "G": "0E11101711110F", "H": "1111111F111111", "I": "0E04040404040E", "J": "0702020202120C",
-    "K": "11121418141211", "L": "1010101010101F", "M": "111B1515111111", "N": "11191513111111", "O": "0E11111111110E",
-    "P": "1E11111E101010", "Q": "0E11111115120D", "R": "1E11111E141211", "S": "0F10100E01011E", "T": "1F040404040404",
-    "U": "1111111111110E", "V": "11111111110A04", "W": "11111115151B11", "X": "11110A040A1111", "Y": "11110A04040404",
-    "Z": "1F01020408101F", "0": "0E11131519110E", "1": "040C040404040E", "2": "0E11010608101F", "3": "1F02040601110E",
-    "4": "02060A121F0202", "5": "1F101E0101110E", "6": "0608101E11110E", "7": "1F010204080808", "8": "0E11110E11110E",
+    "A": "0E11111F111111", "B": "1E11111E11111E", "C": "0E11101010110E",
+    "D": "1E11111111111E", "E": "1F10101E10101F",
+    "F": "1F10101E101010", "G": "0E11101711110F", "H": "1111111F111111",
+    "I": "0E04040404040E", "J": "0702020202120C",
+    "K": "11121418141211", "L": "1010101010101F", "M": "111B1515111111",
+    "N": "11191513111111", "O": "0E11111111110E",
+    "P": "1E11111E101010", "Q": "0E11111115120D", "R": "1E11111E141211",
+    "S": "0F10100E01011E", "T": "1F040404040404",
+    "U": "1111111111110E", "V": "11111111110A04", "W": "11111115151B11",
+    "X": "11110A040A1111", "Y": "11110A04040404",
+    "Z": "1F01020408101F", "0": "0E11131519110E", "1": "040C040404040E",
+    "2": "0E11010608101F", "3": "1F02040601110E",
+    "4": "02060A121F0202", "5": "1F101E0101110E", "6": "0608101E11110E",
+    "7": "1F010204080808", "8": "0E11110E11110E",
     "9": "0E11110F01020C",
 }  # fmt: skip
 """Seven rows of five bits each, in hexadecimal."""
 
-WORDS = ("OCEAN", "NORTH", "WILD", "NOVA", "CITY", "PEAK", "LOOP", "SUNNY", "TEAM", "RIVER", "ZERO", "MAGIC", "HELLO",
+WORDS = ("OCEAN", "NORTH", "WILD",
+         "NOVA", "CITY", "PEAK", "LOOP", "SUNNY", "TEAM", "RIVER", "ZERO", "MAGIC", "HELLO",
          "FOX")  # fmt: skip
 EMBLEMS = ("disc", "star", "heart", "peaks", "sun", "diamond", "bolt", "ring")
 PRINTS = {"words": 0.3, "emblem": 0.22, "both": 0.22, "logo": 0.13, "picture": 0.13}
@@ -63,7 +73,9 @@ def random_text(rng: np.random.Generator) -> str:
 
 
 def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
-    """(n,) ink of a word at points given in cells from its lower left corner, x to the right, y up; edges are rounded."""
+    """(n,) ink of a word at points given in cells from its lower left corner, x to the right, y up;
+    edges are rounded.
+    """
     padded = np.pad(cells.astype(np.float32), 1)
     column = np.clip(x + 0.5, 0, padded.shape[1] - 1.001)
     row = np.clip(ROWS - y + 0.5, 0, padded.shape[0] - 1.001)
@@ -75,7 +87,10 @@ def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
 
 
 def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
-    """(n,) how far inside of an emblem of radius 1 or so: positive inside, in units of x and y. `points`: of a star."""
+    """(n,) how far inside of an emblem of radius 1 or so: positive inside, in units of x and y.
+
+    `points`: of a star.
+    """
     r, a = np.sqrt(x * x + y * y), np.arctan2(x, y)
     if kind == "disc":
         return 1 - r
@@ -135,7 +150,9 @@ def hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points
 
 
 def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
-    """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a scene."""
+    """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a
+    scene.
+    """
     number, base = "number" in garment.details, garment.fabric.base
     ink = accent(rng, base)
     ink2 = accent(rng, ink)
@@ -244,7 +261,9 @@ def _boundary(x: Field, y: Field, half_width: float, half_height: float) -> Fiel
 def pocketed(
     colors: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str
 ) -> Points:
-    """Pockets as stitched silhouettes: on the chest, in a jacket's front, on jeans (front and back) or on the thighs (cargo)."""
+    """Pockets as stitched silhouettes: on the chest, in a jacket's front, on jeans (front and back)
+    or on the thighs (cargo).
+    """
     sides = rng.choice([1, 2]) if kind == "chest" else 2
     bright = 1.6 if kind == "jeans" and rng.random() < 0.5 else 0.6
     x, y, front = s.template[:, 0], s.template[:, 1], s.cloth[:, 2] > 0
@@ -303,14 +322,16 @@ SEWN_ON = (
     (("coat", *DRESSES), "sash", sashed),
     (("jeans",), "turn_up", turned_up),
 )
-"""Kinds of garments, the detail that they need for it, None: all have it; a trimming, and its further arguments. In this order:
-they share the fabric's random numbers."""
+"""Kinds of garments, the detail that they need for it, None: all have it; a trimming, and its
+further arguments. In this order: they share the fabric's random numbers."""
 
 
 def sewn(
     garment: Garment, hem: float, sleeve: float | None = None, seams: bool = True
 ) -> Callable[[Spots], Points]:
-    """The garment's fabric with stitches at the hem (height y) and the sleeves' ends, seams, prints and what is sewn on."""
+    """The garment's fabric with stitches at the hem (height y) and the sleeves' ends, seams, prints
+    and what is sewn on.
+    """
     details = garment.details
     if "collar" in details and "open" not in details:
         details = details | {"closed collar"}
@@ -382,7 +403,10 @@ def buckled(s: Spots, garment: Garment) -> Points:
 
 
 def bagged(s: Spots, garment: Garment) -> Points:
-    """A bag with a zip around the top, a front pocket and darker edges. Template: the bag's own unit box."""
+    """A bag with a zip around the top, a front pocket and darker edges.
+
+    Template: the bag's own unit box.
+    """
     rng, base = garment.fabric.rng(2), garment.fabric.base
     ink = color(0.1, 0.05, rng.choice([0.1, 0.7]))
     second = accent(rng, base) if rng.random() < 0.3 else base * 0.8

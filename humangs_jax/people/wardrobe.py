@@ -1,4 +1,6 @@
-"""Clothes built: every `Garment` becomes surfaces with materials, layer on layer, and hides what lies well below it."""
+"""Clothes built: every `Garment` becomes surfaces with materials, layer on layer, and hides what
+lies well below it.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +28,10 @@ LAYER = 0.006
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """One surface of one material. hidden: (n,) vertices that a later layer covers; None if it knows no template coordinates."""
+    """One surface of one material.
+
+    hidden: (n,) vertices that a later layer covers; None if it knows no template coordinates.
+    """
 
     surface: Surface
     material: Material
@@ -42,10 +47,11 @@ class Piece:
 
 @dataclasses.dataclass
 class Outfit:
-    """What has been put on so far. cover: (n,) how far inside of some hem each body vertex is, metres; negative on bare skin.
+    """What has been put on so far. cover: (n,) how far inside of some hem each body vertex is,
+    metres; negative on bare skin.
 
-    removed: (n,) hidden body vertices. rng: of the garment that is put on. trunk, legs: distances from the skin of the outermost
-    layer, metres. fit: of the outermost layer on the trunk.
+    removed: (n,) hidden body vertices. rng: of the garment that is put on. trunk, legs: distances
+    from the skin of the outermost layer, metres. fit: of the outermost layer on the trunk.
     """
 
     anatomy: Anatomy
@@ -74,7 +80,9 @@ class Outfit:
         )
 
     def hide(self, cover: Cover, margin: float, cloth: bool = True) -> None:
-        """Take away what lies further than a margin inside of a garment that is put on next: skin, and cloth if it is below."""
+        """Take away what lies further than a margin inside of a garment that is put on next: skin,
+        and cloth if it is below.
+        """
         field = cover(self.template)
         self.cover = np.maximum(self.cover, field)
         self.removed = self.removed | (field > margin)
@@ -92,7 +100,9 @@ class Outfit:
         finish: Callable[[Surface], Surface] = lambda surface: surface,
         over: bool = True,
     ) -> None:
-        """A shell where all cuts (a function of template points, and its further arguments) are positive, and what it hides."""
+        """A shell where all cuts (a function of template points, and its further arguments) are
+        positive, and what it hides.
+        """
         fields = lambda points: [field(points, *arguments) for field, *arguments in cuts]
         surface = finish(shell(self.rng, self.anatomy, fields(self.template), fit))
         self.hide(lambda points: np.min(fields(points), axis=0), margin, over)
@@ -123,7 +133,9 @@ def _bodice(
     margin: float,
     opening: Sequence[Cut] = (),
 ) -> None:
-    """Cloth on trunk and arms, the outermost so far. sizes: depth of the neckline, ends of the sleeves and of the trunk."""
+    """Cloth on trunk and arms, the outermost so far. sizes: depth of the neckline, ends of the
+    sleeves and of the trunk.
+    """
     depth, sleeve, bottom = sizes
     cuts = [
         (tailoring.neckline, neck, depth),
@@ -263,7 +275,9 @@ def _trousers(outfit: Outfit, garment: Garment) -> None:
 
 
 def _let_hang_over(outfit: Outfit, margin: float) -> None:
-    """An untucked top hides the last piece below it, except for a margin inside of the top's hem."""
+    """An untucked top hides the last piece below it, except for a margin inside of the top's
+    hem.
+    """
     lower = outfit.pieces[-1]
     x, y, _ = lower.surface.template.T
     hidden = (y > outfit.lowest + margin) & (np.abs(x) < tailoring.TRUNK_HALF_WIDTH)
@@ -288,7 +302,9 @@ def _skirt(outfit: Outfit, garment: Garment) -> None:
 
 
 def _hem_of(sizes: Mapping[str, float]) -> tuple[float, tuple[int, float]]:
-    """Of a skirt: metres wider per metre down, so that the hem of a short one stands off as far as a long one's; pleats."""
+    """Of a skirt: metres wider per metre down, so that the hem of a short one stands off as far as
+    a long one's; pleats.
+    """
     return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
 
 

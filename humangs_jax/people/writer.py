@@ -1,10 +1,14 @@
-"""Synthetic people as capture folders: images, masks, cameras and body poses on disk, made from seeds.
+"""Synthetic people as capture folders: images, masks, cameras and body poses on disk, made from
+seeds.
 
 out/manifest.json                    settings of the set and finished subjects, see `data.sets`
-out/SEED/                            a capture (docs/capture_format.md): views of one person in one or several poses
-out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
+out/SEED/                            a capture (docs/capture_format.md): views of one person in one
+                                     or several poses
+out/SEED/held_out/                   a capture of its own with the views that reconstruction may not
+                                     see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
-out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see `bank`
+out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see
+                                     `bank`
 """
 
 import dataclasses
@@ -81,7 +85,10 @@ class Layout:
     """Cameras of the same pose, and of each of `novel_poses` others, in held_out/."""
     novel_poses: int = 0
     frames: int = 0
-    """0: poses are independent. Otherwise `poses` evenly spaced frames of a motion of this many frames, 30 a second."""
+    """0: poses are independent.
+
+    Otherwise `poses` evenly spaced frames of a motion of this many frames, 30 a second.
+    """
     scan_texture: int = 0
     """Texels a side of the scan's texture, 0: no scan."""
 
@@ -96,7 +103,10 @@ class View:
 
 
 def sample_pose(subject: SyntheticSubject, index: int) -> PosedSubject:
-    """The subject in its pose of that number, standing on y = 0. Pose 0 is the one of the input views."""
+    """The subject in its pose of that number, standing on y = 0.
+
+    Pose 0 is the one of the input views.
+    """
     rng = np.random.default_rng([subject.seed, POSE_STREAM, index])
     return stand(subject, sample_rotations(rng, subject.build))
 
@@ -109,7 +119,9 @@ def stand(subject: SyntheticSubject, rotations: np.ndarray) -> PosedSubject:
 
 
 def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = None) -> Motion:
-    """The subject's motion, see `sequences`; its lowest points, soles of shoes included, are on y = 0 about all the time."""
+    """The subject's motion, see `sequences`; its lowest points, soles of shoes included, are on y =
+    0 about all the time.
+    """
     sequence = sample_sequence(
         np.random.default_rng([subject.seed, MOTION_STREAM]), subject.build, frames, kind
     )
@@ -190,13 +202,16 @@ def write_set(
     body: BodyModel | None = None,
     progress: bool = True,
 ) -> list[Path]:
-    """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are there already are kept.
+    """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are
+    there already are kept.
 
-    workers: processes; more than one use the CPU, write the same files, and need the calling script to be guarded by
-    `if __name__ == "__main__"`. body: default: the body that comes with the package. progress: show a bar. Returns the folders.
+    workers: processes; more than one use the CPU, write the same files, and need the calling script
+    to be guarded by `if __name__ == "__main__"`. body: default: the body that comes with the
+    package. progress: show a bar. Returns the folders.
 
-    Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by another version of the
-    generator, or (at the end) some could not be made; OSError if nothing can be written there.
+    Raises: ValueError if the people reach beyond the split, `out` was written with other settings
+    or by another version of the generator, or (at the end) some could not be made; OSError if
+    nothing can be written there.
     """
     out, seeds = Path(out), seeds_of(split, first, subjects)
     made_with = {
@@ -232,7 +247,8 @@ def write_set(
     if failed:
         seed, error = next(iter(failed.items()))
         raise ValueError(
-            f"{out}: {len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}"
+            f"{out}: {len(failed)} of {subjects} people could not be made, the first of them"
+            f" {seed}: {error}"
         )
     return list(folders.values())
 
@@ -262,9 +278,11 @@ def _views(
 
 
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
-    """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic, only of one split.
+    """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic,
+    only of one split.
 
-    Other folders (real captures, those of `humangs preprocess`) are taken as they are. split None: any.
+    Other folders (real captures, those of `humangs preprocess`) are taken as they are. split None:
+    any.
     Raises: ValueError if a written set holds a subject of another split, or there is no capture.
     """
     root = Path(root)

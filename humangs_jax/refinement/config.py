@@ -1,4 +1,6 @@
-"""Settings of refinement: how long, what is compared, how fast each parameter moves, what holds it back."""
+"""Settings of refinement: how long, what is compared, how fast each parameter moves, what holds it
+back.
+"""
 
 import dataclasses
 from typing import Annotated, Literal
@@ -30,8 +32,8 @@ HEAD_STEPS = 500
 
 @configuration
 class LearningRates:
-    """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine` lowers all by a cosine
-    and, after iterations, in long runs (`RefineConfig.full_steps`).
+    """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine`
+    lowers all by a cosine and, after iterations, in long runs (`RefineConfig.full_steps`).
     """
 
     means: Spread = 2e-4
@@ -57,23 +59,29 @@ class RefineConfig:
     steps: RefineSteps | None = knob(
         None, cost="blur at few", gain="time in proportion", measured=MEASURED
     )
-    """Limit of the optimizer's steps. None: no limit. 0: iterations alone, which are always finished."""
+    """Limit of the optimizer's steps. None: no limit.
+
+    0: iterations alone, which are always finished.
+    """
     seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(
         5.0, cost="blur at few", gain="time", measured=MEASURED
     )
-    """Limit of the run without compilation; with `steps`, what ends earlier counts. None: no limit. It becomes a number of steps
-    before the first step, by the time that a few take; that number, `Refinement.planned`, repeats the run exactly."""
+    """Limit of the run without compilation; with `steps`, what ends earlier counts. None: no limit.
+    It becomes a number of steps before the first step, by the time that a few take; that number,
+    `Refinement.planned`, repeats the run exactly."""
     head_steps: RefineSteps = knob(
         HEAD_STEPS,
         cost="time in proportion",
         gain="detail of faces",
         measured="benchmarks/quality.md",
     )
-    """Steps on the head alone afterwards, where photos have 512 pixels or more and calibrated cameras, and `seconds` is None or
-    `steps` 0; 0: none. They move the Gaussians of the head by crops of the photos around it, and hold back what grows beyond the
-    masks (see `head.py`)."""
+    """Steps on the head alone afterwards, where photos have 512 pixels or more and calibrated
+    cameras, and `seconds` is None or `steps` 0; 0: none. They move the Gaussians of the head by
+    crops of the photos around it, and hold back what grows beyond the masks (see `head.py`)."""
     region: tuple[str, ...] = HEAD
-    """The region of interest of `head_steps`: parts of the names of its joints; `("left_wrist", "left_index")` is a hand."""
+    """The region of interest of `head_steps`: parts of the names of its joints; `("left_wrist",
+    "left_index")` is a hand.
+    """
     image_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED
     )
@@ -86,16 +94,17 @@ class RefineConfig:
     """What scales the gradients, by its name in optax. The rates suit the steps of Adam."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     full_steps: Steps = 100
-    """After iterations, a run of more steps than this takes smaller ones in proportion: Gaussians that move further overfit to
-    the photos."""
+    """After iterations, a run of more steps than this takes smaller ones in proportion: Gaussians
+    that move further overfit to the photos."""
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
-    """A Gaussian whose largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what
-    no photo shows stays."""
+    """A Gaussian whose largest weight on a pixel of the photos is at least this moves at the full
+    rate, others more slowly; what no photo shows stays."""
     held_out: Share = 0.05
-    """With fewer photos than `search.HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no iteration and no
-    step sees: the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole
-    photo out of a trial, a third of the steps, which decides by its PSNR whether the iterations and how many of the steps are
-    kept; then all photos are fitted. 0: nothing is held out, and the last state is returned."""
+    """With fewer photos than `search.HELD_OUT_PHOTOS` the share of the pixels, in square blocks,
+    that no iteration and no step sees: the state with the highest PSNR on them is returned. With as
+    many or more, any share above 0 holds one whole photo out of a trial, a third of the steps,
+    which decides by its PSNR whether the iterations and how many of the steps are kept; then all
+    photos are fitted. 0: nothing is held out, and the last state is returned."""
     checks: Few = 5
     """How often the PSNR is measured."""
     seed: Seed = 0

@@ -1,7 +1,9 @@
-"""Detail where people look: steps on the head, or another region, alone, in crops of the photos around it.
+"""Detail where people look: steps on the head, or another region, alone, in crops of the photos
+around it.
 
-Only Gaussians of the head move; those around it are drawn. Colors are compared inside of the masks, and alpha beyond a mask costs
-more than in steps on the whole person, so that little coverage grows at the silhouette.
+Only Gaussians of the head move; those around it are drawn. Colors are compared inside of the masks,
+and alpha beyond a mask costs more than in steps on the whole person, so that little coverage grows
+at the silhouette.
 """
 
 import dataclasses
@@ -40,7 +42,9 @@ LEAST_SIDE = 512
 LARGEST_HEAD = 112
 """Pixels: photos are reduced until heads are no larger."""
 LOOK = 1024
-"""Pixels of the photos' longer side in which heads are looked for, at most; crops are of photos of twice that at most."""
+"""Pixels of the photos' longer side in which heads are looked for, at most; crops are of photos of
+twice that at most.
+"""
 SIDES = 32
 """Sides of the crops are multiples of it, pixels."""
 SIMILAR = 1.25
@@ -58,8 +62,9 @@ PARTS = 10
 
 
 class Crops(NamedTuple):
-    """moved: (g,) the Gaussians of the head. drawn: the numbers of those that the crops show. views: the crops. finer: whether
-    these have smaller pixels than the other steps have seen. splat: how they are drawn, with buffers.
+    """moved: (g,) the Gaussians of the head. drawn: the numbers of those that the crops show.
+    views: the crops. finer: whether these have smaller pixels than the other steps have seen.
+    splat: how they are drawn, with buffers.
     """
 
     moved: Bool[np.ndarray, " g"]
@@ -70,8 +75,9 @@ class Crops(NamedTuple):
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
-    """Whether photos are large enough for steps on the head, and cameras exact enough: those that were found from the person are
-    centimetres off. That blurs a face, and the steps would fit the blur.
+    """Whether photos are large enough for steps on the head, and cameras exact enough: those that
+    were found from the person are centimetres off. That blurs a face, and the steps would fit the
+    blur.
     """
     longest = max(capture.images.shape[1:3])
     return capture.calibrated and min(longest, config.image_size or longest) >= LEAST_SIDE
@@ -153,7 +159,9 @@ def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
 
 
 def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops | None:
-    """Crops of the photos around the region; None if the body has none or no photo shows it. capture: of usable views."""
+    """Crops of the photos around the region; None if the body has none or no photo shows it.
+    capture: of usable views.
+    """
     columns = [
         i
         for i, name in enumerate(avatar.joint_names)
@@ -213,7 +221,9 @@ _projected = jax.jit(project)
 def _squares(
     pixels: Float[np.ndarray, "v g 2"], views: SubjectViews
 ) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "v 2"], int]:
-    """The views that show most of the points; (y, x) of the middles of the squares that these fill, and the largest side."""
+    """The views that show most of the points; (y, x) of the middles of the squares that these fill,
+    and the largest side.
+    """
     low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[
         ..., ::-1
     ]

@@ -1,14 +1,16 @@
-"""Learned refinement: in a few iterations a small recurrent network reads the photos' errors at every Gaussian and moves it.
+"""Learned refinement: in a few iterations a small recurrent network reads the photos' errors at
+every Gaussian and moves it.
 
-After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are gathered at the Gaussians, and a
-network that knows the neighbours adds to their parameters; one set of weights for all iterations, no gradient through the errors.
-Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, in place of features of
-a frozen network, and the neighbours are those in the T-pose, at two levels: of Gaussians, and of clusters of them. Between two
-photos, the nearest silhouette that a photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them
-on.
+After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are
+gathered at the Gaussians, and a network that knows the neighbours adds to their parameters; one set
+of weights for all iterations, no gradient through the errors.
+Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's
+parameters, in place of features of a frozen network, and the neighbours are those in the T-pose, at
+two levels: of Gaussians, and of clusters of them. Between two photos, the nearest silhouette that a
+photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them on.
 
-Trained (`python -m experiments train_refiner`) on views that are not among the photos. Parts that no photo shows move with
-their neighbours. Gradient descent on the photos cannot do that.
+Trained (`python -m experiments train_refiner`) on views that are not among the photos. Parts that
+no photo shows move with their neighbours. Gradient descent on the photos cannot do that.
 """
 
 import functools
@@ -45,19 +47,24 @@ CLUSTER_LEVELS, NEAREST_CLUSTERS = 9, 4
 CLUSTER_BLUR = 0.01
 """Metres: what lies this close to the centre of a cluster reads mostly that cluster."""
 PERSON = 8000.0
-"""Pixels of a person in the photos of training: sums over pixels are brought to it, whatever the size of the photos."""
+"""Pixels of a person in the photos of training: sums over pixels are brought to it, whatever the
+size of the photos.
+"""
 SEEN = 0.02
 """A Gaussian of this largest weight on a pixel of a photo counts as seen there."""
 TYPICAL_LOG_SCALE = -4.5
 MOST_PHOTOS = 6
-"""Photos that an iteration looks at, as in training: sums over more are nothing that the network knows, and take longer."""
+"""Photos that an iteration looks at, as in training: sums over more are nothing that the network
+knows, and take longer.
+"""
 
 
 @pytree_dataclass
 class Signals:
     """What photos say about g Gaussians; without the axis v: one photo.
 
-    gradients: of the sum of squared errors of colors and coverage; those of the Gaussians' colors by the foreground alone.
+    gradients: of the sum of squared errors of colors and coverage; those of the Gaussians' colors
+    by the foreground alone.
     visibility: largest weight on a pixel. pixels: sum of the weights.
     """
 
@@ -68,7 +75,10 @@ class Signals:
 
 @pytree_dataclass
 class Neighbors:
-    """A symmetric graph. index: the neighbours of each point, itself where it has fewer. share: 1 / their number, else 0."""
+    """A symmetric graph. index: the neighbours of each point, itself where it has fewer.
+
+    share: 1 / their number, else 0.
+    """
 
     index: Int[Array, "g k"]
     share: Float[Array, "g k"]
@@ -78,8 +88,8 @@ class Neighbors:
 class Graph:
     """Of g Gaussians at two levels.
 
-    gaussians, clusters: the neighbours at each. members: the Gaussians of each cluster. nearest: the clusters around each
-    Gaussian. weights: of those, by distance; they sum to 1.
+    gaussians, clusters: the neighbours at each. members: the Gaussians of each cluster. nearest:
+    the clusters around each Gaussian. weights: of those, by distance; they sum to 1.
     """
 
     gaussians: Neighbors
@@ -103,9 +113,11 @@ def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
 
 
 def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
-    """The Gaussians of 2**CLUSTER_LEVELS clusters of equal size: halved along their longest side, again and again.
+    """The Gaussians of 2**CLUSTER_LEVELS clusters of equal size: halved along their longest side,
+    again and again.
 
-    Some are in more than once, where the number of Gaussians is not a multiple of the number of clusters.
+    Some are in more than once, where the number of Gaussians is not a multiple of the number of
+    clusters.
     """
     count = 2**CLUSTER_LEVELS
     members = np.resize(np.arange(len(means)), (1, count * -(-len(means) // count)))
@@ -137,7 +149,10 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
 
 @jax.custom_vjp
 def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Array, "g c"]:
-    """Mean over the neighbours. Its gradient gathers, too, because the graph is symmetric: scattering is slow on a CPU."""
+    """Mean over the neighbours.
+
+    Its gradient gathers, too, because the graph is symmetric: scattering is slow on a CPU.
+    """
     return jnp.sum(values[neighbors.index] * neighbors.share[..., None], axis=1)
 
 
@@ -157,7 +172,8 @@ neighbor_mean.defvjp(_mean_forward, _mean_backward)
 class Refiner(nn.Module):
     """The network of an iteration.
 
-    width: of its features. layers, cluster_layers: of messages between neighbours. per_photo: width for a photo.
+    width: of its features. layers, cluster_layers: of messages between neighbours. per_photo: width
+    for a photo.
     """
 
     width: int = 48
@@ -175,7 +191,9 @@ class Refiner(nn.Module):
         graph: Graph,
         center: Float[Array, "3"],
     ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
-        """(values, hidden) after an iteration; values: the parameters side by side, start: those before the first one."""
+        """(values, hidden) after an iteration; values: the parameters side by side, start: those
+        before the first one.
+        """
         dense = lambda name, width: nn.Dense(width, name=name)
         errors = _relative_errors(values, signals)
         seen = jnp.minimum(signals.visibility / SEEN, 1.0)[..., None]
@@ -214,7 +232,9 @@ class Refiner(nn.Module):
         return values + moves * LARGEST_MOVES, features
 
     def from_clusters(self, features: Float[Array, "g w"], graph: Graph) -> Float[Array, "g w"]:
-        """Features of the clusters around each Gaussian, after messages between clusters and a mean over all of them."""
+        """Features of the clusters around each Gaussian, after messages between clusters and a mean
+        over all of them.
+        """
         dense = lambda name: nn.Dense(self.width, name=f"cluster_{name}")
         norm = lambda name: nn.LayerNorm(name=f"cluster_{name}")
         clusters = dense("enter")(norm("norm")(jnp.mean(features[graph.members], axis=1)))
@@ -233,7 +253,9 @@ class Refiner(nn.Module):
 
 
 def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Array, "v g 14"]:
-    """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of colors before the sigmoid."""
+    """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of
+    colors before the sigmoid.
+    """
     colors = nn.sigmoid(values[:, 11:])
     longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))
     units = [
@@ -276,7 +298,9 @@ def learned_update(
     iterations: int,
     splat: SplatConfig,
 ) -> tuple[UnconstrainedGaussians, Int[Array, ""]]:
-    """The parameters after some iterations on at most `MOST_PHOTOS` of the photos, evenly spaced; and the overflow."""
+    """The parameters after some iterations on at most `MOST_PHOTOS` of the photos, evenly spaced;
+    and the overflow.
+    """
     start = values = stacked(parameters)
     hidden, overflow = jnp.zeros((len(values), Refiner.width)), jnp.zeros((), jnp.int32)
     used = min(len(photos), MOST_PHOTOS)
@@ -294,7 +318,9 @@ def learned_update(
 def photo_signals(
     parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Signals, Int[Array, ""]]:
-    """Signals of one photo (without the axis v), from the pixels that count; and the overflow. splat: with `visibility`."""
+    """Signals of one photo (without the axis v), from the pixels that count; and the overflow.
+    splat: with `visibility`.
+    """
     image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat)
     gradient, _ = pulled(pull_back, squared_errors(image, photo))
     foreground, _ = pulled(pull_back, foreground_errors(image, photo))
@@ -311,7 +337,9 @@ def squared_errors(image: Image, photo: Photo) -> Image:
 
 @compiled
 def foreground_errors(image: Image, photo: Photo) -> Image:
-    """Likewise of the colors in the foreground alone: what stands before the background is to fade, not to take its color."""
+    """Likewise of the colors in the foreground alone: what stands before the background is to fade,
+    not to take its color.
+    """
     rgb, alpha = squared_errors(image, photo)
     return rgb * photo.mask[..., None], jnp.zeros_like(alpha)
 
@@ -330,11 +358,14 @@ def signals_from(
     rendering: Rendering,
     photo: Photo,
 ) -> Signals:
-    """Signals from `squared_errors`, `foreground_errors` and `colors_alone`, each pulled back to the Gaussians."""
+    """Signals from `squared_errors`, `foreground_errors` and `colors_alone`, each pulled back to
+    the Gaussians.
+    """
     assert rendering.visibility is not None
     scale = PERSON / jnp.maximum(jnp.sum(photo.mask), 1.0)
     gradient = replace(gradient, color_logits=foreground.color_logits)
-    # a change of all three colors of a Gaussian changes the sum of an image by three times its weights
+    # a change of all three colors of a Gaussian changes the sum of an image by three times its
+    # weights
     return Signals(scale * stacked(gradient), rendering.visibility, scale * pixels / 3)
 
 
@@ -366,7 +397,10 @@ def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
 
 
 def read_refiner(path: str | os.PathLike[str]) -> PyTree:
-    """What `save_refiner` wrote. Raises: FileNotFoundError; FileError if it is no safetensors file."""
+    """What `save_refiner` wrote.
+
+    Raises: FileNotFoundError; FileError if it is no safetensors file.
+    """
     variables: dict[str, Any] = {}
     for key, tensor in read_safetensors(path)[0].items():
         layer, name = key.split("/")

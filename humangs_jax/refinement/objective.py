@@ -1,7 +1,9 @@
-"""What refinement moves and what it minimises: unconstrained Gaussians, and the difference of their renderings from the photos.
+"""What refinement moves and what it minimises: unconstrained Gaussians, and the difference of their
+renderings from the photos.
 
-The Gaussians are skinned to the pose of each photo, so the photos may show different poses. All functions are of one photo, pure,
-and pieces of few programs: a run on the host compiles one renderer and its transpose for steps, iterations and comparisons.
+The Gaussians are skinned to the pose of each photo, so the photos may show different poses. All
+functions are of one photo, pure, and pieces of few programs: a run on the host compiles one
+renderer and its transpose for steps, iterations and comparisons.
 """
 
 import dataclasses
@@ -37,7 +39,10 @@ from humangs_jax.rendering.splatting import Rendering, render
 Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
 """Colors and alpha."""
 FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
-"""On a CPU: compiles in 0.8 to 0.9 of the time of level 3, and the programs take the same time. Level 0: eight times."""
+"""On a CPU: compiles in 0.8 to 0.9 of the time of level 3, and the programs take the same time.
+
+Level 0: eight times.
+"""
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -47,7 +52,8 @@ jax.tree_util.register_static(
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: called with arrays, a program of its own; inside of a transformation, a part of that program.
+    """Decorator: called with arrays, a program of its own; inside of a transformation, a part of
+    that program.
 
     Parameters named config and splat are static.
     """
@@ -72,18 +78,25 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-# Parameters --------------------------------------------------------------------------------------------------------------
+# Parameters
+# --------------------------------------------------------------------------------------------------
 
 
 PullBack = Callable[[Image], tuple[UnconstrainedGaussians, Float[Array, " g"]]]
-"""From the gradient with respect to an image to those with respect to the parameters, and to the brightness of each Gaussian."""
+"""From the gradient with respect to an image to those with respect to the parameters, and to the
+brightness of each Gaussian.
+"""
 
 
 def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """What refinement moves: inverse of `gaussians_of`, as far as `unconstrain` is one. Raises: ValueError for harmonics."""
+    """What refinement moves: inverse of `gaussians_of`, as far as `unconstrain` is one.
+
+    Raises: ValueError for harmonics.
+    """
     if gaussians.harmonics is not None:
         raise ValueError(
-            "refine: gaussians.harmonics: expected none: colors that depend on the view are not refined"
+            "refine: gaussians.harmonics: expected none: colors that depend on the view are not"
+            " refined"
         )
     return unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
 
@@ -101,7 +114,8 @@ def avatar_of(parameters: UnconstrainedGaussians, avatar: Avatar) -> Avatar:
     return replace(avatar, gaussians=gaussians_of(parameters, avatar.gaussians.low_pass))
 
 
-# Images and their difference from the photos -----------------------------------------------------------------------------
+# Images and their difference from the photos
+# -----------------------------------------------------------------------------
 
 
 def posed_gaussians(parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo) -> Gaussians:
@@ -155,8 +169,9 @@ def loss_gradient(image: Image, photo: Photo, config: RefineConfig) -> Image:
 class Comparison:
     """Comparison of an avatar with a photo (or with each of some, leading axis v).
 
-    squared: sum over the pixels that count, `pixels` of them, of the squared error. visibility: (g,) the largest weight of each
-    Gaussian on any pixel. overflow: what the buffers had no room for.
+    squared: sum over the pixels that count, `pixels` of them, of the squared error. visibility:
+    (g,) the largest weight of each Gaussian on any pixel. overflow: what the buffers had no room
+    for.
     """
 
     loss: Float[Array, "*v"]

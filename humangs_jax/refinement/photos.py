@@ -1,4 +1,6 @@
-"""The photos that refinement compares with: cut to the person, reduced, with the pixels that are held out."""
+"""The photos that refinement compares with: cut to the person, reduced, with the pixels that are
+held out.
+"""
 
 from collections.abc import Sequence
 
@@ -15,7 +17,9 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 
 MARGIN = 8
-"""Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the silhouette cost alpha there."""
+"""Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the
+silhouette cost alpha there.
+"""
 MULTIPLE = 16
 """Sides of crops are multiples of it, so that few sizes are compiled."""
 COVERED = 0.02
@@ -46,8 +50,8 @@ def photos_of(views: SubjectViews) -> Photo:
 def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectViews:
     """The photos, cut to the person by windows of one size, with the cameras that see the windows.
 
-    In a world with y up (`data.views.upright_world`). Photos whose longer side exceeds `image_size` are reduced to it. Views
-    whose mask does not show the person are left out, see `usable_views`.
+    In a world with y up (`data.views.upright_world`). Photos whose longer side exceeds `image_size`
+    are reduced to it. Views whose mask does not show the person are left out, see `usable_views`.
 
     Raises: ValueError without masks; CaptureError if no view is left.
     """
@@ -77,7 +81,9 @@ def windows(
     cameras: Camera,
     boxes: Sequence[Sequence[Sequence[int]]],
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
-    """Windows of one size around a box in each view, ((top, bottom), (left, right)), and the cameras that see them."""
+    """Windows of one size around a box in each view, ((top, bottom), (left, right)), and the
+    cameras that see them.
+    """
     height, width = masks.shape[1:]
     rows, columns = (
         _window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width))

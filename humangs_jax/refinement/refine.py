@@ -1,7 +1,8 @@
-"""Refinement: the Gaussians of an avatar are fitted to its photos, by iterations of a learned update, then by Adam.
+"""Refinement: the Gaussians of an avatar are fitted to its photos, by iterations of a learned
+update, then by Adam.
 
-The learned update moves what no photo shows, too; Adam leaves it where it is. `refine` crops the photos, and keeps the best of
-what `search` finds until its time is over.
+The learned update moves what no photo shows, too; Adam leaves it where it is. `refine` crops the
+photos, and keeps the best of what `search` finds until its time is over.
 """
 
 import dataclasses
@@ -53,7 +54,8 @@ class Refinement:
     interrupted: bool = False
     """Whether Ctrl-C ended the run."""
     planned: int | None = None
-    """`RefineConfig(steps=planned, seconds=None)` repeats the run exactly; None: it was cut short."""
+    """`RefineConfig(steps=planned, seconds=None)` repeats the run exactly; None: it was cut short.
+    """
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
     head_steps: int = 0
@@ -86,27 +88,32 @@ def refine(
     progress: bool = False,
     watch: Callable[[Avatar], None] | None = None,
 ) -> Avatar:
-    """The avatar, fitted to the photos of a capture, or the avatar itself where that makes it no better.
+    """The avatar, fitted to the photos of a capture, or the avatar itself where that makes it no
+    better.
 
-    Learned-optimizer iterations, then Adam for as long as asked, or steps on the head alone where photos have 512 px or more.
-    Views whose mask does not show the person are left out, and exposure is made equal as in `reconstruct`. Ctrl-C ends the run;
-    the best state until then is returned. `refine_with_report` also tells the steps, the seconds and the gain.
+    Learned-optimizer iterations, then Adam for as long as asked, or steps on the head alone where
+    photos have 512 px or more. Views whose mask does not show the person are left out, and exposure
+    is made equal as in `reconstruct`. Ctrl-C ends the run; the best state until then is returned.
+    `refine_with_report` also tells the steps, the seconds and the gain.
 
     Args:
         avatar: of the person in the photos, on the body of the capture.
         capture: photos with masks, in any poses.
         config: how; None: `RefineConfig()`.
-        seconds: limit, instead of the configuration's; it becomes a number of steps before the first one.
-        steps: the same in steps, which repeats a run exactly on the same machine; 0: iterations, and the head, alone.
+        seconds: limit, instead of the configuration's; it becomes a number of steps before the
+            first one.
+        steps: the same in steps, which repeats a run exactly on the same machine; 0: iterations,
+            and the head, alone.
         progress: show a bar.
-        watch: gets the avatar so far after the iterations and at each of the checks; its time counts.
+        watch: gets the avatar so far after the iterations and at each of the checks; its time
+            counts.
 
     Returns:
         The refined avatar.
 
     Raises:
-        ValueError: if the capture has no view or no masks or no view that shows the person, or its poses have another
-            number of joints than the avatar.
+        ValueError: if the capture has no view or no masks or no view that shows the person, or its
+            poses have another number of joints than the avatar.
 
     Examples:
         >>> sharp = hg.refine(avatar, capture, seconds=15)
@@ -129,8 +136,8 @@ def refine_with_report(
 ) -> Refinement:
     """`refine`, with the number of steps, the seconds and the gain. Arguments, errors: as there.
 
-    A number of steps repeats a run exactly on the same machine; `Refinement.planned` is that of a run that was limited by its
-    seconds.
+    A number of steps repeats a run exactly on the same machine; `Refinement.planned` is that of a
+    run that was limited by its seconds.
     """
     config = config or RefineConfig()
     if seconds is not None or steps is not None:
@@ -220,7 +227,8 @@ def _check(avatar: Avatar, capture: Capture) -> None:
     joints = capture.poses.rotations.shape[1]
     if joints != len(avatar.parents):
         raise ValueError(
-            f"refine: the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}"
+            f"refine: the capture's poses have {joints} joints, the avatar has"
+            f" {len(avatar.parents)}"
         )
 
 

@@ -1,9 +1,11 @@
-"""The search of `refine`: which photos are fitted, by how many iterations of the learned update and how many steps.
+"""The search of `refine`: which photos are fitted, by how many iterations of the learned update and
+how many steps.
 
-With `HELD_OUT_PHOTOS` photos or more, a search is made twice. The trial leaves one photo out and asks it whether the iterations
-help, whether they help without the photo that fits least, and how many of the steps do. Then all photos are fitted as the trial
-says. Iterations alone are tried only if one photo fits much less than the others.
-The photo that is asked is the one that the avatar explains best before it is refined: a photo that misleads is never asked.
+With `HELD_OUT_PHOTOS` photos or more, a search is made twice. The trial leaves one photo out and
+asks it whether the iterations help, whether they help without the photo that fits least, and how
+many of the steps do. Then all photos are fitted as the trial says. Iterations alone are tried only
+if one photo fits much less than the others. The photo that is asked is the one that the avatar
+explains best before it is refined: a photo that misleads is never asked.
 
 With fewer photos, blocks of pixels are held out instead, and one search is made.
 """
@@ -38,24 +40,32 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 T = TypeVar("T")
 
 HELD_OUT_PHOTOS = 4
-"""With this number of photos or more, a whole photo is held out of a trial, not pixels of each: views that no step sees."""
+"""With this number of photos or more, a whole photo is held out of a trial, not pixels of each:
+views that no step sees.
+"""
 TRIAL = 1 / 3
 """Share of the steps that the trial makes."""
 ALLOWED_LOSS = 0.5
-"""Decibels that steps may lose on the photo that is held out: it lacks what they learn from it when all photos are fitted. With
-six validation people they lose up to 0.4 there, and gain at least 0.1 in other views of that pose by all photos."""
+"""Decibels that steps may lose on the photo that is held out: it lacks what they learn from it when
+all photos are fitted. With six validation people they lose up to 0.4 there, and gain at least 0.1
+in other views of that pose by all photos."""
 ALLOWED_LOSS_OF_ITERATIONS = 1.0
-"""Decibels, likewise, that the learned update may lose there: one of eight test people loses 0.2 and gains 2.1 by all."""
+"""Decibels, likewise, that the learned update may lose there: one of eight test people loses 0.2
+and gains 2.1 by all.
+"""
 SUSPICIOUS = 1.5
-"""Loss of the photo that fits least over the median, before refinement, from which on iterations alone are tried first. With
-right poses and masks eight of nine people have 1.0 to 1.3, one 1.55. Half a mask makes 1.6, a body that is turned by 10 degrees
-2.1."""
+"""Loss of the photo that fits least over the median, before refinement, from which on iterations
+alone are tried first. With right poses and masks eight of nine people have 1.0 to 1.3, one 1.55.
+Half a mask makes 1.6, a body that is turned by 10 degrees 2.1."""
 TIMED_STEPS = 3
 """Steps that are timed to plan how many a run has."""
 OVERRUN = 1.5
 """A run ends early, and cannot be repeated, where it takes this many times its seconds."""
 BUFFER_MARGIN = 1.5
-"""Room in the renderer's buffers beyond the need of the start: Gaussians grow. Where it does not suffice, it is doubled."""
+"""Room in the renderer's buffers beyond the need of the start: Gaussians grow.
+
+Where it does not suffice, it is doubled.
+"""
 BUFFERS = ("max_pairs", "max_rows")
 HOST_SETTINGS = {
     "iterations": 1,
@@ -72,7 +82,9 @@ HOST_SETTINGS = {
 
 
 class Clock:
-    """The time of a run without compilation, its number of steps and its bar: all that a run keeps beside its states."""
+    """The time of a run without compilation, its number of steps and its bar: all that a run
+    keeps beside its states.
+    """
 
     def __init__(self, config: RefineConfig, progress: bool = False):
         self.limit, self.seconds = config.steps, config.seconds
@@ -98,7 +110,9 @@ class Clock:
     def with_room(
         self, function: Callable[[SplatConfig], tuple[T, Array]], splat: SplatConfig
     ) -> T:
-        """The result of a function of buffers, which also returns what did not fit: they are doubled until all does."""
+        """The result of a function of buffers, which also returns what did not fit: they are
+        doubled until all does.
+        """
         result, overflow = function(splat)
         with self.compiling() if int(overflow) else contextlib.nullcontext():
             while int(overflow):
@@ -109,9 +123,11 @@ class Clock:
         return result
 
     def plan(self, one_step: Callable[[], RefineState], ahead: float = 0.0) -> int:
-        """How many steps the run has: those of the configuration, or as many as fit into its seconds, by the time of a few.
+        """How many steps the run has: those of the configuration, or as many as fit into its
+        seconds, by the time of a few.
 
-        A number that is fixed before the first step can be repeated. ahead: seconds that other work will take.
+        A number that is fixed before the first step can be repeated. ahead: seconds that other work
+        will take.
         """
         self.planned = self.limit or 0
         if self.seconds is not None and self.limit != 0:
@@ -147,8 +163,9 @@ class Clock:
 class Task(NamedTuple):
     """What a run works with.
 
-    avatar: with the low-pass of the photos. fresh: the same with the scales that the learned update was trained with, without any
-    low-pass of its own. photos: with all their pixels. seen: likewise, without the pixels that are held out. config: the user's.
+    avatar: with the low-pass of the photos. fresh: the same with the scales that the learned update
+    was trained with, without any low-pass of its own. photos: with all their pixels. seen:
+    likewise, without the pixels that are held out. config: the user's.
     settings: what programs are compiled for, the same for runs of 5 s and of 15 s.
     """
 
@@ -163,7 +180,9 @@ class Task(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a run has found. iterations: that the state has had. used: the photos to fit. kept: whether it is the best so far."""
+    """What a run has found. iterations: that the state has had. used: the photos to fit. kept:
+    whether it is the best so far.
+    """
 
     state: RefineState
     iterations: int
@@ -201,11 +220,14 @@ def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
     return dataclasses.replace(configs[0], visibility=True, **most)
 
 
-# The search --------------------------------------------------------------------------------------------------------------
+# The search
+# --------------------------------------------------------------------------------------------------------------
 
 
 def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
-    """What a run finds, one after the other: the last that is kept is its result. each: comparison of the start with photos."""
+    """What a run finds, one after the other: the last that is kept is its result. each:
+    comparison of the start with photos.
+    """
     with task.clock.compiling():  # each part once, so that it is compiled
         if task.config.steps != 0:
             start = start._replace(
@@ -220,8 +242,9 @@ def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
 
 
 def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
-    """The held-out pixels choose the best state. Where there are none, the loss on all pixels decides on the iterations, and the
-    last state of the steps is kept. losses: of the photos, at first.
+    """The held-out pixels choose the best state. Where there are none, the loss on all pixels
+    decides on the iterations, and the last state of the steps is kept. losses: of the photos, at
+    first.
     """
     hidden = [
         replace(all, counted=all.counted & ~seen.counted)
@@ -246,7 +269,9 @@ def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) 
 
 
 def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
-    """A trial without one photo, then a fit of all photos as the trial says. losses: of the photos, at first."""
+    """A trial without one photo, then a fit of all photos as the trial says. losses: of the
+    photos, at first.
+    """
     config, clock, everybody = task.config, task.clock, np.arange(len(losses))
     if config.steps == 0 and np.max(losses) < SUSPICIOUS * np.median(losses):
         clock.planned = 0
@@ -292,8 +317,8 @@ def steps(
     end: int,
     shown: tuple[float, float],
 ) -> Iterator[Found]:
-    """The first `end` of `total` steps on some photos: the state at each check and at the end. shown: from where to where the
-    bar goes.
+    """The first `end` of `total` steps on some photos: the state at each check and at the end.
+    shown: from where to where the bar goes.
     """
     config, clock = task.config, task.clock
     share = min(1.0, config.full_steps / max(total, 1)) if begin.iterations else 1.0
@@ -311,7 +336,8 @@ def steps(
             return
 
 
-# What it is made of: the pure functions of `steps`, `learned` and `objective`, with buffers in which all fits ------------
+# What it is made of: the pure functions of `steps`, `learned` and `objective`, with buffers in
+# which all fits ------------
 
 
 def stepped(task: Task, state: RefineState, view: int | np.integer) -> RefineState:

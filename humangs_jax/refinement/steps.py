@@ -1,6 +1,7 @@
 """Adam's part of refinement: an explicit state, and a step that makes the next one from a photo.
 
-Everything is a pure function for one person: on the host a few compiled programs, under `jax.jit` and `jax.vmap` one.
+Everything is a pure function for one person: on the host a few compiled programs, under `jax.jit`
+and `jax.vmap` one.
 """
 
 from collections.abc import Callable
@@ -49,8 +50,9 @@ OPTIMIZERS: dict[str, Callable[[], optax.GradientTransformation]] = {
 class RefineState:
     """All that steps change, and what they know of the run.
 
-    start: the parameters before the first step. trust: (g,) share of the rates at which a Gaussian moves. moments: those of the
-    optimizer. overflow: (splat, tile) pairs for which the last step had no room. splat: how photos are drawn, with buffers. done,
+    start: the parameters before the first step. trust: (g,) share of the rates at which a Gaussian
+    moves. moments: those of the optimizer. overflow: (splat, tile) pairs for which the last step
+    had no room. splat: how photos are drawn, with buffers. done,
     total: steps. share: of the rates, in the whole run.
     """
 
@@ -68,8 +70,8 @@ class RefineState:
 def init_state(
     parameters: UnconstrainedGaussians, found: Comparison, config: RefineConfig, splat: SplatConfig
 ) -> RefineState:
-    """The state before the first step. found: comparison of the parameters with the photos; Gaussians that no photo shows get
-    no trust.
+    """The state before the first step. found: comparison of the parameters with the photos;
+    Gaussians that no photo shows get no trust.
     """
     return started(parameters, _trust(found.visibility, config), config, splat)
 
@@ -91,7 +93,10 @@ def _trust(visibility: Float[Array, " g"], config: RefineConfig) -> Float[Array,
 
 
 def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig) -> RefineState:
-    """The state after one step on a photo. Where it overflows, it is not to be used: repeat it with larger buffers."""
+    """The state after one step on a photo.
+
+    Where it overflows, it is not to be used: repeat it with larger buffers.
+    """
     image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat)
     gradient, _ = pulled(pull_back, loss_gradient(image, photo, config))
     return update(replace(state, overflow=rendering.overflow), gradient, config)
@@ -123,11 +128,13 @@ def update(
 def refine_views(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, splat: SplatConfig, steps: int
 ) -> tuple[Avatar, Int[Array, ""]]:
-    """`steps` steps of one photo each, in turns, on all pixels: `refine` without its decisions, for `jax.jit` and `jax.vmap`.
+    """`steps` steps of one photo each, in turns, on all pixels: `refine` without its decisions, for
+    `jax.jit` and `jax.vmap`.
 
-    Static: config (its limits, iterations, `full_steps` and held-out pixels are not used), splat (with `max_pairs`, see
-    `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have
-    the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
+    Static: config (its limits, iterations, `full_steps` and held-out pixels are not used), splat
+    (with `max_pairs`, see `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs
+    that did not fit. Batch over people whose arrays have the same shapes with `jax.vmap(...,
+    in_axes=(0, 0, None, None, None))`.
     """
     avatar, photos = with_low_pass_of(avatar, views), photos_of(views)
     parameters = parameters_of(avatar.gaussians)

@@ -1,4 +1,7 @@
-"""Buffers of splatting: how many (splat, tile) pairs fit. Measured on a scene, or guessed for traced calls; what does not fit."""
+"""Buffers of splatting: how many (splat, tile) pairs fit.
+
+Measured on a scene, or guessed for traced calls; what does not fit.
+"""
 
 import dataclasses
 import functools
@@ -22,8 +25,8 @@ from humangs_jax.rendering.tiling import TileGrid, count_pairs, footprints_by
 logger = logging.getLogger(__name__)
 
 PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
-"""Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
-x 1024, where its 16,384 tiles add another 5 each."""
+"""Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512
+x 512 and 15 at 1024 x 1024, where its 16,384 tiles add another 5 each."""
 
 STEPS_PER_OCTAVE = 4
 """Sizes that `round_up` knows per power of two."""
@@ -34,14 +37,17 @@ class BufferOverflowError(ValueError):
 
 
 def round_up(size: int, smallest: int = 64) -> int:
-    """The next (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation, at most a fifth is spare."""
+    """The next (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation, at
+    most a fifth is spare.
+    """
     size = max(size, smallest)
     unit = 1 << max(0, (size - 1).bit_length() - STEPS_PER_OCTAVE.bit_length())
     return -(-size // unit) * unit
 
 
 def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
-    """`max_pairs` of a traced call that gives None: enough for a person, never more than can be needed.
+    """`max_pairs` of a traced call that gives None: enough for a person, never more than can be
+    needed.
 
     g: Gaussians. width, height, tile_size: pixels.
     """
@@ -64,13 +70,15 @@ def plan_buffers(
     config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
 ) -> SplatConfig:
-    """A configuration with buffers for one camera, or for the most demanding one of a batch, times `margin`.
+    """A configuration with buffers for one camera, or for the most demanding one of a batch, times
+    `margin`.
 
-    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays: call it
-    outside of transformations.
+    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation.
+    Measures concrete arrays: call it outside of transformations.
 
-    No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow` above 0 tells, and
-    `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as they are; the program compiles again.
+    No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow`
+    above 0 tells, and `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as
+    they are; the program compiles again.
 
     Args:
         gaussians: one set.
@@ -100,13 +108,16 @@ def raise_on_overflow(
     if missing := int(jnp.max(overflow, initial=0)):
         rows, pairs = _needed(gaussians, cameras, config)
         raise BufferOverflowError(
-            f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
-            f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
+            f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs}"
+            f" and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows ="
+            f" {config.max_rows}"
         )
 
 
 def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
-    """Log a warning when a traced program runs and a view has overflowed, if the configuration asks for it."""
+    """Log a warning when a traced program runs and a view has overflowed, if the configuration asks
+    for it.
+    """
     if config.warn_overflow:  # else nothing is added to the program
         warn = functools.partial(_warn, max_pairs=config.max_pairs, max_rows=config.max_rows)
         jax.debug.callback(warn, jnp.max(overflow, initial=0))
@@ -115,8 +126,8 @@ def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
 def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | None) -> None:
     if missing > 0:
         logger.warning(
-            "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s, max_rows = %s. Larger buffers: "
-            "plan_buffers with the Gaussians as they are now",
+            "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s,"
+            " max_rows = %s. Larger buffers: plan_buffers with the Gaussians as they are now",
             missing,
             max_pairs,
             max_rows,

@@ -1,28 +1,34 @@
 """Front-to-back compositing of splats over tiles, and its hand-written gradient.
 
-A splat is a row of numbers (see `pack_splats`). With d the offset of a pixel centre from the splat's
-centre,
+A splat is a row of numbers (see `pack_splats`). With d the offset of a pixel centre from the
+splat's centre,
 
-    raw_k   = exp(log opacity - (r00 dx + r01 dy)^2 - (r11 dy)^2)                    r^T r = conic / 2, conic = cov2d^-1
+    raw_k   = exp(log opacity - (r00 dx + r01 dy)^2 - (r11 dy)^2)
     alpha_k = min(alpha_max, raw_k), and 0 where raw_k < alpha_min
-    T_k+1   = T_k (1 - alpha_k),  w_k = alpha_k T_k                                  T_0 = 1, nearest splat first
-    C       = sum_k w_k f_k                                                          f_k: features, rgb and z
+    T_k+1   = T_k (1 - alpha_k),  w_k = alpha_k T_k
+    C       = sum_k w_k f_k
 
-and a pixel ends before the first splat whose T_k+1 <= transmittance_stop. The exponent is a sum of squares, hence never
-positive, and accurate for needles, where the conic's quadratic form cancels.
+where r^T r = conic / 2 and conic = cov2d^-1, T_0 = 1 before the nearest splat, and f_k holds the
+splat's features, rgb and z.
 
-Gradient, front to back as well: with g the cotangent of C, g_T that of the final T, and Q = g . C + g_T T_end,
+A pixel ends before the first splat whose T_k+1 <= transmittance_stop. The exponent is a sum of
+squares, hence never positive, and accurate for needles, where the conic's quadratic form cancels.
+
+Gradient, front to back as well: with g the cotangent of C, g_T that of the final T, and Q = g . C +
+g_T T_end,
 
     dL/dalpha_k = (g . f_k) T_k - (Q - sum_{i <= k} w_i g . f_i) / (1 - alpha_k),
 
-so that the backward pass saves nothing per pair: it recomputes alpha and T in the same order with the same decisions.
-alpha enters as log alpha, whose derivative is dL/dalpha_k alpha_k =: e_k, 0 where alpha was clamped or skipped; the
-sums over pixels of e_k (1, dx, dy, dx^2, dx dy, dy^2) give the gradient of a splat's shape. They are matrix products
-with monomials about the tile's centre that are moved to the splat's centre afterwards.
+so that the backward pass saves nothing per pair: it recomputes alpha and T in the same order with
+the same decisions. alpha enters as log alpha, whose derivative is dL/dalpha_k alpha_k =: e_k, 0
+where alpha was clamped or skipped; the sums over pixels of e_k (1, dx, dy, dx^2, dx dy, dy^2) give
+the gradient of a splat's shape. They are matrix products with monomials about the tile's centre
+that are moved to the splat's centre afterwards.
 
-The order of the work is a schedule, one for CPUs and one for accelerators. Pixels and splats are taken relative to a tile's
-centre, so that nothing is lost in float32 however large the image. `vmap` joins the tiles of all images into one list of tiles: a
-batch is one call with more tiles, not a loop of masked loops.
+The order of the work is a schedule, one for CPUs and one for accelerators. Pixels and splats are
+taken relative to a tile's centre, so that nothing is lost in float32 however large the image.
+`vmap` joins the tiles of all images into one list of tiles: a batch is one call with more tiles,
+not a loop of masked loops.
 """
 
 import functools
@@ -54,7 +60,9 @@ def pack_splats(
     features: Float[Array, "g n"],
     alpha_min: float,
 ) -> Float[Array, "g width"]:
-    """Rows x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features; finite where not drawn."""
+    """Rows x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features; finite where not
+    drawn.
+    """
     p = projected
     drawn = p.visible & (opacities >= alpha_min)
     log_opacity = jnp.log(jnp.where(drawn, opacities, 1.0))
@@ -67,8 +75,9 @@ def composite(
 ) -> tuple[Float[Array, "t n p"], Float[Array, "t p"], Float[Array, " g"]]:
     """Draws lists of splats, which must be in depth order, into tiles.
 
-    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; and the largest w of each
-    splat if `config.visibility`, else 0. The first two are differentiable with respect to `splats`, in reverse mode only.
+    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; and
+    the largest w of each splat if `config.visibility`, else 0. The first two are differentiable
+    with respect to `splats`, in reverse mode only.
     """
     return _composite_fwd(splats, lists, grid, config)[0]
 
@@ -107,21 +116,26 @@ def _scheduled(
 def _splat_gradients(
     splats: Float[Array, "g width"], sums: Float[Array, "g width"]
 ) -> Float[Array, "g width"]:
-    """Gradient of the rows from their sums over pixels of e (1, dx, dy, dx^2, dx dy, dy^2) and of w g."""
+    """Gradient of the rows from their sums over pixels of e (1, dx, dy, dx^2, dx dy, dy^2) and of w
+    g.
+    """
     r00, r01, r11 = (splats[:, i] for i in (R00, R01, R11))
     e, ex, ey, exx, exy, eyy = sums[:, :6].T
-    # d log alpha = -2 (u du + v dv) with u = r00 dx + r01 dy, v = r11 dy; the sums of e u dx, e u dy, e v dy:
+    # d log alpha = -2 (u du + v dv) with u = r00 dx + r01 dy, v = r11 dy; the sums of e u dx, e u
+    # dy, e v dy:
     ux, uy, vy = r00 * exx + r01 * exy, r00 * exy + r01 * eyy, r11 * eyy
     u, v = r00 * ex + r01 * ey, r11 * ey
     columns = [2 * r00 * u, 2 * (r01 * u + r11 * v), -2 * ux, -2 * uy, -2 * vy, e]
     return jnp.concatenate([jnp.stack(columns, axis=-1), sums[:, 6:]], axis=-1)
 
 
-# What both schedules share -------------------------------------------------------------------------------------------
+# What both schedules share
+# -------------------------------------------------------------------------------------------
 
 
 def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """Under `vmap`, a function of (splats, items, starts, more per tile...) is called once, with the tiles of all images.
+    """Under `vmap`, a function of (splats, items, starts, more per tile...) is called once, with
+    the tiles of all images.
 
     Its outputs must be arrays per tile or per splat; those of the images then follow one another.
     """
@@ -154,9 +168,11 @@ def take_chunk(
 ) -> tuple[
     Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]
 ]:
-    """The first k splats of each of b lists, `items[starts : starts + counts]`, which lie on `tiles`.
+    """The first k splats of each of b lists, `items[starts : starts + counts]`, which lie on
+    `tiles`.
 
-    Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw alphas (0 past the end).
+    Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw
+    alphas (0 past the end).
     """
     slot = jnp.arange(k, dtype=jnp.int32)
     item = items.at[starts[:, None] + slot].get(mode="clip")
@@ -204,7 +220,9 @@ def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
 def moments_about_splat(
     moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
 ) -> Float[Array, "*b 6"]:
-    """Moments of d = (pixel - splat) from those of (pixel - centre of the tile); x, y: (splat - centre)."""
+    """Moments of d = (pixel - splat) from those of (pixel - centre of the tile); x, y: (splat -
+    centre).
+    """
     m, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
     about = [
         m,
@@ -220,22 +238,25 @@ product = functools.partial(jnp.matmul, precision=EXACT)
 """Sums over pixels as a matrix product."""
 
 
-# Small blocks of tiles, for CPUs -------------------------------------------------------------------------------------
+# Small blocks of tiles, for CPUs
+# -------------------------------------------------------------------------------------
 
-# Tiles come by falling list length in blocks of `config.block`; a block takes its lists in chunks until the longest list ends or
-# all its pixels have. A chunk's arrays (block, chunk, pixels) stay in the cache, and its chain of splats is unrolled, once for
-# each thing that the loop carries: XLA makes of each ONE kernel that runs the chain in registers. Once a pixel has stopped, the
-# loop carries -T, which keeps the final T. Compile with `core.processes.compiler_options`: sharing small kernels out over threads
-# costs more than it gains, and the barriers have to be kept.
+# Tiles come by falling list length in blocks of `config.block`; a block takes its lists in chunks
+# until the longest list ends or all its pixels have. A chunk's arrays (block, chunk, pixels) stay
+# in the cache, and its chain of splats is unrolled, once for each thing that the loop carries: XLA
+# makes of each ONE kernel that runs the chain in registers. Once a pixel has stopped, the loop
+# carries -T, which keeps the final T. Compile with `core.processes.compiler_options`: sharing small
+# kernels out over threads costs more than it gains, and the barriers have to be kept.
 
 LINK = 2
-"""Splats of a chunk whose chain one kernel of the backward pass runs. Its outputs for splat j redo the chain from the
-last stored link on; storing T after every splat costs more than that."""
+"""Splats of a chunk whose chain one kernel of the backward pass runs. Its outputs for splat j redo
+the chain from the last stored link on; storing T after every splat costs more than that."""
 
 
 @functools.lru_cache
 def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the lists (t,), peaks (g,).
+    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the
+    lists (t,), peaks (g,).
 
     peaks: largest w of each splat; 0 unless `config.visibility`.
     """
@@ -305,7 +326,8 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
 
 @functools.lru_cache
 def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over pixels for each splat, (g, 6 + n).
+    """(splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over pixels for each splat,
+    (g, 6 + n).
 
     They are those of e (1, dx, dy, dx^2, dx dy, dy^2), d from the splat's centre, and of w g.
     """
@@ -369,32 +391,45 @@ def _lists_of(tile: Array, starts: Array, counts: Array) -> Iterator[Array]:
     return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))
 
 
-# Few fat steps, for accelerators -------------------------------------------------------------------------------------
+# Few fat steps, for accelerators
+# -------------------------------------------------------------------------------------
 
-# A sequential step costs microseconds there, however little it does. Every list is cut into chunks of `CHUNK` splats, and the
-# chunks of ALL lists of all images of a batch, B at once, become arrays (B, k, p) (p pixels of a tile). The chain over a list
-# becomes products, because along it only log T accumulates:
-#     log T_j = (sum of the log(1 - alpha) before the chunk) + (strict lower triangle (k, k)) @ log(1 - alpha)
-# The sum before the chunk is a product, too, with the 0-1 matrix (B, B) of "earlier chunk of the same list", plus what the list
-# that runs on from the step before has come to, all that steps hand on. The sums over i <= j of w_i g . f_i of the backward pass
-# are formed by the same two products. T agrees with the other schedule's to |log T| eps. Past the stop log T can rise by rounding
-# only while alpha is 0; hence the final log T sums log(1 - alpha) over the splats before the stop. A NaN spreads to other tiles
-# of its step. Scatter-adds: on a GPU the last bit may differ between runs.
+# A sequential step costs microseconds there, however little it does. Every list is cut into chunks
+# of `CHUNK` splats, and the chunks of ALL lists of all images of a batch, B at once, become arrays
+# (B, k, p) (p pixels of a tile). The chain over a list becomes products, because along it only log
+# T accumulates:
+# log T_j = (sum of the log(1 - alpha) before the chunk) + (strict lower triangle (k, k)) @ log(1 -
+# alpha) The sum before the chunk is a product, too, with the 0-1 matrix (B, B) of "earlier chunk of
+# the same list", plus what the list that runs on from the step before has come to, all that steps
+# hand on. The sums over i <= j of w_i g . f_i of the backward pass are formed by the same two
+# products. T agrees with the other schedule's to |log T| eps. Past the stop log T can rise by
+# rounding only while alpha is 0; hence the final log T sums log(1 - alpha) over the splats before
+# the stop. A NaN spreads to other tiles of its step. Scatter-adds: on a GPU the last bit may differ
+# between runs.
 
 CHUNK = 64
-"""Splats of a list in one chunk. The triangular product costs 2 CHUNK flops per pair; half a chunk per list is padding."""
+"""Splats of a list in one chunk.
+
+The triangular product costs 2 CHUNK flops per pair; half a chunk per list is padding.
+"""
 STEP_BYTES = 64 << 20
 """Largest size of one of the arrays (B, k, p) of a step; the backward pass holds five of them."""
 STEP_CHUNKS = 2048
-"""Largest B: the product over earlier chunks costs 2 B / k flops per pair, half of the triangular one at this B."""
+"""Largest B: the product over earlier chunks costs 2 B / k flops per pair, half of the triangular
+one at this B.
+"""
 _LOG_ZERO = -1e3
-"""Stands for log 0 where 1 - alpha_max rounds to 0: its exp is 0, and its product with 0 is 0 and not NaN."""
+"""Stands for log 0 where 1 - alpha_max rounds to 0: its exp is 0, and its product with 0 is 0 and
+not NaN.
+"""
 
 
 class Chunks(NamedTuple):
-    """All lists cut into chunks of at most `CHUNK`, list by list; chunks that are not needed have tile t and count 0.
+    """All lists cut into chunks of at most `CHUNK`, list by list; chunks that are not needed have
+    tile t and count 0.
 
-    tiles, starts, counts: of each chunk. ends: how far into its list it reaches. steps: of B chunks that hold any.
+    tiles, starts, counts: of each chunk. ends: how far into its list it reaches. steps: of B chunks
+    that hold any.
     """
 
     tiles: Int[Array, " s"]
@@ -405,7 +440,9 @@ class Chunks(NamedTuple):
 
 
 def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step: int) -> Chunks:
-    """Cuts lists, of `capacity` items at most together, into chunks; their number is a multiple of `step`."""
+    """Cuts lists, of `capacity` items at most together, into chunks; their number is a multiple of
+    `step`.
+    """
     t = counts.shape[0]
     most = _most_chunks(capacity, t)
     slots = expand((counts + CHUNK - 1) // CHUNK, -(-most // step) * step)
@@ -537,7 +574,9 @@ def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
 def _sums_before(
     x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Sums of x (B, k, p) along its lists: of what comes before each chunk (B, p), and from there to each splat."""
+    """Sums of x (B, k, p) along its lists: of what comes before each chunk (B, p), and from there
+    to each splat.
+    """
     b, k, _ = x.shape
     triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))
     since = lax.optimization_barrier(jnp.matmul(triangle, x, precision=EXACT))

@@ -1,7 +1,8 @@
 """3D Gaussians: the scene that every splatter here draws.
 
-Covariance of a Gaussian: A R diag(s)^2 R^T A^T with R the rotation of its quaternion, s its scales (standard deviations, metres)
-and A an optional linear deformation (blend skinning leaves it; identity if absent).
+Covariance of a Gaussian: A R diag(s)^2 R^T A^T with R the rotation of its quaternion, s its scales
+(standard deviations, metres) and A an optional linear deformation (blend skinning leaves it;
+identity if absent).
 """
 
 import dataclasses
@@ -30,14 +31,17 @@ THINNEST = 1e-5
 class Gaussians(Batchable):
     """A set of 3D Gaussians, or a batch of sets (leading axes on every field).
 
-    means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard deviations, metres.
+    means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard
+    deviations, metres.
     opacities: (g,) in [0, 1]. colors: (g, 3) RGB in [0, 1], as images have them (sRGB-encoded).
-    deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the mean.
-    low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales contain (`avatar.animate`).
-    Renderers add no more than `MIP_EPS2D` pixels^2 then, and dim what this makes larger in images of larger pixels.
-    harmonics: (g, k, 3) or None; spherical harmonics of degrees 1 (k = 3), 1 to 2 (8) or 1 to 3 (15) in the frame of the means:
-    what they add to the colors by the direction of sight, see below. `skin_gaussians` turns them with the Gaussians, so
-    those of an avatar are in its T-pose.
+    deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the
+    mean.
+    low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales
+    contain (`avatar.animate`). Renderers add no more than `MIP_EPS2D` pixels^2 then, and dim what
+    this makes larger in images of larger pixels.
+    harmonics: (g, k, 3) or None; spherical harmonics of degrees 1 (k = 3), 1 to 2 (8) or 1 to 3
+    (15) in the frame of the means: what they add to the colors by the direction of sight, see
+    below. `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its T-pose.
     """
 
     means: Float[Array, "g 3"]
@@ -53,7 +57,8 @@ class Gaussians(Batchable):
 def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Values]]:
     """What `core.checks.check_values` needs to check Gaussians.
 
-    Colors may be any finite numbers: splatting is linear in them, and people draw normals and labels as colors.
+    Colors may be any finite numbers: splatting is linear in them, and people draw normals and
+    labels as colors.
     """
     ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE, "low_pass": NOT_NEGATIVE}
     names = (field.name for field in dataclasses.fields(gaussians))
@@ -63,14 +68,18 @@ def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Value
 
 
 def added_variance(low_pass: Float[Array, " g"] | None, eps2d: float) -> float:
-    """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the scales contain a low-pass."""
+    """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the
+    scales contain a low-pass.
+    """
     return eps2d if low_pass is None else min(eps2d, MIP_EPS2D)
 
 
 def widened(
     scales: Float[Array, "g 3"], low_pass: Float[Array, " g"] | None, sign: int = 1
 ) -> Float[Array, "g 3"]:
-    """Scales with the low-pass of pixels of a size in metres, all but `MIP_EPS2D` of it. sign: -1 takes it away again."""
+    """Scales with the low-pass of pixels of a size in metres, all but `MIP_EPS2D` of it. sign: -1
+    takes it away again.
+    """
     if low_pass is None:
         return scales
     added = sign * (EPS2D - MIP_EPS2D) * jnp.square(low_pass)
@@ -93,7 +102,8 @@ def covariances(gaussians: Gaussians) -> Float[Array, "g 3 3"]:
 
 
 def factored(gaussians: Gaussians) -> Gaussians:
-    """The same covariances without `deformations`: quats and scales from the singular vectors of A R diag(s).
+    """The same covariances without `deformations`: quats and scales from the singular vectors of A
+    R diag(s).
 
     Not meant to be differentiated: the factors are not unique where two scales coincide.
     """
@@ -110,14 +120,17 @@ def skin_gaussians(
     transforms: Float[Array, "g 4 4"],
     mode: Literal["affine", "rotation"] = "affine",
 ) -> Gaussians:
-    """Move each Gaussian by its (blended) transform; scales, opacities and colors stay, harmonics turn with it: by the rotation
-    that the quaternion of the linear part stands for.
+    """Move each Gaussian by its (blended) transform; scales, opacities and colors stay, harmonics
+    turn with it: by the rotation that the quaternion of the linear part stands for.
 
-    affine: the covariance is transformed by the full linear part, which is appended to `deformations`.
-    rotation: as published, the linear part times the Gaussian's rotation matrix is read as a quaternion. Where blending
-    left no rotation the quaternion's norm is below 1; draw with `normalize_quats=False` to reproduce that.
+    affine: the covariance is transformed by the full linear part, which is appended to
+    `deformations`.
+    rotation: as published, the linear part times the Gaussian's rotation matrix is read as a
+    quaternion. Where blending left no rotation the quaternion's norm is below 1; draw with
+    `normalize_quats=False` to reproduce that.
 
-    Raises: ValueError for another mode, or for `rotation` of Gaussians that carry deformations already.
+    Raises: ValueError for another mode, or for `rotation` of Gaussians that carry deformations
+    already.
     """
     linear, means = transforms[:, :3, :3], transform.apply(transforms, gaussians.means)
     if gaussians.harmonics is not None:
@@ -142,15 +155,16 @@ def skin_gaussians(
 SMALLEST_SCALE = 1e-6
 """Metres; keeps the logarithm finite for flat Gaussians."""
 COLOR_MARGIN, OPACITY_MARGIN = 0.005, 0.001
-"""How far both are pulled inside (0, 1), where the gradient of the sigmoid does not vanish; opacities less than the smallest that
-is drawn, 1/255, so that what is hidden stays hidden."""
+"""How far both are pulled inside (0, 1), where the gradient of the sigmoid does not vanish;
+opacities less than the smallest that is drawn, 1/255, so that what is hidden stays hidden."""
 
 
 @pytree_dataclass
 class UnconstrainedGaussians(Batchable):
     """Parameters of Gaussians, or a batch of them, for optax.
 
-    means: (g, 3) metres. quats: (g, 4), of any length. log_scales: (g, 3) of metres. opacity_logits: (g,). color_logits: (g, 3).
+    means: (g, 3) metres. quats: (g, 4), of any length. log_scales: (g, 3) of metres.
+    opacity_logits: (g,). color_logits: (g, 3).
     harmonics: (g, k, 3) or None, as they are.
     """
 
@@ -164,7 +178,8 @@ class UnconstrainedGaussians(Batchable):
 
 @checked_arguments
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Inverse of `constrain`, but for opacities and colors within `OPACITY_MARGIN` and `COLOR_MARGIN` of 0 or 1.
+    """Inverse of `constrain`, but for opacities and colors within `OPACITY_MARGIN` and
+    `COLOR_MARGIN` of 0 or 1.
 
     Args:
         gaussians: without deformations. A low-pass is no parameter: it stays in the scales.
@@ -177,13 +192,15 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
 
     Examples:
         >>> parameters = hg.unconstrain(gaussians)
-        >>> loss = lambda p: jnp.mean(jnp.square(hg.render(hg.constrain(p), camera, config).rgb - photo))
+        >>> image = lambda p: hg.render(hg.constrain(p), camera, config).rgb
+        >>> loss = lambda p: jnp.mean(jnp.square(image(p) - photo))
         >>> updates, state = optimizer.update(jax.grad(loss)(parameters), state)
         >>> parameters = optax.apply_updates(parameters, updates)
     """
     if gaussians.deformations is not None:
         raise ValueError(
-            "unconstrain: the Gaussians carry deformations: take rendering.gaussians.factored(gaussians)"
+            "unconstrain: the Gaussians carry deformations: take"
+            " rendering.gaussians.factored(gaussians)"
         )
     parameters = UnconstrainedGaussians(
         gaussians.means,
@@ -193,7 +210,8 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
         inverse_sigmoid(gaussians.colors, COLOR_MARGIN),
         gaussians.harmonics,
     )
-    # of `jnp.full(n, 0.5)` types are weak, those of a step's result are not: the step would compile twice
+    # of `jnp.full(n, 0.5)` types are weak, those of a step's result are not: the step would compile
+    # twice
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
 
 
@@ -220,13 +238,14 @@ def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
     )
 
 
-# Colors that depend on the direction of sight: real spherical harmonics, by the convention of 3DGS. With d the unit vector from
-# the camera's centre to the mean, in the world, Gaussians are drawn in the color
+# Colors that depend on the direction of sight: real spherical harmonics, by the convention of 3DGS.
+# With d the unit vector from the camera's centre to the mean, in the world, Gaussians are drawn in
+# the color
 #
 #     max(colors + sum_k Y_k(d) harmonics_k, 0),     colors = 1/2 + Y_00 f_dc in files of 3DGS.
-#
-# Y_k: by degree l, then by order m from -l to l, normalised over the sphere, with the sign (-1)^m of Condon and Shortley, as in
-# https://github.com/graphdeco-inria/diff-gaussian-rasterization (Y_1 = -c y, Y_2 = c z, Y_3 = -c x).
+#  Y_k: by degree l, then by order m from -l to l, normalised over the sphere, with the sign (-1)^m
+# of Condon and Shortley, as in https://github.com/graphdeco-inria/diff-gaussian-rasterization (Y_1
+# = -c y, Y_2 = c z, Y_3 = -c x).
 
 COUNTS = (0, 3, 8, 15)
 """Of the functions of degrees 1 to l, by l."""
@@ -280,7 +299,9 @@ def added_colors(
 def turned_harmonics(
     harmonics: Float[Array, "*g k 3"], rotations: Float[Array, "*#g 3 3"]
 ) -> Float[Array, "*g k 3"]:
-    """Harmonics of the same colors after everything has been turned: those that were seen along d are seen along R d."""
+    """Harmonics of the same colors after everything has been turned: those that were seen along d
+    are seen along R d.
+    """
     count = harmonics.shape[-2]
     points, inverse = _points(count)
     before = jnp.matmul(jnp.asarray(points, harmonics.dtype), rotations, precision=EXACT)
@@ -291,7 +312,9 @@ def turned_harmonics(
 
 @functools.cache
 def _points(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (p, 3) on a spiral, and the matrix (k, p) from the values there to the factors of the functions."""
+    """Unit vectors (p, 3) on a spiral, and the matrix (k, p) from the values there to the factors
+    of the functions.
+    """
     z = 1 - (2 * np.arange(POINTS) + 1) / POINTS
     angle = np.pi * (1 + math.sqrt(5)) * np.arange(POINTS)
     ring = np.sqrt(1 - z * z)

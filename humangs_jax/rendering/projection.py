@@ -1,23 +1,29 @@
-"""EWA projection: 3D Gaussians to 2D Gaussians on the image (Zwicker et al. 2001; Kerbl et al. 2023).
+"""EWA projection: 3D Gaussians to 2D Gaussians on the image (Zwicker et al. 2001; Kerbl et al.
+2023).
 
 With p = (X, Y, Z) the mean in the camera's frame, fx, fy, cx, cy of K and W the camera's rotation,
 
     mean2d = (fx X/Z + cx, fy Y/Z + cy)
-    J      = [[fx/Z, 0, -fx X/Z^2], [0, fy/Z, -fy Y/Z^2]]             the projection's derivative at p
-    cov2d  = M M^T + eps2d I,   M = J W A R diag(s)                (2, 3), A R diag(s) the factor of the covariance
+    J      = [[fx/Z, 0, -fx X/Z^2], [0, fy/Z, -fy Y/Z^2]]
+    cov2d  = M M^T + eps2d I,   M = J W A R diag(s)
 
-Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the projection, and its
-gradient, into a few loops. Its determinant is not taken from the entries of cov2d, where float32 cancels for needles,
-but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 + |m1|^2) + eps2d^2 for the rows m0, m1 of M. What is drawn is
-the upper triangular r with r^T r = cov2d^-1 / 2, whose gradient is written by hand for the same reason.
+where J is the projection's derivative at p, and A R diag(s) the factor of the covariance; M is
+(2, 3).
 
-The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels of s metres
-(`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d), where e = eps2d (s fx/Z)^2 <= eps2d is what
-was added in images of such pixels: what they weigh together stays the same in smaller images (Mip-Splatting's 2D filter,
+Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the
+projection, and its gradient, into a few loops. Its determinant is not taken from the entries of
+cov2d, where float32 cancels for needles, but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 +
+|m1|^2) + eps2d^2 for the rows m0, m1 of M. What is drawn is the upper triangular r with r^T r =
+cov2d^-1 / 2, whose gradient is written by hand for the same reason.
+
+The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels
+of s metres (`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d),
+where e = eps2d (s fx/Z)^2 <= eps2d is what was added in images of such pixels: what they weigh
+together stays the same in smaller images (Mip-Splatting's 2D filter,
 https://arxiv.org/abs/2311.16493, equation 9, which has e = 0).
 
-Gaussians that are not drawn (centre nearer than `near` or behind, footprint beyond `LARGEST_FOOTPRINT`) have finite
-values and pass zero gradients. K's skew is taken as 0.
+Gaussians that are not drawn (centre nearer than `near` or behind, footprint beyond
+`LARGEST_FOOTPRINT`) have finite values and pass zero gradients. K's skew is taken as 0.
 """
 
 import functools
@@ -47,9 +53,11 @@ Planes = list[Array]
 class ProjectedGaussians(NamedTuple):
     """2D Gaussians on the image, planes of (g,). In gsplat's arrays: `means2d`, `depths`, `conics`.
 
-    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, eps2d included.
-    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic / 2, 1 / pixels,
-    finite where not drawn. visible: whether it is drawn. dimming: factor of the opacity in (0, 1], None without low-pass.
+    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2,
+    eps2d included.
+    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic
+    / 2, 1 / pixels, finite where not drawn. visible: whether it is drawn. dimming: factor of the
+    opacity in (0, 1], None without low-pass.
     added_colors: what harmonics add to the colors from here, None without.
     """
 
@@ -92,8 +100,8 @@ def project_gaussians(
 ) -> ProjectedGaussians:
     """Every Gaussian on the image that `config` draws: the first half of `splatting.render`.
 
-    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the half field of view beyond the
-    border.
+    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the
+    half field of view beyond the border.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d, jacobian_margin = (
@@ -174,20 +182,23 @@ def _cross(m0: Planes, m1: Planes, j: int, i: int) -> Array:
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _conic_factor(m0: Planes, m1: Planes, eps2d: float) -> tuple[Array, Array, Array]:
-    """Upper triangular r with r^T r = cov2d^-1 / 2: r00, r01, r11. Where cov2d is singular, some finite numbers.
+    """Upper triangular r with r^T r = cov2d^-1 / 2: r00, r01, r11. Where cov2d is singular, some
+    finite numbers.
 
-    Gradient. With k the symmetric matrix of k00 = r00 g00 + r01 g01, k01 = r11 g01, k11 = r11 g11 (g: the cotangents),
+    Gradient. With k the symmetric matrix of k00 = r00 g00 + r01 g01, k01 = r11 g01, k11 = r11 g11
+    (g: the cotangents),
 
         dL/dM = -2 r^T k r M.
 
-    For a needle of length l and width w, in pixels, the entries of r are of the order of 1 / w, but r's product with
-    its long axis is of the order of 1. In
+    For a needle of length l and width w, in pixels, the entries of r are of the order of 1 / w, but
+    r's product with its long axis is of the order of 1. In
 
         (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + eps2d m0_j),     (r M)_1j = r11 m1_j
 
-    the term that would cancel, m_j x m_j, is left out. Autodiff sums two terms that cancel, through yy and through the
-    determinant; that is ten times less accurate, and once the determinant passes 2e19 pixels^4 (7e4 pixels square: the square
-    of the determinant overflows) one of them is lost and the gradient along the long axis is as large as across.
+    the term that would cancel, m_j x m_j, is left out. Autodiff sums two terms that cancel, through
+    yy and through the determinant; that is ten times less accurate, and once the determinant passes
+    2e19 pixels^4 (7e4 pixels square: the square of the determinant overflows) one of them is lost
+    and the gradient along the long axis is as large as across.
     """
     _, xy, yy, determinant = _covariance(m0, m1, eps2d)
     regular = determinant > 0
@@ -250,9 +261,9 @@ def _times(rows: Sequence[Planes], matrix: Sequence[Planes]) -> list[Planes]:
 def _planes(columns: Array) -> Planes:
     """(g, c) -> c planes of (g,).
 
-    The gradient joins the planes by selection. Autodiff's concatenation (or sum of padded planes) gets fused with the
-    expressions that it joins, and XLA's CPU backend then evaluates their common parts anew at each use: measured, 50 to
-    100 times slower.
+    The gradient joins the planes by selection. Autodiff's concatenation (or sum of padded planes)
+    gets fused with the expressions that it joins, and XLA's CPU backend then evaluates their common
+    parts anew at each use: measured, 50 to 100 times slower.
     """
     return [columns[:, i] for i in range(columns.shape[1])]
 

@@ -1,12 +1,15 @@
-"""The image by its definition: every Gaussian on every pixel, one after the other. The oracle of `splatting`.
+"""The image by its definition: every Gaussian on every pixel, one after the other. The oracle of
+`splatting`.
 
-Shares no code with the tiled renderer: its projection multiplies plain matrices, its compositing is the loop of the
-formula, its gradients are autodiff's. With a_j the columns of M and C = cov2d = M M^T + eps2d I, the exponent is
+Shares no code with the tiled renderer: its projection multiplies plain matrices, its compositing is
+the loop of the formula, its gradients are autodiff's. With a_j the columns of M and C = cov2d = M
+M^T + eps2d I, the exponent is
 
-    d^T C^-1 d = (sum_j (a_j x d)^2 + eps2d |d|^2) / det C,   det C = sum_i<j (a_i x a_j)^2 + eps2d |M|^2 + eps2d^2,
+    d^T C^-1 d = (sum_j (a_j x d)^2 + eps2d |d|^2) / det C,
+    det C      = sum_i<j (a_i x a_j)^2 + eps2d |M|^2 + eps2d^2,
 
-sums of squares, accurate for needles of any length (the inverse of C has no correct digit left at 1e8 pixels). Memory and
-time grow with Gaussians times pixels; use it in float64 on small images.
+sums of squares, accurate for needles of any length (the inverse of C has no correct digit left at
+1e8 pixels). Memory and time grow with Gaussians times pixels; use it in float64 on small images.
 """
 
 import functools
@@ -38,7 +41,8 @@ def render_reference(
     background: Background = None,
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
-    """The image of `render` by its definition, without tiles or buffers, in the precision of its arguments.
+    """The image of `render` by its definition, without tiles or buffers, in the precision of its
+    arguments.
 
     Of `config`, only what decides on what is drawn is read. Values are not checked.
 
@@ -126,9 +130,11 @@ def _reference(
 def _project(
     gaussians: Gaussians, camera: Camera, config: SplatConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie at z = 1.
+    """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie
+    at z = 1.
 
-    Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d I.
+    Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d
+    I.
     """
     p = transform.apply(camera.cam_from_world, gaussians.means)
     visible = p[:, 2] > config.near
@@ -159,7 +165,9 @@ def _project(
 
 
 def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
-    """Real spherical harmonics of degrees 1 to `degree` of unit vectors: N P_l^m (cos m phi, sin m phi), by recurrence."""
+    """Real spherical harmonics of degrees 1 to `degree` of unit vectors: N P_l^m (cos m phi, sin m
+    phi), by recurrence.
+    """
     x, y, z = sight.T
     cosine, sine, found = (
         jnp.ones_like(x),
@@ -191,7 +199,9 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
 
 
 def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:
-    """Determinant of axes axes^T + eps2d I (Cauchy-Binet): of a needle, the matrix itself cancels in float64 too."""
+    """Determinant of axes axes^T + eps2d I (Cauchy-Binet): of a needle, the matrix itself cancels
+    in float64 too.
+    """
     pairs = _cross(axes[..., jnp.asarray([0, 1, 2])], axes[..., jnp.asarray([1, 2, 0])])
     return jnp.sum(pairs**2, axis=-1) + eps2d * jnp.sum(axes**2, axis=(-1, -2)) + eps2d**2
 

@@ -1,9 +1,11 @@
-"""Every knob of the splatting renderer, in one frozen dataclass, and its presets. For JAX it is a pytree without leaves.
+"""Every knob of the splatting renderer, in one frozen dataclass, and its presets. For JAX it is a
+pytree without leaves.
 
 Two rasterizers set the conventions: INRIA's diff-gaussian-rasterization
-(https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat (https://github.com/nerfstudio-project/gsplat). Ours
-are gsplat's where they differ, except that nothing is cut at three standard deviations: a footprint ends where its alpha falls
-below `ALPHA_MIN`, so the image follows from the formula and not from a bounding box.
+(https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat
+(https://github.com/nerfstudio-project/gsplat). Ours are gsplat's where they differ, except that
+nothing is cut at three standard deviations: a footprint ends where its alpha falls below
+`ALPHA_MIN`, so the image follows from the formula and not from a bounding box.
 """
 
 import dataclasses
@@ -26,28 +28,35 @@ NEAR = 0.01
 """Metres; Gaussians whose centre is nearer (or behind) are not drawn. gsplat 0.01; INRIA 0.2."""
 
 EPS2D = 0.3
-"""Pixels^2 added to both variances of the image: a low-pass of about one pixel, without which a Gaussian thinner than a
-pixel falls between pixel centres. The same in INRIA and gsplat; opacity is not compensated for it (gsplat
-"classic")."""
+"""Pixels^2 added to both variances of the image: a low-pass of about one pixel, without which a
+Gaussian thinner than a pixel falls between pixel centres. The same in INRIA and gsplat; opacity is
+not compensated for it (gsplat "classic")."""
 
 MIP_EPS2D = 0.1
-"""Pixels^2, for Gaussians whose scales contain the low-pass of the images that they were fitted to: about the footprint of a
-pixel, so that images of other sizes show them as wide as those did (Mip-Splatting, https://arxiv.org/abs/2311.16493)."""
+"""Pixels^2, for Gaussians whose scales contain the low-pass of the images that they were fitted to:
+about the footprint of a pixel, so that images of other sizes show them as wide as those did
+(Mip-Splatting, https://arxiv.org/abs/2311.16493)."""
 
 LEAST_DIMMING = 1e-4
-"""Of opacities, by the variance that is added: a factor too small to be seen, which keeps gradients finite."""
+"""Of opacities, by the variance that is added: a factor too small to be seen, which keeps gradients
+finite.
+"""
 
 ALPHA_MIN = 1 / 255
 """A smaller alpha is skipped: it could not change an 8-bit image by itself. The same everywhere."""
 
 ALPHA_MAX = 0.999
-"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat and INRIA have 0.99."""
+"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat and INRIA have 0.99.
+"""
 
 TRANSMITTANCE_STOP = 1e-4
 """A pixel ends before the splat that would leave a transmittance T <= this. The same everywhere."""
 
 LARGEST_FOOTPRINT = 1e9
-"""Pixels; a Gaussian with a longer projected axis is not drawn. Its square's square would overflow float32."""
+"""Pixels; a Gaussian with a longer projected axis is not drawn.
+
+Its square's square would overflow float32.
+"""
 
 MEASURED = "performance.md"
 
@@ -55,8 +64,8 @@ MEASURED = "performance.md"
 @jax.tree_util.register_static
 @configuration
 class SplatConfig:
-    """What is drawn, where footprints end, what is computed, in which buffers, on which schedule. docs/knobs.md gives what
-    each knob costs and gains.
+    """What is drawn, where footprints end, what is computed, in which buffers, on which schedule.
+    docs/knobs.md gives what each knob costs and gains.
     """
 
     near: Annotated[float, Range(0, 1e6)] = NEAR
@@ -84,15 +93,19 @@ class SplatConfig:
         gain="14 %, 27 %, 35 % of the time",
         measured=MEASURED,
     )
-    """Standard deviations at which footprints end; a splat is drawn on whole tiles, all that its footprint meets. None: where
-    alpha falls below alpha_min, so that nothing is lost. Smaller values draw faster; the image then depends on tile_size."""
+    """Standard deviations at which footprints end; a splat is drawn on whole tiles, all that its
+    footprint meets. None: where alpha falls below alpha_min, so that nothing is lost. Smaller
+    values draw faster; the image then depends on tile_size."""
     square: bool = False
-    """INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the larger standard deviation,
-    rounded up to pixels, at tiles as INRIA counts them."""
+    """INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the
+    larger standard deviation, rounded up to pixels, at tiles as INRIA counts them."""
     visibility: bool = knob(
         False,
         cost="memory of one number a Gaussian",
-        gain="`seen_from(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop 0.001: 0.75 of the time at 53.9 dB",
+        gain=(
+            "`seen_from(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop 0.001: 0.75"
+            " of the time at 53.9 dB"
+        ),
         measured=MEASURED,
     )
     """Whether `Rendering.visibility` is computed."""
@@ -102,22 +115,27 @@ class SplatConfig:
         gain="memory, one compilation",
         measured=MEASURED,
     )
-    """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and
-    takes `buffers.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and `plan_buffers`
-    measures a capacity for such calls."""
+    """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under
+    jit, grad or vmap) cannot, and takes `buffers.default_pairs(g, width, height)`; what does not
+    fit is counted in `Rendering.overflow`, and `plan_buffers` measures a capacity for such calls.
+    """
     max_rows: Slots | None = knob(
         None, cost="as max_pairs", gain="a little time", measured=MEASURED
     )
     """Room for (splat, row of tiles) pairs. None: as many as pairs, always enough in practice."""
     warn_overflow: bool = False
-    """Traced calls log a warning whenever something did not fit. It adds a callback to the program."""
+    """Traced calls log a warning whenever something did not fit.
+
+    It adds a callback to the program.
+    """
     tile_size: Annotated[int, Range(1, 4096)] = knob(
         8,
         cost="none",
         gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time",
         measured=MEASURED,
     )
-    """Pixels. From here on: the schedule, which changes the time, not the image (but for rounding)."""
+    """Pixels. From here on: the schedule, which changes the time, not the image (but for rounding).
+    """
     block: Chunk = 32
     """Tiles that are composited together; on CPUs only. From 16 to 64 times differ by 4 %."""
     chunk: Chunk = 8
@@ -126,7 +144,8 @@ class SplatConfig:
     def __post_init__(self):
         if not self.alpha_min < self.alpha_max < 1:
             raise ValueError(
-                f"SplatConfig: need alpha_min < alpha_max < 1, got {self.alpha_min}, {self.alpha_max}"
+                f"SplatConfig: need alpha_min < alpha_max < 1, got {self.alpha_min},"
+                f" {self.alpha_max}"
             )
         if not self.transmittance_stop < 1:
             raise ValueError(
@@ -146,8 +165,9 @@ SPLAT_PRESETS: Presets[SplatConfig] = Presets(
         "inria": SplatConfig(
             near=0.2,
             alpha_max=0.99,
-            # the Jacobian is evaluated no farther out than this fraction of the half field of view beyond the border: it bounds
-            # the footprints of Gaussians beside a near camera, at the price of a wrong shape there
+            # the Jacobian is evaluated no farther out than this fraction of the half field of view
+            # beyond the border: it bounds the footprints of Gaussians beside a near camera, at the
+            # price of a wrong shape there
             jacobian_margin=0.3,
             normalize_quats=False,
             radius_sigma=3.0,  # gsplat: 3.33; visible for opaque splats
@@ -157,8 +177,9 @@ SPLAT_PRESETS: Presets[SplatConfig] = Presets(
     },
     '; "as_trained" of Settings and Shot is SPLAT_PRESETS[avatar.rendering]',
 )
-"""exact: every alpha of 1/255 and more, in float32. near_exact and fast: see docs/performance.md for their errors and
-gains. inria: the conventions of diff-gaussian-rasterization, which the published weights were trained with."""
+"""exact: every alpha of 1/255 and more, in float32. near_exact and fast: see docs/performance.md
+for their errors and gains. inria: the conventions of diff-gaussian-rasterization, which the
+published weights were trained with."""
 
 
 def splat_config(config: SplatConfig | str) -> SplatConfig:

@@ -1,13 +1,14 @@
-"""Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and `grad` (reverse mode, first
-derivatives).
+"""Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and
+`grad` (reverse mode, first derivatives).
 
-Projected Gaussians -> depth order -> lists by tile -> composited tiles -> image over a background. `reference` draws the same
-image by the definition. Gradients reach means, quats, scales, opacities, colors, harmonics, deformations, the
-background, and K and cam_from_world of the camera.
+Projected Gaussians -> depth order -> lists by tile -> composited tiles -> image over a background.
+`reference` draws the same image by the definition. Gradients reach means, quats, scales, opacities,
+colors, harmonics, deformations, the background, and K and cam_from_world of the camera.
 
-Shapes are static, so how many (splat, tile) pairs fit is decided before drawing. A call outside of transformations measures
-what its scene needs. A traced call takes `default_pairs`, or what `plan_buffers` has measured on a scene like its own. What does
-not fit is counted (`Rendering.overflow`), and eager calls raise `BufferOverflowError`.
+Shapes are static, so how many (splat, tile) pairs fit is decided before drawing. A call outside of
+transformations measures what its scene needs. A traced call takes `default_pairs`, or what
+`plan_buffers` has measured on a scene like its own. What does not fit is counted
+(`Rendering.overflow`), and eager calls raise `BufferOverflowError`.
 """
 
 import dataclasses
@@ -65,10 +66,11 @@ __all__ = [
 class Rendering(Batchable):
     """One image of a set of Gaussians; with leading axes, a batch of images.
 
-    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
-    colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
-    drawn. visibility: (g,) the largest weight alpha T of each Gaussian on any pixel, 0 if it is hidden; not
-    differentiable; None unless `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
+    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is
+    seen, weighted as the colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that
+    did not fit in the buffers and were not drawn. visibility: (g,) the largest weight alpha T of
+    each Gaussian on any pixel, 0 if it is hidden; not differentiable; None unless
+    `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
     over 0; None without.
     """
 
@@ -97,13 +99,15 @@ def render(
     background: Background = None,
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
-    """Draw Gaussians as one camera sees them. Gradients are of reverse mode, first derivatives: no `jvp`, no Hessian.
+    """Draw Gaussians as one camera sees them. Gradients are of reverse mode, first derivatives: no
+    `jvp`, no Hessian.
 
     After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079).
 
-    Called directly, arguments are checked and buffers sized to the scene. Inside `jit`, `vmap` and `grad` values are not
-    checked, and buffers come from `config`: `plan_buffers` sizes them once. Pairs of splats and tiles that do not fit are not
-    drawn there; they are counted in `Rendering.overflow`, which `SplatConfig.warn_overflow` logs. Conventions are gsplat's
+    Called directly, arguments are checked and buffers sized to the scene. Inside `jit`, `vmap` and
+    `grad` values are not checked, and buffers come from `config`: `plan_buffers` sizes them once.
+    Pairs of splats and tiles that do not fit are not drawn there; they are counted in
+    `Rendering.overflow`, which `SplatConfig.warn_overflow` logs. Conventions are gsplat's
     (`rendering.splat_config`).
 
     Args:
@@ -111,28 +115,31 @@ def render(
         camera: one camera; its size is the image's.
         config: what is drawn, and the buffers; or the name of one of `SPLAT_PRESETS`.
         background: (3,) RGB, three numbers, or a color's name. None: white.
-        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels, what a network has
-            learned.
+        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels,
+            what a network has learned.
 
     Returns:
         A `Rendering`: rgb (h, w, 3), alpha, depth, features, overflow, visibility.
 
     Raises:
         TypeError: for arguments of other classes.
-        ValueError: for a batch of cameras or of sets, shapes that do not fit each other, a background that is no color,
-            values that are not finite, opacities outside of [0, 1], and negative scales or focal lengths.
+        ValueError: for a batch of cameras or of sets, shapes that do not fit each other, a
+            background that is no color, values that are not finite, opacities outside of [0, 1],
+            and negative scales or focal lengths.
         BufferOverflowError: if `config.max_pairs` or `max_rows` is too small.
 
     Examples:
         >>> rendering = hg.render(gaussians, camera)
         >>> config = hg.plan_buffers(gaussians, cameras)
-        >>> loss = lambda gaussians: jnp.mean((hg.render(gaussians, camera, config).rgb - photo) ** 2)
+        >>> image = lambda gaussians: hg.render(gaussians, camera, config).rgb
+        >>> loss = lambda gaussians: jnp.mean((image(gaussians) - photo) ** 2)
         >>> gradient = jax.jit(jax.grad(loss), compiler_options=hg.compiler_options())(gaussians)
     """
     if camera.batch_shape:
         raise ValueError(
-            f"render draws one camera, got a batch {camera.batch_shape}: use render_views(gaussians, cameras), "
-            "or jax.vmap(render, in_axes=(None, 0))(gaussians, cameras) to draw all views at once"
+            f"render draws one camera, got a batch {camera.batch_shape}: use"
+            " render_views(gaussians, cameras), or jax.vmap(render, in_axes=(None, 0))(gaussians,"
+            " cameras) to draw all views at once"
         )
     return _render(draw, gaussians, camera, config, background, features)
 
@@ -144,10 +151,11 @@ def render_views(
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
 ) -> Rendering:
-    """Draw every camera of a batch (leading axis v), one after the other: working memory does not grow with v.
+    """Draw every camera of a batch (leading axis v), one after the other: working memory does not
+    grow with v.
 
-    What a gradient keeps of each view does. `jax.vmap` of `render` draws all views at once and holds the buffers of all. On
-    CPUs it is as fast, but slower with gradients of many views.
+    What a gradient keeps of each view does. `jax.vmap` of `render` draws all views at once and
+    holds the buffers of all. On CPUs it is as fast, but slower with gradients of many views.
 
     Args:
         gaussians: as `render`.
@@ -204,7 +212,8 @@ def _render(
 ) -> Rendering:
     if gaussians.batch_shape:
         raise ValueError(
-            f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap"
+            f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with"
+            " jax.vmap"
         )
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
@@ -221,7 +230,10 @@ def _render(
         "render",
         gaussian_values(gaussians)
         | camera_values(cameras)
-        | {"background": (background, FINITE), "features": (features, FINITE)},
+        | {
+            "background": (background, FINITE),
+            "features": (features, FINITE),
+        },
     )
     if config.max_pairs is None:
         config = plan_buffers(gaussians, cameras, config, margin=1.0)
@@ -239,8 +251,9 @@ def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
 def _once_per_image(array: Array, camera: Camera) -> Array:
     """The same array; where `vmap` shares it among cameras, each camera gets its own.
 
-    Its gradient is then summed over the cameras once, and not at each of the dozen operations of the projection that mix
-    what is shared with what is not, which on a CPU cost a fifth of the image.
+    Its gradient is then summed over the cameras once, and not at each of the dozen operations of
+    the projection that mix what is shared with what is not, which on a CPU cost a fifth of the
+    image.
     """
     return _own(array, camera.K)
 
@@ -263,7 +276,8 @@ def _own_in_batch(
     return array if batched[0] else jnp.broadcast_to(array, (size, *array.shape)), True
 
 
-# One image -----------------------------------------------------------------------------------------------------------
+# One image
+# --------------------------------------------------------------------------------------------------
 
 
 def with_background(
@@ -319,8 +333,9 @@ def draw_projected(
 ) -> Rendering:
     """The second half of `render`, for use inside transformations.
 
-    projected: by `project_gaussians`, of these Gaussians, camera and config. Of the Gaussians only opacities and colors
-    are read here. background: as `Background`. features: other numbers of the Gaussians, as in `render`.
+    projected: by `project_gaussians`, of these Gaussians, camera and config. Of the Gaussians only
+    opacities and colors are read here. background: as `Background`. features: other numbers of the
+    Gaussians, as in `render`.
     """
     gaussians, camera, background = with_background(gaussians, camera, background)
     features = features_of(features, len(gaussians.opacities))
@@ -389,8 +404,8 @@ def _draw(
     footprints = footprints_by(projected, opacities, config)
     footprints = jax.tree.map(lambda plane: take(plane, order), footprints)
 
-    # Depths are blended relative to the nearest: their gradient is a difference of depths, which must not drown in the
-    # rounding of depths.
+    # Depths are blended relative to the nearest: their gradient is a difference of depths, which
+    # must not drown in the rounding of depths.
     nearest = jnp.min(depths)
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
     behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
@@ -426,9 +441,11 @@ def _blended(
     overflow: Array,
     visibility: Array | None,
 ) -> Rendering:
-    """features: (t, 4 + n, p) premultiplied rgb, z - nearest and others. transmittance: (t, 1, p) the final one.
+    """features: (t, 4 + n, p) premultiplied rgb, z - nearest and others. transmittance: (t, 1, p)
+    the final one.
 
-    Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor does its gradient.
+    Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor
+    does its gradient.
     """
     alpha = 1 - transmittance
     rgb = features[:, :3] + transmittance * background[:, None]

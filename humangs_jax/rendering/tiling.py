@@ -1,27 +1,29 @@
-"""Tiles: which splats (or triangles) touch which square of pixels, one list per tile in one buffer of fixed size.
+"""Tiles: which splats (or triangles) touch which square of pixels, one list per tile in one buffer
+of fixed size.
 
 A rasterizer uses it in five steps, all with static shapes and none of them differentiated:
 
-1. `expand` the counts of the tiles that each item touches: slot -> item (or item -> rows of tiles -> tiles: `emit_pairs`).
-2. `sort_into_tiles`: the (tile, item) pairs by tile, and by item inside a tile. Number the items by depth first (`depth_order`)
-   and every list runs front to back.
-3. `blocks_by_length`: tiles by falling list length, so that a block of consecutive ones has lists of about the same length, and
-   empty tiles come last and are never visited.
-4. its own loop over blocks, and over chunks of their lists; pixels of a tile are one axis of `tile_size`^2 values, row by row, at
-   `grid.offsets` from the tile's centre.
+1. `expand` the counts of the tiles that each item touches: slot -> item (or item -> rows of tiles
+   -> tiles: `emit_pairs`).
+2. `sort_into_tiles`: the (tile, item) pairs by tile, and by item inside a tile. Number the items by
+   depth first (`depth_order`) and every list runs front to back.
+3. `blocks_by_length`: tiles by falling list length, so that a block of consecutive ones has lists
+   of about the same length, and empty tiles come last and are never visited.
+4. its own loop over blocks, and over chunks of their lists; pixels of a tile are one axis of
+   `tile_size`^2 values, row by row, at `grid.offsets` from the tile's centre.
 5. `tiles_to_image`.
 
-What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Where the last row and column of
-tiles reach beyond the image, those pixels are cut off.
+What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Where
+the last row and column of tiles reach beyond the image, those pixels are cut off.
 
-A splat's footprint is the ellipse d^T cov2d^-1 d <= reach around its centre, outside of which alpha < alpha_min. It meets a
-tile if it meets the rectangle spanned by the tile's pixel centres. With D the determinant of cov2d, the ellipse at height dy
-above its centre spans
+A splat's footprint is the ellipse d^T cov2d^-1 d <= reach around its centre, outside of which alpha
+< alpha_min. It meets a tile if it meets the rectangle spanned by the tile's pixel centres. With D
+the determinant of cov2d, the ellipse at height dy above its centre spans
 
     dx = (xy / yy) dy -+ sqrt(D / yy (reach - dy^2 / yy)),     |dy| <= sqrt(reach yy),
 
-so inside one row of tiles it reaches farthest right at dy = xy sqrt(reach / xx), clamped to the row, and farthest left
-at the opposite point.
+so inside one row of tiles it reaches farthest right at dy = xy sqrt(reach / xx), clamped to the
+row, and farthest left at the opposite point.
 """
 
 import dataclasses
@@ -36,7 +38,9 @@ from humangs_jax.rendering.projection import ProjectedGaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, SplatConfig
 
 SUM_LIMIT = 1 << 30
-"""Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only says "too many"."""
+"""Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only
+says "too many".
+"""
 
 _ROW = 64
 """Width of the triangular products in `cumsum`: 64 numbers below 2^18 add up exactly in float32."""
@@ -71,7 +75,10 @@ class TileGrid:
         return self.tile_size**2
 
     def offsets(self, dtype: np.dtype | type = np.float32) -> np.ndarray:
-        """(2, pixels): x and y of a tile's pixel centres, from the tile's centre. Small: moments stay accurate."""
+        """(2, pixels): x and y of a tile's pixel centres, from the tile's centre.
+
+        Small: moments stay accurate.
+        """
         pixel = np.arange(self.pixels)
         offsets = (
             np.stack([pixel % self.tile_size, pixel // self.tile_size]) + 0.5 - self.tile_size / 2
@@ -84,7 +91,8 @@ class Expansion(NamedTuple):
 
     source: (capacity,) item of each slot; of slots >= needed, the last item.
     first: (n,) first slot of each item, so that slot - first[source] counts the slots of one item.
-    needed: slots asked for, whatever the capacity (saturates at `SUM_LIMIT`). Slot s is used if s < needed.
+    needed: slots asked for, whatever the capacity (saturates at `SUM_LIMIT`). Slot s is used if s <
+    needed.
     """
 
     source: Int[Array, " capacity"]
@@ -106,8 +114,9 @@ class TileLists(NamedTuple):
 class TileBlocks(NamedTuple):
     """Tiles by falling list length, padded to whole blocks.
 
-    tiles: (blocks * block,) tile numbers; the padding has the number "no tile" (t), which is out of bounds on purpose:
-    gather with a fill value, scatter with mode="drop". used: how many blocks hold a tile whose list is not empty.
+    tiles: (blocks * block,) tile numbers; the padding has the number "no tile" (t), which is out of
+    bounds on purpose: gather with a fill value, scatter with mode="drop". used: how many blocks
+    hold a tile whose list is not empty.
     """
 
     tiles: Int[Array, " t_padded"]
@@ -117,9 +126,10 @@ class TileBlocks(NamedTuple):
 def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
     """Inclusive running sum of int32 numbers >= 0, saturating at `SUM_LIMIT`.
 
-    Any 64 consecutive ones must sum to less than 2^24. Three levels: rows of 64 by a triangular matrix product, rows of
-    64 of their totals likewise, and the few numbers left by comparing all with all. Faster than `jnp.cumsum` on a CPU
-    and, which matters more, it neither wraps nor has logarithmically many steps to compile.
+    Any 64 consecutive ones must sum to less than 2^24. Three levels: rows of 64 by a triangular
+    matrix product, rows of 64 of their totals likewise, and the few numbers left by comparing all
+    with all. Faster than `jnp.cumsum` on a CPU and, which matters more, it neither wraps nor has
+    logarithmically many steps to compile.
     """
     n = x.shape[0]
     within = _sums_in_rows(_in_rows(x))
@@ -152,7 +162,10 @@ def _sums_in_rows(rows: Int[Array, "rows 64"]) -> Int[Array, "rows 64"]:
 
 
 def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
-    """Divides `capacity` slots: item i takes the next counts[i] >= 0 of them. For the counts, the limits of `cumsum` hold."""
+    """Divides `capacity` slots: item i takes the next counts[i] >= 0 of them.
+
+    For the counts, the limits of `cumsum` hold.
+    """
     if counts.shape[0] == 0:
         return Expansion(jnp.zeros(capacity, jnp.int32), counts, jnp.zeros((), jnp.int32))
     end = materialized(cumsum(counts))
@@ -163,10 +176,12 @@ def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
 def owners(
     first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0
 ) -> Int[Array, " size"]:
-    """Which item owns each of the slots start .. start + size, if item i owns those from first[i] to first[i + 1].
+    """Which item owns each of the slots start .. start + size, if item i owns those from first[i]
+    to first[i + 1].
 
-    As many items begin at or before a slot as the running sum of marks says, and the last of them owns the slot: items
-    without slots begin together with the next one that has any. (Exact below 2^24 items, see `cumsum`.)
+    As many items begin at or before a slot as the running sum of marks says, and the last of them
+    owns the slot: items without slots begin together with the next one that has any. (Exact below
+    2^24 items, see `cumsum`.)
     """
     marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(first - start, 0)].add(1, mode="drop")
     return materialized(cumsum(marks) - 1)
@@ -175,7 +190,9 @@ def owners(
 def take(
     table: Shaped[Array, "n *rest"], indices: Int[Array, " slots"]
 ) -> Shaped[Array, "slots *rest"]:
-    """Rows of a table at indices that are known to be in range: no clamping, no wrapping of negative ones."""
+    """Rows of a table at indices that are known to be in range: no clamping, no wrapping of
+    negative ones.
+    """
     return (
         materialized(table).at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
     )
@@ -184,8 +201,9 @@ def take(
 def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
     """The same numbers, stored before they are used.
 
-    XLA's CPU backend would evaluate the expression behind a table anew for each number that a gather takes from it.
-    It respects the barrier where a program is compiled with `core.processes.compiler_options`.
+    XLA's CPU backend would evaluate the expression behind a table anew for each number that a
+    gather takes from it. It respects the barrier where a program is compiled with
+    `core.processes.compiler_options`.
     """
     return lax.optimization_barrier(array)
 
@@ -196,8 +214,8 @@ def bits_for(count: int) -> int:
 
 
 def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
-    """Ascending. Equal keys are identical, so a sort need not be stable; XLA's stable sort is a third faster on CPUs, and
-    elsewhere has to carry the positions along.
+    """Ascending. Equal keys are identical, so a sort need not be stable; XLA's stable sort is a
+    third faster on CPUs, and elsewhere has to carry the positions along.
     """
     return lax.platform_dependent(
         keys, cpu=jnp.sort, default=lambda keys: lax.sort(keys, is_stable=False)
@@ -207,10 +225,11 @@ def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
 def sort_into_tiles(
     tiles: Int[Array, " capacity"], items: Int[Array, " capacity"], tile_count: int, item_count: int
 ) -> TileLists:
-    """Pairs (tile, item) -> lists by tile, ascending by item. Pairs of tile `tile_count` ("no tile") are left out.
+    """Pairs (tile, item) -> lists by tile, ascending by item. Pairs of tile `tile_count` ("no
+    tile") are left out.
 
-    One sort of one uint32 where the tile number and the item number fit it together (sorting a key with a payload costs
-    several times as much); otherwise a sort by two keys.
+    One sort of one uint32 where the tile number and the item number fit it together (sorting a key
+    with a payload costs several times as much); otherwise a sort by two keys.
     """
     bits = bits_for(item_count)
     if (tile_count + 1) << bits <= 1 << 32:
@@ -224,7 +243,9 @@ def sort_into_tiles(
 
 
 def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
-    """Tiles in blocks of `block`, by falling list length; equal ones, and ones too long for the key, by number."""
+    """Tiles in blocks of `block`, by falling list length; equal ones, and ones too long for the
+    key, by number.
+    """
     t = counts.shape[0]
     bits = bits_for(t)
     longest = (1 << (32 - bits)) - 1
@@ -244,21 +265,30 @@ def tiles_to_image(tiles: Float[Array, "t c p"], grid: TileGrid) -> Float[Array,
     return image.reshape(grid.rows * size, grid.columns * size, c)[: grid.height, : grid.width]
 
 
-# Splats -----------------------------------------------------------------------------------------------------------------
+# Splats
+# --------------------------------------------------------------------------------------------------
 
 
 SLACK = 2e-3
-"""Pixels by which footprints are widened, against rounding of positions (a float32 at 1000 pixels has 6e-5)."""
+"""Pixels by which footprints are widened, against rounding of positions (a float32 at 1000 pixels
+has 6e-5).
+"""
 
 REACH_SLACK = (1.0001, 1e-5)
-"""The squared reach is multiplied by the first and raised by the second, against rounding of alpha at its threshold."""
+"""The squared reach is multiplied by the first and raised by the second, against rounding of alpha
+at its threshold.
+"""
 
 INRIA_MIN_DISCRIMINANT = 0.1
-"""Pixels^4; INRIA's rasterizer raises the squared half difference of a splat's two variances to at least this."""
+"""Pixels^4; INRIA's rasterizer raises the squared half difference of a splat's two variances to at
+least this.
+"""
 
 
 class Footprints(NamedTuple):
-    """Ellipses on the image, planes of (g,), named as in `ProjectedGaussians`; reach is 0 where nothing is drawn."""
+    """Ellipses on the image, planes of (g,), named as in `ProjectedGaussians`; reach is 0 where
+    nothing is drawn.
+    """
 
     x: Float[Array, " g"]
     y: Float[Array, " g"]
@@ -291,8 +321,8 @@ class Footprints(NamedTuple):
 
 
 class _Bands(NamedTuple):
-    """What a row of tiles needs of an ellipse, planes of (g,): centre, half its height, how high above the centre its
-    rightmost point is, xy / yy, D / yy, 1 / yy and the squared reach.
+    """What a row of tiles needs of an ellipse, planes of (g,): centre, half its height, how high
+    above the centre its rightmost point is, xy / yy, D / yy, 1 / yy and the squared reach.
     """
 
     x: Float[Array, " g"]
@@ -321,7 +351,8 @@ class _Bands(NamedTuple):
 
 
 class Squares(NamedTuple):
-    """INRIA's footprints, planes of (g,): the tiles that meet a square, as its rasterizer counts them.
+    """INRIA's footprints, planes of (g,): the tiles that meet a square, as its rasterizer counts
+    them.
 
     radius: half a side, whole pixels; 0 where nothing is drawn.
     """
@@ -355,7 +386,8 @@ class Squares(NamedTuple):
 class Pairs(NamedTuple):
     """(tile, splat) pairs; unused ones have the tile number "no tile".
 
-    tiles, splats: (capacity,). needed: how many there are in all. overflow: how many of them are missing here.
+    tiles, splats: (capacity,). needed: how many there are in all. overflow: how many of them are
+    missing here.
     """
 
     tiles: Int[Array, " capacity"]
@@ -367,8 +399,9 @@ class Pairs(NamedTuple):
 def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
     """Stable order of positive depths, nearest first.
 
-    float32: radix passes, each a sort of ONE uint32 (digit of the depth, then position), which XLA's CPU backend does
-    four times as fast as an argsort. The bits of positive floats are ordered like the floats.
+    float32: radix passes, each a sort of ONE uint32 (digit of the depth, then position), which
+    XLA's CPU backend does four times as fast as an argsort. The bits of positive floats are ordered
+    like the floats.
     """
     g = depths.shape[0]
     if depths.dtype != jnp.float32:
@@ -386,7 +419,10 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
 def squared_reach(
     opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN
 ) -> Float[Array, " g"]:
-    """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below. No gradient."""
+    """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below.
+
+    No gradient.
+    """
     opacities = lax.stop_gradient(opacities)
     seen = opacities > alpha_min
     return jnp.where(seen, 2 * jnp.log(jnp.where(seen, opacities, 1.0) / alpha_min), 0.0)
@@ -403,7 +439,9 @@ def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Foot
 def square_footprints(
     projected: ProjectedGaussians, reach: Float[Array, " g"], radius_sigma: float
 ) -> Squares:
-    """Squares of `radius_sigma` times the larger standard deviation, rounded up to pixels, where reach is positive."""
+    """Squares of `radius_sigma` times the larger standard deviation, rounded up to pixels, where
+    reach is positive.
+    """
     p = lax.stop_gradient(projected)
     middle = 0.5 * (p.xx + p.yy)
     largest = middle + jnp.sqrt(
@@ -416,7 +454,9 @@ def square_footprints(
 def footprints_by(
     projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig
 ) -> Footprints | Squares:
-    """The footprints that a configuration asks for: ellipses that end at `alpha_min` or `radius_sigma`, or squares."""
+    """The footprints that a configuration asks for: ellipses that end at `alpha_min` or
+    `radius_sigma`, or squares.
+    """
     reach = squared_reach(opacities, config.alpha_min)
     if config.radius_sigma is None:
         return footprints(projected, reach)
@@ -436,7 +476,9 @@ def count_pairs(
 def emit_pairs(
     footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int
 ) -> Pairs:
-    """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose theirs."""
+    """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose
+    theirs.
+    """
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
     rows = expand(counts, max_rows)
@@ -453,7 +495,8 @@ def emit_pairs(
         jnp.stack([row * grid.columns + column0 - pairs.first, rows.source], axis=-1), pairs.source
     )
     tiles = jnp.where(slot < pairs.needed, table[:, 0] + slot, grid.tiles)
-    # If rows are missing, so are their pairs, and they are counted row by row; otherwise this loop runs zero times.
+    # If rows are missing, so are their pairs, and they are counted row by row; otherwise this loop
+    # runs zero times.
     missing = rows.needed > max_rows
     recount = _count_row_by_row(footprints, grid, jnp.where(missing, jnp.max(counts, initial=0), 0))
     needed = jnp.where(missing, recount, pairs.needed)

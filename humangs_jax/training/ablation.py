@@ -1,6 +1,8 @@
-"""Variants of a training run against the run itself: the same people, steps and seeds, differences with intervals.
+"""Variants of a training run against the run itself: the same people, steps and seeds, differences
+with intervals.
 
-All of them are compared on the same people, photos and targets, those that the base is validated on, whatever a variant changes.
+All of them are compared on the same people, photos and targets, those that the base is validated
+on, whatever a variant changes.
 """
 
 import dataclasses
@@ -44,7 +46,9 @@ People = int | Sequence[str | Path] | MakeSource
 
 
 class AblationRow(NamedTuple):
-    """A variant. interval: half of the 95 % interval of `difference` by Student's t over paired seeds; None below two pairs."""
+    """A variant. interval: half of the 95 % interval of `difference` by Student's t over paired
+    seeds; None below two pairs.
+    """
 
     name: str
     seeds: int
@@ -60,8 +64,10 @@ class AblationRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Ablation:
-    """What `ablate` found. scores: of each variant, `metric` by seed. missing: runs that the budget had no room for.
-    longest: seconds of the longest run, those of the base and of each variant compile a program of their own.
+    """What `ablate` found. scores: of each variant, `metric` by seed. missing: runs that the budget
+    had no room for.
+    longest: seconds of the longest run, those of the base and of each variant compile a program of
+    their own.
     """
 
     metric: str
@@ -104,7 +110,8 @@ class Ablation:
         return told
 
     def plot(self) -> Any:
-        """Differences to the base with their intervals; gray where the interval contains 0. Without a difference it says so.
+        """Differences to the base with their intervals; gray where the interval contains 0. Without
+        a difference it says so.
 
         Raises: ImportError without matplotlib, which the extra `notebooks` installs.
         """
@@ -148,35 +155,41 @@ def ablate(
 ) -> Ablation:
     """Train a base and its variants with several seeds each, and compare them on other people.
 
-    Runs are made seed by seed, so that differences are paired however far the budget reaches. Each run is a folder
-    `out/VARIANT/SEED` that `train` goes on with: the same call resumes.
+    Runs are made seed by seed, so that differences are paired however far the budget reaches. Each
+    run is a folder `out/VARIANT/SEED` that `train` goes on with: the same call resumes.
 
     Args:
         base: a run, or the name of a preset of training ("tiny", "small", "paper", "published").
         variants: fields that change, by their paths (`vary`), of each variant by its name.
         seeds: runs of each variant.
-        budget: wall-clock time, such as "90s", "5min" or "2h": no run begins that would probably end after it. The first one,
-            which compiles, may exceed it. The result says which budget would do for what is missing. None: all runs.
-        people: to train on: a number of synthetic people, who are rendered during training; capture folders; or a source.
-        validation: other people to compare on, likewise. Of a number and of folders each is looked at once, of a source the
-            first eight. Photos and targets are those of the base for all variants.
+        budget: wall-clock time, such as "90s", "5min" or "2h": no run begins that would probably
+            end after it. The first one, which compiles, may exceed it. The result says which budget
+            would do for what is missing. None: all runs.
+        people: to train on: a number of synthetic people, who are rendered during training; capture
+            folders; or a source.
+        validation: other people to compare on, likewise. Of a number and of folders each is looked
+            at once, of a source the first eight. Photos and targets are those of the base for all
+            variants.
         out: folder of the runs.
         metric: of validation: "psnr", "psnr_fg", "ssim" and so on.
         body: that the people's parameters belong to. None: the shipped one.
-        networks: of losses that need them; those of the base without one are replaced (`fitting_losses`).
+        networks: of losses that need them; those of the base without one are replaced
+            (`fitting_losses`).
         progress: show a bar.
 
     Returns:
         Rows with means, differences to the base and intervals; `print` and `.plot()` show them.
 
     Raises:
-        ValueError: before the first run, for a variant that cannot be trained: named "base", with a path that is no field, a
-            seed of its own, or a loss whose network is missing; for a metric, budget or number of seeds that cannot be meant.
-            Later, for a folder with runs of other settings.
+        ValueError: before the first run, for a variant that cannot be trained: named "base", with a
+            path that is no field, a seed of its own, or a loss whose network is missing; for a
+            metric, budget or number of seeds that cannot be meant. Later, for a folder with runs of
+            other settings.
         TrainingInterrupted: after Ctrl-C; what is trained is kept.
 
     Examples:
-        >>> result = hg.ablate("tiny", {"no class token": {"model.architecture.encoder.transformer.class_token": False}})
+        >>> class_token = "model.architecture.encoder.transformer.class_token"
+        >>> result = hg.ablate("tiny", {"no class token": {class_token: False}})
         >>> result.plot()
     """
     if seeds < 1:
@@ -256,8 +269,9 @@ def _checked_variants(
 
 
 def _folder_names(names: Sequence[str]) -> dict[str, str]:
-    """A folder for each variant: its name without signs that file systems dislike, and a checksum where that is no name of its
-    own, not even for file systems that do not tell upper from lower case.
+    """A folder for each variant: its name without signs that file systems dislike, and a checksum
+    where that is no name of its own, not even for file systems that do not tell upper from lower
+    case.
     """
     plain = {name: re.sub(r"[^\w.+-]+", "_", name) for name in names}
     unusable = [

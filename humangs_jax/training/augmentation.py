@@ -1,7 +1,8 @@
-"""Errors of real captures, added to the inputs of training: exposure, masks, cameras, poses and shape.
+"""Errors of real captures, added to the inputs of training: exposure, masks, cameras, poses and
+shape.
 
-The targets stay true. The network learns to place Gaussians well although its photos and bodies are a little off, as
-`humangs fit` leaves them.
+The targets stay true. The network learns to place Gaussians well although its photos and bodies are
+a little off, as `humangs fit` leaves them.
 """
 
 import math
@@ -22,14 +23,20 @@ from humangs_jax.geometry.camera import Camera
 
 @configuration
 class Augmentation:
-    """Standard deviations of normal distributions, unless said otherwise; one draw for each photo, or for each example.
+    """Standard deviations of normal distributions, unless said otherwise; one draw for each photo,
+    or for each example.
 
-    exposure: of every photo, natural logarithm of the gain. tint: of each channel of a photo, likewise.
-    share: of the examples that are disturbed in the other ways, too; 0: nothing is disturbed, and no work.
-    mask_pixels: masks are eroded or dilated by up to this, uniform, and the color of some background appears there.
+    exposure: of every photo, natural logarithm of the gain. tint: of each channel of a photo,
+    likewise.
+    share: of the examples that are disturbed in the other ways, too; 0: nothing is disturbed, and
+    no work.
+    mask_pixels: masks are eroded or dilated by up to this, uniform, and the color of some
+    background appears there.
     camera_degrees: of a camera about the person. camera_metres: its shift, each axis.
-    pose_degrees: each axis of each joint, the same in all photos of an example, as are the following.
-    body_metres: each axis of the translation. betas: each shape coefficient; the wrong shape is also that of the targets.
+    pose_degrees: each axis of each joint, the same in all photos of an example, as are the
+    following.
+    body_metres: each axis of the translation. betas: each shape coefficient; the wrong shape is
+    also that of the targets.
     """
 
     share: Share = 0.0
@@ -44,7 +51,10 @@ class Augmentation:
 
 
 def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -> Example:
-    """The example with other exposures, or with all of its inputs and betas disturbed. Pure and jittable."""
+    """The example with other exposures, or with all of its inputs and betas disturbed.
+
+    Pure and jittable.
+    """
     choice_key, betas_key, views_key = jax.random.split(key, 3)
 
     def augmented(example):
@@ -80,7 +90,10 @@ def _gains(key: Key, count: int, dtype: Any, config: Augmentation) -> Float[Arra
 def augment_views(
     key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Augmentation
 ) -> SubjectViews:
-    """Photos, masks, cameras and poses. pelvis: (3,) metres, in the rest pose: cameras turn about the posed one."""
+    """Photos, masks, cameras and poses.
+
+    pelvis: (3,) metres, in the rest pose: cameras turn about the posed one.
+    """
     photo_key, camera_key, pose_key, body_key = jax.random.split(key, 4)
     normal = lambda key, like: jax.random.normal(key, like.shape, like.dtype)
     rotations = views.rotations[0]
@@ -101,8 +114,8 @@ def augment_photos(
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
     """Photos on white whose exposure, tint and masks are off.
 
-    A photo is m f + (1 - m) of its mask m and the person's color f. It becomes m' (m g f + (1 - m) b) + (1 - m') with the gain
-    g, the mask m' and the color b of a background.
+    A photo is m f + (1 - m) of its mask m and the person's color f. It becomes m' (m g f + (1 - m)
+    b) + (1 - m') with the gain g, the mask m' and the color b of a background.
     """
     count = len(images)
     gain_key, radius_key, background_key = jax.random.split(key, 3)

@@ -1,11 +1,15 @@
-"""Checkpoints of a run: the newest few and the best, each complete or not there, bit for bit what was saved.
+"""Checkpoints of a run: the newest few and the best, each complete or not there, bit for bit what
+was saved.
 
-Each records a checksum of its arrays. A damaged one is never used: the run continues from the newest good one and reports it.
+Each records a checksum of its arrays. A damaged one is never used: the run continues from the
+newest good one and reports it.
 
-They are written while the run goes on. Each process writes what its devices hold. A run on other devices can read them.
+They are written while the run goes on. Each process writes what its devices hold. A run on other
+devices can read them.
 
 out/config.json          the configuration of the run
-out/checkpoints/STEP             Orbax checkpoints of the TrainState, with the score of their validation
+out/checkpoints/STEP             Orbax checkpoints of the TrainState, with the score of their
+                                 validation
 out/checkpoints/damaged-STEP     those that could not be read, set aside
 """
 
@@ -40,11 +44,14 @@ ADJUSTABLE = (
     "keep_checkpoints",
     "microbatch_size",
 )
-"""What may change in the middle of a run without changing its numbers (but for shared batch statistics)."""
+"""What may change in the middle of a run without changing its numbers (but for shared batch
+statistics).
+"""
 
 
 class Checkpoints:
-    """The checkpoints in a folder. `keep`: how many of the newest stay, besides the one of the highest score.
+    """The checkpoints in a folder. `keep`: how many of the newest stay, besides the one of the
+    highest score.
 
     read_only: nothing is written, deleted or tidied up.
     """
@@ -83,15 +90,19 @@ class Checkpoints:
         return self._manager.best_step()
 
     def score(self, step: int) -> float | None:
-        """The score that a checkpoint was saved with; None without one, or for NaN, to which no score compares."""
+        """The score that a checkpoint was saved with; None without one, or for NaN, to which no
+        score compares.
+        """
         metrics = self._manager.metrics(step)
         unscored = metrics is None or metrics["score"] == UNSCORED or math.isnan(metrics["score"])
         return None if unscored else metrics["score"]
 
     def save(self, state: TrainState, score: float | None = None) -> None:
-        """Write the state under its step, in the background: see `wait`. The state may be donated afterwards.
+        """Write the state under its step, in the background: see `wait`. The state may be donated
+        afterwards.
 
-        A step that is there already is left as it is. Raises: as `wait`, of this checkpoint or of the one before.
+        A step that is there already is left as it is. Raises: as `wait`, of this checkpoint or of
+        the one before.
         """
         step = int(state.step)
         if step in self._manager.all_steps():
@@ -108,7 +119,10 @@ class Checkpoints:
             )
 
     def wait(self) -> None:
-        """Return when all that was saved is on disk. Raises: FileError if one could not be written, as on a full disk."""
+        """Return when all that was saved is on disk.
+
+        Raises: FileError if one could not be written, as on a full disk.
+        """
         with self._writing():
             self._manager.wait_until_finished()
 
@@ -122,10 +136,12 @@ class Checkpoints:
             ) from error
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
-        """The state of a step (None: the newest good one). `like`: a state of the same run, for structure, shapes and devices.
+        """The state of a step (None: the newest good one). `like`: a state of the same run, for
+        structure, shapes and devices.
 
         Newer checkpoints that are damaged are reported and set aside.
-        Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if all are damaged or of another model.
+        Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if all
+        are damaged or of another model.
         """
         self.wait()
         folder = Path(self._manager.directory)
@@ -201,9 +217,11 @@ def _everywhere(value: Any) -> np.ndarray:
 
 
 def _checksum(state: TrainState) -> str:
-    """64 bits, in hexadecimal, of all arrays: the sum of their words, each times an odd number that depends on its place.
+    """64 bits, in hexadecimal, of all arrays: the sum of their words, each times an odd number that
+    depends on its place.
 
-    Any one word that changes changes it. It does not depend on how arrays lie on devices: each process adds its own shards.
+    Any one word that changes changes it. It does not depend on how arrays lie on devices: each
+    process adds its own shards.
     """
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path(_as_dict(state)):
@@ -258,7 +276,8 @@ def _set_aside(steps: list[Path]) -> None:
 def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> None:
     """Write out/config.json, or check the one that is there. write: only check otherwise.
 
-    A finished run may get more steps: it goes on, and its learning rate is then that of the longer run.
+    A finished run may get more steps: it goes on, and its learning rate is then that of the longer
+    run.
 
     Raises: ValueError, naming a field, if the folder belongs to a run of another configuration.
     """
@@ -278,7 +297,10 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
 
 
 def load_config(out: str | Path) -> TrainConfig:
-    """The configuration of the run in a folder. Raises: FileNotFoundError; ValueError, naming file and field."""
+    """The configuration of the run in a folder.
+
+    Raises: FileNotFoundError; ValueError, naming file and field.
+    """
     path = Path(out) / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run here")
@@ -286,7 +308,10 @@ def load_config(out: str | Path) -> TrainConfig:
 
 
 def _placed_as(value: jax.Array, like: jax.Array) -> jax.Array:
-    """Through numpy: the buffers are XLA's own then, and may be donated. Uncommitted stays uncommitted: no recompiling."""
+    """Through numpy: the buffers are XLA's own then, and may be donated.
+
+    Uncommitted stays uncommitted: no recompiling.
+    """
     if not value.is_fully_addressable:
         return value
     host = jax.device_get(value)
@@ -310,5 +335,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _not_of_orbax(record: logging.LogRecord) -> bool:
-    """A filter of absl's logger: Orbax logs every step there, and prints in full the errors that it also raises."""
+    """A filter of absl's logger: Orbax logs every step there, and prints in full the errors that it
+    also raises.
+    """
     return "orbax" not in Path(record.pathname).parts

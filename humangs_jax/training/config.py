@@ -1,4 +1,6 @@
-"""Everything that a training run depends on, composed of the configurations beside what they configure."""
+"""Everything that a training run depends on, composed of the configurations beside what they
+configure.
+"""
 
 import dataclasses
 import itertools
@@ -40,7 +42,9 @@ HOST_SETTINGS = {
     "checkpoint_every": 1,
     "keep_checkpoints": 1,
 }
-"""Settings of a run that no compiled program depends on, with the values that programs are compiled for."""
+"""Settings of a run that no compiled program depends on, with the values that programs are compiled
+for.
+"""
 
 
 @configuration
@@ -64,7 +68,9 @@ class OptimizerConfig:
 
 @configuration
 class Stage:
-    """What changes at step `start` of a run and holds until the next stage; None: as the run's own configuration says."""
+    """What changes at step `start` of a run and holds until the next stage; None: as the run's own
+    configuration says.
+    """
 
     start: Steps
     image_size: InputSide | None = None
@@ -74,9 +80,11 @@ class Stage:
 
 
 STAGED = {
-    "image_size": "model.conventions.image_size", "token_capacity": "model.runtime.token_capacity",
-    "target_size": "target_size", "batch_size": "batch_size",
-}  # fmt: skip
+    "image_size": "model.conventions.image_size",
+    "token_capacity": "model.runtime.token_capacity",
+    "target_size": "target_size",
+    "batch_size": "batch_size",
+}
 """What the fields of a stage change in a `TrainConfig`."""
 
 
@@ -105,10 +113,14 @@ class TrainConfig:
         gain="fewer, larger steps on accelerators",
         measured="performance.md",
     )
-    """How many subjects of a device it works on at once, gradients accumulating over the rest: 1 needs least memory and suits
-    CPUs. The upsampler's batch statistics are of the subjects that all devices work on at once."""
+    """How many subjects of a device it works on at once, gradients accumulating over the rest: 1
+    needs least memory and suits CPUs. The upsampler's batch statistics are of the subjects that all
+    devices work on at once."""
     stages: tuple[Stage, ...] = ()
-    """In the order of their starts, for instance larger photos for the last steps. Before the first one the fields here hold."""
+    """In the order of their starts, for instance larger photos for the last steps.
+
+    Before the first one the fields here hold.
+    """
     ema_decay: Share | None = None
     """Of the averaged parameters, None for none."""
     seed: Seed = 0
@@ -122,7 +134,8 @@ class TrainConfig:
     def __post_init__(self):
         if self.model.runtime.dtype == "float16":
             raise ValueError(
-                "model.runtime.dtype float16: gradients underflow; expected float32 or bfloat16 for training"
+                "model.runtime.dtype float16: gradients underflow; expected float32 or bfloat16 for"
+                " training"
             )
         starts = [stage.start for stage in self.stages]
         if starts != sorted(set(starts)) or (starts and starts[-1] >= self.steps):
@@ -133,7 +146,10 @@ class TrainConfig:
             self.at(start)
 
     def at(self, step: int) -> "TrainConfig":
-        """The configuration in force at a step, without stages. Raises: ValueError if its sizes do not fit together."""
+        """The configuration in force at a step, without stages.
+
+        Raises: ValueError if its sizes do not fit together.
+        """
         config = dataclasses.replace(self, stages=())
         for stage in self.stages:
             if stage.start <= step:
@@ -144,7 +160,9 @@ class TrainConfig:
         return config
 
     def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """(first, end) of the runs of steps between two steps during which the configuration stays the same."""
+        """(first, end) of the runs of steps between two steps during which the configuration stays
+        the same.
+        """
         inner = [stage.start for stage in self.stages if start < stage.start < stop]
         return list(itertools.pairwise([start, *inner, stop])) if start < stop else []
 
@@ -154,12 +172,17 @@ class TrainConfig:
 
 
 def compiled_for(config: TrainConfig) -> TrainConfig:
-    """The same for all runs that share compiled programs: without what only the loop and the loader read."""
+    """The same for all runs that share compiled programs: without what only the loop and the loader
+    read.
+    """
     return dataclasses.replace(config, **HOST_SETTINGS)
 
 
 def small() -> TrainConfig:
-    """For the shipped network: some hours on a CPU of two cores. Its present weights had other losses (assets/weights.md)."""
+    """For the shipped network: some hours on a CPU of two cores.
+
+    Its present weights had other losses (assets/weights.md).
+    """
     return TrainConfig(
         views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
         loss=LossConfig(
@@ -182,7 +205,8 @@ def small() -> TrainConfig:
 
 
 def published() -> TrainConfig:
-    """The release: 100,000 steps at 512 pixels, 4 input and 4 target views. Needs VGG-19 and LPIPS, see `LossConfig`.
+    """The release: 100,000 steps at 512 pixels, 4 input and 4 target views. Needs VGG-19 and LPIPS,
+    see `LossConfig`.
 
     The release has 2 subjects per device and does not say how many devices: 4 are taken here.
     """
@@ -200,7 +224,10 @@ def published() -> TrainConfig:
 
 
 def paper() -> TrainConfig:
-    """The paper: 60,000 steps at 256 pixels with 8 subjects, then 10,000 at 512 with 4. Needs VGG-19."""
+    """The paper: 60,000 steps at 256 pixels with 8 subjects, then 10,000 at 512 with 4.
+
+    Needs VGG-19.
+    """
     return dataclasses.replace(
         published(),
         model=presets.paper().with_conventions(image_size=256),
@@ -262,7 +289,10 @@ def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
     if not missing:
         return config
     structural = max(config.loss.structural, LossConfig().structural)
-    replaced = "no network is given for the loss %s, so it is replaced by structural dissimilarity (weight %g)"
+    replaced = (
+        "no network is given for the loss %s, so it is replaced by structural dissimilarity"
+        " (weight %g)"
+    )
     logger.warning(replaced, " and ".join(missing), structural)
     loss = dataclasses.replace(config.loss, **dict.fromkeys(missing, 0.0), structural=structural)
     return dataclasses.replace(config, loss=loss)

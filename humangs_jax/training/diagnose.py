@@ -1,11 +1,11 @@
 """Finds the stage of a training step in which numbers stopped being finite.
 
-Stages are the modules of the network, by their path, and the steps beside it that are a `parts.stage`. An interceptor of Linen
-keeps what they return, and adds zeros to what they take and return: the gradients with respect to these zeros are those that pass
-back there.
+Stages are the modules of the network, by their path, and the steps beside it that are a
+`parts.stage`. An interceptor of Linen keeps what they return, and adds zeros to what they take and
+return: the gradients with respect to these zeros are those that pass back there.
 
-For one process and device. It needs the memory of a step that recomputes nothing; JAX_PLATFORMS=cpu helps where an
-accelerator has too little.
+For one process and device. It needs the memory of a step that recomputes nothing; JAX_PLATFORMS=cpu
+helps where an accelerator has too little.
 """
 
 import dataclasses
@@ -46,8 +46,9 @@ PARTS, DEEPEST = (("encoder",), ("reader",), ("decoder",)), 3
 
 @dataclasses.dataclass(frozen=True)
 class Leaf:
-    """Numbers of one array. bad: entries that are not finite, the first of them at index `first`. Of the finite entries:
-    smallest and largest (+-inf without any), the mean of their magnitudes, their Euclidean norm.
+    """Numbers of one array. bad: entries that are not finite, the first of them at index `first`.
+    Of the finite entries: smallest and largest (+-inf without any), the mean of their magnitudes,
+    their Euclidean norm.
     """
 
     name: str
@@ -71,8 +72,8 @@ class Leaf:
 
 @pytree_dataclass
 class StageReport:
-    """values: what a stage gave (or what was stored there). taken, returned: gradients at what it took and gave. gradients: those
-    of its parameters. Arrays by name, or `Leaf`s of them.
+    """values: what a stage gave (or what was stored there). taken, returned: gradients at what it
+    took and gave. gradients: those of its parameters. Arrays by name, or `Leaf`s of them.
     """
 
     name: str = static_field()
@@ -112,7 +113,9 @@ def _numbers(report: StageReport) -> StageReport:
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """An array that is not finite: stored so (in the state or the batch), computed by a stage, or sent back by it."""
+    """An array that is not finite: stored so (in the state or the batch), computed by a stage, or
+    sent back by it.
+    """
 
     direction: Literal["stored", "forward", "backward"]
     stage: str
@@ -125,14 +128,19 @@ class Fault:
             "backward": f"first in a gradient sent back by stage '{self.stage}'",
         }[self.direction]
         place = list(self.leaf.first)
-        return f"not finite {what}: {self.leaf.name or 'its value'}, {self.leaf.bad} entries, first at {place}"
+        return (
+            f"not finite {what}: {self.leaf.name or 'its value'}, {self.leaf.bad} entries, first at"
+            f" {place}"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """The diagnosis of one subject of a step: the first with a fault, or else the one with the largest gradient.
+    """The diagnosis of one subject of a step: the first with a fault, or else the one with the
+    largest gradient.
 
-    step: steps done before it. stored: what the step began with, state and batch. stages: in the order in which they end.
+    step: steps done before it. stored: what the step began with, state and batch. stages: in the
+    order in which they end.
     skip_norm: gradients longer than this are skipped.
     """
 
@@ -150,7 +158,9 @@ class Diagnosis:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """All that was stored and is not finite; then the first stage to blame, going forward or else going back."""
+        """All that was stored and is not finite; then the first stage to blame, going forward or
+        else going back.
+        """
         stored = [
             Fault("stored", part.name, leaf)
             for part in self.stored
@@ -189,12 +199,16 @@ class Diagnosis:
             )
         worst = max(self.stages, key=lambda stage: stage.gradient_norm)
         return (
-            f"all finite, but the gradient norm {norm:.3g} is above {self.skip_norm:g}, where a step is skipped; "
-            f"{(worst.gradient_norm / norm) ** 2:.0%} of its square is of stage '{worst.name}'"
+            f"all finite, but the gradient norm {norm:.3g} is above {self.skip_norm:g}, where a"
+            f" step is skipped; {(worst.gradient_norm / norm) ** 2:.0%} of its square is of stage"
+            f" '{worst.name}'"
         )
 
     def __str__(self) -> str:
-        title = f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
+        title = (
+            f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm"
+            f" {self.gradient_norm:.4g}"
+        )
         rows = [
             (
                 "stage",
@@ -232,10 +246,11 @@ class Diagnosis:
 
 
 class Recorder:
-    """An interceptor for `nn.intercept_methods` that records the stages of one traced computation, in the order of their ends.
+    """An interceptor for `nn.intercept_methods` that records the stages of one traced computation,
+    in the order of their ends.
 
-    given: {stage: what it returned}. probes: {stage: (zeros added to what it takes, to what it returns)}; None in a first run,
-    which finds their `shapes`.
+    given: {stage: what it returned}. probes: {stage: (zeros added to what it takes, to what it
+    returns)}; None in a first run, which finds their `shapes`.
     """
 
     def __init__(self, probes: dict[str, tuple[Named, Named]] | None = None):
@@ -291,8 +306,9 @@ def observe_subject(
 ) -> tuple[Scalar, list[StageReport]]:
     """The loss (`subject_loss`), and all its stages in the order in which they end.
 
-    Blocks are neither looped over nor recomputed, so that each can be watched, and everything is kept: this needs more
-    memory than a step (the published network at 512 pixels, 4 views each: 2.4 GB are kept).
+    Blocks are neither looped over nor recomputed, so that each can be watched, and everything is
+    kept: this needs more memory than a step (the published network at 512 pixels, 4 views each: 2.4
+    GB are kept).
     """
     config = dataclasses.replace(config, model=config.model.with_runtime(scan=False, remat="none"))
 
@@ -328,9 +344,11 @@ def diagnose_step(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> Diagnosis:
-    """Diagnose the step that `train_step` would make of these arguments; the state is not given away.
+    """Diagnose the step that `train_step` would make of these arguments; the state is not given
+    away.
 
-    It works subject by subject: each has its own batch statistics, even where a microbatch would share them.
+    It works subject by subject: each has its own batch statistics, even where a microbatch would
+    share them.
     """
     config, step = config.at(int(state.step)), int(state.step)
     parts = {
@@ -365,10 +383,12 @@ def diagnose_run(
     networks: LossNetworks = NO_NETWORKS,
     variables: Variables | None = None,
 ) -> Diagnosis:
-    """Repeat the first step of a run that its log calls skipped or not finite, from the newest checkpoint before it.
+    """Repeat the first step of a run that its log calls skipped or not finite, from the newest
+    checkpoint before it.
 
-    Without such a step: the one that would come next. body, training, networks, variables: as the run had them.
-    Batches are functions of seed and step, so that on the device that the run had the step is repeated bit for bit.
+    Without such a step: the one that would come next. body, training, networks, variables: as the
+    run had them. Batches are functions of seed and step, so that on the device that the run had the
+    step is repeated bit for bit.
     Raises: FileNotFoundError without a run in `out`.
     """
     config = load_config(out)
@@ -399,7 +419,9 @@ def diagnose_run(
 
 
 def first_failed_step(log: Path) -> int | None:
-    """Number of the first step that a log calls skipped or not finite, counted from 0; None if there is none."""
+    """Number of the first step that a log calls skipped or not finite, counted from 0; None if
+    there is none.
+    """
     if not log.is_file():
         return None
     with reading(log, "log"):

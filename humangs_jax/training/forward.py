@@ -1,7 +1,8 @@
 """From an example to images: photos -> canonical Gaussians -> posed as each target -> drawn.
 
-Validation: the same views of the same unseen people every time, with the running statistics, as numbers and as a sheet. Several
-processes share the people; every process ends up with the means over all of them.
+Validation: the same views of the same unseen people every time, with the running statistics, as
+numbers and as a sheet. Several processes share the people; every process ends up with the means
+over all of them.
 """
 
 import dataclasses
@@ -63,8 +64,9 @@ def reconstruct_example(
 def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     """The network with the token capacity of a step with that number of photos.
 
-    The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share plus that of one view,
-    because one photo may show more of a person than the others. More photos, as in a comparison, get more in proportion.
+    The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share
+    plus that of one view, because one photo may show more of a person than the others. More photos,
+    as in a comparison, get more in proportion.
     """
     most, capacity = max(config.views.input_counts), config.model.runtime.token_capacity
     if views == most:
@@ -82,7 +84,9 @@ def draw_targets(
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
 ) -> Drawn:
-    """The Gaussians drawn in the pose and from the camera of every target. inputs: the photos that they come from."""
+    """The Gaussians drawn in the pose and from the camera of every target. inputs: the photos that
+    they come from.
+    """
     driver = config.model.architecture.driver
     if driver is not None:
         own, given = (
@@ -143,7 +147,9 @@ def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
 def predict(
     variables: Variables, body: BodyModel, example: Example, config: TrainConfig
 ) -> tuple[Drawn, HumanGSOutputs]:
-    """What the trained network shows of an example's targets, on white, and the Gaussians that it shows."""
+    """What the trained network shows of an example's targets, on white, and the Gaussians that it
+    shows.
+    """
     outputs, _ = reconstruct_example(variables, body, example.inputs, config)
     white = white_backgrounds(example.targets)
     return draw_targets(
@@ -151,7 +157,8 @@ def predict(
     ), outputs
 
 
-# Validation -----------------------------------------------------------------------------------------------------------
+# Validation
+# --------------------------------------------------------------------------------------------------
 
 
 METRICS = ("psnr", "psnr_fg", "ssim", "semi_transparent", "dropped_tokens", "overflow")
@@ -165,8 +172,8 @@ def validation_examples(make_source: MakeSource, config: TrainConfig, count: int
 
 
 def as_validated(config: TrainConfig) -> TrainConfig:
-    """The run with the views that it is validated on: inputs evenly spaced and of one pose, as many as in the middle one of the
-    training's counts; targets as large as the inputs.
+    """The run with the views that it is validated on: inputs evenly spaced and of one pose, as many
+    as in the middle one of the training's counts; targets as large as the inputs.
     """
     counts = sorted(config.views.input_counts)
     views = ViewSampling(
@@ -185,8 +192,8 @@ def as_validated(config: TrainConfig) -> TrainConfig:
 
 
 def compared_as(base: TrainConfig, make_source: MakeSource) -> MakeSource:
-    """The people with the photos and targets that a run is validated on, for variants of it: only the size of the photos, which a
-    network is made for, is the variant's.
+    """The people with the photos and targets that a run is validated on, for variants of it: only
+    the size of the photos, which a network is made for, is the variant's.
     """
     own = as_validated(base.at(base.steps - 1))
 
@@ -206,8 +213,9 @@ def evaluate(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
-    """The images of one example's targets and their mean psnr, psnr_fg (both dB), ssim, semi-transparent foreground, and lpips
-    if its network is there. semi-transparent foreground is NaN where the network draws pixels: there is no alpha.
+    """The images of one example's targets and their mean psnr, psnr_fg (both dB), ssim,
+    semi-transparent foreground, and lpips if its network is there. semi-transparent foreground is
+    NaN where the network draws pixels: there is no alpha.
     """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
@@ -235,7 +243,10 @@ def validate(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[dict[str, float], list[np.ndarray]]:
-    """Means over the examples of all processes, and the images of this process's. All arguments are local arrays."""
+    """Means over the examples of all processes, and the images of this process's.
+
+    All arguments are local arrays.
+    """
     # buffers of another size than in training: as many pairs as the larger images may need
     unlimited = dataclasses.replace(config.splat, max_pairs=None, max_rows=None)
     config = dataclasses.replace(compiled_for(config), splat=unlimited)

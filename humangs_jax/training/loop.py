@@ -1,11 +1,14 @@
 """The training loop: the one place of this package's training with side effects.
 
 out/config.json, out/checkpoints/    see `checkpoint`; a run continues from the newest one by itself
-out/log.jsonl                        one object per line; {"step", "loss", ...} while training, {"step", "val_psnr", ...} from
-                                     validations, {"step", "event", ...} where something happened
-out/tensorboard/                     the same numbers and the validation images, if tensorboardX is installed
+out/log.jsonl                        one object per line; {"step", "loss", ...} while training,
+                                     {"step", "val_psnr", ...} from validations, {"step", "event",
+                                     ...} where something happened
+out/tensorboard/                     the same numbers and the validation images, if tensorboardX is
+                                     installed
 out/sheets/STEP.png                  what the network shows of people it was not trained on
-out/weights.safetensors              the newest weights (float16), averaged ones where `ema_decay` is set
+out/weights.safetensors              the newest weights (float16), averaged ones where `ema_decay`
+                                     is set
 out/best.safetensors                 those of the best validation
 
 Of several processes all must see the same folder `out`; one of them writes all but the checkpoints.
@@ -53,11 +56,15 @@ FLUSH_SECONDS = 10
 MANY_SKIPPED = 20
 """Number of consecutive steps that is reported if all were skipped, or all had a gradient of 0."""
 ALL_SKIPPED = "were skipped: `humangs train --diagnose` names the first stage that fails"
-NO_GRADIENT = "had a gradient of 0: no loss depends on a parameter any more; a learning rate that is too high does that"
+NO_GRADIENT = (
+    "had a gradient of 0: no loss depends on a parameter any more; a learning rate that is too high"
+    " does that"
+)
 
 
 class RunLog:
-    """The records of a run that continues after `step`: records of later steps, from a run that was killed, are dropped.
+    """The records of a run that continues after `step`: records of later steps, from a run that was
+    killed, are dropped.
 
     recording: False in all processes but one; then nothing is written or shown.
     """
@@ -93,7 +100,9 @@ class RunLog:
     def steps(
         self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int
     ) -> None:
-        """Numbers of the last step done. subjects: per step; seconds and samples a second are since the last line."""
+        """Numbers of the last step done. subjects: per step; seconds and samples a second are since
+        the last line.
+        """
         numbers = {name: float(value) for name, value in metrics.items()}
         before, began, waited = self._previous
         now = time.perf_counter()
@@ -141,7 +150,9 @@ class RunLog:
 
 
 class Watch:
-    """Reads every step's metrics one step late, so that the device is never idle, and reports failed steps."""
+    """Reads every step's metrics one step late, so that the device is never idle, and reports
+    failed steps.
+    """
 
     def __init__(self, log: RunLog, state: TrainState):
         self._log, self._pending = log, None
@@ -151,8 +162,11 @@ class Watch:
     def __call__(
         self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list
     ) -> None:
-        """The metrics of the step that was just begun; done: steps with it. bad_samples: asked if it failed, see `sources`."""
-        # one step may wait behind the one that runs: enough to keep a device busy, and the run reacts to a signal soon
+        """The metrics of the step that was just begun; done: steps with it. bad_samples: asked if
+        it failed, see `sources`.
+        """
+        # one step may wait behind the one that runs: enough to keep a device busy, and the run
+        # reacts to a signal soon
         self.look()
         names = ("skipped", "nonfinite", "loss", "grad_norm")
         self._pending = done, {name: metrics[name] for name in names}, bad_samples
@@ -189,9 +203,11 @@ class Watch:
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Drop the lines of later steps, and a last line that was not written to its end; the file changes whole or not.
+    """Drop the lines of later steps, and a last line that was not written to its end; the file
+    changes whole or not.
 
-    Raises: FileError for a file that is no log: no text, too large, or with another line that is no record.
+    Raises: FileError for a file that is no log: no text, too large, or with another line that is no
+    record.
     """
     if not path.is_file():
         return
@@ -225,7 +241,8 @@ def _tensorboard(folder: Path, step: int) -> Any:
     return SummaryWriter(str(folder), purge_step=step + 1, flush_secs=FLUSH_SECONDS)
 
 
-# Records --------------------------------------------------------------------------------------------------------------
+# Records
+# --------------------------------------------------------------------------------------------------
 
 
 VALIDATED = 8
@@ -233,14 +250,17 @@ VALIDATED = 8
 SHOWN = 4
 """Validation subjects on the sheet."""
 DROPPED = {
-    "dropped_tokens": "patches without room, mean: model.runtime.token_capacity is too small for these photos",
+    "dropped_tokens": (
+        "patches without room, mean: model.runtime.token_capacity is too small for these photos"
+    ),
     "overflow": "(splat, tile) pairs without room, mean: they were not drawn",
 }
 """What the numbers of a validation say that should be 0."""
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """`train` was asked to stop before its end, by Ctrl-C, SIGTERM or the loss of a machine. All is saved: the same call goes on.
+    """`train` was asked to stop before its end, by Ctrl-C, SIGTERM or the loss of a machine. All is
+    saved: the same call goes on.
 
     A KeyboardInterrupt, so that a loop of runs stops, too. state: the one that was saved.
     """
@@ -267,13 +287,16 @@ def train(
     stop_at: int | None = None,
     progress: bool = True,
 ) -> TrainState:
-    """Train until `config.steps`, from the newest checkpoint in `out` if there is one, on all devices of all processes.
+    """Train until `config.steps`, from the newest checkpoint in `out` if there is one, on all
+    devices of all processes.
 
-    Ctrl-C and SIGTERM finish the step, save and raise `TrainingInterrupted`; a second Ctrl-C interrupts at once.
+    Ctrl-C and SIGTERM finish the step, save and raise `TrainingInterrupted`; a second Ctrl-C
+    interrupts at once.
 
     Args:
         config: the run.
-        body: the model that the captures' parameters belong to; made into the model's `gaussian_body` here.
+        body: the model that the captures' parameters belong to; made into the model's
+            `gaussian_body` here.
         training: capture folders, or what makes another source of examples (`sources`).
         out: folder of checkpoints, logs, sheets and weights.
         validation: the same of other people; no validation without.
@@ -289,12 +312,13 @@ def train(
 
     Raises:
         TrainingInterrupted: a KeyboardInterrupt, as said.
-        ValueError: if `out` belongs to a run of another configuration, no capture can be used, devices and batch do not
-            divide each other, or the sizes of a later stage do not fit.
+        ValueError: if `out` belongs to a run of another configuration, no capture can be used,
+            devices and batch do not divide each other, or the sizes of a later stage do not fit.
         OSError: if another process trains into `out`.
 
     Examples:
-        >>> state = hg.train(config, hg.load_body(), ["people/0000001", "people/0000002"], "runs/mine")
+        >>> people = ["people/0000001", "people/0000002"]
+        >>> state = hg.train(config, hg.load_body(), people, "runs/mine")
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
@@ -410,7 +434,9 @@ def _rehearse(
     networks: LossNetworks,
     mesh: Mesh | None,
 ) -> None:
-    """Trace a step of a later stage: sizes that do not fit raise before the run, not in the middle of it."""
+    """Trace a step of a later stage: sizes that do not fit raise before the run, not in the middle
+    of it.
+    """
     batch = stage_loader(make_source, config, step, mesh).batch_at(step)
     part = config.at(step)
     one = functools.partial(update, config=compiled_for(part), mesh=mesh)
@@ -431,10 +457,12 @@ def _report(
 
 @contextlib.contextmanager
 def stop_requested() -> Generator[Callable[[int], bool], None, None]:
-    """A function of the number of steps done: whether to stop after them, for Ctrl-C or because the machine is taken away.
+    """A function of the number of steps done: whether to stop after them, for Ctrl-C or because the
+    machine is taken away.
 
-    All processes must ask it after every step. One process checks its own signals, a second of which does what it did before.
-    Several may receive one at different steps, so that jax's coordination service agrees on a step
+    All processes must ask it after every step. One process checks its own signals, a second of
+    which does what it did before. Several may receive one at different steps, so that jax's
+    coordination service agrees on a step
     (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
     """
     if jax.process_count() > 1:
@@ -449,7 +477,9 @@ def stop_requested() -> Generator[Callable[[int], bool], None, None]:
             signal.signal(number, previous[number])
             os.kill(os.getpid(), number)
             return
-        stop.set()  # the handler stays: with that of the command line again, saving would have to be done within seconds
+        # the handler stays: with that of the command line again, saving would have to be done
+        # within seconds
+        stop.set()
         logger.warning("stopping after this step; what is done is saved")
 
     caught = (

@@ -1,9 +1,11 @@
-"""How a run is divided among many devices: batches among all of them, the state among those along one axis of the mesh.
+"""How a run is divided among many devices: batches among all of them, the state among those along
+one axis of the mesh.
 
-Data parallelism over both axes of the mesh ("data", "fsdp"); parameters, moments and averages are divided along "fsdp" and
-equal along "data". A step gathers the parameters once, works on its subjects, and sends every device the sum of its own
-part of the gradient (ZeRO stage 3, Rajbhandari et al., 2020, https://arxiv.org/abs/1910.02054, with one gathering a step:
-the network is small beside what it computes).
+Data parallelism over both axes of the mesh ("data", "fsdp"); parameters, moments and averages are
+divided along "fsdp" and equal along "data". A step gathers the parameters once, works on its
+subjects, and sends every device the sum of its own part of the gradient (ZeRO stage 3, Rajbhandari
+et al., 2020, https://arxiv.org/abs/1910.02054, with one gathering a step: the network is small
+beside what it computes).
 """
 
 import functools
@@ -20,13 +22,16 @@ from humangs_jax.training.state import TrainState
 
 AXES = ("data", "fsdp")
 SMALLEST_DIVIDED = 1 << 10
-"""Elements of the smallest array that is worth dividing: below, the messages cost more than the memory."""
+"""Elements of the smallest array that is worth dividing: below, the messages cost more than the
+memory.
+"""
 
 T = TypeVar("T")
 
 
 def training_mesh(fsdp: int | None = None, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """All devices (of all processes) as a mesh of `AXES`. fsdp: devices that share one copy of the state; None: all.
+    """All devices (of all processes) as a mesh of `AXES`. fsdp: devices that share one copy of the
+    state; None: all.
 
     Raises: ValueError if fsdp does not divide the number of devices.
     """
@@ -34,12 +39,15 @@ def training_mesh(fsdp: int | None = None, devices: Sequence[jax.Device] | None 
     fsdp = len(devices) if fsdp is None else fsdp
     if fsdp < 1 or len(devices) % fsdp:
         raise ValueError(f"fsdp {fsdp} does not divide {len(devices)} devices")
-    # automatic axes: with explicit ones, the default of newer jax, every gather of a divided array is an error
+    # automatic axes: with explicit ones, the default of newer jax, every gather of a divided array
+    # is an error
     return Mesh(np.asarray(devices).reshape(-1, fsdp), AXES, axis_types=(AxisType.Auto,) * 2)
 
 
 def divided_axis(shape: tuple[int, ...], parts: int) -> int | None:
-    """The axis of an array of the state along which it is divided: the longest that can be; None for none."""
+    """The axis of an array of the state along which it is divided: the longest that can be; None
+    for none.
+    """
     if np.prod(shape) < SMALLEST_DIVIDED or parts == 1:
         return None
     axes = [axis for axis, length in enumerate(shape) if length % parts == 0]
@@ -77,7 +85,9 @@ def replicated(mesh: Mesh) -> NamedSharding:
 
 
 def place(tree: T, shardings: PyTree) -> T:
-    """Equal host or local arrays of every process as global ones; `shardings`: a tree of them, or one for all leaves."""
+    """Equal host or local arrays of every process as global ones; `shardings`: a tree of them, or
+    one for all leaves.
+    """
     if isinstance(shardings, NamedSharding):
         shardings = jax.tree.map(lambda _: shardings, tree)
 
@@ -89,7 +99,10 @@ def place(tree: T, shardings: PyTree) -> T:
 
 
 def whole(tree: T, mesh: Mesh) -> T:
-    """Arrays of this process's default device equal to those that are divided among devices. All processes must call it."""
+    """Arrays of this process's default device equal to those that are divided among devices.
+
+    All processes must call it.
+    """
     return jax.tree.map(lambda x: x.addressable_data(0), _replicate(mesh)(tree))
 
 
@@ -130,14 +143,16 @@ def join_processes(
 ) -> None:
     """Become one of several processes; call it before anything else asks for devices.
 
-    Arguments: coordinator "host:port" of process 0, how many processes, which of them this is. All None: as the cluster
-    tells (SLURM, Open MPI, Kubernetes and TPU pods do, see `jax.distributed.initialize`).
+    Arguments: coordinator "host:port" of process 0, how many processes, which of them this is. All
+    None: as the cluster tells (SLURM, Open MPI, Kubernetes and TPU pods do, see
+    `jax.distributed.initialize`).
     Raises: ValueError unless all or none are given, or where no cluster is recognised.
     """
     given = (coordinator, process_count, process_index)
     if None in given and any(value is not None for value in given):
         raise ValueError(
-            "several processes: give coordinator, number of processes and process index, or none of them"
+            "several processes: give coordinator, number of processes and process index, or none of"
+            " them"
         )
     jax.config.update(
         "jax_cpu_collectives_implementation", "gloo"

@@ -1,4 +1,5 @@
-"""Where a run's examples come from: capture folders, data sets, people made on the fly, or several of these.
+"""Where a run's examples come from: capture folders, data sets, people made on the fly, or several
+of these.
 
 A run asks for a new source at every stage, because image sizes differ.
 """
@@ -58,9 +59,11 @@ def stage_loader(
 
 
 def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list[str]:
-    """A line for each sample of this process in a step with numbers that are not finite, or colors and masks beyond [0, 1].
+    """A line for each sample of this process in a step with numbers that are not finite, or colors
+    and masks beyond [0, 1].
 
-    batch: of that step, on one device. None: made again; a loader is a pure function, so a run need not keep what it trains on.
+    batch: of that step, on one device. None: made again; a loader is a pure function, so a run need
+    not keep what it trains on.
     """
     found, kinds = [], {"images": UNIT, "masks": UNIT}
     for i, row in enumerate(loader.rows):
@@ -83,7 +86,9 @@ def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list
 def captured_people(
     folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> MakeSource:
-    """Capture folders whose parameters belong to `body`; images that are decoded once serve all stages."""
+    """Capture folders whose parameters belong to `body`; images that are decoded once serve all
+    stages.
+    """
     return cached_people(CaptureCache(folders, body, body_file=body_file))
 
 
@@ -107,9 +112,11 @@ def cached_people(cache: PeopleCache) -> MakeSource:
 def on_the_fly_people(
     bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False
 ) -> MakeSource:
-    """People of a bank, rendered for every step on the device that trains; sizes and views are those of the run.
+    """People of a bank, rendered for every step on the device that trains; sizes and views are
+    those of the run.
 
-    each_once: each person once, in order, as a validation wants them; otherwise they are drawn at random.
+    each_once: each person once, in order, as a validation wants them; otherwise they are drawn at
+    random.
     """
 
     def make(config: TrainConfig) -> Source:
@@ -143,7 +150,8 @@ def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) ->
 
 
 def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> MakeSource:
-    """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md), whose body is `body`.
+    """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md),
+    whose body is `body`.
 
     split: of synthetic captures, see `find_people`.
     Raises: ValueError if the folder has none of these.
@@ -160,10 +168,11 @@ def training_people(
     body: BodyModel,
     body_file: str | Path = DEFAULT_BODY,
 ) -> MakeSource:
-    """The people of `people_on_disk`, `on_the_fly` synthetic people rendered for every step, or both by halves.
+    """The people of `people_on_disk`, `on_the_fly` synthetic people rendered for every step, or
+    both by halves.
 
-    The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are none, or if synthetic people
-    are asked for beside a body that is not theirs.
+    The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are
+    none, or if synthetic people are asked for beside a body that is not theirs.
     """
     parts = [] if data is None else [people_on_disk(data, FileBody(body, str(body_file)))]
     if on_the_fly and str(body_file) != DEFAULT_BODY:

@@ -1,9 +1,10 @@
 """All that a run carries from step to step, and the optimizer whose state is part of it.
 
-Random numbers are not in it: they follow from the seed and the step. The optimizer as published: AdamW, warm-up and cosine,
-clipped gradients, and a guard against bad steps. A gradient is made finite entry by entry first (NaN becomes 0, infinities
-+-1e-6). A step whose gradient norm exceeds `skip_norm`, or whose loss is not finite, changes nothing, neither parameters nor
-moments nor the schedule, and is counted, and so is every step that had anything to make finite.
+Random numbers are not in it: they follow from the seed and the step. The optimizer as published:
+AdamW, warm-up and cosine, clipped gradients, and a guard against bad steps. A gradient is made
+finite entry by entry first (NaN becomes 0, infinities +-1e-6). A step whose gradient norm exceeds
+`skip_norm`, or whose loss is not finite, changes nothing, neither parameters nor moments nor the
+schedule, and is counted, and so is every step that had anything to make finite.
 """
 
 from typing import NamedTuple
@@ -23,7 +24,8 @@ INFINITY_STAND_IN = 1e-6
 
 @pytree_dataclass
 class TrainState:
-    """step: steps done, skipped ones included. params, batch_stats: of the network (`init_humangs`).
+    """step: steps done, skipped ones included. params, batch_stats: of the network
+    (`init_humangs`).
 
     opt_state: of `make_optimizer`. ema_params: running average of params, or None.
     """
@@ -45,7 +47,8 @@ def init_state(config: TrainConfig, variables: Variables | None = None) -> Train
     """The state before the first step, from fresh variables of `config.seed` or from given ones."""
     if variables is None:
         variables = init_humangs(jax.random.key(config.seed), config.model)
-    # copies: the training step gives its state's buffers away, so neither the caller nor two fields may share one
+    # copies: the training step gives its state's buffers away, so neither the caller nor two fields
+    # may share one
     own = jax.tree.map(lambda x: jnp.array(x, jnp.float32), dict(variables))
     params, batch_stats = own["params"], own["batch_stats"]
     opt_state = make_optimizer(config.optimizer, config.steps).init(params)
@@ -54,7 +57,8 @@ def init_state(config: TrainConfig, variables: Variables | None = None) -> Train
 
 
 class GuardState(NamedTuple):
-    """skipped: steps skipped so far. nonfinite: steps so far whose loss or gradient was not finite, skipped or not.
+    """skipped: steps skipped so far. nonfinite: steps so far whose loss or gradient was not finite,
+    skipped or not.
 
     norm: gradient norm of the last step, made finite, before clipping. inner: what is guarded.
     """
@@ -94,7 +98,8 @@ def gradient_norm(gradients: PyTree) -> Scalar:
 def guard(
     inner: optax.GradientTransformation, skip_norm: float
 ) -> optax.GradientTransformationExtraArgs:
-    """`inner` on finite gradients, skipped where their norm exceeds `skip_norm` or the loss is not finite.
+    """`inner` on finite gradients, skipped where their norm exceeds `skip_norm` or the loss is not
+    finite.
 
     The loss is the extra argument `value` of `update`.
     """
@@ -117,7 +122,8 @@ def guard(
         advanced = jax.tree.map(keep, advanced, state.inner)
         return updates, GuardState(state.skipped + ~good, state.nonfinite + ~finite, norm, advanced)
 
-    # optax types the constructor's second argument as that of its base class, which knows no extra arguments
+    # optax types the constructor's second argument as that of its base class, which knows no extra
+    # arguments
     return optax.GradientTransformationExtraArgs(init, update)  # ty: ignore[invalid-argument-type]
 
 

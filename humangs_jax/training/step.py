@@ -1,4 +1,6 @@
-"""One step of training: a pure function of state, batch and body, on one device or on a mesh of them."""
+"""One step of training: a pure function of state, batch and body, on one device or on a mesh of
+them.
+"""
 
 import functools
 from collections.abc import Callable
@@ -25,7 +27,9 @@ from humangs_jax.training.forward import draw_targets, reconstruct_example
 from humangs_jax.training.state import GuardState, TrainState, learning_rate, make_optimizer
 
 SUBJECTS = "subjects"
-"""Name of the vmap axis over the subjects that a device works on at once, along which batch statistics are shared."""
+"""Name of the vmap axis over the subjects that a device works on at once, along which batch
+statistics are shared.
+"""
 COUNTS = ("dropped_tokens", "overflow")
 """Metrics that are sums over a batch; all others are means."""
 AUGMENTED = 1
@@ -54,7 +58,9 @@ def change_background(
 
 @functools.cache
 def seed_numbers(seed: int) -> Shaped[np.ndarray, " n"]:
-    """The key of a run as numbers on the host: an argument of a step's program, so that all seeds share it."""
+    """The key of a run as numbers on the host: an argument of a step's program, so that all seeds
+    share it.
+    """
     with jax.ensure_compile_time_eval():  # may be asked while a step is traced
         return np.asarray(jax.random.key_data(jax.random.key(seed)))
 
@@ -115,10 +121,12 @@ def local_gradients(
     networks: LossNetworks = NO_NETWORKS,
     axes: tuple[str, ...] = (),
 ) -> Gradients:
-    """Gradients of one device's subjects: means over them, but sums of what was dropped. keys: one per subject.
+    """Gradients of one device's subjects: means over them, but sums of what was dropped. keys: one
+    per subject.
 
-    `config.microbatch_size` subjects are worked on at once, the gradients accumulate over the rest. axes: of the mesh,
-    along which batch statistics are shared too. Raises: ValueError if the subjects cannot be divided so.
+    `config.microbatch_size` subjects are worked on at once, the gradients accumulate over the rest.
+    axes: of the mesh, along which batch statistics are shared too. Raises: ValueError if the
+    subjects cannot be divided so.
     """
     count, size = len(keys), config.microbatch_size
     if count % size:
@@ -182,7 +190,8 @@ def batch_gradients(
         mesh=mesh,
         in_specs=(specs, everywhere, everywhere, divided, divided, everywhere),
         out_specs=(everywhere, specs, everywhere, everywhere),
-        # the renderer's loops start from constants, which the check would want marked as differing between devices
+        # the renderer's loops start from constants, which the check would want marked as differing
+        # between devices
         check_vma=False,
     )(params, batch_stats, body, batch, keys, networks)
 
@@ -206,7 +215,9 @@ def compiled_update() -> Callable[
     [TrainState, Example, BodyModel, LossNetworks, Seed, TrainConfig, Mesh | None],
     tuple[TrainState, Metrics],
 ]:
-    """`update` for the default backend; a step of all runs that differ in host settings alone is one program."""
+    """`update` for the default backend; a step of all runs that differ in host settings alone is
+    one program.
+    """
     static, options = ("config", "mesh"), compiler_options()
     return jax.jit(
         update, static_argnames=static, donate_argnames="state", compiler_options=options
@@ -222,18 +233,21 @@ def update(
     config: TrainConfig,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """The state after one more step, and metrics: loss and its terms, psnr, grad_norm, learning_rate, skipped and
-    nonfinite (steps so far), dropped_tokens and overflow (what did not fit its buffers in this step).
+    """The state after one more step, and metrics: loss and its terms, psnr, grad_norm,
+    learning_rate, skipped and nonfinite (steps so far), dropped_tokens and overflow (what did not
+    fit its buffers in this step).
 
-    Arguments: batch: an `Example` with a leading axis of subjects. body: decimated already. networks: of the losses that need
-    them. seed: `seed_numbers`. config: static, of one stage. mesh: static; where there is one, state, batch, body and networks
-    lie on it, see `sharding`. Raises: ValueError for parameters of fewer than 32 bits.
+    Arguments: batch: an `Example` with a leading axis of subjects. body: decimated already.
+    networks: of the losses that need them. seed: `seed_numbers`. config: static, of one stage.
+    mesh: static; where there is one, state, batch, body and networks lie on it, see `sharding`.
+    Raises: ValueError for parameters of fewer than 32 bits.
     """
     for name, leaf in inexact_leaves(state.params):
         if jnp.finfo(leaf.dtype).bits < 32:
             raise ValueError(
-                f"train_step: params.{name}: expected float32, got {leaf.dtype}: small updates would be rounded away; to "
-                'compute in bfloat16, keep the parameters and set model.runtime.dtype to "bfloat16"'
+                f"train_step: params.{name}: expected float32, got {leaf.dtype}: small updates"
+                " would be rounded away; to compute in bfloat16, keep the parameters and set"
+                ' model.runtime.dtype to "bfloat16"'
             )
     keys = subject_keys(seed, state.step, batch.inputs.betas.shape[0])
     loss, gradients, batch_stats, metrics = batch_gradients(

@@ -1,7 +1,9 @@
-"""The page that shows an avatar: one HTML file that needs no network, on disk, on localhost or in a notebook.
+"""The page that shows an avatar: one HTML file that needs no network, on disk, on localhost or in a
+notebook.
 
-Its code lies beside this module in page/, as the browser runs it; here the files become one. The browser itself forbids the
-page all connections (Content-Security-Policy). An avatar and its motion travel in it as 16-bit arrays, see `Packed`.
+Its code lies beside this module in page/, as the browser runs it; here the files become one. The
+browser itself forbids the page all connections (Content-Security-Policy). An avatar and its motion
+travel in it as 16-bit arrays, see `Packed`.
 """
 
 import base64
@@ -47,32 +49,42 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 
 VERSION = 1
 WEIGHTS = 8
-"""Skinning weights kept of each Gaussian. The shipped body has at most 7; leaving out the eighth costs nothing there."""
+"""Skinning weights kept of each Gaussian.
+
+The shipped body has at most 7; leaving out the eighth costs nothing there.
+"""
 STEPS = 65535
 SMALLEST_SCALE = 1e-7
-"""Metres; keeps the logarithm finite for flat Gaussians. A thousandth of eps2d for a camera at any distance."""
+"""Metres; keeps the logarithm finite for flat Gaussians.
+
+A thousandth of eps2d for a camera at any distance.
+"""
 SMALLEST_RANGE = 1e-6
 """Of quantized values: keeps the division finite where all are the same."""
 SHAPE_STEP = 1e-4
 """Metres."""
 SHAPE_TOLERANCE = 1e-3
-"""Metres; a body explains an avatar if its vertices, in the shape that fits best, are this near (root mean square)."""
+"""Metres; a body explains an avatar if its vertices, in the shape that fits best, are this near
+(root mean square).
+"""
 DRAWN_FIELDS = ("near", "alpha_min", "alpha_max", "jacobian_margin")
 
 
 @dataclasses.dataclass
 class Packed:
-    """An avatar and a motion. header: what JSON holds. data: arrays, one after the other, each at a multiple of 4 bytes.
+    """An avatar and a motion. header: what JSON holds. data: arrays, one after the other, each at a
+    multiple of 4 bytes.
 
     Little-endian; `low`, `high` and `step` are in the header:
-        means uint16 (g, 3): from low to high, per axis, metres. scales uint16 (g, 3): log of metres, from low to high.
-        quats int16 (g, 4): unit, wxyz, times 32767. opacities uint16 (g,): [0, 1]. colors uint16 (g, 3): from low to high.
-        harmonics uint16 (g, k, 3): from low to high; only if the Gaussians have some.
-        weights uint16 (g, 8): skinning weights, the largest first; every row sums to 65535. weight_joints uint8 (g, 8).
-        light_normals int8 (g, 3): times 127. light_shading uint16 (g,): from low to high. Both only if the avatar has a light.
-        rest_joints float32 (j, 3): metres.
-        rotations int16 (m, j, 3): axis-angle times step, radians. translations float32 (m, 3): metres. Of the motion.
-        shape_directions int16 (s, n, 3): how vertices move per unit of a shape coefficient, times step, metres. shape_joints
+        means uint16 (g, 3): from low to high, per axis, metres. scales uint16 (g, 3): log of
+        metres, from low to high. quats int16 (g, 4): unit, wxyz, times 32767. opacities uint16
+        (g,): [0, 1]. colors uint16 (g, 3): from low to high. harmonics uint16 (g, k, 3): from low
+        to high; only if the Gaussians have some. weights uint16 (g, 8): skinning weights, the
+        largest first; every row sums to 65535. weight_joints uint8 (g, 8). light_normals int8 (g,
+        3): times 127. light_shading uint16 (g,): from low to high. Both only if the avatar has a
+        light. rest_joints float32 (j, 3): metres. rotations int16 (m, j, 3): axis-angle times step,
+        radians. translations float32 (m, 3): metres. Of the motion. shape_directions int16 (s, n,
+        3): how vertices move per unit of a shape coefficient, times step, metres. shape_joints
         float32 (s, j, 3): likewise of joints, metres. Both only if the body is known.
     """
 
@@ -88,10 +100,11 @@ def pack(
 ) -> Packed:
     """What the page holds of an avatar.
 
-    Arguments: motion: of the avatar's joints. body: the model that the avatar's vertices are of, for sliders of its shape.
+    Arguments: motion: of the avatar's joints. body: the model that the avatar's vertices are of,
+    for sliders of its shape.
 
-    Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other joints, or a body that
-    does not explain the avatar's vertices.
+    Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other
+    joints, or a body that does not explain the avatar's vertices.
     """
     check_values(
         "the page",
@@ -153,7 +166,8 @@ def _low_pass(avatar: Avatar) -> float:
 def largest_weights(
     weights: Float[np.ndarray, "g j"],
 ) -> tuple[Int[np.ndarray, "g 8"], Int[np.ndarray, "g 8"]]:
-    """Joints and weights of the 8 largest of each row, largest first; 65535 is a weight of 1, and rows sum to it.
+    """Joints and weights of the 8 largest of each row, largest first; 65535 is a weight of 1, and
+    rows sum to it.
 
     What is left out is given to the others in proportion; what rounding leaves, to the largest.
     """
@@ -170,7 +184,9 @@ def largest_weights(
 
 
 def fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | None:
-    """The shape coefficients of `body` with which it has the avatar's vertices; None if it cannot have them."""
+    """The shape coefficients of `body` with which it has the avatar's vertices; None if it cannot
+    have them.
+    """
     target = np.asarray(avatar.rest_vertices, np.float64)
     if body.template.shape != target.shape or len(body.parents) != len(avatar.parents):
         return None
@@ -227,7 +243,9 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
 def _pack_shape(
     avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> None:
-    """Of every direction its offsets of the vertices; the Gaussians of a vertex move with it (they are vertex-major)."""
+    """Of every direction its offsets of the vertices; the Gaussians of a vertex move with it (they
+    are vertex-major).
+    """
     betas = fitted_shape(avatar, body)
     vertices = len(avatar.rest_vertices)
     if betas is None or len(avatar.gaussians.means) % vertices:
@@ -265,7 +283,8 @@ def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
     return Packed(header, b"".join(parts))
 
 
-# The page --------------------------------------------------------------------------------------------------------------
+# The page
+# --------------------------------------------------------------------------------------------------
 
 
 SCRIPTS = (
@@ -286,8 +305,8 @@ def page_html(
 ) -> str:
     """The page as text.
 
-    Arguments: motion: None for the walk that comes with the package (if the avatar has its joints). title, motion_name: shown
-    in the page.
+    Arguments: motion: None for the walk that comes with the package (if the avatar has its joints).
+    title, motion_name: shown in the page.
 
     Raises: ValueError, one line, for an avatar or a motion that cannot be drawn (see `pack`).
     """
@@ -318,7 +337,10 @@ def write_page(
     title: str = "avatar",
     motion_name: str | None = None,
 ) -> int:
-    """Write the page; it appears whole or not at all. Returns its size in bytes. Raises: as `page_html`; OSError."""
+    """Write the page; it appears whole or not at all. Returns its size in bytes.
+
+    Raises: as `page_html`; OSError.
+    """
     text = page_html(avatar, motion, title, motion_name)
     write_text(path, text)
     return len(text.encode())
@@ -344,7 +366,8 @@ class NotebookPage:
 
 @checked_arguments
 def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> NotebookPage:
-    """The avatar in a notebook, moving: the last expression of a cell, or `display(hg.show(avatar))`.
+    """The avatar in a notebook, moving: the last expression of a cell, or
+    `display(hg.show(avatar))`.
 
     The page becomes a part of the notebook's file (some 1.2 MB).
 
@@ -380,7 +403,9 @@ def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
 
 
 def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
-    """A server on 127.0.0.1, not yet running, of texts by path, as they are when they are asked for. Raises: as `serve`."""
+    """A server on 127.0.0.1, not yet running, of texts by path, as they are when they are asked
+    for. Raises: as `serve`.
+    """
 
     class Page(BaseHTTPRequestHandler):
         def do_GET(self):
@@ -406,7 +431,9 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
 
 def known_body(avatar: Avatar) -> BodyModel | None:
-    """The shipped body on the avatar's vertices, if the avatar is one of its people: what the sliders of shape need."""
+    """The shipped body on the avatar's vertices, if the avatar is one of its people: what the
+    sliders of shape need.
+    """
     if avatar.parents != PARENTS:
         return None
     body = load_body()
@@ -417,7 +444,9 @@ def known_body(avatar: Avatar) -> BodyModel | None:
 
 
 def _shipped_network() -> HumanGSConfig:
-    """The network of the shipped weights, without reading their tensors; the default one if none are shipped."""
+    """The network of the shipped weights, without reading their tensors; the default one if none
+    are shipped.
+    """
     with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
         metadata = read_safetensors(file, lambda key: False)[2] if file.exists() else {}
     return HumanGSConfig(
@@ -426,7 +455,9 @@ def _shipped_network() -> HumanGSConfig:
 
 
 def page_script(*names: str) -> str:
-    """The text of some of the page's scripts, below the tables that they share with the readers of motions in Python."""
+    """The text of some of the page's scripts, below the tables that they share with the readers of
+    motions in Python.
+    """
     rules = json.dumps(page_rules(), separators=(",", ":")).replace("<", "\\u003c")
     return "\n".join([f"const RULES = {rules};", *(read_part(f"{name}.js") for name in names)])
 
@@ -441,7 +472,9 @@ def read_part(name: str) -> str:
 
 
 def _template() -> str:
-    """index.html with styles, shaders and scripts in their places; the avatar's are still marked."""
+    """index.html with styles, shaders and scripts in their places; the avatar's are still
+    marked.
+    """
     parts = {
         "style": read_part("style.css"),
         "shaders": "\n".join(
@@ -454,8 +487,9 @@ def _template() -> str:
     return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), read_part("index.html"))
 
 
-# Live: an avatar while it is being made, by a training run (the newest weights reconstruct someone) or a refinement (its file).
-# The browser asks for the state of the view every second, and loads the page again where it shows another avatar.
+# Live: an avatar while it is being made, by a training run (the newest weights reconstruct someone)
+# or a refinement (its file). The browser asks for the state of the view every second, and loads the
+# page again where it shows another avatar.
 
 
 RUN_WEIGHTS = "weights.safetensors"
@@ -467,7 +501,8 @@ LOOK_AGAIN = 1.0
 class LiveView:
     """The page of one avatar after the other on 127.0.0.1; a context manager.
 
-    Arguments: motion: played by the page; None: the shipped walk. port: 0 for any free one. Raises: OSError if the port is taken.
+    Arguments: motion: played by the page; None: the shipped walk. port: 0 for any free one. Raises:
+    OSError if the port is taken.
     """
 
     def __init__(self, motion: Motion | None = None, port: int = 0):
@@ -486,7 +521,10 @@ class LiveView:
         self.server.server_close()
 
     def show(self, avatar: Avatar, status: str | None = None) -> None:
-        """Show an avatar in place of the last one, and a line above it. May be called from any thread."""
+        """Show an avatar in place of the last one, and a line above it.
+
+        May be called from any thread.
+        """
         self.pages["/avatar"] = page_html(avatar, self.motion)
         self.shown += 1
         self.say(
@@ -509,8 +547,8 @@ def follow(
 ) -> None:
     """Show what a training run or a refinement makes, until Ctrl-C.
 
-    Arguments: path: the folder of a run of `humangs train`, or an avatar file, which need not exist yet. capture: of the person
-    that a run's network reconstructs; None for the shipped one.
+    Arguments: path: the folder of a run of `humangs train`, or an avatar file, which need not exist
+    yet. capture: of the person that a run's network reconstructs; None for the shipped one.
 
     Raises: ValueError or OSError, one line, for what cannot be followed.
     """
@@ -542,10 +580,11 @@ def follow(
 def show_newest(
     view: LiveView, path: Path, photos: Capture | None, shown: tuple | None
 ) -> tuple | None:
-    """Show the file at `path` unless it is shown already. Returns its time and size, which is `shown` in the next call.
+    """Show the file at `path` unless it is shown already. Returns its time and size, which is
+    `shown` in the next call.
 
-    photos: of the person that the weights of the run in `path` reconstruct; None: `path` is an avatar file. A file that cannot be
-    read is reported in the page, once.
+    photos: of the person that the weights of the run in `path` reconstruct; None: `path` is an
+    avatar file. A file that cannot be read is reported in the page, once.
     """
     file = path if photos is None else path / RUN_WEIGHTS
     try:

@@ -23,7 +23,9 @@ SIZE = 64
 
 @functools.cache
 def boxes():
-    """A torso and two arms as boxes, each moved by a joint of its own; 1 m tall, 1.2 m wide, unequal in front and behind."""
+    """A torso and two arms as boxes, each moved by a joint of its own; 1 m tall, 1.2 m wide,
+    unequal in front and behind.
+    """
 
     def box(low, high):
         corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -196,10 +198,14 @@ def test_each_view_shows_its_own_frame(tmp_path):
     assert [not view.warning for view in report.views] == [True, False, True]
 
 
-# The quick check: what it names, what it leaves alone, what it costs ---------------------------------------------------
+# The quick check: what it names, what it leaves alone, what it costs
+# ---------------------------------------------------
 
 SECONDS = 0.5
-"""Of the processor, for four photos: 0.07 measured. Less than the import of a library or a compilation would take."""
+"""Of the processor, for four photos: 0.07 measured.
+
+Less than the import of a library or a compilation would take.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -245,11 +251,17 @@ CHANGES = {
     ),
     "two cameras are exchanged": (
         lambda c: with_cameras(c, [1, 0, 2, 3]),
-        "cameras are exchanged: the body would fit 0_00 by the camera of 0_01, 0_01 by the camera of 0_00",
+        (
+            "cameras are exchanged: the body would fit 0_00 by the camera of 0_01, 0_01 by the"
+            " camera of 0_00"
+        ),
     ),
     "cameras are shifted": (
         lambda c: with_cameras(c, [1, 2, 3, 0]),
-        "cameras are exchanged: the body would fit 0_00 by the camera of 0_03, 0_01 by the camera of 0_00",
+        (
+            "cameras are exchanged: the body would fit 0_00 by the camera of 0_03, 0_01 by the"
+            " camera of 0_00"
+        ),
     ),
     "poses in degrees": (
         lambda c: {"poses": replace(c.poses, rotations=jnp.degrees(c.poses.rotations))},

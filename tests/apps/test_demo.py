@@ -16,8 +16,9 @@ PRODUCTS = {
     *("novel_views.exr", "novel_views.png", "refined.png", "report.json"),
 }
 LEAST = {"psnr": 25.4, "ssim": 0.924, "psnr_fg": 17.6, "baseline_psnr": 18.6}
-"""What the README claims of the held-out views (25.7 dB, 0.930, 18.0 dB, 18.9 dB), less 0.3 dB and 0.005: that is more than
-processors and XLA's versions differ by, and less than any change of the method that matters."""
+"""What the README claims of the held-out views (25.7 dB, 0.930, 18.0 dB, 18.9 dB), less 0.3 dB and
+0.005: that is more than processors and XLA's versions differ by, and less than any change of the
+method that matters."""
 
 FRAME_SIZE = 64
 

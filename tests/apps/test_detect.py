@@ -209,7 +209,8 @@ def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path
     ]
 
 
-# One person in front of calibrated cameras is one person ---------------------------------------------------------------
+# One person in front of calibrated cameras is one person
+# ---------------------------------------------------------------
 
 SIDE, FOCAL = 600, 700.0
 """Pixels of the photos, and of their focal length."""
@@ -218,7 +219,9 @@ OTHER_BODY = np.random.default_rng(4).normal(0, [0.15, 0.45, 0.1], (33, 3))
 
 
 def camera_at(degrees, turned=0.0, distance=3.5):
-    """cam_from_world of a camera around the origin that looks at it. turned: about its own x, degrees."""
+    """cam_from_world of a camera around the origin that looks at it. turned: about its own x,
+    degrees.
+    """
     look, tilt = (
         Rotation.from_euler(axis, angle, degrees=True).as_matrix()
         for axis, angle in (("y", degrees), ("x", turned))
@@ -364,7 +367,9 @@ def test_rivals_who_are_matched_to_nobody_are_asked_about_and_get_no_black_mask(
         choose(photos, None, tmp_path / "s.png")
     with pytest.raises(
         ValueError,
-        match=r"which of the people of .*s\.png is meant\? Their places do not tell: cut these photos",
+        match=(
+            r"which of the people of .*s\.png is meant\? Their places do not tell: cut these photos"
+        ),
     ):
         choose(photos, 0, tmp_path / "s.png")
 
@@ -401,7 +406,7 @@ def test_masks_and_keypoints_choose_in_each_photo_whatever_the_matching_says(kin
         np.ones((3, 33), np.float32),
     )
     for v, i in enumerate(meant):
-        (top, left) = places[i]
+        top, left = places[i]
         masks[v, top : top + 8, left : left + 4] = 1
         points[v] = left + 2, top + 3
     given = list(masks) if kind == "masks" else Keypoints(points, confidences, MEDIAPIPE_33)

@@ -1,4 +1,6 @@
-"""Files that others wrote are never replaced unasked, whichever command would give its own the same name."""
+"""Files that others wrote are never replaced unasked, whichever command would give its own the same
+name.
+"""
 
 import json
 import shutil
@@ -44,8 +46,8 @@ def test_detect_replaces_what_it_wrote_and_nothing_else(name, here, capsys):
     command = ["detect", "photos", "--out", "photos"]
     assert cli.execute(command) == cli.BAD_DATA
     assert (
-        f"photos/{name}: exists, and was not written by humangs: choose another folder, or --overwrite"
-        in capsys.readouterr().err
+        f"photos/{name}: exists, and was not written by humangs: choose another folder, or"
+        " --overwrite" in capsys.readouterr().err
     )
     assert (
         file.read_bytes() == before

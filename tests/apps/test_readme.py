@@ -1,4 +1,6 @@
-"""The Python of README.md and of the pages, executed as it stands: with what a page takes for given, on small inputs."""
+"""The Python of README.md and of the pages, executed as it stands: with what a page takes for
+given, on small inputs.
+"""
 
 import dataclasses
 import json
@@ -145,7 +147,9 @@ def files(tmp_path, monkeypatch, body):
 
 
 def check_described_capture(text):
-    """The lines of Python wrote a capture whose capture.json has the keys of the one that is described, and its camera."""
+    """The lines of Python wrote a capture whose capture.json has the keys of the one that is
+    described, and its camera.
+    """
     capture, file = hg.load_capture("me"), Path("me/capture.json")
     assert capture.view_count == 4 and capture.body.name == "makehuman"
     written, content = (

@@ -44,7 +44,9 @@ DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """Photos, calibration, masks and keypoints of the demo's person, as other programs write them."""
+    """Photos, calibration, masks and keypoints of the demo's person, as other programs write
+    them.
+    """
     folder = tmp_path_factory.mktemp("mine") / "photos"
     write_material(folder, load_capture("demo_capture"), np.full((4, 133, 2), 100.0))
     return folder
@@ -71,7 +73,9 @@ def test_everything_is_found(mine):
 
 
 def test_other_layouts_are_found(mine):
-    """Photos beside the rest, a folder for each camera, COLMAP's workspace, OpenPose's file of a name of its own."""
+    """Photos beside the rest, a folder for each camera, COLMAP's workspace, OpenPose's file of a
+    name of its own.
+    """
     for path in (mine / "images").iterdir():
         (mine / path.stem).mkdir()
         path.rename(mine / path.stem / "000000.png")
@@ -127,9 +131,11 @@ TOOLS = {
 
 def without(folder, *names):
     for name in names:
-        shutil.rmtree(folder / name) if name != "cameras" else (
-            folder / "calibration.json"
-        ).unlink()
+        (
+            shutil.rmtree(folder / name)
+            if name != "cameras"
+            else (folder / "calibration.json").unlink()
+        )
 
 
 @pytest.mark.parametrize("names", [("cameras",), ("masks",), ("keypoints",), tuple(TOOLS)])
@@ -140,8 +146,11 @@ def test_what_is_missing_comes_with_its_tools(names, mine, capsys):
     code = cli.execute(["start", str(mine), "--out", "me"])
     out, err = capsys.readouterr()
     told = " and ".join(", ".join(names).rsplit(", ", 1))
-    assert code == cli.BAD_DATA and err == (
-        f"humangs: error: photos: {told} missing: make them as above and run the same command again\n"
+    assert (
+        code == cli.BAD_DATA
+        and err
+        == f"humangs: error: photos: {told} missing: make them as above and run the same command"
+        " again\n"
     )
     for other, lines in TOOLS.items():
         assert all((line in out) == (other in names) for line in lines), out
@@ -273,7 +282,9 @@ def test_check_compares_a_capture_without_keypoints_with_what_is_found(mine, det
 
 @pytest.fixture
 def two_people(mine, detected, monkeypatch):
-    """Photos without cameras of two people who are found in another order in each; their keypoints have one order."""
+    """Photos without cameras of two people who are found in another order in each; their keypoints
+    have one order.
+    """
     truth = load_capture("demo_capture")
     without(mine, *TOOLS)
     shown = detect.found_in_capture("me")
@@ -310,7 +321,9 @@ def write_masks(folder, masks):
 
 @pytest.mark.parametrize(("who", "area"), [(0, 2e5), (1, 1e5)])
 def test_without_cameras_keypoints_of_several_people_choose_in_each_photo(who, area, two_people):
-    """`--person` counts in the keypoint file; the person whom the detector found there has the cameras and masks."""
+    """`--person` counts in the keypoint file; the person whom the detector found there has the
+    cameras and masks.
+    """
     files = sorted((two_people / "images").iterdir())
     choice = photos_alone._Choice(who, two_people / "keypoints", None, Path("me"))
     looked = photos_alone._look(two_people / "images", files, files, choice)
@@ -532,7 +545,9 @@ def test_two_people_are_refused_with_the_sheet_that_numbers_them(
 
 
 def test_a_video_becomes_photos_beside_the_capture(tmp_path, monkeypatch, capsys):
-    """Once: a second run goes on with these, and what was added to them; another video under that name is refused."""
+    """Once: a second run goes on with these, and what was added to them; another video under that
+    name is refused.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(blazepose, "available", lambda: False)
     Path("clips").mkdir()
@@ -662,7 +677,8 @@ def test_from_photos_to_the_page(mine, capsys, monkeypatch):
     assert Path("me/body.npz").stat().st_mtime_ns == written
 
 
-# The photo that an avatar has not seen ---------------------------------------------------------------------------------
+# The photo that an avatar has not seen
+# ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -708,7 +724,9 @@ def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
 
 
 def test_the_photo_that_is_held_out_of_a_person_who_turns_is_the_one_with_the_nearest_other():
-    """Turning the person before one camera is going round the person with it, whichever frame a view shows."""
+    """Turning the person before one camera is going round the person with it, whichever frame a
+    view shows.
+    """
     angles = np.radians([0.0, 90.0, 200.0, 215.0])
     around = orbit(
         jnp.zeros(3), 3.0, jnp.asarray(-angles), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8

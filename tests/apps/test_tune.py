@@ -92,7 +92,8 @@ def test_every_preset_is_a_point_of_the_front_that_ships():
     assert qualities == sorted(qualities), qualities
 
 
-# The choice --------------------------------------------------------------------------------------------------------------
+# The choice
+# --------------------------------------------------------------------------------------------------
 
 shares = st.floats(0.05, 20)
 
@@ -217,13 +218,14 @@ def test_without_masks_nothing_that_refines_is_tried(monkeypatch):
     )
 
 
-# The command -------------------------------------------------------------------------------------------------------------
+# The command
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_tuning_for_real(tmp_path, monkeypatch, capsys):
-    """The smallest network finds the better of two settings in a large budget, none in a tiny one; `reconstruct`, `animate` and
-    `render` take the file.
+    """The smallest network finds the better of two settings in a large budget, none in a tiny one;
+    `reconstruct`, `animate` and `render` take the file.
     """
     monkeypatch.chdir(tmp_path)
     config, demo = presets.tiny().with_conventions(body_vertices=500), load_capture("demo_capture")

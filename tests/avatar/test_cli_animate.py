@@ -41,9 +41,25 @@ def test_both_commands_have_the_options_of_a_shot(monkeypatch, capsys):
 def test_what_is_written_is_what_was_asked_for(folder, monkeypatch, capsys):
     small = ("--width", "40", "--height", "64", "--splat", "fast")
     code, printed, error = run(
-        monkeypatch, capsys, "animate", "avatar.npz", "--motion", "motion.npz", "--out", "frames", *small,
-        "--background", "transparent", "--start", "0.5", "--fps", "6", "--loop", "2", "--prune",
-    )  # fmt: skip
+        monkeypatch,
+        capsys,
+        "animate",
+        "avatar.npz",
+        "--motion",
+        "motion.npz",
+        "--out",
+        "frames",
+        *small,
+        "--background",
+        "transparent",
+        "--start",
+        "0.5",
+        "--fps",
+        "6",
+        "--loop",
+        "2",
+        "--prune",
+    )
     assert (
         code == 0
         and " of 324 Gaussians are in no image\nframes: 6 frames of 40 x 64 at 6 frames per second"

@@ -1,12 +1,15 @@
-"""Gradients through all of it: photos -> network -> skinned Gaussians -> images -> loss, in float64.
+"""Gradients through all of it: photos -> network -> skinned Gaussians -> images -> loss, in
+float64.
 
-Differentiable are the network's parameters, the photos, the cameras, posed and canonical vertices and position
-maps that come with them, and pose, shape and camera of every target. Depth maps and foreground only decide; and
-`prepare_inputs`, which rasterizes, is not differentiated: training stops gradients there.
+Differentiable are the network's parameters, the photos, the cameras, posed and canonical vertices
+and position maps that come with them, and pose, shape and camera of every target. Depth maps and
+foreground only decide; and `prepare_inputs`, which rasterizes, is not differentiated: training
+stops gradients there.
 
-The loss has jumps and kinks: a splat's alpha crosses 1/255 on a pixel, two splats change places, a unit of a ReLU turns
-on, a position leaves a texel. A jump within a step spoils its difference, so differences to both sides and smaller steps
-are tried as well: none of them rescues a wrong gradient.
+The loss has jumps and kinks: a splat's alpha crosses 1/255 on a pixel, two splats change places, a
+unit of a ReLU turns on, a position leaves a texel. A jump within a step spoils its difference, so
+differences to both sides and smaller steps are tried as well: none of them rescues a wrong
+gradient.
 """
 
 import dataclasses
@@ -33,12 +36,16 @@ from humangs_jax.training.forward import draw_targets, white_backgrounds
 
 VERTICES, JOINTS, VIEWS, TARGETS, SIZE, TARGET_SIZE = 200, 55, 2, 2, 32, 24
 CHANGES = (1e-8, 1e-9, 1e-10, 5e-11)
-"""What a step is to change the loss by. The loss is about 0.4, its rounding a few 1e-17. The last one is for kinks that lie close
-to the point: there only one side is smooth, and its error falls with the step (1e-5 at 1e-10)."""
+"""What a step is to change the loss by. The loss is about 0.4, its rounding a few 1e-17. The last
+one is for kinks that lie close to the point: there only one side is smooth, and its error falls
+with the step (1e-5 at 1e-10)."""
 AGREEMENT = 5e-6
 """Of the expected derivative: what rounding leaves of a change of 1e-10."""
 SMALLEST_DERIVATIVE = 1e-6
-"""Where everything moves by its own size. The neural texture's is 1e-5; something cut off would have none."""
+"""Where everything moves by its own size.
+
+The neural texture's is 1e-5; something cut off would have none.
+"""
 SEEN = (0.05, 0.5)
 """Mean coverage of the images: there is somebody to see."""
 FLOAT32_COSINE = 0.999
@@ -54,8 +61,9 @@ POSE = ("rotations", "translations", "betas")
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """style: as the published network (mixed convention, rotation skinning, offsets without bound, Gouraud maps) or as
-    the small one (photo colors corrected, affine skinning, bounded offsets). train: statistics of the batch.
+    """style: as the published network (mixed convention, rotation skinning, offsets without bound,
+    Gouraud maps) or as the small one (photo colors corrected, affine skinning, bounded offsets).
+    train: statistics of the batch.
     bare: neither class token nor upsampler, but a head that corrects skinning weights.
     """
 
@@ -129,7 +137,9 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def as_dtype(tree, dtype):
-    """In numpy, as all sums over points are here: jax would compile an operation for every shape of a leaf."""
+    """In numpy, as all sums over points are here: jax would compile an operation for every shape of
+    a leaf.
+    """
     cast = lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x
     return jax.tree.map(lambda x: cast(np.asarray(x)), tree)
 
@@ -203,7 +213,9 @@ def group_of(path):
 
 @functools.cache
 def in_a_hurry():
-    """Options with which XLA compiles ten times the code that it saves running; one of them is gone in jax 0.12."""
+    """Options with which XLA compiles ten times the code that it saves running; one of them is gone
+    in jax 0.12.
+    """
     options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
     try:
         jax.jit(jnp.sin, compiler_options=options)(0.0)
@@ -226,8 +238,8 @@ def subject(position_map):
 def starting_point(inputs, targets, params):
     """Everything that is differentiable, by group.
 
-    Pixels beside the body have a position on the very border of the texture, where a step out of it is not a step in:
-    they are moved inside, between texels.
+    Pixels beside the body have a position on the very border of the texture, where a step out of it
+    is not a step in: they are moved inside, between texels.
     """
     positions = jnp.where((inputs.depth_maps >= 0)[..., None], inputs.position_maps, INSIDE)
     return {

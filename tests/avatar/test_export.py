@@ -1,4 +1,6 @@
-"""Files for other people's viewers: one world for all, read back by our own reader (test_splat_files) and by npm's tools."""
+"""Files for other people's viewers: one world for all, read back by our own reader
+(test_splat_files) and by npm's tools.
+"""
 
 import importlib
 import os
@@ -51,9 +53,13 @@ SPZ_LOSSES = {
     **{"SCALE": 0.02, "ROTATION": 0.08, "OPACITY": 0.51 / 255},
     "SH_DEGREE_0_COEF_0": 0.51 / 255 / 0.15,
 }
-"""What the bits of `.spz` leave: scales of up to 0.6 m in steps of 6 %, which covariances have twice."""
+"""What the bits of `.spz` leave: scales of up to 0.6 m in steps of 6 %, which covariances have
+twice.
+"""
 TOOLS = Path(os.environ.get("HUMANGS_NPM", "."))
-"""Folder where `npm install @playcanvas/splat-transform` was run; the environment variable HUMANGS_NPM."""
+"""Folder where `npm install @playcanvas/splat-transform` was run; the environment variable
+HUMANGS_NPM.
+"""
 TRANSFORM = shutil.which(
     "splat-transform",
     path=f"{TOOLS / 'node_modules' / '.bin'}{os.pathsep}{os.environ.get('PATH', '')}",
@@ -85,7 +91,9 @@ def off_by(a, b):
     st.integers(0, 2**32 - 1), st.sampled_from(sorted(MATRICES)), st.floats(-8, 2), st.floats(-2, 4)
 )
 def test_one_person_comes_back_from_every_file(tmp_path_factory, seed, up, thickness, distance):
-    """Any Gaussians: metres to micrometres thick, near and a kilometre away, opaque and faint, in any world."""
+    """Any Gaussians: metres to micrometres thick, near and a kilometre away, opaque and faint, in
+    any world.
+    """
     folder = tmp_path_factory.mktemp("files")
     rng, before = np.random.default_rng(seed), random_gaussians(seed)
     opacities = jnp.asarray(rng.choice([0.0, 1e-3, 0.5, 1.0], 20), jnp.float32)
@@ -104,8 +112,8 @@ def test_one_person_comes_back_from_every_file(tmp_path_factory, seed, up, thick
     np.testing.assert_allclose(np.asarray(back.means) @ R, before.means, atol=step)
     covariance, opacity, color = off_by(world, back)
     assert opacity <= 0.501 / 255 and color <= 0.501 / 255 / 0.15 * SH_C0
-    # scales in steps of 1 / 16: e^(1 / 16) of the squares. Those below e^-10 become it; of a covariance whose largest scale is s
-    # the largest element is at least s^2 / 3
+    # scales in steps of 1 / 16: e^(1 / 16) of the squares. Those below e^-10 become it; of a
+    # covariance whose largest scale is s the largest element is at least s^2 / 3
     raised = (
         3 * (np.exp(-10) / np.asarray(scales).max()) ** 2
         if np.asarray(scales).min() < np.exp(-10)
@@ -168,7 +176,9 @@ def test_viewers_that_do_not_know_the_extension_show_colored_points(tmp_path):
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_viewers_that_add_their_own_low_pass_draw_what_we_draw(tmp_path_factory, seed):
-    """A viewer of 3DGS adds 0.3 pixels^2 to what is in the file, our renderer 0.1 to scales that contain the rest."""
+    """A viewer of 3DGS adds 0.3 pixels^2 to what is in the file, our renderer 0.1 to scales that
+    contain the rest.
+    """
     file, depth = tmp_path_factory.mktemp("files") / "a.ply", 2.0
     camera = Camera.from_opencv(
         np.asarray([[512.0, 0, 256], [0, 512, 256], [0, 0, 1]]), np.eye(4), 512, 512
@@ -356,7 +366,9 @@ def _covariances(xyzw, scales):
 @needs_npm
 @pytest.mark.parametrize("name", ["a.ply", "a.spz"])
 def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
-    """Worlds, scales, rotations, opacities and colors of both files are the same to a program that is not ours."""
+    """Worlds, scales, rotations, opacities and colors of both files are the same to a program that
+    is not ours.
+    """
     gaussians = random_gaussians()
     write = {"a.ply": write_ply, "a.spz": write_spz}[name]
     form = chosen_format(Path(name).suffix)

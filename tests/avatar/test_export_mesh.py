@@ -1,4 +1,6 @@
-"""The body as a mesh: its colors, skin and motion, read back by trimesh, by our own reader and by Khronos's validator."""
+"""The body as a mesh: its colors, skin and motion, read back by trimesh, by our own reader and by
+Khronos's validator.
+"""
 
 import functools
 import json
@@ -36,7 +38,8 @@ from humangs_jax.rendering.gaussians import Gaussians
 VALIDATOR = Path(os.environ.get("HUMANGS_NPM", ".")) / "node_modules" / "gltf-validator"
 """Where `npm install gltf-validator` was run: the environment variable HUMANGS_NPM."""
 BLENDER = os.environ.get("HUMANGS_BLENDER", "")
-"""A Python that has Blender's module (`pip install bpy`): the environment variable HUMANGS_BLENDER."""
+"""A Python that has Blender's module (`pip install bpy`): the environment variable HUMANGS_BLENDER.
+"""
 TEXTURE = 256
 
 
@@ -153,7 +156,9 @@ def test_the_texture_is_what_was_on_the_body(tmp_path):
 
 
 def skinned(path, frame):
-    """The vertices of a frame by the letter of glTF's skins: sum of weights, joint matrices and inverse bind matrices."""
+    """The vertices of a frame by the letter of glTF's skins: sum of weights, joint matrices and
+    inverse bind matrices.
+    """
     content, binary = parse_glb(path.read_bytes())
     get = lambda index: read_accessor(content, binary, index)
     nodes = content["nodes"]
@@ -222,7 +227,9 @@ def test_a_motion_that_was_exported_is_read_again(tmp_path):
 
 
 def test_numbers_of_turns_never_jump_between_frames(tmp_path):
-    """Some players interpolate numbers: two whole turns, each wrapped at half a turn, so that the sign flips twice."""
+    """Some players interpolate numbers: two whole turns, each wrapped at half a turn, so that the
+    sign flips twice.
+    """
     angles = (np.linspace(0, 4 * np.pi, 25) + np.pi) % (2 * np.pi) - np.pi
     rotations = np.zeros((25, 55, 3))
     rotations[:, 0, 1], rotations[:, 3, 0] = angles, -angles
@@ -294,7 +301,9 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
 )
 @pytest.mark.slow
 def test_khronos_validator_finds_nothing(tmp_path):
-    """No issue at all with the mesh; with the Gaussians only that it does not know the extension."""
+    """No issue at all with the mesh; with the Gaussians only that it does not know the
+    extension.
+    """
     write_mesh_glb(tmp_path / "mesh.glb", avatar(), mesh(), dance(), "dance", "z")
     write_glb(tmp_path / "gaussians.glb", avatar().gaussians)
     found = {}
@@ -341,7 +350,9 @@ bpy.ops.export_anim.bvh(filepath=f"{folder}/theirs.bvh", frame_start=0, frame_en
 )
 @pytest.mark.slow
 def test_blender_shows_our_frames_and_we_read_its_files(tmp_path):
-    """Vertices of a frame in Blender are ours with z up; its .glb and .bvh of our motion are that motion."""
+    """Vertices of a frame in Blender are ours with z up; its .glb and .bvh of our motion are that
+    motion.
+    """
     one = avatar()
     rest = RestBody(one.rest_vertices, one.rest_joints)
     motion = grounded(dance(4), rest, PARENTS)

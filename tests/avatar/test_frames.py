@@ -1,4 +1,6 @@
-"""Frames of an animation: where the cameras stand, which frames there are, what is behind the person, how buffers are planned."""
+"""Frames of an animation: where the cameras stand, which frames there are, what is behind the
+person, how buffers are planned.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +71,8 @@ def test_each_camera_has_its_exposure(monkeypatch):
     assert plain.rgb.max() > 0.1
 
 
-# Cameras -----------------------------------------------------------------------------------------------------------------
+# Cameras
+# --------------------------------------------------------------------------------------------------
 
 
 def pixels(cameras, points):
@@ -198,7 +201,8 @@ def test_the_a_pose_lowers_the_arms():
         frames.a_pose_of(replace(avatar, joint_names=("pelvis", "a", "right_shoulder")))
 
 
-# Frames and colors ------------------------------------------------------------------------------------------------------
+# Frames and colors
+# --------------------------------------------------------------------------------------------------
 
 
 def walk(count=24, fps=24.0):
@@ -242,7 +246,9 @@ def test_times_outside_of_the_motion_are_named(times):
 
 
 def test_what_is_behind_the_person():
-    """A color shows through; without one the image has straight alpha, which gives the same over that color."""
+    """A color shows through; without one the image has straight alpha, which gives the same over
+    that color.
+    """
     rng = np.random.default_rng(0)
     alpha = np.concatenate([[0.0, 1.0], rng.random(10)]).reshape(3, 4).astype(np.float32)
     own = rng.random((3, 4, 3)).astype(np.float32)

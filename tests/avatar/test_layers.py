@@ -20,13 +20,17 @@ from humangs_jax.rendering.splatting import Rendering
 TURN, MOVE = np.asarray([0.0, 0.3, 0.5]), np.asarray([0.2, -0.1, 0.4])
 ALL = ("rgba", "z", "position", "normal", "part")
 SURFACE = 4 * SPLAT
-"""Metres: splats of this size that are nearer cover those beside them, the more the steeper the surface."""
+"""Metres: splats of this size that are nearer cover those beside them, the more the steeper the
+surface.
+"""
 NORMAL = 0.1
 """1 - cosine; a pixel sees splats of vertices some degrees apart."""
 
 
 def turned_pose():
-    """The root turned and moved, the upper ball turned about its own centre, which changes its normals not at all."""
+    """The root turned and moved, the upper ball turned about its own centre, which changes its
+    normals not at all.
+    """
     rotations = np.stack([TURN, [0.4, 0.0, 0.0], np.zeros(3)]).astype(np.float32)
     return BodyPose(jnp.asarray(rotations), jnp.asarray(MOVE, jnp.float32))
 
@@ -77,7 +81,9 @@ def test_what_does_not_fit_is_refused_before_anything_is_drawn(tmp_path):
 
 
 def test_exr_colors_are_premultiplied(tmp_path, monkeypatch):
-    """A compositing program shows what was rendered when it adds (1 - alpha) times the background."""
+    """A compositing program shows what was rendered when it adds (1 - alpha) times the
+    background.
+    """
     avatar, shot = two_balls(1), Shot(width=3, height=1, background="#336699")
     alpha = np.asarray([[0.0, 0.5, 1.0]], np.float32)
     rendering = Rendering(
@@ -109,7 +115,9 @@ def test_exr_colors_are_premultiplied(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_layers_of_the_two_balls(tmp_path):
-    """Drawn, written, read: the ray through each pixel says where surface, normal and part must be."""
+    """Drawn, written, read: the ray through each pixel says where surface, normal and part must
+    be.
+    """
     avatar, pose, shot = two_balls(), turned_pose(), Shot(width=72, height=96, azimuth=25.0)
     still = frames.rest_pose_of(avatar)
     poses = jax.tree.map(lambda *leaves: jnp.stack(leaves), still, pose)
@@ -167,7 +175,9 @@ def test_layers_of_the_two_balls(tmp_path):
 
 @pytest.mark.slow
 def test_what_no_frame_shows_can_be_left_out():
-    """A ball inside of a ball is never seen; the images stay those of all Gaussians to half a level of 8 bits."""
+    """A ball inside of a ball is never seen; the images stay those of all Gaussians to half a level
+    of 8 bits.
+    """
     avatar = two_balls(3)
     n = len(avatar.rest_vertices) // 2
     inside = CENTRES[0] + 0.5 * (np.asarray(avatar.gaussians.means[n:]) - CENTRES[1])

@@ -20,7 +20,9 @@ from humangs_jax.rendering.splatting import render
 
 PIXEL = 0.0086
 ROUNDING = 3e-4
-"""Relative, of scales of a tenth of a pixel: float32 keeps 1e-7 of the variance that the low-pass has."""
+"""Relative, of scales of a tenth of a pixel: float32 keeps 1e-7 of the variance that the low-pass
+has.
+"""
 
 
 def flat_avatar():
@@ -88,7 +90,9 @@ def test_files_keep_the_size_of_the_pixels(tmp_path):
 
 
 def test_fine_things_weigh_the_same_in_small_images():
-    """A Gaussian thinner than a pixel: its opacity times its area, in metres, is that of the images that it was fitted to."""
+    """A Gaussian thinner than a pixel: its opacity times its area, in metres, is that of the images
+    that it was fitted to.
+    """
     fine = 0.002
     one = Gaussians(
         jnp.zeros((1, 3)),

@@ -24,7 +24,10 @@ def avatar(tmp_path):
 
 
 def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(monkeypatch, avatar):
-    """13 cannot be read, 7 cannot be reconstructed, nor can a batch with it. Captures are numbered by their first frame."""
+    """13 cannot be read, 7 cannot be reconstructed, nor can a batch with it.
+
+    Captures are numbered by their first frame.
+    """
     calls, demo = [], load_capture("demo_capture")
 
     def batch(variables, config, captures):
@@ -66,7 +69,9 @@ def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(monke
 
 @pytest.fixture
 def people(capture_folder, tmp_path, monkeypatch, avatar):
-    """Four captures, one of them spoiled, and a network that always makes the same avatar: the names it was asked for."""
+    """Four captures, one of them spoiled, and a network that always makes the same avatar: the
+    names it was asked for.
+    """
     for name in ("a", "b", "c", "d"):
         shutil.copytree(capture_folder, tmp_path / "people" / name)
     (tmp_path / "people/b/body.npz").write_bytes(b"spoiled")

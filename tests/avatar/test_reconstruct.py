@@ -241,7 +241,9 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
 
 @pytest.mark.slow
 def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, network):
-    """As in the release: vertices are sampled where the whole body model puts them, Gaussians move by blend skinning alone."""
+    """As in the release: vertices are sampled where the whole body model puts them, Gaussians move
+    by blend skinning alone.
+    """
     _, config = network
     directions = (
         np.random.default_rng(0).normal(size=(*body.template.shape, 9 * (len(body.parents) - 1)))
@@ -265,7 +267,9 @@ def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, ne
 
 @pytest.mark.slow
 def test_light_shines_from_above_in_a_capture_of_another_world(body):
-    """Drawing and fitting an avatar with light give the same in a capture whose z axis points up."""
+    """Drawing and fitting an avatar with light give the same in a capture whose z axis points
+    up.
+    """
     photos = capture(body, SIZE, SIZE)
     bent = replace(
         photos.poses, rotations=photos.poses.rotations.at[:, 16].set(jnp.asarray([0.0, 0.0, -1.2]))
@@ -295,7 +299,9 @@ def test_people_who_lie_before_upright_cameras_are_left_lying(body):
 
 
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
-    """The masks say where the person is; the pixel at which a camera shows a point has the same color before and after."""
+    """The masks say where the person is; the pixel at which a camera shows a point has the same
+    color before and after.
+    """
     photos = capture(body, 48, 36)
     photos.masks[:] = 0
     photos.masks[0, 10:26, 4:12], photos.masks[1, 20:48, 20:30] = (
@@ -623,7 +629,9 @@ def test_what_cannot_be_one_batch_is_named(body, network):
 
 @pytest.mark.slow
 def test_stacked_captures_are_a_batch_for_vmap(body, network):
-    """The line of the README gives what `reconstruct_batch` gives, bit by bit: it is the same program."""
+    """The line of the README gives what `reconstruct_batch` gives, bit by bit: it is the same
+    program.
+    """
     variables, config = network
     config = config.with_conventions(body_vertices=300, light=True).with_runtime(token_capacity=0)
     captures = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]

@@ -10,7 +10,9 @@ from humangs_jax.avatar.video import check_video, video_size, write_video
 from humangs_jax.io.images import read_image
 
 H264_ERROR = 0.02
-"""Mean absolute difference after compression of a smooth image; a wrong color matrix gives 0.03 and more."""
+"""Mean absolute difference after compression of a smooth image; a wrong color matrix gives 0.03 and
+more.
+"""
 PALETTE_ERROR = 0.02
 """256 colors for all frames."""
 

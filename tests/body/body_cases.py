@@ -10,7 +10,10 @@ PARENTS = (-1, 0, 5, 0, 3, 0, 2)  # joint 2's parent has a higher index
 
 
 def made_up_body(seed=0, n=25, s=4, pose_directions=True, dtype=None):
-    """Random numbers with the invariants of a body; no plausible shape. dtype: None for that of `jax.enable_x64`."""
+    """Random numbers with the invariants of a body; no plausible shape.
+
+    dtype: None for that of `jax.enable_x64`.
+    """
     rng = np.random.default_rng(seed)
     j = len(PARENTS)
     weights = rng.uniform(size=(n, j)) ** 3

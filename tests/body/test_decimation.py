@@ -191,7 +191,9 @@ def test_what_is_hidden_goes_first():
 
 
 def test_texture_seams_stay_closed():
-    """A vertex with two texture vertices moves along the seam only, so both of its charts find a partner."""
+    """A vertex with two texture vertices moves along the seam only, so both of its charts find a
+    partner.
+    """
     vertices, faces = sphere(rings=8)
     right = vertices[faces].mean(1)[:, 0] > 0
     uv_faces = np.where(right[:, None], faces, faces + len(vertices))

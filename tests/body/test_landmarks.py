@@ -125,7 +125,9 @@ def test_mirror_images_share_one_offset_with_x_turned_round(body, kind):
 
 
 def test_the_sides_of_all_points_of_the_face():
-    """300-W counts jaw, brows, nostrils and upper lips from the person's right to the left, and lower lips back."""
+    """300-W counts jaw, brows, nostrils and upper lips from the person's right to the left, and
+    lower lips back.
+    """
     left = {*range(9, 17), *range(22, 27), 34, 35, *range(42, 48), 52, 53, 54, 55, 56, 63, 64, 65}
     middle = {8, *range(27, 31), 33, 51, 57, 62, 66}
     names = [f"face_{i}" for i in range(68)]

@@ -17,8 +17,10 @@ from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 
 MEGABYTE = 1e6
-SYMMETRY = 1e-3  # metres: MakeHuman's targets are written with 0.1 mm and differ between the sides by a few
-STORED = 3e-5  # metres and weights: half a step of int16 or uint16, and the division by a sum of 7 rounded weights
+# metres: MakeHuman's targets are written with 0.1 mm and differ between the sides by a few
+SYMMETRY = 1e-3
+# metres and weights: half a step of int16 or uint16, and the division by a sum of 7 rounded weights
+STORED = 3e-5
 
 
 @pytest.fixture(scope="module")

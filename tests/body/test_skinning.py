@@ -37,7 +37,9 @@ def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own
 
 @pytest.mark.parametrize("distance", [0.05, 0.1])
 def test_the_kernel_of_spread_weights_is_as_wide_as_the_distance(distance):
-    """Vertices along x, those with x > 0 of the other leg: its share at x is the normal distribution function of x / distance."""
+    """Vertices along x, those with x > 0 of the other leg: its share at x is the normal
+    distribution function of x / distance.
+    """
     x = np.linspace(-1, 1, 8000)
     vertices, of = (
         np.stack([x, 0 * x, 0 * x], axis=1),

@@ -19,7 +19,9 @@ ATOL = 1e-6  # float32 numbers of a metre, read and multiplied once
 
 
 def made_up_file(n=9, columns=20, seed=0):
-    """Arrays of a model file as they are stored: root parent 2^32 - 1, unsigned indices, float64."""
+    """Arrays of a model file as they are stored: root parent 2^32 - 1, unsigned indices,
+    float64.
+    """
     rng = np.random.default_rng(seed)
     weights = rng.uniform(size=(n, 55))
     regressor = np.where(rng.uniform(size=(55, n)) < 0.5, rng.uniform(size=(55, n)), 0)
@@ -156,7 +158,9 @@ def test_current_files_hold_expressions_after_300_columns(tmp_path):
 
 
 def chumpy_pickle(path, content, wrap):
-    """Write a pickle that names chumpy's classes, with the attributes that chumpy's own pickles carry."""
+    """Write a pickle that names chumpy's classes, with the attributes that chumpy's own pickles
+    carry.
+    """
     modules = {
         name: types.ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")
     }

@@ -1,4 +1,6 @@
-"""What users hand in: wrong arguments and values are one line that says what came and what is expected."""
+"""What users hand in: wrong arguments and values are one line that says what came and what is
+expected.
+"""
 
 import ast
 import dataclasses
@@ -91,7 +93,10 @@ WRONG = {
     ),
     "a field of refinement": (
         lambda: hg.refine(AVATAR, CAPTURE, iterations=10),
-        r"^refine\(avatar, capture, ...\): no argument 'iterations': it is a field of RefineConfig, config=RefineConfig",
+        (
+            r"^refine\(avatar, capture, ...\): no argument 'iterations': it is a field of"
+            r" RefineConfig, config=RefineConfig"
+        ),
     ),
     "an unknown name": (
         lambda: hg.render(GAUSSIANS, CAMERA, color=1),
@@ -167,7 +172,10 @@ WRONG = {
     ),
     "a plan of what is traced": (
         lambda: jax.jit(lambda g: hg.plan_buffers(g, CAMERA).max_pairs)(GAUSSIANS),
-        "^plan_buffers measures what a scene needs: call it outside of jit, vmap and grad, which know shapes only",
+        (
+            "^plan_buffers measures what a scene needs: call it outside of jit, vmap and grad,"
+            " which know shapes only"
+        ),
     ),
     "a file of what is traced": (
         lambda: jax.jit(lambda g: hg.save_gaussians("a.ply", g))(GAUSSIANS),
@@ -195,7 +203,10 @@ WRONG = {
     ),
     "a list of coefficients": (
         lambda: shape_body(load_body(), [0.0]),
-        r"^shape_body\(body, betas\): betas: expected an array of shape \(s_used\), got list; jnp.asarray makes one",
+        (
+            r"^shape_body\(body, betas\): betas: expected an array of shape \(s_used\), got list;"
+            r" jnp.asarray makes one"
+        ),
     ),
     "a batch of coefficients": (
         lambda: shape_body(load_body(), jnp.zeros((2, 3))),

@@ -188,7 +188,9 @@ def test_fields_are_varied_by_their_paths():
     )
     for path, like in {
         "loss.squard": "; did you mean loss.squared?",
-        "architecture.encoder.class_token": "; did you mean model.architecture.encoder.transformer.class_token?",
+        "architecture.encoder.class_token": (
+            "; did you mean model.architecture.encoder.transformer.class_token?"
+        ),
         "near": "; did you mean model.runtime.raster.near or splat.near?",
         "steps.a": "; did you mean steps?",
         "nonsense": "",

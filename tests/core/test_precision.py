@@ -1,4 +1,6 @@
-"""Matrix products say how exact they are: accelerators round factors to 10 bits (TF32, bfloat16) where nothing is said."""
+"""Matrix products say how exact they are: accelerators round factors to 10 bits (TF32, bfloat16)
+where nothing is said.
+"""
 
 import ast
 from pathlib import Path

@@ -129,7 +129,8 @@ def test_pytrees_print_on_one_short_line():
     assert traced == [text]
 
 
-# What is handed in is checked by the annotations ----------------------------------------------------------------------
+# What is handed in is checked by the annotations
+# ----------------------------------------------------------------------
 
 GAUSSIANS = Gaussians(
     jnp.zeros((7, 3)), jnp.ones((7, 4)), jnp.ones((7, 3)), jnp.ones(7), jnp.ones((7, 3))
@@ -210,7 +211,8 @@ def test_what_fits_has_no_fault():
         assert shape_fault(tree) is None
 
 
-# Files of jax.export ---------------------------------------------------------------------------------------------------
+# Files of jax.export
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

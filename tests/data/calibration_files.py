@@ -1,4 +1,6 @@
-"""A scene of known cameras and points, and writers of each calibration format as the tools write it."""
+"""A scene of known cameras and points, and writers of each calibration format as the tools write
+it.
+"""
 
 import json
 import struct
@@ -17,7 +19,9 @@ Y_UP_FROM_Z_UP = np.asarray([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def scene(views=VIEWS):
-    """K (v, 3, 3) with pixel centres at +0.5 and cam_from_world (v, 4, 4), y up, metres, all looking at TARGET."""
+    """K (v, 3, 3) with pixel centres at +0.5 and cam_from_world (v, 4, 4), y up, metres, all
+    looking at TARGET.
+    """
     K, poses = [], []
     for i in range(views):
         angle, rise = 2 * np.pi * i / views + 0.3, 0.1 + 0.1 * i
@@ -101,7 +105,10 @@ def write_colmap(folder, K, poses, names, model="PINHOLE", extra=(), seen=None, 
 
 
 def matrix_yaml(key, matrix, decimals=None):
-    """As cv2.FileStorage writes it: data wrapped over lines. With decimals: as EasyMocap does, on one line."""
+    """As cv2.FileStorage writes it: data wrapped over lines.
+
+    With decimals: as EasyMocap does, on one line.
+    """
     matrix = np.atleast_2d(matrix)
     if decimals is None:
         values = [f"{x:.16e}".replace("000000000000000e+00", "") for x in matrix.ravel()]
@@ -200,7 +207,8 @@ def write_transforms(file, K, poses, names, **changes):
     )
 
 
-# Of the scene, with a lens ------------------------------------------------------------------------------------------------
+# Of the scene, with a lens
+# ------------------------------------------------------------------------------------------------
 
 K, POSES = scene()
 SIZE = [WIDTH, HEIGHT]

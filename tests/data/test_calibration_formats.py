@@ -24,7 +24,9 @@ def views_of(out):
 
 
 def error_of(out, K, poses):
-    """Largest distance in pixels between points seen by the imported cameras and by the true ones."""
+    """Largest distance in pixels between points seen by the imported cameras and by the true
+    ones.
+    """
     views = views_of(out)
     p = written.points()
     got = [
@@ -302,7 +304,8 @@ def test_faults_of_file_storage_name_the_line(text, problem):
         parse_file_storage(text, Path("file"))
 
 
-# Faults, and moments of videos ---------------------------------------------------------------------------------------------
+# Faults, and moments of videos
+# ---------------------------------------------------------------------------------------------
 
 
 def colmap(tmp_path, cameras=None, images=None):
@@ -395,7 +398,9 @@ def test_faults_of_transforms_name_the_key(tmp_path, edit, problem):
 
 
 def at_moments(tmp_path, keys, poses=None):
-    """Six photos in a transforms.json, each with its own of `keys`. poses: which camera each has; default: three, twice."""
+    """Six photos in a transforms.json, each with its own of `keys`. poses: which camera each has;
+    default: three, twice.
+    """
     names = [f"{i}.png" for i in range(6)]
     K, all_poses = written.scene(3 if poses is None else 6)
     which = [0, 1, 2, 0, 1, 2] if poses is None else poses
@@ -472,7 +477,10 @@ def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
         ),
         (
             [{}] * 6,
-            r"frames\[0\] and frames\[3\] have the same camera pose, so they show different moments",
+            (
+                r"frames\[0\] and frames\[3\] have the same camera pose, so they show different"
+                r" moments"
+            ),
         ),
         (
             [{"time": 0.0} if i else {} for i in ALL],
@@ -483,7 +491,10 @@ def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
         ([{"time": str(i) if i else 0} for i in ALL], r"time: expected numbers or names, got both"),
         (
             [{"timestep_index": 0, "camera_index": i % 3} for i in ALL],
-            r"frames\[3\]: the camera_index and timestep_index of frames\[0\]: expected one photo of a camera",
+            (
+                r"frames\[3\]: the camera_index and timestep_index of frames\[0\]: expected one"
+                r" photo of a camera"
+            ),
         ),
     ],
 )

@@ -34,7 +34,8 @@ def views_of(out):
     return read_description(out / "capture.json")["views"]
 
 
-# What is written ---------------------------------------------------------------------------------------------------
+# What is written
+# --------------------------------------------------------------------------------------------------
 
 
 def test_photos_and_masks_are_copied_as_they_are(rig, tmp_path):
@@ -51,8 +52,10 @@ def test_photos_and_masks_are_copied_as_they_are(rig, tmp_path):
     assert report.warnings == ()
     assert str(report).splitlines() == [
         f"{rig[2]}: 4 photos of 64 x 48 pixels: 4 cameras, 1 frame",
-        f"read as: OpenCV, AvatarReX or THuman4.0 ({rig[0]}): cam_from_world, OpenCV axes; +y up; 1 m per unit; "
-        "pixel centres at whole numbers (0.5 added to cx and cy)",
+        (
+            f"read as: OpenCV, AvatarReX or THuman4.0 ({rig[0]}): cam_from_world, OpenCV axes; +y"
+            " up; 1 m per unit; pixel centres at whole numbers (0.5 added to cx and cy)"
+        ),
         "the cameras stand 2.3 m from where they look",
     ]
 
@@ -122,7 +125,8 @@ def test_whole_or_not_at_all(rig):
     assert sorted(p.name for p in rig[2].parent.iterdir()) == ["out", "photos", "rig.json"]
 
 
-# Distortion --------------------------------------------------------------------------------------------------------
+# Distortion
+# --------------------------------------------------------------------------------------------------
 
 
 def distort_rig(file, coefficients):
@@ -170,7 +174,8 @@ def test_alpha_is_a_mask_when_undistorted_or_stays_beside_masks(rig, tmp_path, m
         np.testing.assert_allclose(image[5, 30], 1)
 
 
-# Conventions -------------------------------------------------------------------------------------------------------
+# Conventions
+# --------------------------------------------------------------------------------------------------
 
 FLIP = np.diag([1.0, -1, -1, 1])
 MEANINGS = {
@@ -225,7 +230,8 @@ def test_wrong_scale_and_wrong_image_size_are_warned_of(rig):
     assert warning.startswith("a: the principal point") and "another size" in warning
 
 
-# What is refused ---------------------------------------------------------------------------------------------------
+# What is refused
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -344,7 +350,8 @@ def test_a_bare_photo_of_16_bits_stays_what_it_is(rig):
     )
 
 
-# Masks -------------------------------------------------------------------------------------------------------------
+# Masks
+# --------------------------------------------------------------------------------------------------
 
 PERSON = np.zeros((written.HEIGHT, written.WIDTH), np.uint8)
 PERSON[8:40, 20:40] = 255

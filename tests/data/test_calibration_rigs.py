@@ -1,4 +1,6 @@
-"""Cameras of motion capture programs and data sets, written from known cameras and read back; lens distortion."""
+"""Cameras of motion capture programs and data sets, written from known cameras and read back; lens
+distortion.
+"""
 
 import json
 
@@ -166,7 +168,8 @@ def test_wrong_files_are_one_line(case, tmp_path):
     assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
 
 
-# Lenses ----------------------------------------------------------------------------------------------------------------
+# Lenses
+# --------------------------------------------------------------------------------------------------
 
 
 def test_dots_land_where_the_pinhole_says():

@@ -1,4 +1,6 @@
-"""Units of calibrations, cameras that stand relative to others, and files that are no calibration."""
+"""Units of calibrations, cameras that stand relative to others, and files that are no
+calibration.
+"""
 
 import json
 
@@ -58,7 +60,9 @@ def test_a_scale_that_is_given_is_taken_and_metres_need_no_words(tmp_path):
 
 
 def multical(relations):
-    """The scene as multical writes it; relations: camera -> the one in whose axes it stands, None for the world."""
+    """The scene as multical writes it; relations: camera -> the one in whose axes it stands, None
+    for the world.
+    """
     index = NAMES.index
     lens = lambda i: {
         "model": "standard",
@@ -119,8 +123,14 @@ def test_faults_of_multical_name_the_key(change, problem, tmp_path):
         read_calibration(tmp_path / "calibration.json", lambda name: (1, 1))
 
 
-KALIBR = "cam0:\n  distortion_model: radtan\n  intrinsics: [1, 1, 1, 1]\n  T_cn_cnm1:\n  - [1, 0, 0, 0]\n"
-LENS = "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [1,0,0, 0,1,0, 0,0,1]\n"
+KALIBR = (
+    "cam0:\n  distortion_model: radtan\n  intrinsics: [1, 1, 1, 1]\n  T_cn_cnm1:\n  - [1, 0, 0,"
+    " 0]\n"
+)
+LENS = (
+    "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data:"
+    " [1,0,0, 0,1,0, 0,0,1]\n"
+)
 
 
 @pytest.mark.parametrize(

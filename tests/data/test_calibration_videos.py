@@ -1,4 +1,6 @@
-"""Synchronised videos become the frames of a capture; of one video, sharp frames that show something new become photos."""
+"""Synchronised videos become the frames of a capture; of one video, sharp frames that show
+something new become photos.
+"""
 
 import numpy as np
 import pytest
@@ -123,7 +125,8 @@ def test_frames_of_videos_have_a_budget_of_pixels(tmp_path):
         set_limits(None)
 
 
-# Which frames become photos -------------------------------------------------------------------------------------------
+# Which frames become photos
+# -------------------------------------------------------------------------------------------
 
 SIZE = 120, 160
 

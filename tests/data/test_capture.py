@@ -84,7 +84,10 @@ def test_a_body_without_displacement_has_none_in_its_file(tmp_path):
         assert "displacement" not in file
 
 
-TOO_MANY = "capture.json: 1,008,000,000 pixels in 84 photos of 4000 x 3000: the limit capture_pixels is 1,000,000,000"
+TOO_MANY = (
+    "capture.json: 1,008,000,000 pixels in 84 photos of 4000 x 3000: the limit capture_pixels is"
+    " 1,000,000,000"
+)
 
 
 def test_large_captures_are_read_and_endless_ones_refused_before_their_photos_are(
@@ -206,7 +209,8 @@ def test_a_body_file_is_referred_to_by_a_relative_path(folder, tmp_path, monkeyp
     assert np.load(tmp_path / "flat" / "body.npz")["body"].item() == "../models/BODY.npz"
 
 
-# What is wrong on disk: one line, file and field ---------------------------------------------------------------------
+# What is wrong on disk: one line, file and field
+# ---------------------------------------------------------------------
 
 
 def edit_description(folder, change):
@@ -404,7 +408,8 @@ def test_bad_arrays_are_one_line(case):
     assert str(caught.value).startswith(f"arrays: {expected}") and "\n" not in str(caught.value)
 
 
-# The kind of the shape coefficients ----------------------------------------------------------------------------------
+# The kind of the shape coefficients
+# ----------------------------------------------------------------------------------
 
 SMPLX_NAMES = (*(f"shape_{i}" for i in range(2)), "expression_0")
 OWN_NAMES = ("sex", "age", "height")
@@ -473,7 +478,8 @@ def test_betas_of_another_kind_are_refused(kind):
         )
 
 
-# Nothing is written when something is wrong --------------------------------------------------------------------------
+# Nothing is written when something is wrong
+# --------------------------------------------------------------------------
 
 
 def spoiled(**changes):

@@ -1,4 +1,6 @@
-"""A body that is displaced to the masks: a known coat is found, and masks that say nothing do no harm."""
+"""A body that is displaced to the masks: a known coat is found, and masks that say nothing do no
+harm.
+"""
 
 import dataclasses
 import functools
@@ -58,7 +60,9 @@ def free(body):
 
 @pytest.fixture(scope="module")
 def dressed(body):
-    """A capture of eight photos in two poses of somebody in a coat, 1 cm thick, and how far its vertices are from the body."""
+    """A capture of eight photos in two poses of somebody in a coat, 1 cm thick, and how far its
+    vertices are from the body.
+    """
     rng = np.random.default_rng(0)
     betas = jnp.zeros(len(body.shape_names)).at[:2].set(jnp.asarray([0.5, -0.3]))
     rotations = jnp.asarray(0.15 * rng.normal(size=(POSES, len(body.parents), 3)), jnp.float32)
@@ -71,9 +75,17 @@ def dressed(body):
     masks = masks_of(body, replace(rest, vertices=rest.vertices + coat), poses, frames, cameras)
     images = np.ones((*masks.shape, 3), np.float32)
     capture = capture_from_arrays(
-        images, cameras.K, cameras.cam_from_world, rotations, poses.translation,
-        betas=betas, masks=masks, frames=frames, background="white", body=body,
-    )  # fmt: skip
+        images,
+        cameras.K,
+        cameras.cam_from_world,
+        rotations,
+        poses.translation,
+        betas=betas,
+        masks=masks,
+        frames=frames,
+        background="white",
+        body=body,
+    )
     return capture, coat
 
 

@@ -1,4 +1,6 @@
-"""Folders of photos as phones, disks and other programs fill them: what is used, and what is said of the rest."""
+"""Folders of photos as phones, disks and other programs fill them: what is used, and what is said
+of the rest.
+"""
 
 import json
 
@@ -42,8 +44,8 @@ def test_photos_win_over_the_clips_beside_them(suffix, rig):
     report = imported(rig)
     assert (report.views, report.frames) == (4, 1)
     assert (
-        f"not used: 4 videos beside photos (a{suffix.upper()}, b{suffix.upper()}, c{suffix.upper()} and 1 more)"
-        in str(report)
+        f"not used: 4 videos beside photos (a{suffix.upper()}, b{suffix.upper()}, c{suffix.upper()}"
+        " and 1 more)" in str(report)
     )
     assert "not used: 4 videos" in str(look(rig[1]))
     assert (

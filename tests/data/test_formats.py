@@ -1,4 +1,6 @@
-"""A further format is a module and a row of a table: help, reading, `start`, errors and docs have it from there."""
+"""A further format is a module and a row of a table: help, reading, `start`, errors and docs have
+it from there.
+"""
 
 import importlib
 import json

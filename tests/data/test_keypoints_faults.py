@@ -38,7 +38,8 @@ def annotations(size=SIZE, **more):
     return {"images": [image], "annotations": [{"image_id": 1, "keypoints": keypoints} | more]}
 
 
-# Odd, but used -------------------------------------------------------------------------------------------------------
+# Odd, but used
+# --------------------------------------------------------------------------------------------------
 
 
 def test_views_without_an_entry_are_missing(tmp_path):
@@ -100,7 +101,8 @@ def test_points_half_an_image_outside_are_dropped_and_counted(tmp_path, index, v
     assert keypoints.points[0, 0, index] == value + 0.5
 
 
-# Several people ------------------------------------------------------------------------------------------------------
+# Several people
+# --------------------------------------------------------------------------------------------------
 
 
 def test_several_people_are_refused(tmp_path):
@@ -113,7 +115,9 @@ def test_several_people_are_refused(tmp_path):
 
 @pytest.mark.parametrize(("count", "set_size"), [(16, 133), (5, 133), (17, 133), (16, 17)])
 def test_people_whose_hands_and_faces_were_not_found_are_people(tmp_path, count, set_size):
-    """16 points of the body are 12 % of COCO-WholeBody's: the more confident of two such people was taken in silence."""
+    """16 points of the body are 12 % of COCO-WholeBody's: the more confident of two such people was
+    taken in silence.
+    """
     people = [entry(count=set_size, confidence=confidence) for confidence in (0.7, 0.9)]
     for person in people:
         person["keypoints"][3 * count + 2 :: 3] = [0.0] * (set_size - count)
@@ -163,7 +167,8 @@ def test_a_person_can_be_chosen(tmp_path):
         read(tmp_path / "k.json", people, person=-1)
 
 
-# Wrong ---------------------------------------------------------------------------------------------------------------
+# Wrong
+# --------------------------------------------------------------------------------------------------
 
 FAULTS = {
     "no JSON": ("{,", r"line 1: not valid JSON"),
@@ -175,7 +180,10 @@ FAULTS = {
     "empty": ("", r"not valid JSON"),
     "another": (
         [entry(count=27)],
-        r"keypoints: expected 17 \(coco17\) or 26 \(halpe26\) or 133 \(wholebody133\) or 136 \(halpe136\) points, got 27",
+        (
+            r"keypoints: expected 17 \(coco17\) or 26 \(halpe26\) or 133 \(wholebody133\) or 136"
+            r" \(halpe136\) points, got 27"
+        ),
     ),
     "two sets": (
         [entry(), entry("back", count=133)],
@@ -229,7 +237,10 @@ FAULTS = {
     ),
     "openpose coco": (
         {"version": 1.3, "people": [{"pose_keypoints_2d": [1.0] * 45}]},
-        r"people\[0\]\.pose_keypoints_2d: expected 17, 18, 25, 26, 133, 136 points .*, got 15 points of MPI \(OpenPose: ",
+        (
+            r"people\[0\]\.pose_keypoints_2d: expected 17, 18, 25, 26, 133, 136 points .*, got 15"
+            r" points of MPI \(OpenPose: "
+        ),
     ),
     "an animal of another tool": (
         [
@@ -271,7 +282,10 @@ FAULTS = {
     ),
     "openpose hand": (
         {"people": [{"pose_keypoints_2d": [], "hand_left_keypoints_2d": [1.0] * 60}]},
-        r"people\[0\]\.hand_left_keypoints_2d: expected a flat list of 63 \(21 times x, y, confidence\)",
+        (
+            r"people\[0\]\.hand_left_keypoints_2d: expected a flat list of 63 \(21 times x, y,"
+            r" confidence\)"
+        ),
     ),
 }
 
@@ -339,7 +353,10 @@ OWN = {
         ({"names": np.array([{}, {}])}, r"names: a pickled object"),
         (
             {"set": np.array("halpe27")},
-            r"set: expected one of coco17, halpe26, .*, openpose67, openpose_b67, mediapipe33, got 'halpe27'",
+            (
+                r"set: expected one of coco17, halpe26, .*, openpose67, openpose_b67, mediapipe33,"
+                r" got 'halpe27'"
+            ),
         ),
         (
             {"points": np.ones((2, 133, 2))},

@@ -1,4 +1,6 @@
-"""Each format as its tool writes it, from known points, read back exactly; names of views, and sets of points."""
+"""Each format as its tool writes it, from known points, read back exactly; names of views, and sets
+of points.
+"""
 
 import dataclasses
 import json
@@ -37,7 +39,9 @@ CAMERA_NAMES = (
 
 
 def known(count, views=3, seed=0):
-    """(v, k, 3): pixels in eighths and confidences in sixteenths, which float32 and JSON keep exactly."""
+    """(v, k, 3): pixels in eighths and confidences in sixteenths, which float32 and JSON keep
+    exactly.
+    """
     rng = np.random.default_rng(seed)
     points = rng.integers(8, 8 * 200, (views, count, 2)) / 8
     return np.concatenate([points, rng.integers(1, 17, (views, count, 1)) / 16], axis=-1)
@@ -224,7 +228,8 @@ def test_nobody_is_found_in_a_view(tool, tmp_path):
     np.testing.assert_array_equal(keypoints.points[[0, 2]], values[[0, 2], :, :2] + 0.5)
 
 
-# COCO ----------------------------------------------------------------------------------------------------------------
+# COCO
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("keypoint_set", [COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136])
@@ -290,7 +295,8 @@ def test_fractional_visibilities_are_reliable(tmp_path):
     np.testing.assert_array_equal(keypoints.confidences, 1)
 
 
-# Ours ----------------------------------------------------------------------------------------------------------------
+# Ours
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("keypoint_set", KEYPOINT_SETS.values(), ids=lambda each: each.name)
@@ -401,7 +407,8 @@ def test_saving_checks_its_arguments(tmp_path):
         save_keypoints(tmp_path / "k.npz", keypoints, NAMES)
 
 
-# Views by name and number ----------------------------------------------------------------------------------------------
+# Views by name and number
+# ----------------------------------------------------------------------------------------------
 
 CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "images_cam1_000012")
 
@@ -419,7 +426,8 @@ CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "im
         (["cam1_000000000012", "cam0_000000000000"], CAMERAS, [3, 0]),  # OpenPose on videos
         (["cam1/12"], CAMERAS, [3]),  # MMPose on videos
         (["000012.png"], CAMERAS, [None]),  # of which camera?
-        # a video's frames from 0 and photos from 1, or the other way round: in order, for each video by itself
+        # a video's frames from 0 and photos from 1, or the other way round: in order, for each
+        # video by itself
         (
             ["f_000000000000", "f_000000000001", "f_000000000002"],
             ("f_001", "f_002", "f_003"),
@@ -485,7 +493,8 @@ def test_numbers_of_several_cameras_are_refused():
         match_views([12], CAMERAS)
 
 
-# Sets of points --------------------------------------------------------------------------------------------------------
+# Sets of points
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("keypoint_set", KEYPOINT_SETS.values(), ids=KEYPOINT_SETS)
@@ -602,7 +611,8 @@ def test_landmarks_of_the_face_mirror_as_in_300w():
         assert COCO_WHOLEBODY_133.mirror[names.index(f"face_{a}")] == names.index(f"face_{b}")
 
 
-# Orders of OpenPose's points ------------------------------------------------------------------------------------------
+# Orders of OpenPose's points
+# ------------------------------------------------------------------------------------------
 
 COCO_18 = (
     *(

@@ -217,7 +217,9 @@ def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):
 
 
 def test_captures_of_another_body_are_left_out(tmp_path):
-    """Its joints and coefficients have the same shapes, and would be posed as those of the body that is trained on."""
+    """Its joints and coefficients have the same shapes, and would be posed as those of the body
+    that is trained on.
+    """
     write_subject(tmp_path / "ours", 1)
     write_subject(tmp_path / "smplx", 2)
     edit_npz(tmp_path / "smplx" / "body.npz", body="../SMPLX_NEUTRAL.npz")
@@ -386,14 +388,17 @@ def test_a_folder_without_captures_is_named(tmp_path):
         find_captures(tmp_path)
 
 
-# The release's rule ---------------------------------------------------------------------------------------------------
+# The release's rule
+# --------------------------------------------------------------------------------------------------
 
 
 WINDOW = ViewSampling(input_counts=(4,), target_count=4, rule="window")
 
 
 def test_the_window_rule_is_the_release_s():
-    """Of 60 views: the ends of a window come first, 25 to 59 views apart, then views inside of it; all are different."""
+    """Of 60 views: the ends of a window come first, 25 to 59 views apart, then views inside of it;
+    all are different.
+    """
     distances, subject = set(), fake_subject(60, 1)
     for seed in range(3000):
         inputs, targets = draw_views(np.random.default_rng(seed), subject, 4, WINDOW)

@@ -224,7 +224,9 @@ def test_keys_drawn_for_a_split_are_of_its_people(seed, index, split):
 @given(st.sampled_from(sorted(SPLITS)), st.integers(0, 999), st.integers(0, 2**32 - 1))
 @settings(deadline=None, max_examples=60)
 def test_a_key_is_its_person_and_appearance(split, number, appearance):
-    """The words of keys are (appearance, seed): keys of different splits cannot be equal, whatever the appearance."""
+    """The words of keys are (appearance, seed): keys of different splits cannot be equal, whatever
+    the appearance.
+    """
     seed = SPLITS[split][number]
     key = subject_key(seed, appearance)
     np.testing.assert_array_equal(

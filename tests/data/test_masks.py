@@ -1,4 +1,6 @@
-"""Masks that are too large or too small, moved to the edges in the photos; and colors along the edge of a mask."""
+"""Masks that are too large or too small, moved to the edges in the photos; and colors along the
+edge of a mask.
+"""
 
 import json
 import logging
@@ -28,8 +30,8 @@ HEIGHT, WIDTH = 240, 160
 FOUND = 0.5
 """Of a step more than that of the search, in pixels of a person who is 200 high."""
 LEFT = 0.7
-"""Mean distance of a silhouette from the true one, in the same pixels; measured up to 0.4. The search has steps of 0.5;
-silhouettes with corners do not grow and shrink by a distance."""
+"""Mean distance of a silhouette from the true one, in the same pixels; measured up to 0.4. The
+search has steps of 0.5; silhouettes with corners do not grow and shrink by a distance."""
 
 
 def fit_mask(photo, mask):
@@ -37,7 +39,9 @@ def fit_mask(photo, mask):
 
 
 def figure(scale=1):
-    """Coverage of a figure of two ellipses and a box, 200 pixels high at scale 1, with soft edges."""
+    """Coverage of a figure of two ellipses and a box, 200 pixels high at scale 1, with soft
+    edges.
+    """
     fine = 4
     y, x = (np.mgrid[: HEIGHT * scale * fine, : WIDTH * scale * fine] + 0.5) / fine / scale
     parts = [
@@ -137,7 +141,9 @@ def before_a_wall(colors, masks, rim=0.0, color=WALL, where=True):
 @pytest.mark.parametrize("rim", [2.0, 4.0])
 @pytest.mark.parametrize("kind", ["rim light", "piping", "on one side"])
 def test_exact_masks_stay_where_the_rim_looks_like_the_wall(person, kind, rim):
-    """A stripe that cannot be told from the wall is told by the fingers, which a mask that is too large would not have."""
+    """A stripe that cannot be told from the wall is told by the fingers, which a mask that is too
+    large would not have.
+    """
     colors, masks = person
     side = np.arange(masks.shape[2]) < np.median(np.nonzero(masks > 0.5)[2])
     how = {"rim light": {"color": 0.97}, "piping": {}, "on one side": {"where": side}}[kind]
@@ -283,7 +289,8 @@ def test_reconstruct_moves_masks_unless_told_not_to(
     assert ("masks were off" in caplog.text) == moved
 
 
-# Rims ------------------------------------------------------------------------------------------------------------------
+# Rims
+# --------------------------------------------------------------------------------------------------
 
 SKIN, ROOM = np.asarray([0.8, 0.5, 0.4], np.float32), np.asarray([0.1, 0.2, 0.9], np.float32)
 ROUNDING = 1e-5

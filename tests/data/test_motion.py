@@ -45,7 +45,8 @@ def upright_poses(columns):
     return random((FRAMES, columns), scale=0.1)
 
 
-# Formats -------------------------------------------------------------------------------------------------------------
+# Formats
+# --------------------------------------------------------------------------------------------------
 
 
 def test_our_own_format_round_trips(tmp_path):
@@ -87,7 +88,9 @@ def test_principal_coefficients_of_hands_are_left_flat_and_that_is_said(tmp_path
 
 
 def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
-    """Known to the command's help and to `load_motion`, which finds the one of two formats that a file is by its content."""
+    """Known to the command's help and to `load_motion`, which finds the one of two formats that a
+    file is by its content.
+    """
     standing = lambda path, reading: Poses(
         np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text())
     )
@@ -107,7 +110,8 @@ def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     assert load_motion(tmp_path / "a.pkl").fps == 60.0
 
 
-# The world's up ------------------------------------------------------------------------------------------------------
+# The world's up
+# --------------------------------------------------------------------------------------------------
 
 
 def rotation_vector(matrix):
@@ -162,7 +166,9 @@ def parts(rotations, translations):
 @pytest.mark.parametrize("heading", [0, 215])
 @pytest.mark.parametrize("kind", motions())
 def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, heading):
-    """AMASS has z up and the others y, also when people crawl along an axis, lie, or stand on their hands."""
+    """AMASS has z up and the others y, also when people crawl along an axis, lie, or stand on their
+    hands.
+    """
     facing = Rotation.from_euler("y", heading, degrees=True)
     for up, arrays in (("z", amass), ("y", parts)):
         path = write(tmp_path / f"{up}.npz", **arrays(*in_world(*motions()[kind], UP[up] * facing)))
@@ -276,7 +282,8 @@ def test_where_no_axis_is_clear_the_format_decides(tmp_path):
     np.testing.assert_allclose(other.translations, trans, atol=FLOAT32)
 
 
-# Wrong files ---------------------------------------------------------------------------------------------------------
+# Wrong files
+# --------------------------------------------------------------------------------------------------
 
 NAN = np.zeros((FRAMES, 165))
 NAN[2, 7] = np.nan
@@ -393,7 +400,8 @@ def test_other_bad_files(tmp_path, capsys):
         load_motion(tmp_path / "ok.npz", up="w")
 
 
-# Using motions -------------------------------------------------------------------------------------------------------
+# Using motions
+# --------------------------------------------------------------------------------------------------
 
 
 def rest_body():
@@ -443,7 +451,9 @@ def test_at_rate_keeps_frames_and_interpolates_between_them():
 
 
 def test_at_rate_turns_at_an_even_speed():
-    """30 to 60: about a fixed axis, through half a turn where rotation vectors jump, and between opposite vectors."""
+    """30 to 60: about a fixed axis, through half a turn where rotation vectors jump, and between
+    opposite vectors.
+    """
     axis = np.asarray([0.6, 0.0, 0.8])
     angles = np.asarray([2.9, 3.1, 3.3, 3.5])
     vectors = (angles - 2 * np.pi * (angles > np.pi))[:, None, None] * axis

@@ -1,4 +1,6 @@
-"""Motions as estimators and data sets write them, read back as the motion that was written; files of several people."""
+"""Motions as estimators and data sets write them, read back as the motion that was written; files
+of several people.
+"""
 
 import collections
 import json
@@ -135,7 +137,9 @@ def array(name, values):
 
 
 def mdm(frames=FRAMES):
-    """24 joints of SMPL by the first two rows of their matrices and the pelvis in space, the frames last."""
+    """24 joints of SMPL by the first two rows of their matrices and the pelvis in space, the frames
+    last.
+    """
     turns = matrices(np.concatenate([ROTATIONS[:frames, :22], np.zeros((frames, 2, 3))], axis=1))
     thetas = turns[..., :2, :].reshape(frames, 24, 6).transpose(1, 2, 0).astype(np.float32)
     moves = (PLACES[:frames] + PELVIS).T
@@ -541,7 +545,9 @@ FILES = {
         {"person": 1, "frames": 4},
     ),
 }
-"""What writes a file, the joints that it has, and options; places: whether positions are in it; frames: of it."""
+"""What writes a file, the joints that it has, and options; places: whether positions are in it;
+frames: of it.
+"""
 
 
 @pytest.mark.parametrize("kind", FILES)
@@ -686,7 +692,8 @@ def test_sam_3d_body_gives_the_directions_of_bones(kind, tmp_path):
     np.testing.assert_allclose(moved, PLACES[:count, [0, 2]], atol=1e-4)
 
 
-# Several people -------------------------------------------------------------------------------------------------------
+# Several people
+# --------------------------------------------------------------------------------------------------
 
 SEVERAL = {
     "WHAM": saved("a.pkl", {0: wham(), 7: wham(OTHER, AWAY, frame_ids=np.arange(4))}),

@@ -1,4 +1,7 @@
-"""Skeletons of other programs: bones, feet and names, in files as CMU, Mixamo and LaFAN write them. The page: tests/viewer."""
+"""Skeletons of other programs: bones, feet and names, in files as CMU, Mixamo and LaFAN write them.
+
+The page: tests/viewer.
+"""
 
 import dataclasses
 import functools
@@ -137,7 +140,9 @@ def test_hips_that_hang_on_a_turned_pelvis_itself(tmp_path):
 
 
 def test_joints_between_those_we_know_turn_bones_too(tmp_path):
-    """A joint of no length above the elbow that turns by itself, as some rigs have: the forearm starts where the file's does."""
+    """A joint of no length above the elbow that turns by itself, as some rigs have: the forearm
+    starts where the file's does.
+    """
     rest, poses, bent = person(), dance(3, names=CMU), dance(3, names=CMU)
     arm, elbow = INDEX["left_shoulder"], INDEX["left_elbow"]
     bent[:, arm] = (
@@ -205,7 +210,9 @@ def test_names_of_programs_and_the_tree_of_those_unknown(tmp_path, scheme):
 
 
 def test_a_foot_without_toes_does_not_follow_the_shin(tmp_path):
-    """Where bones lie along one axis in the rest pose nothing tells where it points: as in T-pose on average."""
+    """Where bones lie along one axis in the rest pose nothing tells where it points: as in T-pose
+    on average.
+    """
     rest, short = (
         person(),
         {ours: theirs for ours, theirs in LAFAN.items() if not ours.endswith("_foot")},
@@ -233,7 +240,10 @@ def test_names_with_spaces(tmp_path, gap, brace):
         np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
 
 
-HEAD = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
+HEAD = (
+    "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd"
+    " Site\n{\nOFFSET 0 0 0\n}\n}\n"
+)
 BAD = {
     "words": ("hello", "not a BVH file: expected HIERARCHY first"),
     "cut": ("HIERARCHY ROOT Hips { OFFSET 0 0", "cut short"),
@@ -295,12 +305,16 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
     (tmp_path / "walk.fbx").write_text("Kaydara")
     with pytest.raises(
         MotionError,
-        match=r"expected a file .npz, .pkl, .pickle, .pt, .pth, .npy, .smpl, .json, .bvh, .glb, .vrma or a folder, got .fbx",
+        match=(
+            r"expected a file .npz, .pkl, .pickle, .pt, .pth, .npy, .smpl, .json, .bvh, .glb, .vrma"
+            r" or a folder, got .fbx"
+        ),
     ):
         load_motion(tmp_path / "walk.fbx")
 
 
-# GLB --------------------------------------------------------------------------------------------------------------------
+# GLB
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("interpolation", ["LINEAR", "CUBICSPLINE", "STEP"])
@@ -400,7 +414,9 @@ def test_glb_files_that_are_no_motion(tmp_path):
 
 
 def test_the_text_of_a_glb_may_be_as_long_as_other_json(tmp_path):
-    """A character of many clips has a megabyte of it; a scan, which another library loads, may not."""
+    """A character of many clips has a megabyte of it; a scan, which another library loads, may
+    not.
+    """
     for name, more in (("a.glb", {}), ("b.glb", {"extras": ["clip"] * 150_000})):
         write_glb(tmp_path / name, person(), dance(2), np.zeros((2, 3)), MIXAMO, **more)
     assert (tmp_path / "b.glb").stat().st_size > 1_000_000
@@ -408,7 +424,8 @@ def test_the_text_of_a_glb_may_be_as_long_as_other_json(tmp_path):
     np.testing.assert_array_equal(one.rotations, other.rotations)
 
 
-# The world's up ---------------------------------------------------------------------------------------------------------
+# The world's up
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("up", ["y", "z"])

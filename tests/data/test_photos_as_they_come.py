@@ -1,4 +1,6 @@
-"""Photos of several sizes, flags and formats in one folder become a capture of one size in which pixels keep their places."""
+"""Photos of several sizes, flags and formats in one folder become a capture of one size in which
+pixels keep their places.
+"""
 
 import json
 import shutil
@@ -25,7 +27,9 @@ HEIC = Path(__file__).parents[1] / "io" / "phone.heic"
 
 
 def write_phones(folder, masks=False, reach=(0, 0)):
-    """Calibration of the upright photos, and photos of noise. reach: rows and columns of the masks up to the rim."""
+    """Calibration of the upright photos, and photos of noise. reach: rows and columns of the masks
+    up to the rim.
+    """
     K, poses = written.scene(len(SHOWN))
     K[:, :2, 2] = np.asarray(list(SHOWN.values())) / 2 + (1.3, -0.8)
     written.write_calibration_full(folder / "rig.json", K, poses, [name[0] for name in SHOWN])
@@ -134,7 +138,8 @@ def test_heic_photos_become_png(tmp_path):
     )
 
 
-# EXIF flags: pixels, masks and cameras of the import agree, and no flag is left for others to obey ---------------------
+# EXIF flags: pixels, masks and cameras of the import agree, and no flag is left for others to obey
+# ---------------------
 
 NAMES = written.NAMES
 POINT = written.TARGET + np.asarray([0.12, 0.1, 0.05])
@@ -175,7 +180,9 @@ def phone(
     size=(written.WIDTH, written.HEIGHT),
     **changes,
 ):
-    """A rig whose photos have a flag, and its import. mask: "stored" or "shown", or "flagged" for stored with the flag."""
+    """A rig whose photos have a flag, and its import. mask: "stored" or "shown", or "flagged" for
+    stored with the flag.
+    """
     K, poses = written.scene()
     K[:, 0, 2], K[:, 1, 2] = size[0] / 2 + 1.3, size[1] / 2 - 0.8
     shown = size if flag < 5 else size[::-1]
@@ -206,7 +213,9 @@ def phone(
 
 
 def check_agreement(folder):
-    """The spot is where the capture's camera sees the point, in photo and mask; photos are read as written."""
+    """The spot is where the capture's camera sees the point, in photo and mask; photos are read as
+    written.
+    """
     photos = load_photos(folder)
     for i, name in enumerate(json.loads((folder / "capture.json").read_text())["views"]):
         expected = written.project(

@@ -30,11 +30,18 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 SIZE, VIEWS = 384, 6
 HEM = 2 * (BOTTOM - TOP) / (ROWS - 1)
-"""The hem is known to a row; cameras above see its front lower and its back higher than the points between the legs."""
+"""The hem is known to a row; cameras above see its front lower and its back higher than the points
+between the legs.
+"""
 SURFACE = 0.016
-"""Metres, median: two pixels of these masks; between the photos the section is a smooth guess. It starts at some 0.06."""
+"""Metres, median: two pixels of these masks; between the photos the section is a smooth guess.
+
+It starts at some 0.06.
+"""
 STRETCH = 3.0
-"""A skirt of legs that are turned by 60 degrees against each other: longest edge over that in the T-pose, without a tear."""
+"""A skirt of legs that are turned by 60 degrees against each other: longest edge over that in the
+T-pose, without a tear.
+"""
 CONE = (0.28, 0.17)
 """Half axes of the hem, metres."""
 
@@ -50,7 +57,9 @@ def rasterizer():
 
 
 def cone(body, hem):
-    """An elliptic cone around the legs of the T-pose, from the hips to `hem` (0: hips, 1: ankles), and its height at the hem."""
+    """An elliptic cone around the legs of the T-pose, from the hips to `hem` (0: hips, 1: ankles),
+    and its height at the hem.
+    """
     joints = np.asarray(body.joint_regressor @ body.template)
     names = list(body.joint_names)
     leg = joints[[names.index(name) for name in LEGS[0]]]
@@ -66,14 +75,20 @@ def cone(body, hem):
     )
     index = np.arange(points[..., 0].size).reshape(12, -1)
     following = np.roll(index, -1, axis=1)
-    faces = [np.stack(x, -1).reshape(-1, 3) for x in (
-        (index[:-1], following[:-1], index[1:]), (following[:-1], following[1:], index[1:]),
-    )]  # fmt: skip
+    faces = [
+        np.stack(x, -1).reshape(-1, 3)
+        for x in (
+            (index[:-1], following[:-1], index[1:]),
+            (following[:-1], following[1:], index[1:]),
+        )
+    ]
     return points.reshape(-1, 3), np.concatenate(faces)
 
 
 def in_clothes(body, rotations=None, worn=None, grown=0.0):
-    """A capture of the body, its skin `grown` along the normals, and of something worn in the T-pose."""
+    """A capture of the body, its skin `grown` along the normals, and of something worn in the
+    T-pose.
+    """
     pose = BodyPose(
         jnp.zeros((len(body.parents), 3)) if rotations is None else rotations, jnp.zeros(3)
     )
@@ -98,9 +113,15 @@ def in_clothes(body, rotations=None, worn=None, grown=0.0):
     )
     masks = np.stack([shown(i) for i in range(VIEWS)]).astype(np.float32)
     return capture_from_arrays(
-        np.ones((*masks.shape, 3), np.float32), cameras.K, cameras.cam_from_world, pose.rotations[None], pose.translation[None],
-        masks=masks, background="white", body=body,
-    )  # fmt: skip
+        np.ones((*masks.shape, 3), np.float32),
+        cameras.K,
+        cameras.cam_from_world,
+        pose.rotations[None],
+        pose.translation[None],
+        masks=masks,
+        background="white",
+        body=body,
+    )
 
 
 def turned_hips(body, degrees):

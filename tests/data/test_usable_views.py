@@ -1,4 +1,6 @@
-"""Photos before they are used: views left out whose mask does not show the person, few of many, in equal exposure."""
+"""Photos before they are used: views left out whose mask does not show the person, few of many, in
+equal exposure.
+"""
 
 import dataclasses
 import itertools
@@ -144,7 +146,8 @@ def test_no_view_left_is_an_error_that_names_them(demo):
             read(nobody)
 
 
-# Which photos of many to use -------------------------------------------------------------------------------------------
+# Which photos of many to use
+# -------------------------------------------------------------------------------------------
 
 GUARANTEE = 1 - 1 / np.e
 """Of the greedy choice for a monotone submodular function."""
@@ -219,7 +222,9 @@ def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
 
 
 def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
-    """One photo shows the 60 % of the vertices with the smallest areas, the other one the others: more skin."""
+    """One photo shows the 60 % of the vertices with the smallest areas, the other one the others:
+    more skin.
+    """
 
     def quality(body, views):
         area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
@@ -231,7 +236,8 @@ def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
     assert select_views(demo.select([0, 1]), 1) == [1]
 
 
-# Equal exposure --------------------------------------------------------------------------------------------------------
+# Equal exposure
+# --------------------------------------------------------------------------------------------------
 
 SHRINKING = 0.1
 """Share of a gain that the prior keeps back where many points are shared."""

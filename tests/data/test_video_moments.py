@@ -1,4 +1,6 @@
-"""Frames of one moment are found by time; what videos say about colors and the shape of pixels is obeyed."""
+"""Frames of one moment are found by time; what videos say about colors and the shape of pixels is
+obeyed.
+"""
 
 import subprocess
 
@@ -112,7 +114,8 @@ def test_numbers_are_written_as_progressions():
     ] == numbers
 
 
-# Videos ---------------------------------------------------------------------------------------------------------------
+# Videos
+# --------------------------------------------------------------------------------------------------
 
 
 def encode(path, frames, rate, *options, filters="null", pixels="yuv420p", codec="libx264"):
@@ -175,8 +178,8 @@ def test_videos_of_other_rates_and_with_gaps_become_frames_of_one_moment(tmp_pat
     for frame in range(20):
         assert np.ptp(seen[photos.frames == frame]) < 0.03
     assert (
-        "videos of 30 and 10 frames a second: paired by time, views of one moment are at most 0.000 s apart"
-        in str(report)
+        "videos of 30 and 10 frames a second: paired by time, views of one moment are at most 0.000"
+        " s apart" in str(report)
     )
     assert "warning: c: no frame at 5 moments (0.50 to 0.90 s): left out there" in str(report)
     report = import_cameras(
@@ -198,9 +201,11 @@ def test_masks_are_those_of_the_frames_they_go_with(tmp_path):
         for name in ("a", "b"):
             times = [i for i in range(12) if name == "a" or not 4 <= i < 8]
             frames = [
-                moment(i / 10)
-                if kind == "videos"
-                else np.eye(48, 64)[..., None] * [1, 1, 1] + (i > 7)
+                (
+                    moment(i / 10)
+                    if kind == "videos"
+                    else np.eye(48, 64)[..., None] * [1, 1, 1] + (i > 7)
+                )
                 for i in times
             ]
             gap = (
@@ -250,9 +255,11 @@ def test_masks_of_another_rate_are_found_by_their_times(tmp_path):
         (tmp_path / kind).mkdir()
         for name, each in (("a", rate), ("b", 10)):
             frames = [
-                moment(i / each)
-                if kind == "videos"
-                else np.eye(48, 64)[..., None] + (i / each > 0.55)
+                (
+                    moment(i / each)
+                    if kind == "videos"
+                    else np.eye(48, 64)[..., None] + (i / each > 0.55)
+                )
                 for i in range(each)
             ]
             encode(tmp_path / kind / f"{name}.mp4", [frame * [1, 1, 1] for frame in frames], each)

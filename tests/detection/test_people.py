@@ -1,4 +1,6 @@
-"""People found in the photos of the demo capture, whose bodies are known; steps of BlazePose on small inputs."""
+"""People found in the photos of the demo capture, whose bodies are known; steps of BlazePose on
+small inputs.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,8 +38,9 @@ PARTS = {"shoulder": 11, "elbow": 13, "wrist": 15, "hip": 23, "knee": 25, "ankle
 """Where the left one is; the right one comes next."""
 NAMES = tuple(f"{side}_{part}" for part in PARTS for side in ("left", "right"))
 MEDIAN_ERROR, LARGEST_ERROR, LEAST_OVERLAP = 0.035, 0.1, 0.9
-"""Of joints, shares of the person's height; of the mask, intersection over union. Measured over all views and turns: at most
-0.028 and 0.075, and at least 0.915. A landmark is not the joint's centre: some 2 cm lie between them."""
+"""Of joints, shares of the person's height; of the mask, intersection over union. Measured over all
+views and turns: at most 0.028 and 0.075, and at least 0.915. A landmark is not the joint's centre:
+some 2 cm lie between them."""
 
 
 def expected(capture, view):
@@ -104,7 +107,9 @@ def test_nobody_in_noise_and_in_the_dark(networks):
 
 
 class Drifting(Networks):
-    """They see one person, well in a crop of the right size; larger crops far off drift towards it with wrong points."""
+    """They see one person, well in a crop of the right size; larger crops far off drift towards it
+    with wrong points.
+    """
 
     hips, side = np.asarray([200.0, 300.0]), 240.0
 
@@ -154,7 +159,9 @@ PERSON, ROOM = np.asarray([0.7, 0.5, 0.4], np.float32), np.asarray([0.2, 0.3, 0.
 
 
 def scene(scale):
-    """Photo, true coverage, and the mask of a network that has one pixel for `scale` of the photo; a body with a thin arm."""
+    """Photo, true coverage, and the mask of a network that has one pixel for `scale` of the photo;
+    a body with a thin arm.
+    """
     y, x = np.mgrid[: 60 * scale, : 60 * scale] / scale
     true = (
         (np.hypot((x - 30) / 12, (y - 32) / 22) < 1)
@@ -197,7 +204,8 @@ def test_a_photo_without_edges_leaves_the_place_of_the_edge():
     assert overlap(found > 0.5, mask > 0.4) > 0.9
 
 
-# Pre- and postprocessing -----------------------------------------------------------------------------------------------
+# Pre- and postprocessing
+# -----------------------------------------------------------------------------------------------
 
 ROUNDING = 1e-9
 """Of float64 pixels up to some thousands."""

@@ -1,4 +1,6 @@
-"""Crops and backgrounds of the protocols against other implementations, on random images and masks."""
+"""Crops and backgrounds of the protocols against other implementations, on random images and
+masks.
+"""
 
 import typing
 
@@ -67,7 +69,9 @@ def test_the_presets_are_those_of_the_table():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_square_box(seed):
-    """Padded by hand, resampled by scipy: sample i of n lies at (i + 1/2) of / n - 1/2, and the rim goes on as it is."""
+    """Padded by hand, resampled by scipy: sample i of n lies at (i + 1/2) of / n - 1/2, and the rim
+    goes on as it is.
+    """
     image, mask = blob(seed, 130, 110)
     (top, bottom), (left, right) = bounds(mask > 0.5)
     np.testing.assert_array_equal(
@@ -97,7 +101,9 @@ def test_the_square_box(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_centred_window(seed):
-    """Of an image that has the size already; the corner by the published rule, said once more in words of branches."""
+    """Of an image that has the size already; the corner by the published rule, said once more in
+    words of branches.
+    """
     image, mask = blob(seed, 100, 80)
     wanted, corner = (70, 30), []
     for (first, last), size, side in zip(bounds(mask > 0), wanted, mask.shape, strict=True):

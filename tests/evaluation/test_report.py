@@ -55,7 +55,8 @@ def column(browser, heading):
 
 def press(browser, heading):
     browser.run(
-        "[...document.querySelectorAll('#images th button')].find((b) => b.textContent === given[0]).click()",
+        "[...document.querySelectorAll('#images th button')].find((b) => b.textContent ==="
+        " given[0]).click()",
         heading,
     )
 
@@ -89,7 +90,10 @@ def test_images_load_and_grow(browser):
         "return document.getElementById('shown').textContent"
     )
     browser.run(f"{TABLE}[0].querySelectorAll('img')[3].click()")
-    large = "return [document.getElementById('large').hidden, document.querySelectorAll('#large img').length]"
+    large = (
+        "return [document.getElementById('large').hidden, document.querySelectorAll('#large"
+        " img').length]"
+    )
     assert browser.run(large) == [False, 3]
     browser.run("document.dispatchEvent(new KeyboardEvent('keydown', { key: 'Escape' }))")
     assert browser.run(large)[0] is True
@@ -97,11 +101,13 @@ def test_images_load_and_grow(browser):
 
 def test_one_person_alone_and_means_with_intervals(browser, found):
     browser.run(
-        "const s = document.getElementById('person'); s.value = 'ann'; s.dispatchEvent(new Event('change'))"
+        "const s = document.getElementById('person'); s.value = 'ann'; s.dispatchEvent(new"
+        " Event('change'))"
     )
     assert column(browser, "person") == ["ann"] * 3
     browser.run(
-        "const s = document.getElementById('person'); s.value = ''; s.dispatchEvent(new Event('change'))"
+        "const s = document.getElementById('person'); s.value = ''; s.dispatchEvent(new"
+        " Event('change'))"
     )
     assert len(column(browser, "person")) == 6
     means = browser.run("return document.getElementById('means').innerText")
@@ -115,7 +121,8 @@ def test_one_person_alone_and_means_with_intervals(browser, found):
 def test_the_page_asks_for_nothing(browser):
     assert (
         browser.run(
-            "return performance.getEntriesByType('resource').filter((e) => !e.name.startsWith('data:')).length"
+            "return performance.getEntriesByType('resource').filter((e) =>"
+            " !e.name.startsWith('data:')).length"
         )
         == 0
     )

@@ -1,4 +1,6 @@
-"""The evaluator from source to report: which views are compared, predictions by file name, and what is wrong in one line."""
+"""The evaluator from source to report: which views are compared, predictions by file name, and what
+is wrong in one line.
+"""
 
 import dataclasses
 import functools
@@ -110,7 +112,9 @@ def test_a_page_keeps_the_worst(people):
 
 
 def test_people_who_are_scored_are_kept(people, tmp_path):
-    """An interrupted call leaves them; the same call goes on and finds what an undisturbed one does."""
+    """An interrupted call leaves them; the same call goes on and finds what an undisturbed one
+    does.
+    """
     asked, stop = [], ["bob"]
 
     def method(case, background):

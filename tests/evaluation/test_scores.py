@@ -1,4 +1,6 @@
-"""Scores against other implementations: scikit-image, torchmetrics' definition in numpy, crops made by hand."""
+"""Scores against other implementations: scikit-image, torchmetrics' definition in numpy, crops made
+by hand.
+"""
 
 import dataclasses
 
@@ -23,11 +25,15 @@ from humangs_jax.losses.losses import (
 from humangs_jax.losses.perceptual import lpips
 
 DECIBELS = 1e-4
-"""Of a mean of some thousand float32 squares: 10 / ln 10 times their relative error of 1e-5 at most."""
+"""Of a mean of some thousand float32 squares: 10 / ln 10 times their relative error of 1e-5 at
+most.
+"""
 
 
 def torchmetrics_ssim(x, y):
-    """StructuralSimilarityIndexMeasure(data_range=1.0): moments by 2-D kernel, reflected padding, which is cut off again."""
+    """StructuralSimilarityIndexMeasure(data_range=1.0): moments by 2-D kernel, reflected padding,
+    which is cut off again.
+    """
     at = np.arange(11) - 5.0
     kernel = np.exp(-0.5 * (at / 1.5) ** 2)
     kernel = np.outer(kernel, kernel) / kernel.sum() ** 2
@@ -103,7 +109,9 @@ def test_lpips_of_a_padded_image_is_that_of_the_image(networks, net):
 
 @pytest.mark.slow
 def test_backgrounds_masks_and_crops_of_every_protocol():
-    """Each preset's PSNR and SSIM from images that are put on its background, cut out and cropped by hand."""
+    """Each preset's PSNR and SSIM from images that are put on its background, cut out and cropped
+    by hand.
+    """
     predicted, truth, masks = (x[0] for x in random_views(1, 1, 128, 128))
     alpha = np.roll(masks, 2, axis=1)
     capture = capture_from(truth[None], masks[None])
@@ -201,7 +209,9 @@ def test_patches_are_those_that_are_more_than_half_person(networks):
 
 
 def test_patches_that_are_mostly_background_do_not_count():
-    """Two patches of 96 x 80 pixels, one above the other: people fill more than half of the upper one alone."""
+    """Two patches of 96 x 80 pixels, one above the other: people fill more than half of the upper
+    one alone.
+    """
     predicted, truth, masks = (x.copy() for x in random_views(5, 1))
     masks[:, :40], masks[:, 40:] = 1, 0
     (row,) = scores.score_views(predicted, capture_from(truth, masks), PROTOCOLS["lvsm"])

@@ -51,7 +51,9 @@ def test_a_score_that_one_lacks_has_no_plain_mean():
 
 
 def test_the_interval_covers_the_true_mean_as_often_as_it_says():
-    """Of 200 samples of 40 normal numbers; the percentile interval of so few is a little short: 93 % (Student's t)."""
+    """Of 200 samples of 40 normal numbers; the percentile interval of so few is a little short: 93
+    % (Student's t).
+    """
     rng = np.random.default_rng(0)
     intervals = [bootstrap(rng.normal(5.0, 2.0, 40).tolist(), seed=i) for i in range(200)]
     covered = np.mean([low <= 5.0 <= high for low, high in intervals])

@@ -1,4 +1,6 @@
-"""Bodies that weights are tried on: the made-up one is another mesh of the same people, and reads as SMPL-X."""
+"""Bodies that weights are tried on: the made-up one is another mesh of the same people, and reads
+as SMPL-X.
+"""
 
 import jax.numpy as jnp
 import numpy as np

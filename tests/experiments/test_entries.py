@@ -15,7 +15,10 @@ CASES = {
     "fit_sequences": "--people 2 --smoothness 0.02 --cases",
     "paper_claims": "",
     "people_faults": "--subjects 1 --size 64",
-    "refinement": f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg --plot FOLDER/a.png",
+    "refinement": (
+        f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg"
+        " --plot FOLDER/a.png"
+    ),
     "splatting_finite_differences": "--size 32",
     "splatting": "--sizes 64 --repeats 1",
     "splatting_tradeoff": "--size 64 --repeats 1 --image FOLDER/a.png --only preset scale",

@@ -112,7 +112,10 @@ def test_a_table_goes_to_the_page_that_shows_it(tmp_path, monkeypatch):
 
 
 def test_the_list_imports_nothing_heavy_and_the_readme_has_all_names():
-    code = "import sys; sys.argv[1:] = []; from experiments.harness import main; main(); print(sorted(sys.modules))"
+    code = (
+        "import sys; sys.argv[1:] = []; from experiments.harness import main; main();"
+        " print(sorted(sys.modules))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,

@@ -51,9 +51,16 @@ def run(psnr, photos=4, done=True, seed=0, counts=(), curve=(10.0, 12.0, 12.1)):
         str(count): {"reconstruction": scores, "animation": scores} for count in (photos, *counts)
     }
     return {
-        "curve": list(curve), "validation": curve[-1], "done": done, "photos": photos, "steps": 40, "operations": 2e15,
-        "parameters": 1000, "cpu_seconds": 60.0, **({"scores": by_count} if done else {}),
-    }  # fmt: skip
+        "curve": list(curve),
+        "validation": curve[-1],
+        "done": done,
+        "photos": photos,
+        "steps": 40,
+        "operations": 2e15,
+        "parameters": 1000,
+        "cpu_seconds": 60.0,
+        **({"scores": by_count} if done else {}),
+    }
 
 
 def seeded(psnr, spread=0.1, **others):
@@ -160,7 +167,8 @@ def test_an_interval_covers_people_and_seeds(report):
         and found.seeds == (3, 3)
         and found.people == PEOPLE
     )
-    # 3 pairs of groups with a standard deviation of 0.1: 8 degrees or so; people are paired, so that their spread does not count
+    # 3 pairs of groups with a standard deviation of 0.1: 8 degrees or so; people are paired, so
+    # that their spread does not count
     by_hand = 2.4 * 0.1 * (2 / 3) ** 0.5
     assert found.half == pytest.approx(by_hand, rel=0.15)
     alone = bench.difference(
@@ -414,7 +422,9 @@ def checkpoint(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_table_is_one_command_on_the_layout_of_its_data(layout, tmp_path, monkeypatch, capsys):
-    """Rows: a checkpoint that was converted; of THuman also the weights that are shipped and a network trained by the command."""
+    """Rows: a checkpoint that was converted; of THuman also the weights that are shipped and a
+    network trained by the command.
+    """
     table, how = LAYOUTS[layout]
     raw, converted, out = (
         tmp_path / "raw",
@@ -526,7 +536,9 @@ def test_people_of_one_name_are_refused(tmp_path):
 
 @pytest.mark.slow
 def test_training_at_the_published_size_starts():
-    """A step of both stages of `--config paper`, on shapes alone: eight people at 256 pixels, then four at 512."""
+    """A step of both stages of `--config paper`, on shapes alone: eight people at 256 pixels, then
+    four at 512.
+    """
     config, body = read_config("paper"), load_body()
     state, networks = (
         jax.eval_shape(lambda: init_state(config)),

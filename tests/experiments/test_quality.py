@@ -1,4 +1,5 @@
-"""Quality of reconstructions: every number is that of the images that were drawn; rows, tables and verdicts.
+"""Quality of reconstructions: every number is that of the images that were drawn; rows, tables and
+verdicts.
 
 The network is `tiny` with variables of zero; for bodies of other sizes its avatars are made up.
 """
@@ -73,7 +74,9 @@ def mean_psnr(drawn, truth, chosen):
 
 @pytest.mark.slow
 def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch):
-    """People, reconstruction and drawing are real; every reported number is that of the images that were drawn."""
+    """People, reconstruction and drawing are real; every reported number is that of the images that
+    were drawn.
+    """
     made, ours, painted = [], [], []
     make, draw, paint = (
         subjects.make_evaluation_subject,
@@ -202,7 +205,8 @@ def test_the_shipped_weights_beat_the_painted_body(tmp_path):
     assert all(scores["psnr"] > scores["baseline_psnr"] for scores in tasks.values())
 
 
-# Tables --------------------------------------------------------------------------------------------------------------
+# Tables
+# --------------------------------------------------------------------------------------------------
 
 
 def people(**psnrs):
@@ -238,7 +242,8 @@ def test_the_section_has_means():
     assert "LPIPS" not in section
 
 
-# What eyes see ------------------------------------------------------------------------------------------------------------
+# What eyes see
+# --------------------------------------------------------------------------------------------------
 
 
 def test_loosest_and_worst_people_are_listed_apart():

@@ -1,4 +1,6 @@
-"""The parts of the real capture that need no download: its calibration, lenses, background and careful masks."""
+"""The parts of the real capture that need no download: its calibration, lenses, background and
+careful masks.
+"""
 
 import numpy as np
 import pytest

@@ -22,7 +22,8 @@ def page(tmp_path):
     path = tmp_path / "docs" / "page.md"
     path.parent.mkdir()
     path.write_text(
-        "before\n<!-- table: x -->\nold\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n"
+        "before\n<!-- table: x -->\nold\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end"
+        " -->\nafter\n"
     )
     return path
 
@@ -112,8 +113,10 @@ def test_a_result_is_written_beside_its_page(page, monkeypatch):
         ],
     )
     publish(page, "x", TABLE, {"psnr": 1.0})
-    assert page.read_text() == (
-        f"before\n<!-- table: x -->\n{TABLE}\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n"
+    assert (
+        page.read_text()
+        == f"before\n<!-- table: x -->\n{TABLE}\n<!-- end -->\nbetween\n<!-- table: y"
+        " -->\nkept\n<!-- end -->\nafter\n"
     )
     result = json.loads((page.parent / "results" / "x.json").read_text())
     assert (result["script"], result["arguments"]) == (

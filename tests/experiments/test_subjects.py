@@ -1,4 +1,6 @@
-"""People to evaluate on: one set of photos for all numbers of views, held-out views as the written captures have them."""
+"""People to evaluate on: one set of photos for all numbers of views, held-out views as the written
+captures have them.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""The comparison systems: shapes, gradients, and the properties that make each of them that system."""
+"""The comparison systems: shapes, gradients, and the properties that make each of them that
+system.
+"""
 
 import dataclasses
 

@@ -1,4 +1,6 @@
-"""Systems that run again for every target: gradients, and the properties that make each of them that system."""
+"""Systems that run again for every target: gradients, and the properties that make each of them
+that system.
+"""
 
 import dataclasses
 import functools
@@ -117,7 +119,8 @@ def test_every_parameter_has_a_finite_gradient(name):
         assert np.abs(gradient).max() > 0, path
 
 
-# Pixels --------------------------------------------------------------------------------------------------------------
+# Pixels
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -218,7 +221,8 @@ def test_a_network_that_draws_pixels_makes_no_avatar():
         make_avatar(outputs, tube(), shape_body(tube(), BETAS), config)
 
 
-# Drivers -------------------------------------------------------------------------------------------------------------
+# Drivers
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", DRIVEN)
@@ -312,7 +316,9 @@ def test_corrections_are_bounded_and_zeros_are_none():
 
 
 def test_corrections_turn_gaussians_about_the_axes_of_the_body():
-    """A quarter turn about z takes a Gaussian that is long along y to one that is long along x, however it was written."""
+    """A quarter turn about z takes a Gaussian that is long along y to one that is long along x,
+    however it was written.
+    """
     half = 0.5**0.5
     gaussians = Gaussians(
         means=jnp.zeros((1, 3)),
@@ -332,7 +338,9 @@ def test_corrections_turn_gaussians_about_the_axes_of_the_body():
 
 
 def test_texels_attend_by_scaled_products():
-    """Products grow with the width; their softmax must not: of random features it stays far from one token."""
+    """Products grow with the width; their softmax must not: of random features it stays far from
+    one token.
+    """
     module, width = PoseAttention(width=4, tokens=2), 4
     x, pose_vector = jnp.asarray([[[[1.0, 2, 3, 4]]]]), jnp.ones(3)
     params = jax.tree.map(jnp.zeros_like, module.init(jax.random.key(0), x, pose_vector)["params"])
@@ -346,7 +354,9 @@ def test_texels_attend_by_scaled_products():
 
 
 def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
-    """Texels that two photos see, one red and one green: their weights are exp(sharpness * cosine)."""
+    """Texels that two photos see, one red and one green: their weights are exp(sharpness *
+    cosine).
+    """
     inputs = inputs_of("giga")
     images = jnp.stack([jnp.full_like(inputs.images[0], 0).at[..., i].set(1.0) for i in range(2)])
     inputs = replace(inputs, images=images, depth_maps=0 * inputs.depth_maps + 100.0)
@@ -368,12 +378,15 @@ def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
     np.testing.assert_allclose(odds(4.0), 2 * odds(2.0), atol=1e-3)  # log odds grow in proportion
 
 
-# Pairs of photos -----------------------------------------------------------------------------------------------------
+# Pairs of photos
+# --------------------------------------------------------------------------------------------------
 
 
 @functools.cache
 def stereo():
-    """A small GPS-Gaussian-style network, its variables, inputs of four photos, and their Gaussians."""
+    """A small GPS-Gaussian-style network, its variables, inputs of four photos, and their
+    Gaussians.
+    """
     config = SYSTEMS["gps"]("bench").with_parts(decoder=StereoDecoder((4, 8), planes=6))
     variables, inputs = random_variables(config), random_inputs(views=4, size=SIZE)
     return (
@@ -421,7 +434,9 @@ def test_a_target_is_drawn_from_the_two_photos_nearest_to_it():
 
 
 def test_depths_come_from_what_two_photos_have_in_common():
-    """With the learned scores at 0 a photo's depths depend on the nearest other photo, and on no third one."""
+    """With the learned scores at 0 a photo's depths depend on the nearest other photo, and on no
+    third one.
+    """
     config, variables, inputs, _ = stereo()
     zero = lambda path, x: 0 * x if path[-2].key == "0_out" else x
     still = jax.tree_util.tree_map_with_path(zero, variables)
@@ -452,7 +467,8 @@ def test_a_pair_of_photos_has_finite_gradients_and_shows_no_other_pose():
     assert not config.architecture.driver.moves
 
 
-# Parts ---------------------------------------------------------------------------------------------------------------
+# Parts
+# --------------------------------------------------------------------------------------------------
 
 
 def test_architectures_are_recorded_whole():

@@ -1,7 +1,8 @@
-"""People before known cameras for the tests of fits, without the generator: quick to make, and of every kind of pose.
+"""People before known cameras for the tests of fits, without the generator: quick to make, and of
+every kind of pose.
 
-A toy body, what is fitted to it compiles quickly; chosen poses of the shipped body; random poses with their keypoints; and what a
-detector sees in photos without a calibration.
+A toy body, what is fitted to it compiles quickly; chosen poses of the shipped body; random poses
+with their keypoints; and what a detector sees in photos without a calibration.
 """
 
 import functools
@@ -28,7 +29,8 @@ from humangs_jax.fitting.state import MIRROR, pose_prior
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 
-# A body of four joints and eight landmarks -----------------------------------------------------------------------------
+# A body of four joints and eight landmarks
+# -----------------------------------------------------------------------------
 
 TOY_JOINTS = np.asarray([[0, 0, 0], [0, 0.5, 0], [0, 1.0, 0], [0.5, 1.0, 0]], np.float32)
 
@@ -55,7 +57,8 @@ def toy_model():
 TOY_MODEL = toy_model()
 
 
-# Known poses -----------------------------------------------------------------------------------------------------------
+# Known poses
+# --------------------------------------------------------------------------------------------------
 
 SIZE = 512
 VIEWS = 4
@@ -123,7 +126,9 @@ def _truth(model, betas, rotations, translations, turn, views):
 
 
 def observe(poses, *, seed=0, views=VIEWS, noise=0.0, outliers=0.0, model=None):
-    """True joints (m, j, 3), betas, and observations of one person in poses (m), with noise and outliers in pixels."""
+    """True joints (m, j, 3), betas, and observations of one person in poses (m), with noise and
+    outliers in pixels.
+    """
     model, rng = model_of() if model is None else model, np.random.default_rng(seed)
     rotations = np.stack([rotations_of(pose) for pose in poses])
     translations = rng.uniform(-0.5, 0.5, (len(poses), 3)).astype(np.float32)
@@ -141,7 +146,8 @@ def observe(poses, *, seed=0, views=VIEWS, noise=0.0, outliers=0.0, model=None):
     return np.asarray(joints), betas, make_observations(pixels, confidences, K, pose)
 
 
-# Captures of random poses whose keypoints in some views are known ------------------------------------------------------
+# Captures of random poses whose keypoints in some views are known
+# ------------------------------------------------------
 
 PHOTO_SIZE, NOISE = 256, 1.0
 
@@ -155,10 +161,11 @@ def _landmarks(names):
 def person(
     seed, frames, views, *, still=False, even=False, moving=False, outliers=0.0, kind=COCO_17
 ):
-    """A capture and noisy keypoints of it, views of a frame one after the other, named m0v0, m0v1, ...
+    """A capture and noisy keypoints of it, views of a frame one after the other, named m0v0, m0v1,
+    ...
 
-    still: cameras are the same for all frames. even: evenly spaced around the person. moving: from one pose to another in 8
-    frames, and not at random.
+    still: cameras are the same for all frames. even: evenly spaced around the person. moving: from
+    one pose to another in 8 frames, and not at random.
     """
     rng = np.random.default_rng(seed)
     prior = pose_prior(default_body().joint_names)
@@ -216,7 +223,8 @@ def _cameras(rng, frames, views, still, even):
     )
 
 
-# As a detector sees them: pixels, and 3D landmarks with the errors that it makes ---------------------------------------
+# As a detector sees them: pixels, and 3D landmarks with the errors that it makes
+# ---------------------------------------
 
 PARTS = (
     "eye",
@@ -241,7 +249,9 @@ def turned(vector):
 
 
 def posed(pose="standing", seed=0, change=0.0):
-    """Landmarks (k, 3) of the shipped body, metres. change: std of random turns of all joints but the first, radians."""
+    """Landmarks (k, 3) of the shipped body, metres. change: std of random turns of all joints but
+    the first, radians.
+    """
     rng = np.random.default_rng(seed)
     rotations = rotations_of(pose) + change * rng.normal(size=rotations_of(pose).shape)
     pose = BodyPose(jnp.asarray(rotations, jnp.float32), jnp.zeros(3))
@@ -249,7 +259,9 @@ def posed(pose="standing", seed=0, change=0.0):
 
 
 def cameras_around(views, seed=0):
-    """cam_from_world (c, 4, 4) in float64 of cameras somewhere around the origin, nearly level, that see the person whole."""
+    """cam_from_world (c, 4, 4) in float64 of cameras somewhere around the origin, nearly level,
+    that see the person whole.
+    """
     rng = np.random.default_rng(seed)
     matrices = []
     for azimuth in 2 * np.pi * (np.arange(views) + rng.uniform(-0.25, 0.25, views)) / max(views, 3):
@@ -272,8 +284,9 @@ def cameras_around(views, seed=0):
 
 
 def seen_by(landmarks, matrices, *, seed=0, pixels=0.0, world=0.0, turn=0.0, size=1.0, focal=FOCAL):
-    """What a detector sees. landmarks: (k, 3), or (c, k, 3) of photos of several moments. pixels, world: std of its noise, pixels
-    and metres; turn: std of the turn of a view's 3D landmarks, degrees; size: factor on them.
+    """What a detector sees. landmarks: (k, 3), or (c, k, 3) of photos of several moments. pixels,
+    world: std of its noise, pixels and metres; turn: std of the turn of a view's 3D landmarks,
+    degrees; size: factor on them.
     """
     rng, views = np.random.default_rng(seed), len(matrices)
     landmarks = np.broadcast_to(landmarks, (views, *landmarks.shape[-2:]))
@@ -304,8 +317,8 @@ def seen_by(landmarks, matrices, *, seed=0, pixels=0.0, world=0.0, turn=0.0, siz
 
 
 def errors_of(found, matrices):
-    """Rotations (c,) in degrees and centres (c,) in metres against the truth, after the similarity that fits best; one camera:
-    its distance.
+    """Rotations (c,) in degrees and centres (c,) in metres against the truth, after the similarity
+    that fits best; one camera: its distance.
     """
 
     mine = np.asarray([camera.cam_from_world for camera in found.cameras], float)

@@ -201,7 +201,8 @@ def test_the_table_is_of_the_views_that_fit_worst():
     assert "worst in frame 4" in text
 
 
-# Findings ------------------------------------------------------------------------------------------------------------
+# Findings
+# --------------------------------------------------------------------------------------------------
 
 
 def test_undetermined_joints_are_named_in_groups():
@@ -236,7 +237,8 @@ def test_warnings_stay_few():
     )
 
 
-# Of what a fit kept --------------------------------------------------------------------------------------------------
+# Of what a fit kept
+# --------------------------------------------------------------------------------------------------
 
 
 def record_of(capture, keypoints, order, **changes):
@@ -276,7 +278,8 @@ def test_keypoints_and_records_of_something_else(good):
         examine(capture, keypoints, record_of(capture, keypoints, np.arange(16), **some))
 
 
-# The sheet -----------------------------------------------------------------------------------------------------------
+# The sheet
+# --------------------------------------------------------------------------------------------------
 
 
 def drawn(sheet, color):

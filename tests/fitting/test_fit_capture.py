@@ -136,7 +136,9 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
     assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
     with pytest.raises(
         ValueError,
-        match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images ",
+        match=(
+            r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "
+        ),
     ):
         check_place(folder[0], target, overwrite=False)
     (tmp_path / "other").mkdir()

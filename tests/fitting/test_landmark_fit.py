@@ -29,9 +29,13 @@ from humangs_jax.geometry.mesh import smallest_turns
 
 NAMES = list(POSES)
 EXACT_MM = 6.0
-"""Mean joint error without noise: priors pull by millimetres at what keypoints leave open, collars and the spine."""
+"""Mean joint error without noise: priors pull by millimetres at what keypoints leave open, collars
+and the spine.
+"""
 NOISY_MM, OUTLIER_MM = 10.0, 20.0
-"""What issue 8 asks for, 2 pixels of noise at 512; and with 20 % of the points up to 140 pixels off."""
+"""What issue 8 asks for, 2 pixels of noise at 512; and with 20 % of the points up to 140 pixels
+off.
+"""
 
 
 def mean_mm(fit, joints, rows=slice(None)):
@@ -152,7 +156,9 @@ def test_predicted_deviations_are_of_the_size_of_the_errors(noisy):
 
 @pytest.fixture(scope="module")
 def still():
-    """Somebody who stands still, six frames of one view, 4 pixels of noise: joints (j, 3), what is seen, the fit."""
+    """Somebody who stands still, six frames of one view, 4 pixels of noise: joints (j, 3), what is
+    seen, the fit.
+    """
     joints, _, seen = observe(["standing"], views=1)
     noise = np.random.default_rng(0).normal(0, 4, (6, *seen.points.shape[1:]))
     seen = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[0], (6, *leaf.shape[1:])), seen)
@@ -182,7 +188,10 @@ def test_smoothness_shrinks_the_jitter_of_a_motion_that_stands_still(still):
 
 
 FEW_STEPS, SAME_PATH = 10, 1e-4
-"""Steps before rounding decides which step is accepted; metres. After 30 steps the two are 4 to 36 mm apart."""
+"""Steps before rounding decides which step is accepted; metres.
+
+After 30 steps the two are 4 to 36 mm apart.
+"""
 
 
 @pytest.mark.slow
@@ -201,12 +210,13 @@ def test_vmap_over_people_is_a_loop(monkeypatch):
         assert difference.max() < SAME_PATH
 
 
-# Keypoints that lie where a detector sees them, and not where annotators would put them; and how cert -----------------
+# Keypoints that lie where a detector sees them, and not where annotators would put them; and how
+# cert -----------------
 
 
 NEAR_MM, BIASED = 15.0, 1.5
-"""Mean joint error of a fit that knows the places, in one frame with noise (10 mm measured), and how many times larger it is
-without them (2.2 measured)."""
+"""Mean joint error of a fit that knows the places, in one frame with noise (10 mm measured), and
+how many times larger it is without them (2.2 measured)."""
 
 
 @pytest.mark.slow
@@ -233,11 +243,12 @@ MOVED = {
     "ankle": (0, 10, -10),
     "nose": (0, 10, 20),
 }
-"""Millimetres by which a detector sees landmarks of the left side beside where the body has them."""
+"""Millimetres by which a detector sees landmarks of the left side beside where the body has them.
+"""
 LESS, CLOSER, HARMLESS = 0.9, 0.7, 1.1
-"""Most of the error of the joints of a fit that finds the places, over one that does not; of the error of the places over their
-size; and of the error of the joints where there is nothing to find. Measured in five frames of four views: 20.1 to 17.2 mm, 16.5
-to 10.3 mm, and 11.2 to 11.7 mm."""
+"""Most of the error of the joints of a fit that finds the places, over one that does not; of the
+error of the places over their size; and of the error of the joints where there is nothing to find.
+Measured in five frames of four views: 20.1 to 17.2 mm, 16.5 to 10.3 mm, and 11.2 to 11.7 mm."""
 
 
 def test_a_set_without_a_table_has_places_that_change_nothing():
@@ -317,7 +328,8 @@ def test_a_landmark_that_the_detector_hardly_finds_counts_less_and_few_keypoints
     assert relative[len(POSES)] < 0.4 < relative[1] < 1
 
 
-# 3D landmarks of a detector as evidence where a frame has one view ----------------------------------------------------
+# 3D landmarks of a detector as evidence where a frame has one view
+# ----------------------------------------------------
 
 
 WORLD_POSES = ("standing", "crouching", "facing away")
@@ -326,7 +338,9 @@ NOISE = 0.04
 
 
 def seen_in_space(model, observations, seed):
-    """The landmarks of `WORLD_POSES` in camera axes, too small by a tenth, about another middle, with noise: (m, 1, k, 3)."""
+    """The landmarks of `WORLD_POSES` in camera axes, too small by a tenth, about another middle,
+    with noise: (m, 1, k, 3).
+    """
     rotations, none = jnp.stack([rotations_of(pose) for pose in WORLD_POSES]), jnp.zeros(3)
     betas = jnp.asarray(betas_of(seed))
     landmarks = jax.vmap(lambda r: pose_landmarks(model, betas, BodyPose(r, none))[0])(rotations)
@@ -368,7 +382,9 @@ def test_size_and_place_in_space_do_not_count_and_unseen_landmarks_neither():
 
 
 def test_landmarks_of_a_file_come_into_the_axes_of_the_camera(tmp_path):
-    """The detector looks at the middle of the hips, which here is far from the middle of the photo."""
+    """The detector looks at the middle of the hips, which here is far from the middle of the
+    photo.
+    """
     rng, hips = (
         np.random.default_rng(0),
         [MEDIAPIPE_33.names.index(f"{side}_hip") for side in ("left", "right")],

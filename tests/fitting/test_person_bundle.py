@@ -23,13 +23,19 @@ from humangs_jax.fitting.person_bundle import (
 from humangs_jax.fitting.person_moments import evidence_of
 
 SCALE, DIFFERENCE = 6.0, 1e-6
-"""Robust scale of pixels, standard deviations; half the distance of central differences, metres and radians."""
+"""Robust scale of pixels, standard deviations; half the distance of central differences, metres and
+radians.
+"""
 RELATIVE = 1e-6
-"""Of derivatives against differences in float64: the square of the distance, times third derivatives."""
+"""Of derivatives against differences in float64: the square of the distance, times third
+derivatives.
+"""
 
 
 def problem(views=3, seed=0, known=2):
-    """Evidence of noisy photos, of which all but `known` tell no focal length, and a rig that is some way from the minimum."""
+    """Evidence of noisy photos, of which all but `known` tell no focal length, and a rig that is
+    some way from the minimum.
+    """
     rng = np.random.default_rng(seed)
     seen = seen_by(
         posed("crouching", seed, 0.2),
@@ -70,7 +76,9 @@ def scaled(step, factor):
 
 
 def changes(evidence, of, step):
-    """What the derivatives say of a step: of residuals of landmarks in views, and of those that tie landmarks."""
+    """What the derivatives say of a step: of residuals of landmarks in views, and of those that tie
+    landmarks.
+    """
     seen = np.einsum("ckra,ka->ckr", of.by_landmark, step.landmarks) + np.einsum(
         "ckra,ca->ckr", of.by_view, step.views
     )
@@ -111,7 +119,9 @@ def test_the_depth_of_a_landmark_behind_the_camera_does_not_move_its_pixel():
 
 
 def dense(evidence, rows, of):
-    """All residuals and their derivatives as one matrix, a loop for each block: landmarks, views, focal lengths."""
+    """All residuals and their derivatives as one matrix, a loop for each block: landmarks, views,
+    focal lengths.
+    """
     c, k = evidence.weights.shape
     g = len(rows.focal)
     J, r = [], []
@@ -134,7 +144,8 @@ def test_eliminated_landmarks_give_the_step_of_the_dense_normal_equations(views,
     rows, of = residuals(evidence, rig, SCALE), derivatives(evidence, rig, SCALE)
     normal, (J, r) = normal_equations(evidence, rows, of), dense(evidence, rows, of)
     k, m, damping = len(rig.landmarks), len(normal.by_cameras), 0.01
-    # what is damped is what the elimination adds to its diagonals: not of the rows that tie landmarks
+    # what is damped is what the elimination adds to its diagonals: not of the rows that tie
+    # landmarks
     own = J[: -len(rows.tied) - len(rows.focal)]
     diagonal = np.sum(own**2, axis=0) + np.concatenate(
         [np.zeros(3 * k + VIEW * views), np.ones(len(rows.focal))]

@@ -33,7 +33,9 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
 EXACT_DEGREES, EXACT_METRES = 0.1, 0.01
-"""Of exact landmarks: float32, and priors (size, level cameras) that are not quite those of the test's person."""
+"""Of exact landmarks: float32, and priors (size, level cameras) that are not quite those of the
+test's person.
+"""
 NOISE = {"pixels": 4.0, "world": 0.04, "turn": 10.0, "size": 0.93}
 """What the detector is off on photos of 1,920 pixels."""
 NOISY_DEGREES, NOISY_METRES = 3.5, 0.25
@@ -285,12 +287,14 @@ def test_a_person_of_another_height_looks_the_same():
     assert np.ptp(after[:, 1]) == pytest.approx(np.ptp(before[:, 1]), rel=0.01)
 
 
-# A camera that is turned is found, named and turned back; cameras that are right are left alone -----------------------
+# A camera that is turned is found, named and turned back; cameras that are right are left alone
+# -----------------------
 
 
 TURN, ROLL = 0.35, 0.9
-"""Degrees: what may be left of a turn of 1 degree with keypoints of one moment that err by a pixel, of a person who is 120 high;
-17 of them know a turn about the camera's own axis to 0.45 degrees only."""
+"""Degrees: what may be left of a turn of 1 degree with keypoints of one moment that err by a pixel,
+of a person who is 120 high; 17 of them know a turn about the camera's own axis to 0.45 degrees
+only."""
 VIEWS = 4
 """Cameras of people who move."""
 
@@ -349,7 +353,9 @@ def test_all_moments_of_a_camera_that_stands_still_count_and_two_cameras_may_be_
 
 
 def late(keypoints, cameras, frames):
-    """The keypoints of a moving person, of whom some cameras show what the others have shown so many frames before."""
+    """The keypoints of a moving person, of whom some cameras show what the others have shown so
+    many frames before.
+    """
     views = np.arange(len(keypoints.points)).reshape(-1, VIEWS)
     for camera, by in zip(cameras, frames, strict=True):
         views[:, camera] = views[np.clip(np.arange(len(views)) - by, 0, len(views) - 1), camera]
@@ -413,7 +419,9 @@ def test_outliers_exchanged_sides_and_another_person_are_no_camera_errors():
 
 
 def test_landmarks_that_the_detector_hardly_sees_turn_no_camera():
-    """An error that all landmarks of a view share is a rotation, too, however small their scatter: the certainty decides."""
+    """An error that all landmarks of a view share is a rotation, too, however small their scatter:
+    the certainty decides.
+    """
     truth, keypoints = person(2, 1, 4)
     points = np.array(keypoints.points)
     points[1] += [3.0, 0.0]
@@ -444,7 +452,8 @@ def test_a_fit_turns_the_camera_back_and_says_so_and_check_names_it(tmp_path):
         fitted.report.errors["keypoint_error_px"].after
         < left.report.errors["keypoint_error_px"].after
     )
-    # a body that is wider than the masks: cameras stay only where the keypoints say that they are right
+    # a body that is wider than the masks: cameras stay only where the keypoints say that they are
+    # right
     masks = np.zeros(truth.images.shape[:3], np.float32)
     said = lambda capture, known: str(
         check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known)

@@ -1,4 +1,6 @@
-"""Refinement from end to end on small images of the bare body, and its report on starts that it cannot improve."""
+"""Refinement from end to end on small images of the bare body, and its report on starts that it
+cannot improve.
+"""
 
 import dataclasses
 import functools
@@ -265,7 +267,9 @@ def test_settings_suit_what_is_known():
 
 
 def test_keypoints_of_long_narrow_photos_are_where_they_are():
-    """At the size that is looked at, the height is 0.853 and the width, of whole pixels, 0.856 of the photo's."""
+    """At the size that is looked at, the height is 0.853 and the width, of whole pixels, 0.856 of
+    the photo's.
+    """
     known, cameras = keypoints(), truth().cameras.resized(90, 600)
     known = dataclasses.replace(known, points=known.points * np.float32([90 / SIZE, 600 / SIZE]))
     images = np.broadcast_to(np.float32(0), (VIEWS, 600, 90, 3))
@@ -297,7 +301,8 @@ def test_keypoints_weigh_by_the_noise_that_the_body_finds():
     assert noises[0] == pytest.approx(0.5) and (noises[1] > 5).all()
 
 
-# Silhouettes of a sphere and of a disc, which are known, and what of two silhouettes belongs together -----------------
+# Silhouettes of a sphere and of a disc, which are known, and what of two silhouettes belongs
+# together -----------------
 
 
 SIDE, FOCAL, DISTANCE, RADIUS = 128, 160.0, 3.0, 0.8

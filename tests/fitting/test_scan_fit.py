@@ -71,7 +71,9 @@ def few_points():
 
 @pytest.fixture(scope="module")
 def truth(body):
-    """A person's vertices in a pose, normals and landmarks, metres; and the similarity to the scan's coordinates."""
+    """A person's vertices in a pose, normals and landmarks, metres; and the similarity to the
+    scan's coordinates.
+    """
     rng = np.random.default_rng(5)
     prior = pose_prior(body.joint_names)
     rotations = np.clip(
@@ -242,7 +244,8 @@ def test_facing_back_twice_is_facing_forward(body):
     np.testing.assert_allclose(twice.align(points), start.align(points), atol=1e-5)
 
 
-# Scans from files, and images of scans --------------------------------------------------------------------------------
+# Scans from files, and images of scans
+# --------------------------------------------------------------------------------
 
 
 def sphere(radius=1.0, subdivisions=3):
@@ -291,7 +294,9 @@ def test_parts_of_a_scene_are_where_the_scene_has_them(tmp_path):
 
 
 def boxes(folder):
-    """Objects and materials in turn, each with its own vertices, quads among triangles; as (vertices, faces) and as a file."""
+    """Objects and materials in turn, each with its own vertices, quads among triangles; as
+    (vertices, faces) and as a file.
+    """
     vertices, faces, lines = [], [], ["mtllib boxes.mtl"]
     for i in range(6):
         box = trimesh.creation.box((1, 1, 1)).subdivide()
@@ -383,7 +388,9 @@ def test_what_is_no_scan_is_refused_by_name(tmp_path):
 
 
 def blocks(path, up=2):
-    """A tall box with a head, painted red, that stands along an axis, large and far from the origin."""
+    """A tall box with a head, painted red, that stands along an axis, large and far from the
+    origin.
+    """
     body, head = trimesh.creation.box((40, 40, 150)), trimesh.creation.icosphere(2, 25)
     head.apply_translation([0, 0, 95])
     mesh = trimesh.util.concatenate([body.subdivide(), head])

@@ -1,4 +1,6 @@
-"""Smooth motion of a body of four joints: frames that are badly seen neither ruin the others nor their own."""
+"""Smooth motion of a body of four joints: frames that are badly seen neither ruin the others nor
+their own.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +63,9 @@ def seen_by(landmarks, seed=0):
 
 @pytest.fixture(scope="module")
 def walk():
-    """Observations, the start that independent fits would give (the truth with errors), and true joints."""
+    """Observations, the start that independent fits would give (the truth with errors), and true
+    joints.
+    """
     rotations, translations = true_poses()
     landmarks, joints = (np.asarray(x) for x in landmarks_of(rotations, translations))
     rng = np.random.default_rng(1)
@@ -73,7 +77,9 @@ def walk():
 
 
 def smoothed(seen, start, spoilt=(), model=MODEL):
-    """The result; frames that are spoilt start where a fit of nothing would: at rest in the world's origin."""
+    """The result; frames that are spoilt start where a fit of nothing would: at rest in the world's
+    origin.
+    """
     rotations, translations = (x.copy() for x in start)
     rotations[list(spoilt)], translations[list(spoilt)] = 0, 0
     nothing = jnp.zeros((FRAMES, 1, 3))
@@ -145,7 +151,9 @@ def test_somebody_else_in_one_frame_does_not_move_the_others(walk):
 def test_smoothness_that_the_keypoints_contradict_by_the_certainty_that_the_fit_found_is_not_forced(
     walk,
 ):
-    """Six times the expected acceleration: less is expected then, and keypoints are followed as by frames one by one."""
+    """Six times the expected acceleration: less is expected then, and keypoints are followed as by
+    frames one by one.
+    """
     rotations, translations = (x.copy() for x in walk[1])
     translations[:, 1] += 0.015 * (np.arange(FRAMES) % 2)
     landmarks, joints = (np.asarray(x) for x in landmarks_of(rotations, translations))
@@ -154,7 +162,8 @@ def test_smoothness_that_the_keypoints_contradict_by_the_certainty_that_the_fit_
     assert next(
         iter(_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), STD))
     ).startswith("smoothness 0.003: the keypoints contradict it")
-    # what the model supposed of its landmarks before the fit is asked neither in the search nor where its result is accepted
+    # what the model supposed of its landmarks before the fit is asked neither in the search nor
+    # where its result is accepted
     supposed = replace(MODEL, certainty=jnp.full(8, 1e-3))
     again = smoothed(seen_by(landmarks), (rotations, translations), model=supposed)
     assert float(again.smoothness) == float(fit.smoothness)
@@ -168,7 +177,9 @@ def bridged(seen, state):
 
 
 def test_frames_without_keypoints_are_bridged_on_the_shortest_way(walk):
-    """A quarter, a half and three quarters of the way from frame 1 to frame 5; behind the last one the pose stays."""
+    """A quarter, a half and three quarters of the way from frame 1 to frame 5; behind the last one
+    the pose stays.
+    """
     rotations, translations = (
         np.zeros((FRAMES, 4, 3), np.float32),
         np.zeros((FRAMES, 3), np.float32),

@@ -183,7 +183,8 @@ def test_points_that_say_nothing_are_refused(points):
         align_points(points, points, np.ones(len(points)))
 
 
-# Swaps -----------------------------------------------------------------------------------------------------------------
+# Swaps
+# --------------------------------------------------------------------------------------------------
 
 MIRROR = list(COCO_17.mirror)
 
@@ -353,7 +354,8 @@ def test_where_hands_are_exchanged_the_body_is_right():
     assert [swap.kind for swap in examine(capture, exchanged).report.swaps] == ["hands"]
 
 
-# People of several views are told apart by how their landmarks triangulate --------------------------------------------
+# People of several views are told apart by how their landmarks triangulate
+# --------------------------------------------
 
 
 SIZE, NOISE = 512, 4.0
@@ -364,7 +366,9 @@ MIRRORED = np.asarray(COCO_17.mirror)
 
 
 def seen_in(people, views=4, seed=0):
-    """Views of people (n, 17, 3) metres, each in another order; the order of view 0 is the given one."""
+    """Views of people (n, 17, 3) metres, each in another order; the order of view 0 is the given
+    one.
+    """
     rng = np.random.default_rng(seed)
     cameras = orbit(
         jnp.zeros(3), 3.5, AROUND[:views], 0.1, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE

@@ -100,7 +100,9 @@ def test_zero_quaternion_is_the_identity_with_finite_gradient():
 
 
 def test_interpolation_goes_the_shortest_way_at_an_even_speed():
-    """scipy's Slerp, through half a turn and between rotation vectors that are far apart but nearly one rotation."""
+    """scipy's Slerp, through half a turn and between rotation vectors that are far apart but nearly
+    one rotation.
+    """
     rng = np.random.default_rng(5)
     a, b = rng.normal(0, 1.5, (2, 20, 3)).astype(np.float32)
     a[0], b[0] = [0, 3.1, 0], [0, -3.1, 0]

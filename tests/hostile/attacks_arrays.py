@@ -1,4 +1,6 @@
-"""Arrays of avatars, bodies, motions, fits and banks: not finite, out of range, of other types and shapes."""
+"""Arrays of avatars, bodies, motions, fits and banks: not finite, out of range, of other types and
+shapes.
+"""
 
 import io
 import json
@@ -13,7 +15,8 @@ from readers import AMASS
 
 from humangs_jax.body.library import save_body
 
-# Avatars and other arrays ---------------------------------------------------------------------------------------------
+# Avatars and other arrays
+# ---------------------------------------------------------------------------------------------
 
 
 def arrays_case(kind, reader, arrays, change, item=7, expect="refused"):

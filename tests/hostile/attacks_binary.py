@@ -1,4 +1,7 @@
-"""Archives (npz, safetensors): false sizes, bombs, nesting. Photos: too many pixels, damage. Scans: accessors, textures."""
+"""Archives (npz, safetensors): false sizes, bombs, nesting. Photos: too many pixels, damage.
+
+Scans: accessors, textures.
+"""
 
 import gzip
 import io
@@ -16,7 +19,8 @@ from PIL import Image
 
 from humangs_jax.avatar.export.spz import zstd
 
-# Archives -------------------------------------------------------------------------------------------------------------
+# Archives
+# --------------------------------------------------------------------------------------------------
 
 
 def raw_zip(members):
@@ -42,7 +46,9 @@ def raw_zip(members):
 
 
 def deflated_zeros(size, start=b""):
-    """`start`, then zeros, compressed: one block again and again, so that gigabytes take no time."""
+    """`start`, then zeros, compressed: one block again and again, so that gigabytes take no
+    time.
+    """
     pack = zlib.compressobj(9, zlib.DEFLATED, -15)
     head = pack.compress(start) + pack.flush(zlib.Z_FULL_FLUSH)
     pack.compress(bytes(1 << 20)) + pack.flush(zlib.Z_FULL_FLUSH)
@@ -98,8 +104,8 @@ ARCHIVES = {
     f"with {kind}": npz_of(("x.npy", data + bytes(16 * (kind == "objects"))))
     for kind, data in HEADERS.items()
 } | {
-    "encrypted": raw_zip([(b"x.npy", 0, bytes(20), 20)]).replace(
-        b"PK\3\4\x14\0\0\0", b"PK\3\4\x14\0\1\0"
+    "encrypted": (
+        raw_zip([(b"x.npy", 0, bytes(20), 20)]).replace(b"PK\3\4\x14\0\0\0", b"PK\3\4\x14\0\1\0")
     ),
     "compressed in another way": raw_zip([(b"x.npy", 14, bytes(20), 20)]),
     "with a method that does not exist": raw_zip([(b"x.npy", 99, bytes(20), 20)]),
@@ -137,7 +143,8 @@ case("100,000 members", "npz", written("a.npz", many(".npy")), item=5)
 case("100,000 members", "torch zip", written("a.pt", many("")), item=5)
 
 
-# safetensors -----------------------------------------------------------------------------------------------
+# safetensors
+# -----------------------------------------------------------------------------------------------
 
 
 def safetensors(header, data=bytes(64)):
@@ -169,7 +176,8 @@ case(
 )
 
 
-# Photos ---------------------------------------------------------------------------------------------------------------
+# Photos
+# --------------------------------------------------------------------------------------------------
 
 
 def chunk(name, data):
@@ -244,17 +252,26 @@ PHOTOS = {
     "a false checksum": (png(4, 4, data=zlib.compress(bytes(52))).replace(b"IDAT", b"IDBT"), 6),
     "text of a gigabyte": (png(4, 4, extra=chunk(b"zTXt", b"x\0\0" + zlib_zeros(1 << 30))), 5),
     "EPS": (EPS, 4),
-    "EPS behind a comment": (b"\xc5\xd0\xd3\xc6" + struct.pack("<IIIIIIH", 32, len(EPS), 0, 0, 0, 0, 0xFFFF) + b"\0\0" + EPS, 4),
+    "EPS behind a comment": (
+        b"\xc5\xd0\xd3\xc6"
+        + struct.pack("<IIIIIIH", 32, len(EPS), 0, 0, 0, 0, 0xFFFF)
+        + b"\0\0"
+        + EPS,
+        4,
+    ),
     **{kind: (as_format(kind)(), 4) for kind in ("GIF", "TIFF", "BMP", "ICO", "PDF", "PPM")},
     "SVG": (b"<svg xmlns='http://www.w3.org/2000/svg'/>", 4),
     "a JPEG of 1,000 scans": (progressive(1000), 5),
-    "a JPEG of 65,000 x 65,000": (as_format("JPEG")().replace(struct.pack(">HH", 8, 8), struct.pack(">HH", 65000, 65000)), 5),
+    "a JPEG of 65,000 x 65,000": (
+        as_format("JPEG")().replace(struct.pack(">HH", 8, 8), struct.pack(">HH", 65000, 65000)),
+        5,
+    ),
     "a HEIC of 60,000 x 60,000": (heic(60_000, 60_000), 5),
     "a HEIC of no width": (heic(0, 24), 6),
     "a HEIC without pixels": (HEIC[: HEIC.index(b"mdat") + 4], 6),
     "a HEIC of zeros": (HEIC[: HEIC.index(b"mdat") + 4] + bytes(400), 6),
     "a HEIC that is a video": (b"\0\0\0\x14ftypheic" + bytes(8) + b"\0\0\0\x08moov", 6),
-}  # fmt: skip
+}
 for kind, (data, item) in PHOTOS.items():
     expect = (
         "either"
@@ -275,7 +292,8 @@ for kind in ("EPS", "13,000 x 13,000", "TIFF", "16 bits, cut"):
         )
 
 
-# Pillow decodes these -------------------------------------------------------------------------------------------------
+# Pillow decodes these
+# -------------------------------------------------------------------------------------------------
 
 
 def damaged(data, name):
@@ -304,7 +322,8 @@ for kind, data in DECODED.items():
 case("a palette", "mask", written("a.png", BY_PALETTE), "either", item=6)
 
 
-# Scans --------------------------------------------------------------------------------------------------------------------
+# Scans
+# --------------------------------------------------------------------------------------------------
 
 
 def glb(change=None, **options):
@@ -513,23 +532,34 @@ MESHES = {
     "places of words": ("scan.obj", "v a b c\n" * 9 + "f 1 2 3\n" * 60),
     "another encoding": ("scan.obj", b"\xff\xfe" * 5000 + b"\nf 1 2 3\n"),
     "one line of 4 MB": ("scan.obj", "v " + "1 " * (2 << 20)),
-    "10^12 corners": ("scan.ply", "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n"),
+    "10^12 corners": (
+        "scan.ply",
+        "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n",
+    ),
     "10^12 corners in binary": (
-        "scan.ply", "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n",
+        "scan.ply",
+        "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n",
     ),
     "a list of 2^31": (
         "scan.ply",
         b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 1\n"
-        b"property list int int vertex_indices\nend_header\n" + struct.pack("<fi", 0, (1 << 31) - 1),
+        b"property list int int vertex_indices\nend_header\n"
+        + struct.pack("<fi", 0, (1 << 31) - 1),
     ),
     "a header without an end": ("scan.ply", "ply\nformat ascii 1.0\n" + "comment x\n" * 100_000),
-    "a type that does not exist": ("scan.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty quaternion x\nend_header\n1\n"),
+    "a type that does not exist": (
+        "scan.ply",
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty quaternion x\nend_header\n1\n",
+    ),
     "2^32 triangles": ("scan.stl", bytes(80) + struct.pack("<I", (1 << 32) - 1) + bytes(50)),
-    "text of nothing": ("scan.stl", "solid x\nfacet normal a b c\nouter loop\nvertex 1 2\nendsolid\n"),
+    "text of nothing": (
+        "scan.stl",
+        "solid x\nfacet normal a b c\nouter loop\nvertex 1 2\nendsolid\n",
+    ),
     "10^12 corners and faces": ("scan.off", "OFF\n1000000000000 1000000000000 0\n"),
     "fewer than it says": ("scan.off", "OFF\n3 100 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
     "corners outside": ("scan.off", "OFF\n3 60 0\n0 0 0\n1 0 0\n0 1 0\n" + "3 0 1 99\n" * 60),
-}  # fmt: skip
+}
 for kind, (name, data) in MESHES.items():
     expect = "either" if kind == "a corner of 0" else "refused"  # trimesh counts it from the end
     case(
@@ -548,7 +578,8 @@ for suffix in ("dae", "3mf", "gltf", "zip", "xyz", "dxf", "svg", "step", "urdf",
     )
 
 
-# Parts and textures -------------------------------------------------------------------------------------------------------
+# Parts and textures
+# --------------------------------------------------------------------------------------------------
 
 
 def many_changes(word, count):
@@ -585,7 +616,10 @@ two = written(
     "scan.obj", lambda: re.sub(r"usemtl a\d*(\d)", r"usemtl \1", many_changes("usemtl", 30_000))
 )
 case("two materials, 30,000 changes", "obj", two, "read", 5)
-SOLID = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 {}\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
+SOLID = (
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 {}\nvertex 1 0 0\nvertex 0 1"
+    " 0\nendloop\nendfacet\nendsolid a\n"
+)
 solids = lambda: "".join(SOLID.format(i) for i in range(30_000))
 case("30,000 solids", "stl", written("scan.stl", solids), item=5)
 case("30,000 SOLIDS", "stl", written("scan.stl", lambda: solids().upper()), item=5)

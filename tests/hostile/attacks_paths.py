@@ -1,4 +1,6 @@
-"""Captures and calibrations that name files outside of their folder, and folders that cost more than they weigh."""
+"""Captures and calibrations that name files outside of their folder, and folders that cost more
+than they weigh.
+"""
 
 import json
 import os
@@ -9,7 +11,8 @@ from honest_files import pixels
 from hostile_cases import capture_with, case
 from PIL import Image
 
-# Paths out of the folder -------------------------------------------------------------------------------------------------
+# Paths out of the folder
+# -------------------------------------------------------------------------------------------------
 
 CAPTURES = ("capture", "photos", "boundary")
 """Readers of captures."""
@@ -89,11 +92,14 @@ for name in ("..", "../..", "/", "/tmp", "x\0y"):
     case(f"a camera {name!r}", "import", import_of("cameras.json", {name: camera}), item=2)
 
 
-# Captures and folders of photos that cost more than they weigh ------------------------------------------------------------------
+# Captures and folders of photos that cost more than they weigh
+# ------------------------------------------------------------------
 
 
 def capture_of(count, prepare=lambda folder: None, image="images/000.png", **changes):
-    """Views that name a photo each: `image` with the number of the view, if it has a place for it."""
+    """Views that name a photo each: `image` with the number of the view, if it has a place for
+    it.
+    """
     view = {
         key: value
         for key, value in honest.capture_description()["views"][0].items()

@@ -1,4 +1,6 @@
-"""What photos say about themselves, and it is nonsense: color profiles, EXIF, sizes, and what stands behind the picture."""
+"""What photos say about themselves, and it is nonsense: color profiles, EXIF, sizes, and what
+stands behind the picture.
+"""
 
 import io
 import struct
@@ -23,7 +25,8 @@ def photo(kind="JPEG", **options):
     return stream.getvalue()
 
 
-# Color profiles ---------------------------------------------------------------------------------------------------------
+# Color profiles
+# --------------------------------------------------------------------------------------------------
 
 HONEST = profiles.of_colors(profiles.P3_TO_XYZ, profiles.SRGB_CURVE)
 TABLES = profiles.of_tables(
@@ -119,7 +122,8 @@ for kind, extra in CHUNKS.items():
     )
 
 
-# Behind the picture, and in its segments --------------------------------------------------------------------------------
+# Behind the picture, and in its segments
+# --------------------------------------------------------------------------------
 
 JPEG = photo(quality=80)
 SCANS = b"\xff\xda\0\x08" * 1000
@@ -132,10 +136,9 @@ def segment(code, content):
 BEHIND = {
     "a video": JPEG + b"\0\0\0\x18ftypmp42" + SCANS + RNG.bytes(100_000),
     "a thousand pictures": JPEG * 1000,
-    "marks of scans": JPEG[:2]
-    + segment(0xE1, b"Exif\0\0" + SCANS)
-    + segment(0xFE, SCANS)
-    + JPEG[2:],
+    "marks of scans": (
+        JPEG[:2] + segment(0xE1, b"Exif\0\0" + SCANS) + segment(0xFE, SCANS) + JPEG[2:]
+    ),
     "a million bytes FF": JPEG[:2] + b"\xff" * 1_000_000 + JPEG[2:],
 }
 for kind, data in BEHIND.items():
@@ -161,7 +164,8 @@ for kind, between in HIDDEN.items():
     case(f"1,000 scans behind {kind}", "image", written("a.jpg", data), item=5)
 
 
-# EXIF -------------------------------------------------------------------------------------------------------------------
+# EXIF
+# --------------------------------------------------------------------------------------------------
 
 
 def exif(**tags):
@@ -181,17 +185,21 @@ EXIF = {
     "half a frame": exif(equivalent=26, width=40),
     "an equivalent of words": exif(equivalent="26", width=48, height=32),
     "an orientation of 60,000": exif(orientation=60_000),
-    "folders within themselves": b"Exif\0\0MM\0*\0\0\0\x08\0\1\x87\x69\0\4\0\0\0\1\0\0\0\x08\0\0\0\x08",
+    "folders within themselves": (
+        b"Exif\0\0MM\0*\0\0\0\x08\0\1\x87\x69\0\4\0\0\0\1\0\0\0\x08\0\0\0\x08"
+    ),
     "a folder behind the end": b"Exif\0\0MM\0*\xff\xff\xff\xf0",
-    "60,000 tags": b"Exif\0\0MM\0*\0\0\0\x08\xff\xff"
-    + b"\xa0\2\0\4\xff\xff\xff\xff\0\0\0\x08" * 5000,
+    "60,000 tags": (
+        b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + b"\xa0\2\0\4\xff\xff\xff\xff\0\0\0\x08" * 5000
+    ),
 }
 for kind, data in EXIF.items():
     for form in ("JPEG", "WEBP"):
         case(f"EXIF of {kind}, {form}", "image", written("a", photo(form, exif=data)), "read", 6)
 
 
-# WebP and AVIF ----------------------------------------------------------------------------------------------------------
+# WebP and AVIF
+# --------------------------------------------------------------------------------------------------
 
 WEBP, LOSSLESS, AVIF = photo("WEBP"), photo("WEBP", lossless=True), photo("AVIF")
 EXTENDED = photo("WEBP", exif=exif(orientation=6))

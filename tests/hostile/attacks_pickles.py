@@ -24,7 +24,8 @@ import numpy as np
 from hostile_cases import case, written
 from torch_writer import FakeTensor, pickled, write_checkpoint, write_stream
 
-# Pickles --------------------------------------------------------------------------------------------------------------
+# Pickles
+# --------------------------------------------------------------------------------------------------
 
 
 def name_of(module, name):
@@ -90,13 +91,19 @@ HIDDEN_OBJECT = numpy_array(
     numpy_dtype(
         "V8",
         dtype_state(
-            number(3), word("|"), b"N", word("f") + TUPLE1,
+            number(3),
+            word("|"),
+            b"N",
+            word("f") + TUPLE1,
             EMPTY_DICT + word("f") + numpy_dtype("O8", b"") + number(0) + TUPLE2 + SETITEM,
-            number(8), number(1), number(0),
+            number(8),
+            number(1),
+            number(0),
         ),
     ),
-    shape_of(4), raw(struct.pack("<4Q", 0x41414141, 8, 16, 1 << 40)),
-)  # fmt: skip
+    shape_of(4),
+    raw(struct.pack("<4Q", 0x41414141, 8, 16, 1 << 40)),
+)
 
 
 def doubled(times):
@@ -287,7 +294,8 @@ case("six million instructions", "pickle", written("a.pkl", many_instructions), 
 case("six million instructions", "torch stream", written("a.pt", many_instructions), item=5)
 
 
-# torch ----------------------------------------------------------------------------------------------------------------
+# torch
+# --------------------------------------------------------------------------------------------------
 
 NUMBERS = np.ones(4, np.float32)
 

@@ -1,4 +1,6 @@
-"""JSON, YAML, COLMAP and configurations: nesting, length, numbers that are none, parts that do not exist."""
+"""JSON, YAML, COLMAP and configurations: nesting, length, numbers that are none, parts that do not
+exist.
+"""
 
 import json
 import re
@@ -8,7 +10,8 @@ import numpy as np
 from hostile_cases import case, changed, edited, json_case, setting, written
 from readers import FORMATS
 
-# JSON and YAML --------------------------------------------------------------------------------------------------------
+# JSON and YAML
+# --------------------------------------------------------------------------------------------------
 
 JSON_READERS = (
     "json",
@@ -56,8 +59,10 @@ YAML = {
     "lists in lists": "a: " + "[" * 3000 + "]" * 3000,
     "maps in maps": "\n".join(" " * i + "a:" for i in range(2000)),
     "keys of keys": "? " * 3000 + "a",
-    "a billion laughs": "a: &a [x,x]\n"
-    + "\n".join(f"{c}: &{c} [*{b},*{b}]" for b, c in zip("abcdefgh", "bcdefghi", strict=True)),
+    "a billion laughs": (
+        "a: &a [x,x]\n"
+        + "\n".join(f"{c}: &{c} [*{b},*{b}]" for b, c in zip("abcdefgh", "bcdefghi", strict=True))
+    ),
     "2 MB": "K_a: 1\n" * 300_000,
     "a number of 400,000 digits": "K_a: " + "1" * 400_000 + "x",
     "a whole number of 400,000 digits": "K_a: " + "1" * 400_000,
@@ -65,8 +70,12 @@ YAML = {
     "python's objects": "K_a: !!python/object/apply:os.system ['touch OWNED']",
     "another tag": "K_a: !!binary aGVsbG8=",
     "a matrix of words": "K_a: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [a, b]",
-    "a matrix of 10^18": "K_a: !!opencv-matrix\n   rows: 1000000000\n   cols: 1000000000\n   dt: d\n   data: [1]",
-    "a matrix that is negative": "K_a: !!opencv-matrix\n   rows: -1\n   cols: -1\n   dt: d\n   data: [1]",
+    "a matrix of 10^18": (
+        "K_a: !!opencv-matrix\n   rows: 1000000000\n   cols: 1000000000\n   dt: d\n   data: [1]"
+    ),
+    "a matrix that is negative": (
+        "K_a: !!opencv-matrix\n   rows: -1\n   cols: -1\n   dt: d\n   data: [1]"
+    ),
     "a matrix of .Inf": "K_a: !!opencv-matrix\n   rows: .Inf\n   cols: 1\n   dt: d\n   data: [1]",
     "names that are a number": honest.opencv_yaml() + "names: 3\n",
     "names of nobody": honest.opencv_yaml() + "names: [x, y]\n",
@@ -80,7 +89,8 @@ for kind, data in YAML.items():
     )
 
 
-# Numbers that are none ------------------------------------------------------------------------------------------------
+# Numbers that are none
+# ------------------------------------------------------------------------------------------------
 
 BAD_NUMBERS = {
     "10^400": 10**400,
@@ -150,7 +160,8 @@ for kind, (name, old, new) in COLMAP.items():
     )
 
 
-# Configurations and weights -------------------------------------------------------------------------------------------
+# Configurations and weights
+# -------------------------------------------------------------------------------------------
 
 ENCODER = "model.architecture.encoder"
 CONFIGURATIONS = {
@@ -224,7 +235,8 @@ for kind, line in {
     )
 
 
-# Words that a terminal would act on -----------------------------------------------------------------------------------
+# Words that a terminal would act on
+# -----------------------------------------------------------------------------------
 
 WORDS = {
     "a title": "\x1b]0;OWNED\x07",
@@ -259,7 +271,8 @@ for kind, word in WORDS.items():
     case(f"{kind} in a word", "bvh", edited("bvh", "CHANNELS", word))
 
 
-# Amounts, of which each file has few bytes -------------------------------------------------------------------------------------
+# Amounts, of which each file has few bytes
+# -------------------------------------------------------------------------------------
 
 PLACEMENTS = {
     "zeros": np.zeros((4, 4)),

@@ -1,8 +1,9 @@
 """Every command that writes, on a full or read-only disk: python disks.py FOLDER [COMMAND ...]
 
-Disks are mounted in memory where this process may; elsewhere files get a largest size, and folders lose the right to be
-written. A run ends with exit status 0, or with 2 and one line that names the place; then everything is as before, nothing is
-left over, and the next run makes what it should. That a disk is read-only is said before the work begins.
+Disks are mounted in memory where this process may; elsewhere files get a largest size, and folders
+lose the right to be written. A run ends with exit status 0, or with 2 and one line that names the
+place; then everything is as before, nothing is left over, and the next run makes what it should.
+That a disk is read-only is said before the work begins.
 """
 
 import json
@@ -23,9 +24,13 @@ SIZE = 256 << 20
 SHARES = (0.0, 0.3, 0.6)
 """Of the bytes of what a command writes: so much is free."""
 LEAST = 1 << 10
-"""Bytes that a file may have where no disk can be mounted, at least: what a run says goes to a file, too."""
+"""Bytes that a file may have where no disk can be mounted, at least: what a run says goes to a
+file, too.
+"""
 GROWS = ("run", "people", "set", "begun")
-"""What training, `synth`, `preprocess` and the stages of `start` have finished stays, and the next run goes on from there."""
+"""What training, `synth`, `preprocess` and the stages of `start` have finished stays, and the next
+run goes on from there.
+"""
 
 
 class Disk:
@@ -80,7 +85,9 @@ def targets(expected: dict) -> list[str]:
 
 
 def begun(command: Command, folder: Path, inputs: Path):
-    """A place as it is before the run that is looked at; its state then and after an undisturbed run; bytes of the latter."""
+    """A place as it is before the run that is looked at; its state then and after an undisturbed
+    run; bytes of the latter.
+    """
     place, kept = writers.place_of(command, folder, inputs, "place"), folder / "kept"
     before, _, expected = run_undisturbed(command, place, kept, inputs)
     size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())

@@ -1,11 +1,13 @@
 """A fuzzer over every reader: python fuzz.py FOLDER INPUTS [READER ...]
 
-Honest files are taken apart as their format has it (arrays of an archive, values of JSON, instructions of a pickle, chunks of a
-PNG, words of a text), a few parts are exchanged for hostile ones, and the file is put together again; or bytes change at random.
-What is found is shrunk by hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
+Honest files are taken apart as their format has it (arrays of an archive, values of JSON,
+instructions of a pickle, chunks of a PNG, words of a text), a few parts are exchanged for hostile
+ones, and the file is put together again; or bytes change at random. What is found is shrunk by
+hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
 
-`CHUNK` inputs at a time go to the reader that had the fewest, until each has INPUTS. FOLDER/record.json has the figures of each
-reader; a later call goes on from there, and tries what was found again.
+`CHUNK` inputs at a time go to the reader that had the fewest, until each has INPUTS.
+FOLDER/record.json has the figures of each reader; a later call goes on from there, and tries what
+was found again.
 """
 
 import argparse
@@ -41,9 +43,13 @@ from hypothesis import strategies as st  # noqa: E402
 CHUNK = 500
 """Inputs that hypothesis draws from one seed: its number among those of the reader."""
 LARGEST = 1 << 26
-"""Bytes of a mutated file: reading what is honestly large takes memory within the limits of docs/security.md."""
+"""Bytes of a mutated file: reading what is honestly large takes memory within the limits of
+docs/security.md.
+"""
 MOST_MAPPINGS = 20_000
-"""Every compiled program maps memory, of which Linux allows 65,530 pieces: with more than this the fuzzer starts itself again."""
+"""Every compiled program maps memory, of which Linux allows 65,530 pieces: with more than this the
+fuzzer starts itself again.
+"""
 
 NUMBERS = [
     0,
@@ -69,7 +75,10 @@ VALUES = [*NUMBERS, None, True, "", "x", "..", "../x", "/", "a\0b", "1", "nan"]
 VALUES += [[], {}, [1, [2]], {"a": 1}, [[]] * 9, [0.0] * 51]
 DTYPES = ("<f4", "<f8", ">f8", "<f2", "<i4", "<i8", "<u1", "<u4", "|b1", "<c8", "<U3", "|S3")
 SIZES = (0, 1, 2, 3, 4, 5, 9, 17, 55, 165)
-WORDS = b"nan inf -1 0 1e400 99999999999999999999 x [ { - !!opencv-matrix !!python/object &a *a %YAML:1.0 # / ..".split()
+WORDS = (
+    b"nan inf -1 0 1e400 99999999999999999999 x [ { - !!opencv-matrix !!python/object &a *a"
+    b" %YAML:1.0 # / ..".split()
+)
 WORDS += [b"9" * 400, b"", b"\0", b"\xff", b"\n", b": ", b"f 1 2 3", b"v 1 2 3"]
 BYTES = [
     *(bytes([i]) for i in range(256)),
@@ -128,7 +137,9 @@ class Draw:
         return some if way == 6 else dict(zip("ab", some, strict=True)) if way == 7 else some[0]
 
     def exchanged(self, pieces, hostile):
-        """Pieces in a list, or a bytearray, of which a few are left out, doubled, or exchanged for hostile ones."""
+        """Pieces in a list, or a bytearray, of which a few are left out, doubled, or exchanged for
+        hostile ones.
+        """
         for _ in range(1 + self.below(4)):
             at, way, count = (
                 self.below(len(pieces) + 1),
@@ -304,14 +315,21 @@ def mutated_safetensors(data, draw):
 
 
 KINDS = {
-    mutated_npz: "npz, smplx npz, hands, body, avatar, keypoints npz, motion npz, amass, thuman, human3r, smplcodec, sam 3d, "
-    "joints npz, fit record, bank, video poses, scene arrays",
-    mutated_json: "panoptic, shelf, easymocap motion, easymocap annots, json, configuration, transforms, opencv json, openpose, "
-    "coco, coco annotations, mmpose, lhm, joints json, manifest, capture, photos, boundary, import, avatarrex, "
-    "scene list, evaluation, preprocessed set, preprocessed scene, skipped subject",
+    mutated_npz: (
+        "npz, smplx npz, hands, body, avatar, keypoints npz, motion npz, amass, thuman, human3r,"
+        " smplcodec, sam 3d, joints npz, fit record, bank, video poses, scene arrays"
+    ),
+    mutated_json: (
+        "panoptic, shelf, easymocap motion, easymocap annots, json, configuration, transforms,"
+        " opencv json, openpose, coco, coco annotations, mmpose, lhm, joints json, manifest,"
+        " capture, photos, boundary, import, avatarrex, scene list, evaluation, preprocessed set,"
+        " preprocessed scene, skipped subject"
+    ),
     mutated_pickle: "pickle, smplx pkl, aist, phalp, thuman fit",
-    mutated_text: "opencv yaml, toml, qualisys, easymocap, colmap, obj, off, log, bvh, 3dgs text, missing photos, actorshq, "
-    "thuman mesh, thuman scan",
+    mutated_text: (
+        "opencv yaml, toml, qualisys, easymocap, colmap, obj, off, log, bvh, 3dgs text, missing"
+        " photos, actorshq, thuman mesh, thuman scan"
+    ),
     mutated_png: "image",
     mutated_zip: "torch zip, gvhmr",
     mutated_glb: "glb, glb motion, glb splats",
@@ -324,7 +342,10 @@ assert set(STRUCTURES) <= set(readers.FORMATS)
 
 
 def checked(read, path, watch):
-    """Reads a file. Raises: AssertionError for anything but a result or one line that names the file."""
+    """Reads a file.
+
+    Raises: AssertionError for anything but a result or one line that names the file.
+    """
 
     folder = path if path.is_dir() else path.parent
     case = SimpleNamespace(name="", reader="", make=lambda _: path)
@@ -346,9 +367,14 @@ def fuzz(name, folder, inputs, number, watch):
 
     @seed(FIRST_SEED + number)
     @settings(
-        max_examples=inputs, deadline=None, database=None, phases=(Phase.generate, Phase.shrink), print_blob=False,
-        suppress_health_check=list(HealthCheck), report_multiple_bugs=False,
-    )  # fmt: skip
+        max_examples=inputs,
+        deadline=None,
+        database=None,
+        phases=(Phase.generate, Phase.shrink),
+        print_blob=False,
+        suppress_health_check=list(HealthCheck),
+        report_multiple_bugs=False,
+    )
     @given(st.data())
     def run(data):
         draw = Draw(data)

@@ -20,7 +20,9 @@ FIRST_SEED = int(os.environ.get("HUMANGS_HOSTILE_SEED", "0"))
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """reader: of `readers.FORMATS`. make: writes the file into a folder, returns its path. item: of test_hostile.ITEMS."""
+    """reader: of `readers.FORMATS`. make: writes the file into a folder, returns its path. item: of
+    test_hostile.ITEMS.
+    """
 
     name: str
     reader: str
@@ -67,9 +69,11 @@ def json_case(kind, reader, changes, item=6, expect="refused"):
 
 
 def capture_with(changes=None, prepare=lambda folder: None, photo=None):
-    """An honest capture with some values of its description changed, by path, after something else was done to its folder.
+    """An honest capture with some values of its description changed, by path, after something else
+    was done to its folder.
 
-    changes: values, or a function of the folder that returns them. photo: the bytes of the first one.
+    changes: values, or a function of the folder that returns them. photo: the bytes of the first
+    one.
     """
 
     def make(folder):
@@ -100,7 +104,8 @@ def edited(name, old, new, inside=None):
     return make
 
 
-# Damage to every honest file ------------------------------------------------------------------------------------------
+# Damage to every honest file
+# ------------------------------------------------------------------------------------------
 
 
 def changed(name, change):
@@ -166,8 +171,8 @@ NOT_NOTICED = {
     "start",
     "splat",
 }
-"""Files that need not be there: a missing log is that of a run without trouble; what preprocessing lacks is made again. Zeros are
-Gaussians of a `.splat`, which has no header."""
+"""Files that need not be there: a missing log is that of a run without trouble; what preprocessing
+lacks is made again. Zeros are Gaussians of a `.splat`, which has no header."""
 READ = {
     *(
         ("manifest", kind)
@@ -175,7 +180,9 @@ READ = {
     ),
     ("easymocap motion", "missing"),
 }
-"""A set is begun where its manifest is no file, and writing it replaces a link or a pipe; a motion may begin later."""
+"""A set is begun where its manifest is no file, and writing it replaces a link or a pipe; a motion
+may begin later.
+"""
 
 
 def expected(reader, kind):

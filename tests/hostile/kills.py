@@ -1,12 +1,14 @@
-"""Kills commands that write at random moments: python kills.py FOLDER [COMMAND ...] [--count 10] [--json FILE]
-Interrupts them instead, as Ctrl-C does: python kills.py FOLDER [COMMAND ...] --interrupts [--count 10] [--json FILE]
+"""Kills commands that write at random moments: python kills.py FOLDER [COMMAND ...] [--count 10]
+[--json FILE] Interrupts them instead, as Ctrl-C does: python kills.py FOLDER [COMMAND ...]
+--interrupts [--count 10] [--json FILE]
 
-A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, until a second after one, or
-at any time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody
-disturbed makes, and to remove what the killed one left. See `writers` for what the commands compute meanwhile.
+A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files,
+until a second after one, or at any time. Then no file under a final name may be half-written or
+lost, and the next run has to make what a run that nobody disturbed makes, and to remove what the
+killed one left. See `writers` for what the commands compute meanwhile.
 
-A run that is interrupted, at any time, has to exit with 130 and one line, and to leave nothing half-written and no temporary name
-itself; after the last of them the next run has to work.
+A run that is interrupted, at any time, has to exit with 130 and one line, and to leave nothing
+half-written and no temporary name itself; after the last of them the next run has to work.
 """
 
 import argparse
@@ -50,7 +52,10 @@ def some_moment(changes: list, generator: random.Random, interrupt: bool) -> Mom
 def run_undisturbed(
     command: Command, place: Path, kept: Path, inputs: Path
 ) -> tuple[dict, writers.Run, dict]:
-    """The files before a run, the run, and the files after it. `kept` becomes a copy of the place before."""
+    """The files before a run, the run, and the files after it.
+
+    `kept` becomes a copy of the place before.
+    """
     if command.first is not None:
         assert writers.run(command, place, inputs, 1).code == 0, command.name
     shutil.rmtree(kept, ignore_errors=True)
@@ -62,7 +67,10 @@ def run_undisturbed(
 
 
 def disturb(command: Command, folder: Path, inputs: Path, count: int, interrupt: bool) -> dict:
-    """Disturbs a command at `count` moments, some of which its end comes before. Returns figures and faults."""
+    """Disturbs a command at `count` moments, some of which its end comes before.
+
+    Returns figures and faults.
+    """
     began, hit, left = time.monotonic(), 0, 0
     place, kept = writers.place_of(command, folder, inputs, "disturbed"), folder / "before"
     before, undisturbed, expected = run_undisturbed(command, place, kept, inputs)

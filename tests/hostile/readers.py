@@ -1,4 +1,6 @@
-"""Every reader of the package, with an honest file for each: what the hostile ones are made from."""
+"""Every reader of the package, with an honest file for each: what the hostile ones are made
+from.
+"""
 
 import functools
 import importlib.util
@@ -65,8 +67,9 @@ from humangs_jax.training.diagnose import first_failed_step
 
 
 class Format(NamedTuple):
-    """read: a function of a path. make: writes an honest file or folder into an empty folder and returns its path; None where it
-    is too large, the readers below have theirs. inside: the file of a folder that damage goes into, the one that is read first.
+    """read: a function of a path. make: writes an honest file or folder into an empty folder and
+    returns its path; None where it is too large, the readers below have theirs. inside: the file of
+    a folder that damage goes into, the one that is read first.
     """
 
     read: Callable[[Path], Any]

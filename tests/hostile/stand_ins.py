@@ -1,8 +1,9 @@
 # ruff: noqa: E402
-"""What stands in for work that takes minutes (fits, reconstruction, rendering, training steps), and the inputs of all commands.
+"""What stands in for work that takes minutes (fits, reconstruction, rendering, training steps), and
+the inputs of all commands.
 
-Imports everything that a command may need, for the process that is forked. Nothing here may start a backend of JAX: its
-threads would not survive.
+Imports everything that a command may need, for the process that is forked. Nothing here may start a
+backend of JAX: its threads would not survive.
 """
 
 import dataclasses
@@ -84,7 +85,9 @@ WORK = {
     ),
     *("fit_scan", "load_checkpoint", "make_subject", "train_step"),
 }
-"""Stand-ins for what takes long: nothing that is wrong with the place may be found only after these."""
+"""Stand-ins for what takes long: nothing that is wrong with the place may be found only after
+these.
+"""
 
 
 def random_of(variant, *more):

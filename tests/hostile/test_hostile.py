@@ -1,8 +1,10 @@
-"""Hostile files end in one line, in bounded memory and time, and nothing else happens; commands that write lose nothing.
+"""Hostile files end in one line, in bounded memory and time, and nothing else happens; commands
+that write lose nothing.
 
-Some files of each item are read here, all of them in a process of their own (`worker`), by the slow tests. So are the commands:
-killed, and on full and read-only disks (`writers`). `python tests/hostile/test_hostile.py FOLDER` reads all files and
-prints the figures of docs/security.md. HUMANGS_HOSTILE_SEED=N makes the randomly damaged files from other seeds.
+Some files of each item are read here, all of them in a process of their own (`worker`), by the slow
+tests. So are the commands: killed, and on full and read-only disks (`writers`). `python
+tests/hostile/test_hostile.py FOLDER` reads all files and prints the figures of docs/security.md.
+HUMANGS_HOSTILE_SEED=N makes the randomly damaged files from other seeds.
 """
 
 import json
@@ -37,13 +39,17 @@ ITEMS = {
     6: "one line, not a traceback",
     7: "arrays of avatars and bodies",
 }
-"""Of the list that these tests began with; 8 is tests/io/test_atomic.py, 9 the checks of arrays in tests/avatar."""
+"""Of the list that these tests began with; 8 is tests/io/test_atomic.py, 9 the checks of arrays
+in tests/avatar.
+"""
 CASES = all_cases()
 FUZZED, MOMENTS = (
     int(os.environ.get(*each))
     for each in (("HUMANGS_FUZZ_INPUTS", "10000"), ("HUMANGS_KILLS", "2"))
 )
-"""Files for each reader, and kills and interrupts of each command; docs/results has the figures of more."""
+"""Files for each reader, and kills and interrupts of each command; docs/results has the figures
+of more.
+"""
 EVERY = 12
 HEAVY = (
     *(
@@ -75,7 +81,9 @@ def program(
 
 
 def run_cases(folder: Path, names: list[str]) -> dict[str, dict]:
-    """Results by name; a case that ends the process is "died", and a new process goes on behind it."""
+    """Results by name; a case that ends the process is "died", and a new process goes on behind
+    it.
+    """
     results, waiting, attempt = {}, list(names), 0
     while waiting:
         place = folder / f"run{attempt}"

@@ -1,6 +1,8 @@
-"""Folders of photos as they come: a result and a warning that names the photo, or one clear line and nothing written.
+"""Folders of photos as they come: a result and a warning that names the photo, or one clear line
+and nothing written.
 
-The person of the demo capture in a drawn room. `humangs detect` is run on each folder; `humangs start` goes on from its answer.
+The person of the demo capture in a drawn room. `humangs detect` is run on each folder; `humangs
+start` goes on from its answer.
 """
 
 import io
@@ -175,17 +177,33 @@ FOLDERS = {
     "a speck": (one(far(1000, 1000, 30)), 3, NOBODY),
     # one clear line
     "black": (only(dark=np.zeros((64, 48, 3))), None, r"no person in dark\.png: expected one"),
-    "tiny photos": (only(a=room(8, 8), b=room(1, 1)), None, r"no person in a\.png, b\.png: expected one"),
-    "two people": (beside((1.0, 0.9)), None, r"2 people in both0\.png, both1\.png: expected one\. Person 0 to 1"),
+    "tiny photos": (
+        only(a=room(8, 8), b=room(1, 1)),
+        None,
+        r"no person in a\.png, b\.png: expected one",
+    ),
+    "two people": (
+        beside((1.0, 0.9)),
+        None,
+        r"2 people in both0\.png, both1\.png: expected one\. Person 0 to 1",
+    ),
     "a photo cut short": (files(odd_jpg=jpeg()[:2000]), None, r"odd\.jpg"),
     "an empty file": (files(odd_jpg=b""), None, r"odd\.jpg"),
     "a HEIC without the extra": (files(odd_heic=HEIC.read_bytes()), None, r"odd\.heic.*heic"),
-    "one name with two suffixes": (one(lambda photo: photo, "good0.jpg"), None, r"good0\.jpg and .*good0\.png"),
+    "one name with two suffixes": (
+        one(lambda photo: photo, "good0.jpg"),
+        None,
+        r"good0\.jpg and .*good0\.png",
+    ),
     "a video": (video, None, "no photo: expected"),
-    "text files alone": (lambda folder: (folder.mkdir(), (folder / "a.txt").write_text("a")), None, "no photo: expected"),
+    "text files alone": (
+        lambda folder: (folder.mkdir(), (folder / "a.txt").write_text("a")),
+        None,
+        "no photo: expected",
+    ),
     "nothing": (lambda folder: folder.mkdir(), None, "no photo: expected"),
     "a folder that is not there": (lambda folder: None, None, "no such folder"),
-}  # fmt: skip
+}
 FAST = (
     "black",
     "one name with two suffixes",

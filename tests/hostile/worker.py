@@ -1,7 +1,9 @@
-"""Reads hostile files in a process that may do little else: python worker.py FOLDER NAMES.json writes a line for each.
+"""Reads hostile files in a process that may do little else: python worker.py FOLDER NAMES.json
+writes a line for each.
 
-Limits: address space (`MEMORY` above what the imports took), seconds a file, and an audit hook that forbids programs, sockets,
-and writing or deleting outside of the file's own folder. A worker that dies is started again behind the file that killed it.
+Limits: address space (`MEMORY` above what the imports took), seconds a file, and an audit hook that
+forbids programs, sockets, and writing or deleting outside of the file's own folder. A worker that
+dies is started again behind the file that killed it.
 """
 
 import json
@@ -15,7 +17,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 MEMORY, RESIDENT, SECONDS, WAITING = 3 << 30, 1 << 30, 10.0, 120.0
-"""Bytes of address space, bytes that a file may make resident, seconds of the processor and of the clock that it may take."""
+"""Bytes of address space, bytes that a file may make resident, seconds of the processor and of the
+clock that it may take.
+"""
 FORBIDDEN = (
     *(
         "subprocess.Popen",
@@ -85,7 +89,9 @@ class Watch:
                     )
 
     def check(self, event, path, folder=-1):
-        """folder: descriptor of the folder that the path is relative to, -1 for the working folder."""
+        """folder: descriptor of the folder that the path is relative to, -1 for the working
+        folder.
+        """
         base = os.getcwd() if folder == -1 else os.readlink(f"/proc/self/fd/{folder}")
         if not Path(os.path.abspath(os.path.join(base, os.fsdecode(path)))).is_relative_to(
             self.folder
@@ -104,7 +110,9 @@ def chain(error):
 
 
 def run(case, read, folder, watch, measured=True):
-    """The result of one file as a dict. measured: whether to look at the memory that it takes, which is slow."""
+    """The result of one file as a dict. measured: whether to look at the memory that it takes,
+    which is slow.
+    """
     path = case.make(folder)
     if measured:
         Path("/proc/self/clear_refs").write_text("5")  # forget the most that was resident so far
@@ -159,7 +167,9 @@ def too_long(*_):
 
 
 def prepare():
-    """Paths of the test helpers, JAX on one CPU, and everything imported that readers import late."""
+    """Paths of the test helpers, JAX on one CPU, and everything imported that readers import
+    late.
+    """
     sys.path[:0] = [
         str(ROOT / "tests" / name) for name in ("hostile", "network", "data", "data/datasets", "")
     ]

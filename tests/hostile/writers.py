@@ -1,9 +1,11 @@
-"""Every command that writes, whole and real but for what it computes: each run is a process of its own, made by a fork.
+"""Every command that writes, whole and real but for what it computes: each run is a process of its
+own, made by a fork.
 
-A process that has imported everything and started no backend of JAX is forked, so that a run takes a second instead of ten.
-What costs minutes (fits, reconstruction, rendering, training steps) is answered by stand-ins at once; options, checks, readers,
-writers, the training loop and its checkpoints are the package's own. A run tells the files that it changes, and can be killed
-at any of these moments.
+A process that has imported everything and started no backend of JAX is forked, so that a run takes
+a second instead of ten. What costs minutes (fits, reconstruction, rendering, training steps) is
+answered by stand-ins at once; options, checks, readers, writers, the training loop and its
+checkpoints are the package's own. A run tells the files that it changes, and can be killed at any
+of these moments.
 """
 
 import contextlib
@@ -42,11 +44,13 @@ CHANGES = {
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """arguments: with {inputs} for the folder of inputs and {v} for 1 or 2, the number of the variant.
+    """arguments: with {inputs} for the folder of inputs and {v} for 1 or 2, the number of the
+    variant.
 
-    copies: inputs that are copied into the place first. first: arguments of the run that made what is there before, None for
-    nothing. varies: files that no two runs write equally, as patterns; `own`: those whose names differ, too; `often`: those
-    that one run writes several times. once: it refuses a place where it has come to its end.
+    copies: inputs that are copied into the place first. first: arguments of the run that made what
+    is there before, None for nothing. varies: files that no two runs write equally, as patterns;
+    `own`: those whose names differ, too; `often`: those that one run writes several times. once: it
+    refuses a place where it has come to its end.
     """
 
     name: str
@@ -71,7 +75,8 @@ SYNTH = (
 COMMANDS = (
     Command(
         "import",
-        "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite",
+        "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v}"
+        " --overwrite",
     ),
     Command("fit in place", f"fit capture {CAPTURE}", copies=("capture",)),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
@@ -104,8 +109,8 @@ COMMANDS = (
     ),
     Command(
         "start",
-        "start {inputs}/photos --cameras {inputs}/transforms.json --keypoints {inputs}/keypoints.npz --out begun "
-        "--without-masks --no-browser",
+        "start {inputs}/photos --cameras {inputs}/transforms.json --keypoints"
+        " {inputs}/keypoints.npz --out begun --without-masks --no-browser",
         first=None,
         # a run that goes on shows the photos of the folder; the stand-in of a fit makes up its own
         varies=("begun/check.png",),
@@ -114,25 +119,29 @@ COMMANDS = (
     ),
     Command(
         "preprocess",
-        "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16 --every 1",
+        "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16"
+        " --every 1",
     ),
     Command(
         "evaluate",
-        "evaluate {inputs}/capture --predictions {inputs}/capture/images --json a.json --html a.html --csv a.csv "
-        "--markdown a.md --latex a.tex",
+        "evaluate {inputs}/capture --predictions {inputs}/capture/images --json a.json --html"
+        " a.html --csv a.csv --markdown a.md --latex a.tex",
     ),
     Command("convert", "convert {inputs}/any.pt --out w.safetensors --losses l.safetensors"),
 )
 
 
-# Runs -----------------------------------------------------------------------------------------------------------------
+# Runs
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """When a run is killed: just before its `event`-th change of a file, some seconds after that, or after the start.
+    """When a run is killed: just before its `event`-th change of a file, some seconds after that,
+    or after the start.
 
-    by: the signal; SIGINT, as Ctrl-C in a terminal, after seconds, and the start is that of the command line.
+    by: the signal; SIGINT, as Ctrl-C in a terminal, after seconds, and the start is that of the
+    command line.
     """
 
     event: int | None = None
@@ -142,7 +151,10 @@ class Moment:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """How a run ended. code: None if it was killed. changes: (seconds since the start, event, path). work: stand-ins called."""
+    """How a run ended. code: None if it was killed.
+
+    changes: (seconds since the start, event, path). work: stand-ins called.
+    """
 
     code: int | None
     out: str
@@ -152,7 +164,9 @@ class Run:
 
 
 class Changes:
-    """The audit hook of a run: notes changes of files in the place, and kills the run, its group of processes, at one."""
+    """The audit hook of a run: notes changes of files in the place, and kills the run, its group of
+    processes, at one.
+    """
 
     def __init__(self, place: Path, moment: Moment | None):
         self.place, self.moment, self.seen = str(place), moment, []
@@ -193,7 +207,10 @@ def start(
     moment: Moment | None = None,
     most: int | None = None,
 ):
-    """Begins a run; most: bytes that a file may have, as on a disk that is full then. Returns what `end` wants."""
+    """Begins a run; most: bytes that a file may have, as on a disk that is full then.
+
+    Returns what `end` wants.
+    """
     log = inputs.with_name("logs") / f"{place.name}.{variant}"  # not on a disk that is full
     shutil.rmtree(log, ignore_errors=True)
     log.mkdir(parents=True)
@@ -258,7 +275,8 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
 def hear_from_the_start(cli, tell):
     """Says when the command line begins; an interrupt before it comes then.
 
-    The audit hook is Python that a user's run does not have, also where extensions allow no exception: none is raised in it.
+    The audit hook is Python that a user's run does not have, also where extensions allow no
+    exception: none is raised in it.
     """
     from humangs_jax.cli import screen
 
@@ -327,7 +345,8 @@ def prepare(inputs: Path) -> None:
     assert os.waitpid(pid, 0)[1] == 0, "the inputs could not be made"
 
 
-# States ---------------------------------------------------------------------------------------------------------------
+# States
+# --------------------------------------------------------------------------------------------------
 
 
 def temporary(part: str) -> bool:
@@ -352,7 +371,9 @@ def snapshot(place: Path) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def contents(path: Path) -> bytes:
-    """The bytes of a file; of weights in one order: their header is written in another one by each run."""
+    """The bytes of a file; of weights in one order: their header is written in another one by each
+    run.
+    """
     data = path.read_bytes()
     if path.suffix != ".safetensors" or not weights_are_whole(data):
         return data
@@ -376,7 +397,9 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
 
 
 def whole(path: Path) -> bool:
-    """Whether a file that no two runs write equally is complete: a log may end in a part of a line."""
+    """Whether a file that no two runs write equally is complete: a log may end in a part of a
+    line.
+    """
     if path.suffix == ".safetensors":
         return weights_are_whole(path.read_bytes())
     if path.suffix == ".png":  # which ends in a chunk of this name and its checksum
@@ -392,7 +415,9 @@ def whole(path: Path) -> bool:
 
 
 def half_written(command: Command, place: Path, before: dict, after: dict) -> list[str]:
-    """What is wrong with a place between two states: files under final names that are neither old nor new, or lost."""
+    """What is wrong with a place between two states: files under final names that are neither old
+    nor new, or lost.
+    """
     final, other = snapshot(place)
     found = []
     for name, content in final.items():
@@ -427,7 +452,9 @@ def unlike(command: Command, place: Path, expected: dict) -> list[str]:
 
 
 def next_run(command: Command, place: Path, inputs: Path, expected: dict) -> list[str]:
-    """What is wrong with the run after one that was killed or failed, and with what is there then."""
+    """What is wrong with the run after one that was killed or failed, and with what is there
+    then.
+    """
     finished = command.once and not unlike(command, place, expected)
     ending = run(command, place, inputs, 2)
     found = (

@@ -87,7 +87,9 @@ def of_grey(curve):
 
 
 def of_tables(space, inputs, to_lab):
-    """A profile whose colors are a table (lut8) of Lab: `to_lab` of the corners of the cube, first channel slowest."""
+    """A profile whose colors are a table (lut8) of Lab: `to_lab` of the corners of the cube, first
+    channel slowest.
+    """
     grid = np.stack(np.meshgrid(*[[0, 1]] * inputs, indexing="ij"), axis=-1).reshape(-1, inputs)
     lab = np.asarray([to_lab(*corner) for corner in grid])
     levels = np.rint(lab * [2.55, 1, 1] + [0, 128, 128]).clip(0, 255).astype(np.uint8)

@@ -140,8 +140,8 @@ def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, r
 
 @pytest.mark.parametrize("moves", [0, 1, 2])
 def test_an_interrupt_between_moves_deletes_no_old_file(tmp_path, monkeypatch, moves):
-    """Files that are out of date go last: a process that is killed before leaves the old or the new of each name. Files that must
-    not lie beside the new ones go first.
+    """Files that are out of date go last: a process that is killed before leaves the old or the new
+    of each name. Files that must not lie beside the new ones go first.
     """
     old, new = ("a.png", "b.png", "c.png"), ("a.png", "b.png")
     for name in (*old, "invalid"):
@@ -232,7 +232,10 @@ def test_a_folder_has_one_writer_at_a_time(tmp_path, replaced):
     if not replaced:
         place.mkdir()
     code = "import sys; from humangs_jax.io import atomic\n"
-    code += f"with atomic.only_writer(sys.argv[1], replaced={replaced}): print('held', flush=True); input()"
+    code += (
+        f"with atomic.only_writer(sys.argv[1], replaced={replaced}): print('held', flush=True);"
+        " input()"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", code, place], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:

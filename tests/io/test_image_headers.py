@@ -1,4 +1,6 @@
-"""What stands behind or inside of a photo is not the photo; formats of phones and the web are read."""
+"""What stands behind or inside of a photo is not the photo; formats of phones and the web are
+read.
+"""
 
 import io
 import sys

@@ -1,4 +1,7 @@
-"""Photos at other sizes, masks as segmentation tools write them, EXIF and HEIC. (Reading and writing photos: tests/data.)"""
+"""Photos at other sizes, masks as segmentation tools write them, EXIF and HEIC.
+
+(Reading and writing photos: tests/data.)
+"""
 
 import struct
 import sys
@@ -27,7 +30,9 @@ from humangs_jax.io.images import (
 from humangs_jax.io.reading import FileError, Limits, set_limits
 
 HEIC = Path(__file__).parent / "phone.heic"
-"""Written by pillow-heif 1.8.1: 32 x 24, red, the upper left quarter blue; EXIF has orientation 6 and a focal length of 26 mm."""
+"""Written by pillow-heif 1.8.1: 32 x 24, red, the upper left quarter blue; EXIF has orientation 6
+and a focal length of 26 mm.
+"""
 
 ROUNDING = 2e-6
 """Of sums of some hundred float32 products of numbers in [0, 1]."""
@@ -35,7 +40,9 @@ SIDE = st.integers(1, 60)
 
 
 def area_average(image, size):
-    """Along the first axis: the integral over each new pixel, by the cumulated sums at its edges."""
+    """Along the first axis: the integral over each new pixel, by the cumulated sums at its
+    edges.
+    """
     sums = np.concatenate([0 * image[:1], np.cumsum(image, axis=0, dtype=np.float64)])
     edges = np.arange(size + 1) * (len(image) / size)
     at = np.stack(
@@ -75,7 +82,9 @@ def test_each_axis_has_its_own_filter_and_no_value_leaves_the_range(
 
 @pytest.mark.parametrize("size", [(90, 70), (41, 33), (160, 31)])
 def test_enlarging_is_bicubic(size):
-    """As Pillow does it, but for the rim, and for what it leaves outside of the range of the image."""
+    """As Pillow does it, but for the rim, and for what it leaves outside of the range of the
+    image.
+    """
     image = np.random.default_rng(0).random((31, 40), np.float32)
     theirs = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC))
     y, x = (
@@ -95,7 +104,8 @@ def test_bytes_are_averaged_as_numbers():
     np.testing.assert_array_equal(resized(image, 4, 3), np.full((3, 4, 3), 255, np.float32))
 
 
-# EXIF and HEIC -------------------------------------------------------------------------------------------------------
+# EXIF and HEIC
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])

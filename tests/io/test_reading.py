@@ -69,7 +69,10 @@ def test_limits_are_those_of_the_environment(monkeypatch):
             limits()
 
 
-TOO_LONG = r"a\.json: 203 bytes: the limit text_bytes is 100 \(HUMANGS_LIMITS=text_bytes=203 raises it; docs/security\.md\)$"
+TOO_LONG = (
+    r"a\.json: 203 bytes: the limit text_bytes is 100 \(HUMANGS_LIMITS=text_bytes=203 raises it;"
+    r" docs/security\.md\)$"
+)
 
 
 def test_a_limit_is_named_and_can_be_changed(tmp_path):
@@ -259,7 +262,9 @@ def test_a_folder_is_searched_once_however_many_links_lead_to_it(tmp_path, caplo
 
 
 def test_threads_parse_one_header_at_a_time(tmp_path, monkeypatch):
-    """More at once are an error of CPython 3.11 now and then, and healthy captures were left out of a run for it."""
+    """More at once are an error of CPython 3.11 now and then, and healthy captures were left out of
+    a run for it.
+    """
     arrays = {name: np.full((2, 3), i) for i, name in enumerate("abc")}
     np.savez(tmp_path / "some.npz", **arrays)
     inside, most = [], []

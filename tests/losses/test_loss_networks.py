@@ -1,4 +1,7 @@
-"""Loss networks out of the files that hold them. Weights are made up; data/torch_heads.pth was written by torch."""
+"""Loss networks out of the files that hold them.
+
+Weights are made up; data/torch_heads.pth was written by torch.
+"""
 
 import pickle
 import re
@@ -249,7 +252,9 @@ def test_what_is_not_given_is_not_there(tmp_path):
 
 
 def released(net="squeeze"):
-    """The loss networks among the tensors of a released checkpoint, blocks and lists of heads twice as there."""
+    """The loss networks among the tensors of a released checkpoint, blocks and lists of heads twice
+    as there.
+    """
     root, blocks = "loss_computer.", (4, 9, 14, 23, 32)
     perceptual, first = {}, 0
     for block, end in enumerate(blocks):

@@ -1,4 +1,6 @@
-"""Losses of frozen networks, on made-up weights, against torch (torch_losses.py), and what must hold for any weights."""
+"""Losses of frozen networks, on made-up weights, against torch (torch_losses.py), and what must
+hold for any weights.
+"""
 
 import itertools
 from pathlib import Path
@@ -35,11 +37,13 @@ TABLES = {"vgg19": VGG19, **BACKBONES}
 SMALLEST = {"vgg19": 16, "vgg": 16, "alex": 31, "squeeze": 25}
 CHANNELS = {**loss_cases.HEADS, "vgg19": loss_cases.HEADS["vgg"]}
 SIZES = {"vgg19": (37, 32), "vgg": (37, 32), "alex": (37, 43), "squeeze": (40, 33)}
-FLOAT32 = 1e-5  # relative; sums of some thousand products, a dozen times over, and differences of unit vectors
+# relative; sums of some thousand products, a dozen times over, and differences of unit vectors
+FLOAT32 = 1e-5
 GRADIENT = 3e-5
-"""Relative L2 in float32. A sum of n terms of either sign, one after the other, rounds by u sqrt(n) / 2.4 of itself: 1.7e-6 for
-the 9 x 512 of VGG's widest layers. Thirteen layers forward and backward: 9e-6 in quadrature; differences of unit vectors
-triple it. Measured with AVX-512, whose vectors shorten the sums: 4e-6."""
+"""Relative L2 in float32. A sum of n terms of either sign, one after the other, rounds by u sqrt(n)
+/ 2.4 of itself: 1.7e-6 for the 9 x 512 of VGG's widest layers. Thirteen layers forward and
+backward: 9e-6 in quadrature; differences of unit vectors triple it. Measured with AVX-512, whose
+vectors shorten the sums: 4e-6."""
 FLOAT64 = 1e-12
 STORED = 1e-7  # the gradients are stored as float32
 BFLOAT16 = 0.05  # relative; features keep 8 bits

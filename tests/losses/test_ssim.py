@@ -19,8 +19,8 @@ from humangs_jax.losses.losses import (
 )
 
 FLOAT32_SSIM = 3e-5
-"""A variance is the difference of two numbers of up to 1, each rounded a few times (2e-7), beside C2 = 9e-4: 8e-4 at a pixel of a
-bright flat region, of either sign, in the mean of thousands."""
+"""A variance is the difference of two numbers of up to 1, each rounded a few times (2e-7), beside
+C2 = 9e-4: 8e-4 at a pixel of a bright flat region, of either sign, in the mean of thousands."""
 WINDOW = GAUSSIAN.size
 
 

@@ -1,9 +1,10 @@
-"""Writes data/torch_losses.npz and data/torch_heads.pth: what torch makes of the loss networks, in float64.
+"""Writes data/torch_losses.npz and data/torch_heads.pth: what torch makes of the loss networks, in
+float64.
 
     python tests/losses/torch_losses.py
 
-Needs torch; the tests do not. The layers are written out one by one, as torchvision and lpips stack them; weights and
-images come from `loss_cases`.
+Needs torch; the tests do not. The layers are written out one by one, as torchvision and lpips stack
+them; weights and images come from `loss_cases`.
 """
 
 from pathlib import Path

@@ -1,10 +1,11 @@
 """The published network's numbers at every stage: the copy of the reference that tests carry.
 
-`data/golden_a.pt` is a checkpoint of the published network with random weights at small sizes, in the released format;
-`data/golden_a_subject_0.npz` the reference's numbers for one subject, some stages thinned out (see `THINNED`). `golden_b` has
-one view, eight layers, and pools visible vertices only (`POOLS`). Both come from the project's golden data (computed in
-float64 by the authors' release, stored as float32); `python tests/network/network_golden.py GOLDEN_DIRECTORY` makes the npz
-files again.
+`data/golden_a.pt` is a checkpoint of the published network with random weights at small sizes, in
+the released format; `data/golden_a_subject_0.npz` the reference's numbers for one subject, some
+stages thinned out (see `THINNED`). `golden_b` has one view, eight layers, and pools visible
+vertices only (`POOLS`). Both come from the project's golden data (computed in float64 by the
+authors' release, stored as float32); `python tests/network/network_golden.py GOLDEN_DIRECTORY`
+makes the npz files again.
 """
 
 import sys
@@ -46,7 +47,9 @@ def carried(name):
 
 
 def load_subject(name="golden_a"):
-    """Arrays of the carried subject in the layout of the golden files (b = 1), stages thinned out."""
+    """Arrays of the carried subject in the layout of the golden files (b = 1), stages thinned
+    out.
+    """
     checkpoint, subject = carried(name)
     arrays = dict(np.load(subject))
     arrays = {name: x if name in check_parity.PER_VIEW else x[None] for name, x in arrays.items()}

@@ -1,7 +1,9 @@
-"""The published network in plain numpy and float64, one subject at a time, from a state dict in the release's names.
+"""The published network in plain numpy and float64, one subject at a time, from a state dict in the
+release's names.
 
-Written from the description of the network alone (equations, names of tensors, layouts), for every option it has; it
-shares no line with `humangs_jax`. Stages come under the names and in the layouts of the golden files.
+Written from the description of the network alone (equations, names of tensors, layouts), for every
+option it has; it shares no line with `humangs_jax`. Stages come under the names and in the layouts
+of the golden files.
 """
 
 import dataclasses
@@ -14,7 +16,9 @@ erf = np.vectorize(math.erf)
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Of a made-up network and its inputs; the upsampler's hidden width and that of the heads' hidden layers are 8."""
+    """Of a made-up network and its inputs; the upsampler's hidden width and that of the heads'
+    hidden layers are 8.
+    """
 
     width: int = 16
     head: int = 8
@@ -199,7 +203,9 @@ def convolution(x, weight, bias):
 
 
 def transposed_convolution(x, weight, bias):
-    """Kernel 4, stride 2, padding 1: every input pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1)."""
+    """Kernel 4, stride 2, padding 1: every input pixel (i, j) adds kernel[a, b] to output pixel (2i
+    + a - 1, 2j + b - 1).
+    """
     v, _, h, w = x.shape
     y = np.zeros((v, weight.shape[1], 2 * h + 2, 2 * w + 2))
     for a in range(4):
@@ -412,7 +418,9 @@ def skinned_quaternion(linear, q):
 
 
 def triple(options, seed=0):
-    """State dict, arrays (inputs and every stage, stored as float32) and release configuration of made-up numbers."""
+    """State dict, arrays (inputs and every stage, stored as float32) and release configuration of
+    made-up numbers.
+    """
     state = random_state(options, seed)
     arrays = random_inputs(options, state, seed + 1)
     network, subjects = Network(state, options), []

@@ -1,4 +1,6 @@
-"""experiments/paper/check_parity.py on made-up triples whose numbers come from an independent network (network_oracle.py)."""
+"""experiments/paper/check_parity.py on made-up triples whose numbers come from an independent
+network (network_oracle.py).
+"""
 
 import dataclasses
 import json

@@ -11,8 +11,8 @@ from experiments.paper import check_parity
 from humangs_jax.network.conversion import load_checkpoint
 
 TOLERANCES = {"float32": 2e-5, "float64": 1e-6}
-"""Relative to a stage's largest magnitude. In float32 ours stays within 3e-6, the release itself within 5e-6. The
-reference is stored as float32: half a rounding step is 6e-8."""
+"""Relative to a stage's largest magnitude. In float32 ours stays within 3e-6, the release itself
+within 5e-6. The reference is stored as float32: half a rounding step is 6e-8."""
 
 
 CASES = [

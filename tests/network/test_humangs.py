@@ -34,7 +34,9 @@ PER_VIEW = ("images", "posed_vertices", "posed_normals", "position_maps", "depth
 
 @functools.partial(jax.jit, static_argnames=("config",))
 def run(variables, inputs, config):
-    """Encoding and outputs, compiled once per configuration and shape (the compiler merges what both compute)."""
+    """Encoding and outputs, compiled once per configuration and shape (the compiler merges what
+    both compute).
+    """
     return encode(variables, inputs, config), apply_humangs(variables, inputs, config)[0]
 
 

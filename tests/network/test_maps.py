@@ -83,7 +83,9 @@ def test_nearest_rounds_halves_to_even():
 
 
 def test_conventions():
-    """Half-pixel indices see the same image at every resolution; the mixed ones miss it by less than half a texel."""
+    """Half-pixel indices see the same image at every resolution; the mixed ones miss it by less
+    than half a texel.
+    """
     pixels = jnp.asarray([[0.5, 0.5], [8.0, 4.0], [15.5, 7.5]])
     half = texel_indices(pixels, (16, 8), (16, 8), "half_pixel")
     assert np.allclose(half, pixels - 0.5)

@@ -1,4 +1,6 @@
-"""A part that is not the paper's takes the place of one: in the pass, in training, in weights files."""
+"""A part that is not the paper's takes the place of one: in the pass, in training, in weights
+files.
+"""
 
 import dataclasses
 

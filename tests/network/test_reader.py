@@ -1,5 +1,5 @@
-"""What vertices read: where they are seen, means over views, and shells. A round body in a wide round coat: what its shells say
-can be written down.
+"""What vertices read: where they are seen, means over views, and shells. A round body in a wide
+round coat: what its shells say can be written down.
 """
 
 import jax
@@ -117,7 +117,10 @@ def test_photo_colors_are_grey_where_nothing_is_seen():
 
 @pytest.mark.parametrize("pool", ["visible", "all"])
 def test_views_that_do_not_see_a_vertex_do_not_dilute_its_feature(pool):
-    """Each photo's map is constant: the mean over the views that count is known. View 1 sees nothing, view 2 is padding."""
+    """Each photo's map is constant: the mean over the views that count is known.
+
+    View 1 sees nothing, view 2 is padding.
+    """
     inputs = random_inputs(views=3)
     inputs = replace(
         inputs, depth_maps=inputs.depth_maps.at[1].set(-1.0), view_count=jnp.asarray(2)
@@ -224,7 +227,9 @@ def read(arguments, present=None):
 
 
 def lateral(points, cameras):
-    """(v, p) sine of the angle between a point and the optical axis, times the camera's distance."""
+    """(v, p) sine of the angle between a point and the optical axis, times the camera's
+    distance.
+    """
     away = points - np.asarray(cameras.center)[:, None]
     axis = np.asarray(cameras.cam_from_world)[:, 2, :3]
     cosine = np.einsum("vpc,vc->vp", away, axis) / np.linalg.norm(away, axis=-1)
@@ -291,7 +296,8 @@ def test_batches_by_vmap_and_gradients_are_finite():
     arguments = scene()
     two = jax.tree.map(lambda x: jnp.stack([x, x]), arguments)
     batched = jax.vmap(read)(two)
-    # near the rim of a silhouette, where few views weigh little, rounding in float32 moves a mean by 1e-5
+    # near the rim of a silhouette, where few views weigh little, rounding in float32 moves a mean
+    # by 1e-5
     assert np.allclose(batched.colors[1], read(arguments).colors, atol=1e-4)
     total = lambda images, vertices: jnp.sum(
         read((images, *arguments[1:4], vertices, *arguments[5:])).colors

@@ -205,7 +205,9 @@ def test_every_truncation_is_a_clear_error(write, tmp_path):
 
 
 def damaged(path):
-    """State dicts of a file with one byte changed, where reading it raises no error, and how often it does."""
+    """State dicts of a file with one byte changed, where reading it raises no error, and how often
+    it does.
+    """
     whole, states, noticed = path.read_bytes(), [], 0
     for position in range(0, len(whole), 3):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 0x5A]) + whole[position + 1 :])
@@ -227,7 +229,9 @@ def test_every_damaged_byte_is_noticed_or_harmless(tmp_path):
 
 
 def test_damage_to_the_older_format_raises_nothing_else(tmp_path):
-    """It has no checksums: numbers, names and shapes may change, but a damaged structure is a ValueError."""
+    """It has no checksums: numbers, names and shapes may change, but a damaged structure is a
+    ValueError.
+    """
     path = write_stream(
         tmp_path / "a.pt", {"model": {"w": FakeTensor(np.arange(40, dtype=np.float32))}}
     )

@@ -206,7 +206,9 @@ def test_quaternions_are_unit_whatever_the_head_says():
 
 
 def test_a_person_twice_as_large_has_gaussians_twice_as_large():
-    """Lengths inside are those of a body of 1.8 m; means, offsets and scales come back to metres."""
+    """Lengths inside are those of a body of 1.8 m; means, offsets and scales come back to
+    metres.
+    """
     decoder, features = (
         VertexDecoder(hidden=8, tight=1, free=1),
         VertexFeatures(jnp.ones((4, 3)), jnp.ones(2)),

@@ -19,7 +19,9 @@ KINDS = {dtype: kind for kind, dtype in STORAGE_DTYPES.items() if kind != "BFloa
 
 @dataclasses.dataclass
 class FakeTensor:
-    """What `torch.save` writes for a tensor: a storage by reference, and a view of it (contiguous if not said)."""
+    """What `torch.save` writes for a tensor: a storage by reference, and a view of it (contiguous
+    if not said).
+    """
 
     storage: np.ndarray
     kind: str = "FloatStorage"
@@ -27,7 +29,9 @@ class FakeTensor:
     strides: tuple | None = None
     offset: int = 0
     part: tuple | None = None
-    """(name, start, count) of the part of the storage that the tensor's own storage is; older format only."""
+    """(name, start, count) of the part of the storage that the tensor's own storage is; older
+    format only.
+    """
 
 
 def tensors(state):
@@ -116,9 +120,11 @@ def write_stream(
 
 
 def write_python2_stream(path, state, device="cuda:0"):
-    """A state dict as Python 2 wrote it in the older format, instruction by instruction: the form of lpips' heads.
+    """A state dict as Python 2 wrote it in the older format, instruction by instruction: the form
+    of lpips' heads.
 
-    Strings are bytes, an OrderedDict is a call with a list of [key, value] lists, and its attributes follow.
+    Strings are bytes, an OrderedDict is a call with a list of [key, value] lists, and its
+    attributes follow.
     """
     text = lambda value: b"U" + bytes([len(value)]) + value.encode()
     count = lambda value: b"J" + struct.pack("<i", value)

@@ -1,4 +1,5 @@
-"""Writes data/torch_*: one state dict in both formats of `torch.save`, and its numbers as npz. Needs torch; tests do not.
+"""Writes data/torch_*: one state dict in both formats of `torch.save`, and its numbers as npz.
+Needs torch; tests do not.
 
 python tests/network/write_torch_files.py
 """

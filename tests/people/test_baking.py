@@ -1,4 +1,6 @@
-"""Textured meshes of dressed people: atlas, baked textures, skinning by few joints, scans that are read back."""
+"""Textured meshes of dressed people: atlas, baked textures, skinning by few joints, scans that are
+read back.
+"""
 
 import dataclasses
 import json
@@ -16,7 +18,9 @@ from humangs_jax.rendering.mesh.rasterizer import sample_texture
 
 SIZE = 512
 LEAST_DENSITY = 0.4
-"""Charts may shrink faces that look aside, to `atlas.LEAST_COSINE` along one direction; measured 0.5 for the worst percent."""
+"""Charts may shrink faces that look aside, to `atlas.LEAST_COSINE` along one direction; measured
+0.5 for the worst percent.
+"""
 SKINNING = 1.5e-3
 """Metres; measured 0.4 mm with six joints a vertex."""
 SCAN_PSNR = 32

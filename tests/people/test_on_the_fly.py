@@ -1,4 +1,6 @@
-"""People on the fly: banks of one split; examples that are a pure function of a key and agree with the body."""
+"""People on the fly: banks of one split; examples that are a pure function of a key and agree with
+the body.
+"""
 
 import dataclasses
 
@@ -31,14 +33,20 @@ SIZE = 96
 SKIN_DEPTH = 1e-3
 """Metres between bare skin and the body: fewer joints a vertex (0.4 mm)."""
 SEEN_ALIKE = 0.99
-"""Share of bare-skin pixels where the body is as near: elsewhere skin under cloth, which the dressed mesh lacks, is in front."""
+"""Share of bare-skin pixels where the body is as near: elsewhere skin under cloth, which the
+dressed mesh lacks, is in front.
+"""
 MIRRORED = 0.96
-"""Share of the body's pixels inside the mask; left and right of the body differ by up to 5 mm, edges by a pixel."""
+"""Share of the body's pixels inside the mask; left and right of the body differ by up to 5 mm,
+edges by a pixel.
+"""
 NEARER = 0.85
-"""Of the distance to the clothes before: what is left of it where the body moved by more than 5 mm. Up to 2.5 cm may be left
-everywhere (`Reach.inset`). Measured: 0.66 and 0.75."""
+"""Of the distance to the clothes before: what is left of it where the body moved by more than 5 mm.
+Up to 2.5 cm may be left everywhere (`Reach.inset`). Measured: 0.66 and 0.75."""
 LIKE_RENDERED = 30
-"""PSNR against `render_view` in the same light, dB; textures of 1 cm texels, other normals at folds. Measured 34 or more."""
+"""PSNR against `render_view` in the same light, dB; textures of 1 cm texels, other normals at
+folds. Measured 34 or more.
+"""
 
 
 draw_view, rasterize = jax.jit(on_the_fly.draw_view), jax.jit(rasterize_mesh)
@@ -196,7 +204,9 @@ def test_it_looks_like_the_rendering_on_the_host(bank, scene, body):
 
 @pytest.mark.slow
 def test_bare_skin_is_where_the_body_is(bank, scene, body):
-    """Depth and position maps are the body's: where no cloth is, the picture shows that very surface."""
+    """Depth and position maps are the body's: where no cloth is, the picture shows that very
+    surface.
+    """
     camera = draw(scene, bank, 1, 0.0, SIZE)
     fragments = rasterize(scene.vertices[0], bank.faces[scene.person].astype(jnp.int32), camera)
     ids = np.asarray(fragments.face_ids)
@@ -214,7 +224,8 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
     depth = np.asarray(inputs.depth_maps[0]) * unit
     alike = np.abs(depth - np.asarray(fragments.depth))[skin] < SKIN_DEPTH
     assert alike.mean() > SEEN_ALIKE
-    # a point of the position map, moved by the pose, is where that pixel sees the body: project the nearest vertex
+    # a point of the position map, moved by the pose, is where that pixel sees the body: project the
+    # nearest vertex
     rest = shape_body(body, views.betas)
     positions = np.asarray(inputs.position_maps[0])[skin][alike] * unit
     nearest = np.linalg.norm(positions[:, None] - np.asarray(rest.vertices)[None], axis=-1).argmin(

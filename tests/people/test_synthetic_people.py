@@ -130,7 +130,9 @@ def test_hardly_any_skin_pokes_through(people, posed, views):
 
 
 def test_garments_move_with_the_pose(people):
-    """Raising the left thigh moves the cloth on the left thigh, and nothing on the head or the right arm."""
+    """Raising the left thigh moves the cloth on the left thigh, and nothing on the head or the
+    right arm.
+    """
     person = people[0]
     rotations = np.zeros((55, 3), np.float32)
     rest = person.posed_vertices(rotations, np.zeros(3))

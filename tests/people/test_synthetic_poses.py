@@ -1,4 +1,6 @@
-"""The pose prior: limits, kinematics, soles on the ground, arms and legs clear of the body, hands."""
+"""The pose prior: limits, kinematics, soles on the ground, arms and legs clear of the body,
+hands.
+"""
 
 import functools
 
@@ -26,7 +28,9 @@ CLOSE = 1e-4
 """Metres or radians after 10 chained float32 rotations against float64."""
 SEEDS = range(40)
 INSIDE = 0.012
-"""Share of the body's vertices inside another part, mean over poses: creases of armpits and groin are 0.7 % of them."""
+"""Share of the body's vertices inside another part, mean over poses: creases of armpits and groin
+are 0.7 % of them.
+"""
 
 
 @functools.cache
@@ -100,8 +104,13 @@ def test_kinematics_are_those_of_the_body_model(body, build, drawn):
 
 
 @given(
-    st.floats(-0.3, 0.3), st.floats(-0.4, 0.4), st.floats(-0.5, 0.5), st.floats(-0.4, 0.7), st.floats(0, 0.3), st.floats(0, 0.3)
-)  # fmt: skip
+    st.floats(-0.3, 0.3),
+    st.floats(-0.4, 0.4),
+    st.floats(-0.5, 0.5),
+    st.floats(-0.4, 0.7),
+    st.floats(0, 0.3),
+    st.floats(0, 0.3),
+)
 @settings(deadline=None, max_examples=40)
 def test_legs_put_the_feet_where_they_are_to_be(x, z, yaw, pitch, lift, sink):
     build = mean_build()
@@ -128,7 +137,9 @@ def test_legs_put_the_feet_where_they_are_to_be(x, z, yaw, pitch, lift, sink):
 
 
 def test_both_soles_are_on_the_ground(body, build, posed):
-    """Whatever the stance, the lowest points of both feet are at one height, unless one leg is raised."""
+    """Whatever the stance, the lowest points of both feet are at one height, unless one leg is
+    raised.
+    """
     part = np.asarray(body.skinning_weights).argmax(1)
     soles = [np.isin(part, (kin.LEFT_ANKLE + side, kin.LEFT_FOOT + side)) for side in (0, 1)]
     gaps = {}
@@ -154,7 +165,9 @@ def test_hands_stay_clear_of_the_body(build, drawn):
 
 
 def winding_numbers(points, vertices, faces):
-    """How often a mesh winds around each point: sum of the signed solid angles of its faces over 4 pi."""
+    """How often a mesh winds around each point: sum of the signed solid angles of its faces over 4
+    pi.
+    """
     dot = lambda x, y: jnp.sum(x * y, axis=-1)
 
     def one(point):
@@ -168,7 +181,10 @@ def winding_numbers(points, vertices, faces):
 
 @jax.jit
 def inside_itself(body, rotations):
-    """Which vertices lie inside of another part: 2 mm off along their normal. Meshes are not quite closed (mouth, eyes)."""
+    """Which vertices lie inside of another part: 2 mm off along their normal.
+
+    Meshes are not quite closed (mouth, eyes).
+    """
     vertices = pose_body(
         body, shape_body(body, jnp.zeros(0)), BodyPose(jnp.asarray(rotations), jnp.zeros(3))
     ).vertices

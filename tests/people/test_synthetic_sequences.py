@@ -13,7 +13,9 @@ from humangs_jax.people.sequences import KINDS, sample_sequence
 FRAMES = 50
 CASES = [(kind, seed) for kind in KINDS for seed in (0, 1)]
 SLIDE = 1.2e-3
-"""Metres a frame (3.6 cm/s) that a planted sole may move: as a foot rolls, its round sole touches elsewhere."""
+"""Metres a frame (3.6 cm/s) that a planted sole may move: as a foot rolls, its round sole touches
+elsewhere.
+"""
 SUNK = 5e-3
 """Metres that a planted sole may be below the ground; the heel and the toes come up by more."""
 

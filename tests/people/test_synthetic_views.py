@@ -196,15 +196,31 @@ def test_processes_write_the_same_files(tmp_path):
     ("arguments", "layout", "first"),
     [
         (("--subjects", "3"), writer.Layout(512, 1, 60, 12), 0),
-        (("--size", "128", "--poses", "4", "--sequences", "--motion-frames", "30", "--first", "7"),
-         writer.Layout(128, 4, 60, 12, frames=30), 7),
-        (("--views", "4", "--close-views", "0", "--held-out", "8", "--scans"),
-         writer.Layout(512, 1, 4, 0, 8, scan_texture=2048), 0),
+        (
+            (
+                "--size",
+                "128",
+                "--poses",
+                "4",
+                "--sequences",
+                "--motion-frames",
+                "30",
+                "--first",
+                "7",
+            ),
+            writer.Layout(128, 4, 60, 12, frames=30),
+            7,
+        ),
+        (
+            ("--views", "4", "--close-views", "0", "--held-out", "8", "--scans"),
+            writer.Layout(512, 1, 4, 0, 8, scan_texture=2048),
+            0,
+        ),
         (("--views", "4"), writer.Layout(512, 1, 4, 0), 0),
         (("--views", "4", "--close-views", "3"), writer.Layout(512, 1, 4, 3), 0),
         (("--for-training",), writer.Layout(256, 2, 12), 0),
     ],
-)  # fmt: skip
+)
 def test_the_command_line_asks_for_layouts(arguments, layout, first, tmp_path, monkeypatch):
     from humangs_jax import cli
 
@@ -216,7 +232,8 @@ def test_the_command_line_asks_for_layouts(arguments, layout, first, tmp_path, m
     assert rest == [layout, "train", first] and keywords["workers"] >= 1
 
 
-# Nobody of the test split can be drawn in training: all ways to people go through seeds of a split ----------------------
+# Nobody of the test split can be drawn in training: all ways to people go through seeds of a split
+# ----------------------
 
 
 @given(st.sampled_from(sorted(SPLITS)), st.integers(-5, 1_000_100), st.integers(-2, 1_000_100))

@@ -1,4 +1,6 @@
-"""One size of buffers for all tests of the normal lane, so that they share compiled programs; slow tests plan their own."""
+"""One size of buffers for all tests of the normal lane, so that they share compiled programs; slow
+tests plan their own.
+"""
 
 import pytest
 from refinement_cases import toy_avatar, toy_capture

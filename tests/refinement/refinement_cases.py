@@ -41,7 +41,9 @@ def toy_avatar(body, shade):
 
 
 def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
-    """Photos of an avatar, each in a pose of its own if `moving`. distance: of each camera, metres."""
+    """Photos of an avatar, each in a pose of its own if `moving`. distance: of each camera,
+    metres.
+    """
     cameras = orbit(
         jnp.asarray([0.0, 0.9, 0.0]),
         distance,
@@ -68,7 +70,9 @@ def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
 
 
 FEW = 0.03
-"""Share of numbers that may differ: where a gradient is rounding alone, Adam makes whole steps of it."""
+"""Share of numbers that may differ: where a gradient is rounding alone, Adam makes whole steps of
+it.
+"""
 
 
 def assert_nearly_all_close(got, expected, atol):

@@ -1,4 +1,6 @@
-"""The learned update: what it sees, that it does nothing untrained, and what the shipped one gains."""
+"""The learned update: what it sees, that it does nothing untrained, and what the shipped one
+gains.
+"""
 
 import dataclasses
 

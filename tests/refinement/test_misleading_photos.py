@@ -1,4 +1,6 @@
-"""The demo's person, one of whose photos misleads: views that nothing saw do not get worse than without refinement."""
+"""The demo's person, one of whose photos misleads: views that nothing saw do not get worse than
+without refinement.
+"""
 
 import dataclasses
 
@@ -27,7 +29,9 @@ def without_mask(capture, view):
 
 
 def with_pose_off(capture, view, joints):
-    """The pose of one photo is off by 10 degrees: the whole body about the vertical (1 joint), or each joint about some axis."""
+    """The pose of one photo is off by 10 degrees: the whole body about the vertical (1 joint), or
+    each joint about some axis.
+    """
     frames = np.asarray(capture.frames)
     rotations, axes = np.array(capture.poses.rotations)[frames], np.asarray([[0.0, 1.0, 0.0]])
     if joints > 1:

@@ -33,7 +33,8 @@ from humangs_jax.rendering.splatting import render
 
 SAME_SIZE = 2e-3  # of alpha, in the mean: flat Gaussians become a little thicker
 SAME_GAIN = 0.05  # dB: a report counts the pixels of the crop
-VMAP_TOLERANCE = 5e-4  # Adam divides by the gradient's size: rounding of gradients near 0 becomes a share of a rate
+# Adam divides by the gradient's size: rounding of gradients near 0 becomes a share of a rate
+VMAP_TOLERANCE = 5e-4
 
 
 @pytest.mark.slow
@@ -67,7 +68,9 @@ def test_what_no_photo_sees_stays(person):
 
 @pytest.mark.slow
 def test_refined_avatars_look_the_same_at_other_sizes(person):
-    """As an image of the photos' size, reduced, does; and at that size as the optimised Gaussians do."""
+    """As an image of the photos' size, reduced, does; and at that size as the optimised Gaussians
+    do.
+    """
     avatar, capture = person
     refined = refinement.refine(avatar, capture, STEPS)
     raw = without_low_pass(refined)
@@ -490,11 +493,14 @@ def test_blocks_of_pixels_are_held_out_and_every_photo_has_its_turn():
     assert len(order) == 8 and set(order[:3]) == set(order[3:6]) == {0, 2, 5}
 
 
-# Steps -------------------------------------------------------------------------------------------------------------------
+# Steps
+# --------------------------------------------------------------------------------------------------
 
 
 def few(**changes):
-    """A state of two Gaussians, a gradient of ones, settings whose steps are the gradient times a rate."""
+    """A state of two Gaussians, a gradient of ones, settings whose steps are the gradient times a
+    rate.
+    """
     names = {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": None, "color_logits": 3}
     arrays = {name: jnp.ones((2,) if n is None else (2, n)) for name, n in names.items()}
     parameters = UnconstrainedGaussians(**arrays)

@@ -1,8 +1,9 @@
-"""Compositing in float64 numpy, written from the formulas of `compositing`, with bounds on what float32 makes of them.
+"""Compositing in float64 numpy, written from the formulas of `compositing`, with bounds on what
+float32 makes of them.
 
-A running error analysis (Higham, section 3.3): beside every number its bound, in units of the last place u = 2^-24. It
-holds for both schedules, in any order of their sums, with or without fused multiplications. Bounds follow the magnitudes
-of the terms, not the results, which cancel.
+A running error analysis (Higham, section 3.3): beside every number its bound, in units of the last
+place u = 2^-24. It holds for both schedules, in any order of their sums, with or without fused
+multiplications. Bounds follow the magnitudes of the terms, not the results, which cancel.
 """
 
 from typing import NamedTuple
@@ -17,7 +18,9 @@ EXP = LOG = 4
 
 
 class Analysed(NamedTuple):
-    """Values in float64 and bounds of their float32 errors, as `schedule` returns them; whether every decision is sure."""
+    """Values in float64 and bounds of their float32 errors, as `schedule` returns them; whether
+    every decision is sure.
+    """
 
     features: np.ndarray
     transmittance: np.ndarray
@@ -28,7 +31,9 @@ class Analysed(NamedTuple):
 
 
 def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
-    """Arguments: as of a schedule, float32 numbers in float64; the cotangents of features (t, 4, p) and T (t, p)."""
+    """Arguments: as of a schedule, float32 numbers in float64; the cotangents of features (t, 4, p)
+    and T (t, p).
+    """
     items, starts, counts = (np.asarray(a) for a in lists)
     t, p = len(counts), grid.pixels
     features, transmittance = np.zeros((t, 4, p)), np.ones((t, p))
@@ -43,7 +48,8 @@ def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
         r00, r01, r11, log_opacity = row.T[2:6, :, None]
         px, py = np.asarray(grid.offsets(np.float64))
 
-        # raw = exp(log opacity - u^2 - v^2): the roundings of u and v are those of their four and two terms
+        # raw = exp(log opacity - u^2 - v^2): the roundings of u and v are those of their four and
+        # two terms
         u, v = r00 * (x - px) + r01 * (y - py), r11 * (y - py)
         b_u = 5 * (abs(r00) * (abs(x) + abs(px)) + abs(r01) * (abs(y) + abs(py)))
         b_v = 4 * abs(r11) * (abs(y) + abs(py))

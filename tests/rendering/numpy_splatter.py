@@ -1,9 +1,11 @@
-"""Gaussian splatting in float64 numpy, written from the formulas and sharing no code with the package, but for `NEAR` and the
-like, which are repeated here as numbers. A reference for small images: everything is held for every Gaussian on every pixel.
+"""Gaussian splatting in float64 numpy, written from the formulas and sharing no code with the
+package, but for `NEAR` and the like, which are repeated here as numbers. A reference for small
+images: everything is held for every Gaussian on every pixel.
 
-EWA projection (Zwicker et al. 2001): cov2d = J W Sigma W^T J^T + eps2d I. With the singular value decomposition M = U S V^T
-of M = J W R diag(s), (2, 3), the quadratic form is sum_i (u_i . d)^2 / (S_i^2 + eps2d): accurate for needles of any length,
-and another formula than both the renderer's (Cholesky) and the reference's (cross products).
+EWA projection (Zwicker et al. 2001): cov2d = J W Sigma W^T J^T + eps2d I. With the singular value
+decomposition M = U S V^T of M = J W R diag(s), (2, 3), the quadratic form is sum_i (u_i . d)^2 /
+(S_i^2 + eps2d): accurate for needles of any length, and another formula than both the renderer's
+(Cholesky) and the reference's (cross products).
 """
 
 import numpy as np
@@ -46,7 +48,9 @@ def splat(means, quats, scales, opacities, colors, K, cam_from_world, background
 
 
 def rotations(quats):
-    """Rotation matrices (g, 3, 3): v + 2 w (q x v) + 2 q x (q x v) applied to the axes; a zero quaternion turns nothing."""
+    """Rotation matrices (g, 3, 3): v + 2 w (q x v) + 2 q x (q x v) applied to the axes; a zero
+    quaternion turns nothing.
+    """
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     w, q = np.split(
         np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0]), [1], axis=1

@@ -1,4 +1,6 @@
-"""Small scenes for the tests of splatting: every awkward Gaussian there is, in an image that no tile size divides."""
+"""Small scenes for the tests of splatting: every awkward Gaussian there is, in an image that no
+tile size divides.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,9 @@ COUNT = 32
 
 
 def random_gaussians(seed, dtype=np.float64, count=COUNT) -> Gaussians:
-    """Gaussians 2 to 4 m before the camera at the origin: blobs, and a few of each kind that asks for care."""
+    """Gaussians 2 to 4 m before the camera at the origin: blobs, and a few of each kind that asks
+    for care.
+    """
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 4, count)
     means = np.stack(

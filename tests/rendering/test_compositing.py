@@ -1,4 +1,6 @@
-"""Compositing of hand-made lists of splats, and its gradient, against the formula and autodiff of the formula."""
+"""Compositing of hand-made lists of splats, and its gradient, against the formula and autodiff of
+the formula.
+"""
 
 import functools
 

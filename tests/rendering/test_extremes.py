@@ -1,4 +1,6 @@
-"""Every extreme of docs/numerics.md, and random scenes over many decades: finite, and float32 close to float64."""
+"""Every extreme of docs/numerics.md, and random scenes over many decades: finite, and float32 close
+to float64.
+"""
 
 import dataclasses
 
@@ -16,16 +18,19 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.splatting import SplatConfig, render
 
 DECISION = 1e-5
-"""An image error beyond rounding: somewhere an alpha at 1/255, a transmittance at the stop or two depths fell the other
-way. Behind an alpha of 0.999 that may be a tenth: 2 of 3,000 scenes of the second sweep."""
+"""An image error beyond rounding: somewhere an alpha at 1/255, a transmittance at the stop or two
+depths fell the other way. Behind an alpha of 0.999 that may be a tenth: 2 of 3,000 scenes of the
+second sweep."""
 
 SWEEP_GRADIENT = 5e-2
-"""Relative L2 of any one gradient, natural units. Of 1,500 scenes of the first sweep, half are below 1.4e-5, 99 % below
-9e-4, all below 9e-3; of the second, with needles of 1e10 that are 1e8 pixels long, 1.1e-5, 7e-3, and one has 0.3."""
+"""Relative L2 of any one gradient, natural units. Of 1,500 scenes of the first sweep, half are
+below 1.4e-5, 99 % below 9e-4, all below 9e-3; of the second, with needles of 1e10 that are 1e8
+pixels long, 1.1e-5, 7e-3, and one has 0.3."""
 
 TYPICAL_GRADIENT = 1.4e-5
-"""Relative L2 of a gradient of an ordinary scene: the median of the sweep above. Without a bias the mean of n such errors has a
-standard deviation of TYPICAL_GRADIENT |g| / n; a biased one would be as large as TYPICAL_GRADIENT times the mean of |g|."""
+"""Relative L2 of a gradient of an ordinary scene: the median of the sweep above. Without a bias the
+mean of n such errors has a standard deviation of TYPICAL_GRADIENT |g| / n; a biased one would be as
+large as TYPICAL_GRADIENT times the mean of |g|."""
 
 
 SMALL = SplatConfig(block=4, chunk=4, max_pairs=256)
@@ -41,8 +46,9 @@ CASES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_case(case):
-    # With bounds divided by 3 two cases fail, for reasons that stand: bfloat16 itself rounds by 2^-9, half of its bound; for the
-    # needle of 1e6:1 one rounding of 6e-8 is 6e-4 of a gradient that is 1e-4 of its terms, and the bound 2e-3 allows three.
+    # With bounds divided by 3 two cases fail, for reasons that stand: bfloat16 itself rounds by
+    # 2^-9, half of its bound; for the needle of 1e6:1 one rounding of 6e-8 is 6e-4 of a gradient
+    # that is 1e-4 of its terms, and the bound 2e-3 allows three.
     outcome = cases.measure(case)
     case = dataclasses.replace(case, image=bound(case.image), gradient=bound(case.gradient))
     assert outcome.passes(case), outcome
@@ -95,8 +101,9 @@ def check_sweep(scene):
 
 
 def anything(seed, focal, nearest, farthest, smallest, largest):
-    """A random scene: every Gaussian has its own depth and three scales (metres), log-uniform within these ranges, any
-    opacity (some 0, 1 and 1 - 1e-7), a quaternion of any norm from 1e-20 to 1e15, and a place on or beside the image.
+    """A random scene: every Gaussian has its own depth and three scales (metres), log-uniform
+    within these ranges, any opacity (some 0, 1 and 1 - 1e-7), a quaternion of any norm from 1e-20
+    to 1e15, and a place on or beside the image.
     """
     rng, count = np.random.default_rng(seed), cases.COUNT
     scene = cases.ordinary(seed)

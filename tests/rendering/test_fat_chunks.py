@@ -1,4 +1,6 @@
-"""The accelerator's schedule of compositing against the CPU's, on the renderer's own lists and on lists made by hand."""
+"""The accelerator's schedule of compositing against the CPU's, on the renderer's own lists and on
+lists made by hand.
+"""
 
 import functools
 from unittest import mock
@@ -19,7 +21,10 @@ from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists, sort_into_tiles
 
 EXACT = 1e-10
-"""In float64, relative to the largest entry. In float32 each entry has its own bound, see compositing_rounding.py."""
+"""In float64, relative to the largest entry.
+
+In float32 each entry has its own bound, see compositing_rounding.py.
+"""
 
 K = compositing.CHUNK
 GRID = TileGrid(21, 13, 8)  # six tiles
@@ -32,7 +37,9 @@ PER_STEP = 3
 
 
 def by_hand(seed, lengths, dtype, grid=GRID, opacities=(0.05, 1.0)):
-    """Splats around the first tiles, and for each tile a list of as many of them as `lengths` says, in depth order."""
+    """Splats around the first tiles, and for each tile a list of as many of them as `lengths` says,
+    in depth order.
+    """
     rng, tile = np.random.default_rng(seed), grid.tile_size
     xy = rng.uniform(-0.6, 3.1, (SPLATS, 2)) * tile
     shape = rng.uniform([0.16, -0.8, 0.16], 0.8, (SPLATS, 3)) / tile
@@ -124,8 +131,8 @@ def assert_rounded(found, exact):
 def assert_equal_in_float32(splats, lists, grid, config, per_step=1024):
     """Each schedule against the same numbers in float64, entry by entry.
 
-    Measured: errors reach 0.2 of the bounds of the images, 0.04 of those of the sums, whose first columns cancel. A mistake
-    in a formula would show in float64, to 1e-10.
+    Measured: errors reach 0.2 of the bounds of the images, 0.04 of those of the sums, whose first
+    columns cancel. A mistake in a formula would show in float64, to 1e-10.
     """
     ours, expected = (
         run(FAT, splats, lists, grid, config, per_step),

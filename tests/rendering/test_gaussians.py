@@ -63,7 +63,9 @@ def test_both_modes_agree_on_rigid_transforms():
 
 
 def test_a_blend_of_rotations_leaves_a_short_quaternion():
-    """As published: half a turn of 90 degrees and none at all is no rotation, and the norm shows it."""
+    """As published: half a turn of 90 degrees and none at all is no rotation, and the norm shows
+    it.
+    """
     rng = np.random.default_rng(2)
     quarter = quaternion.matrix_from_axis_angle(jnp.asarray([0.0, 0.0, np.pi / 2]))
     blend = transform.make(0.5 * (quarter + jnp.eye(3)), jnp.zeros(3))

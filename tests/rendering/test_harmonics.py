@@ -1,4 +1,6 @@
-"""Colors that depend on the direction of sight: the functions against scipy's, what turns them, what is drawn of them."""
+"""Colors that depend on the direction of sight: the functions against scipy's, what turns them,
+what is drawn of them.
+"""
 
 import functools
 
@@ -57,7 +59,9 @@ def test_the_functions_are_scipys_in_both_renderers(degree):
 
 
 def test_signs_and_order_are_the_published_ones():
-    """https://github.com/graphdeco-inria/diff-gaussian-rasterization: -y, z, -x; then -yz second, the zonal one in the middle."""
+    """https://github.com/graphdeco-inria/diff-gaussian-rasterization: -y, z, -x; then -yz second,
+    the zonal one in the middle.
+    """
     x, y, z = np.asarray([0.6, 0.0, 0.8]).tolist()
     got = np.stack(harmonics.basis(x, y, z, 15))
     np.testing.assert_allclose(

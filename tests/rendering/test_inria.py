@@ -1,7 +1,8 @@
-"""The preset `inria` against its conventions written out in numpy: what diff-gaussian-rasterization draws.
+"""The preset `inria` against its conventions written out in numpy: what diff-gaussian-rasterization
+draws.
 
-Pixels, tiles and squares are counted as there: pixel centres at whole numbers, tiles of 16, a splat on all pixels of the
-tiles that its square of three standard deviations meets, and on no other.
+Pixels, tiles and squares are counted as there: pixel centres at whole numbers, tiles of 16, a splat
+on all pixels of the tiles that its square of three standard deviations meets, and on no other.
 """
 
 import dataclasses
@@ -53,7 +54,8 @@ def project(gaussians, i, view):
     if p[2] <= 0.2:
         return None
     (fx, _, cx), (_, fy, cy) = K[0], K[1]
-    # INRIA's frustum is symmetric; for a shifted one the limits lie 0.3 half fields of view beyond each border
+    # INRIA's frustum is symmetric; for a shifted one the limits lie 0.3 half fields of view beyond
+    # each border
     low = np.asarray([-cx / fx - 0.3 * 0.5 * WIDTH / fx, -cy / fy - 0.3 * 0.5 * HEIGHT / fy])
     high = np.asarray(
         [(WIDTH - cx) / fx + 0.3 * 0.5 * WIDTH / fx, (HEIGHT - cy) / fy + 0.3 * 0.5 * HEIGHT / fy]

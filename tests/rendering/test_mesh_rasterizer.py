@@ -1,4 +1,6 @@
-"""The rasterizer against rays: every face meets every pixel's ray in float64 numpy, without edge functions."""
+"""The rasterizer against rays: every face meets every pixel's ray in float64 numpy, without edge
+functions.
+"""
 
 import itertools
 from typing import NamedTuple
@@ -19,7 +21,9 @@ from humangs_jax.rendering.mesh.rasterizer import (
 )
 
 PIXEL_ERROR = 1e-4
-"""Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few operations each."""
+"""Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few
+operations each.
+"""
 DEPTH_TIE = 1e-5
 """Relative depth difference below which float32 may order two faces either way."""
 SMALL_STEPS = RasterConfig(rows_per_step=64, fragments_per_step=128)
@@ -28,7 +32,9 @@ WIDTH, HEIGHT = 33, 21
 
 
 class RayReference(NamedTuple):
-    """What rays hit: (h, w) maps; `unsure` where an edge is within PIXEL_ERROR or two depths are within DEPTH_TIE."""
+    """What rays hit: (h, w) maps; `unsure` where an edge is within PIXEL_ERROR or two depths are
+    within DEPTH_TIE.
+    """
 
     face_ids: np.ndarray
     depth: np.ndarray
@@ -38,7 +44,9 @@ class RayReference(NamedTuple):
 
 
 def ray_reference(vertices, faces, camera, near=0.01):
-    """A ray z d hits the plane of a face where z d = [v0 v1 v2] b with the weights b adding up to 1."""
+    """A ray z d hits the plane of a face where z d = [v0 v1 v2] b with the weights b adding up to
+    1.
+    """
     transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
     points = np.asarray(vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
     v = points[np.asarray(faces)]  # (f, corner, xyz)
@@ -136,14 +144,17 @@ def flat_camera(width=WIDTH, height=HEIGHT):
 
 
 def draw(vertices, faces, camera, config=SMALL_STEPS):
-    """Padded by faces without area (harmless: see `test_bad_faces_are_harmless`), so that many tests share one compilation."""
+    """Padded by faces without area (harmless: see `test_bad_faces_are_harmless`), so that many
+    tests share one compilation.
+    """
     vertices, faces = jnp.asarray(vertices), jnp.asarray(faces, jnp.int32)
     vertices = jnp.pad(vertices, ((0, -len(vertices) % 128), (0, 0)))
     faces = jnp.pad(faces, ((0, -len(faces) % 128), (0, 0)))
     return rasterize_mesh(vertices, faces, camera, config)
 
 
-# --------------------------------------------------------------------------------------------- against rays
+# ---------------------------------------------------------------------------------------------
+# against rays
 
 
 @settings(max_examples=15, deadline=None)
@@ -172,7 +183,9 @@ def test_faces_smaller_than_pixels_equal_rays():
 
 
 def test_strong_perspective_equals_rays():
-    """A floor from under the camera to far away: weights linear in the image would be wrong by more than half."""
+    """A floor from under the camera to far away: weights linear in the image would be wrong by more
+    than half.
+    """
     vertices = np.array([[-40, 1, 0.3], [40, 1, 0.3], [-40, 1, 60], [40, 1, 60]], np.float32)
     faces = np.array([[0, 1, 2], [1, 3, 2]])
     camera = Camera.from_opencv([[20, 0, 16.2], [0, 20, 4.3], [0, 0, 1]], np.eye(4), WIDTH, HEIGHT)
@@ -191,11 +204,14 @@ def test_float64():
         check_against_rays(fragments, vertices, faces, camera, pixel_error=1e-11)
 
 
-# --------------------------------------------------------------------------------------------- watertight
+# ---------------------------------------------------------------------------------------------
+# watertight
 
 
 def grid(x, y):
-    """A sheet at z = 1 through the points x[i, j], y[i, j], cells cut along alternating diagonals."""
+    """A sheet at z = 1 through the points x[i, j], y[i, j], cells cut along alternating
+    diagonals.
+    """
     rows, columns = x.shape
     vertices = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
     faces = []
@@ -246,7 +262,8 @@ def test_fans_of_slivers_have_no_holes():
         assert (np.asarray(fragments.face_ids) >= 0).all()
 
 
-# --------------------------------------------------------------------------------------------- rules
+# ---------------------------------------------------------------------------------------------
+# rules
 
 SQUARE = np.array([[2, 2, 1], [12, 2, 1], [2, 12, 1], [12, 12, 1]], np.float32)
 SQUARE_FACES = np.array([[0, 1, 2], [1, 3, 2]])
@@ -283,7 +300,9 @@ def test_near_plane_drops_and_counts():
 
 @pytest.mark.slow
 def test_bad_faces_are_harmless():
-    """Points, segments, NaN, infinity and coordinates near the largest float leave the other faces as they are."""
+    """Points, segments, NaN, infinity and coordinates near the largest float leave the other faces
+    as they are.
+    """
     bad = np.array(
         [
             [7, 7, 1],
@@ -319,7 +338,9 @@ def test_bad_faces_are_harmless():
 
 
 def test_faces_without_area_cover_nothing():
-    """Three points on a line through a pixel centre, exactly, whose edge functions there are nothing but roundings."""
+    """Three points on a line through a pixel centre, exactly, whose edge functions there are
+    nothing but roundings.
+    """
     rng = np.random.default_rng(0)
     step = rng.integers(1, 1 << 18, (40, 1, 2)) * rng.choice([-1, 1], (40, 1, 2)) * 2.0**-20
     points = 0.5 + step * np.array([-3, 1, 5])[:, None]
@@ -356,7 +377,8 @@ def test_images_of_one_pixel_and_meshes_of_nothing():
     np.testing.assert_array_equal(image, np.broadcast_to([1.0, 2.0, 3.0], (HEIGHT, WIDTH, 3)))
 
 
-# --------------------------------------------------------------------------------------------- transformations
+# ---------------------------------------------------------------------------------------------
+# transformations
 
 
 @pytest.mark.slow

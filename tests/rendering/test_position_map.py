@@ -1,4 +1,6 @@
-"""Position maps against the release's own rasterizer (see `provenance` in data/mesh_crops.npz) and against geometry."""
+"""Position maps against the release's own rasterizer (see `provenance` in data/mesh_crops.npz) and
+against geometry.
+"""
 
 from pathlib import Path
 
@@ -19,7 +21,9 @@ STORED_AS_FLOAT16 = 5e-4
 DEPTH_ERROR = 1e-5
 """Two float32 rasterizers; depths are about 2.5."""
 GOURAUD_ERROR = 5e-5
-"""The highlight's 64th power magnifies roundings of the normals (1e-7) by 64, the interpolation adds a little."""
+"""The highlight's 64th power magnifies roundings of the normals (1e-7) by 64, the interpolation
+adds a little.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +68,9 @@ def test_maps_equal_the_release(golden, view):
 
 
 def test_vertex_normals():
-    """An octahedron's normals are its vertices; a vertex without faces, or of faces without area, has none."""
+    """An octahedron's normals are its vertices; a vertex without faces, or of faces without area,
+    has none.
+    """
     corners = np.concatenate([np.eye(3), -np.eye(3), np.full((2, 3), 5.0)])
     faces = [
         [0, 1, 2],

@@ -1,4 +1,6 @@
-"""EWA projection against the derivative of the pinhole camera, and where float32 and gradients are in danger."""
+"""EWA projection against the derivative of the pinhole camera, and where float32 and gradients are
+in danger.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -150,7 +152,10 @@ def test_reach_is_where_alpha_meets_its_threshold(float64):
 
 
 def test_gradient_along_the_long_axis_of_a_needle_is_accurate_in_float32():
-    """12 million pixels by 600. Autodiff through the determinant makes the gradient along as large as that across."""
+    """12 million pixels by 600.
+
+    Autodiff through the determinant makes the gradient along as large as that across.
+    """
     n = 6
     angles = np.linspace(0.1, 1.5, n)
     quats = np.stack([np.cos(angles), 0 * angles, 0.1 + 0 * angles, np.sin(angles)], axis=-1)

@@ -1,4 +1,6 @@
-"""The reference against closed forms: one Gaussian, two behind each other, the rules at their thresholds."""
+"""The reference against closed forms: one Gaussian, two behind each other, the rules at their
+thresholds.
+"""
 
 import jax
 import jax.numpy as jnp

@@ -46,7 +46,9 @@ def test_visibility_is_the_largest_weight():
 
 
 def wall_before(gaussians):
-    """An opaque wall, in three layers, between one camera and the Gaussians; another camera looks past it."""
+    """An opaque wall, in three layers, between one camera and the Gaussians; another camera looks
+    past it.
+    """
     n = 3
     wall = Gaussians(
         jnp.asarray([[0, 0, 1.0 + 0.01 * i] for i in range(n)]),

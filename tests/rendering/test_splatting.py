@@ -1,4 +1,6 @@
-"""The tiled renderer against the reference, and as a JAX function: jit, vmap, grad, checkpoint, export, its buffers."""
+"""The tiled renderer against the reference, and as a JAX function: jit, vmap, grad, checkpoint,
+export, its buffers.
+"""
 
 import dataclasses
 import functools
@@ -22,10 +24,14 @@ from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splatting import SplatConfig, render, render_views
 
 FLOAT64 = 1e-9
-"""Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the gradient."""
+"""Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the
+gradient.
+"""
 
 FLOAT32, FLOAT32_GRADIENT = 1e-4, 5e-3
-"""float32 against float64; gradients relative to the largest entry, Gaussians at the near plane included."""
+"""float32 against float64; gradients relative to the largest entry, Gaussians at the near plane
+included.
+"""
 
 CHUNKS = SplatConfig(block=4, chunk=4)
 """Several blocks, and several chunks of each, in a small image; also quick to compile."""
@@ -34,7 +40,9 @@ VIEW = (HEIGHT, WIDTH)
 
 
 def loss_weights():
-    """The loss is a random linear function of everything a rendering holds, so no gradient can hide."""
+    """The loss is a random linear function of everything a rendering holds, so no gradient can
+    hide.
+    """
     rng = np.random.default_rng(7)
     return rng.normal(size=(*VIEW, 3)), rng.normal(size=VIEW), rng.normal(size=VIEW)
 
@@ -136,7 +144,9 @@ def test_an_image_in_bands_is_the_image(most):
 
 @pytest.mark.slow
 def test_gradients_are_derivatives():
-    """Central differences, with decisions that do not flip at this seed and no alpha at the clamp."""
+    """Central differences, with decisions that do not flip at this seed and no alpha at the
+    clamp.
+    """
     with jax.enable_x64(True):
         gaussians, step = random_gaussians(11), 1e-6
         gaussians = replace(gaussians, opacities=gaussians.opacities.at[:15].multiply(0.9))

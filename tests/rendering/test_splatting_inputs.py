@@ -1,4 +1,6 @@
-"""What `render` and `render_views` say of inputs that they cannot draw, and that transformations are left alone."""
+"""What `render` and `render_views` say of inputs that they cannot draw, and that transformations
+are left alone.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,10 @@ def scene():
 
 
 def test_a_batch_of_cameras_is_told_where_to_go():
-    words = r"render draws one camera, got a batch \(3,\): use render_views\(gaussians, cameras\), or jax.vmap"
+    words = (
+        r"render draws one camera, got a batch \(3,\): use render_views\(gaussians, cameras\), or"
+        r" jax.vmap"
+    )
     for draw in (render, jax.jit(render)):
         with pytest.raises(ValueError, match=words):
             draw(scene(), BATCH)

@@ -1,6 +1,8 @@
-"""Tile lists against plain numpy: the same pairs in the same order, whether the packed key fits or not.
+"""Tile lists against plain numpy: the same pairs in the same order, whether the packed key fits or
+not.
 
-And the pairs of splats against geometry by brute force: the least d^T cov^-1 d over every tile's rectangle of pixel centres.
+And the pairs of splats against geometry by brute force: the least d^T cov^-1 d over every tile's
+rectangle of pixel centres.
 """
 
 import functools
@@ -120,7 +122,9 @@ def count(footprints, grid):
 
 
 def least_distance(e, i, tile):
-    """min of d^T cov^-1 d over the tile's rectangle: 0 if the centre is inside, else on its border."""
+    """min of d^T cov^-1 d over the tile's rectangle: 0 if the centre is inside, else on its
+    border.
+    """
     cov = np.asarray([[e.xx[i], e.xy[i]], [e.xy[i], e.yy[i]]], np.float64)
     low = np.asarray([tile % GRID.columns, tile // GRID.columns]) * GRID.tile_size + 0.5
     high = low + GRID.tile_size - 1

@@ -18,7 +18,9 @@ make_update = step.compiled_update.__wrapped__
 
 @functools.cache
 def quick_update():
-    """`compiled_update()` without LLVM's optimisations: 37 CPU seconds of compilation for `tiny` instead of 74."""
+    """`compiled_update()` without LLVM's optimisations: 37 CPU seconds of compilation for `tiny`
+    instead of 74.
+    """
     with mock.patch.dict(CPU_COMPILER_OPTIONS, {"xla_backend_optimization_level": 0}):
         return make_update()
 
@@ -50,7 +52,9 @@ def captures(body, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def variables():
-    """Fresh variables of `tiny`; without LLVM's optimisations the many small random draws compile four times faster."""
+    """Fresh variables of `tiny`; without LLVM's optimisations the many small random draws compile
+    four times faster.
+    """
     draw = jax.jit(
         init_humangs.__wrapped__,
         static_argnames="config",

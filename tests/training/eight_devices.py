@@ -25,7 +25,9 @@ def on_mesh(specs, mesh):
 
 
 def a_linear_model():
-    """A state divided among 8 or 4 devices: values survive, the gradient of the mean is that of one device."""
+    """A state divided among 8 or 4 devices: values survive, the gradient of the mean is that of one
+    device.
+    """
     generator = np.random.default_rng(0)
     params = {
         "kernel": generator.normal(size=(64, 48)).astype(np.float32),
@@ -59,8 +61,8 @@ def a_linear_model():
 
 
 def a_training_step():
-    """Loss, gradients, batch statistics and metrics of 8 subjects on 8 devices, all dividing the state or 4, are those of
-    one device that works on all 8 at once."""
+    """Loss, gradients, batch statistics and metrics of 8 subjects on 8 devices, all dividing the
+    state or 4, are those of one device that works on all 8 at once."""
     from training_cases import tube, write_subject
 
     from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader

@@ -12,7 +12,9 @@ WITHOUT = {"no class token": {CLASS_TOKEN: False}}
 
 @pytest.fixture
 def trained(monkeypatch, tmp_path):
-    """The runs that were asked for; the score of one is its seed, and 1 more without the class token and for seed 2."""
+    """The runs that were asked for; the score of one is its seed, and 1 more without the class
+    token and for seed 2.
+    """
     runs = []
 
     def stand_in(config, body, people, folder, **how):
@@ -82,7 +84,8 @@ def test_a_budget_that_was_too_small_says_which_would_do(trained, tmp_path, monk
     times = iter(range(0, 10_000, 40))
     monkeypatch.setattr(ablation.time, "monotonic", lambda: float(next(times)))
     result = run(tmp_path, validation=[], seeds=2, budget="2min")
-    said = 'a run took up to 40s: the same call goes on, budget="3min" would do for the rest'  # 3 x 40 s, and a tenth
+    # 3 x 40 s, and a tenth
+    said = 'a run took up to 40s: the same call goes on, budget="3min" would do for the rest'
     assert said in str(result).splitlines()
     assert run(tmp_path, validation=[], seeds=2, budget="3h").missing == 0
 

@@ -145,7 +145,9 @@ def test_every_example_has_its_exposures_a_share_the_rest_and_targets_keep_photo
 
 
 def _check_one_gain_a_channel(images, before):
-    """Whole pixels of the person have the ratio of their photo, the background is as white as before."""
+    """Whole pixels of the person have the ratio of their photo, the background is as white as
+    before.
+    """
     for image, own, mask in zip(
         *map(np.asarray, (images, before.images, before.masks)), strict=True
     ):

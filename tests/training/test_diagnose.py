@@ -1,4 +1,6 @@
-"""Diagnosis of a step: its numbers are the step's, and what is planted in one place is named there and nowhere else."""
+"""Diagnosis of a step: its numbers are the step's, and what is planted in one place is named there
+and nowhere else.
+"""
 
 import dataclasses
 import functools
@@ -214,7 +216,9 @@ class Network(nn.Module):
 
 
 def test_gradients_are_known_where_a_stage_takes_and_gives():
-    """Of modules by their path, and of a step beside the network, whose entries have their users told apart."""
+    """Of modules by their path, and of a step beside the network, whose entries have their users
+    told apart.
+    """
 
     class Whole(nn.Module):
         reader: nn.Module
@@ -373,7 +377,9 @@ def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(
 
 @pytest.mark.slow
 def test_networks_of_other_parts_have_the_same_stages(monkeypatch, body, batch):
-    """Blocks in a loop and recomputed, all patches, no upsampler, corrected skinning weights, rotated quaternions."""
+    """Blocks in a loop and recomputed, all patches, no upsampler, corrected skinning weights,
+    rotated quaternions.
+    """
     decoder = dataclasses.replace(CONFIG.model.architecture.decoder, skinning_joints=2)
     model = without_upsampler(CONFIG.model).with_parts(decoder=decoder)
     model = model.with_conventions(skinning="rotation").with_runtime(

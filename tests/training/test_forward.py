@@ -60,7 +60,9 @@ def drawn_for_training(gaussians, targets):
 
 
 def test_the_spread_of_rays_does_not_depend_on_harmonics():
-    """It is that of the depths: drawn as a color, a depth would get harmonics added, and be cut at 0."""
+    """It is that of the depths: drawn as a color, a depth would get harmonics added, and be cut at
+    0.
+    """
     gaussians, targets = layered(), one_target()
     drawn = drawn_for_training(gaussians, targets)
     z = gaussians.means[:, 2] - jnp.mean(gaussians.means[:, 2])
@@ -79,7 +81,9 @@ def test_the_spread_of_rays_does_not_depend_on_harmonics():
 
 
 def test_without_harmonics_the_spread_is_what_it_was():
-    """The loss of weights that were trained with it: depths drawn as the first two channels of a color."""
+    """The loss of weights that were trained with it: depths drawn as the first two channels of a
+    color.
+    """
     gaussians, targets = replace(layered(1), harmonics=None), one_target()
     drawn = drawn_for_training(gaussians, targets)
     z = gaussians.means[:, 2] - jnp.mean(gaussians.means[:, 2])

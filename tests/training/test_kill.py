@@ -17,7 +17,9 @@ def finished_checkpoints(out):
 
 
 def kill_in_a_checkpoint_write(arguments, out, delay):
-    """Start a run, wait until a checkpoint is being written, wait a little more, kill; the newest checkpoint there was."""
+    """Start a run, wait until a checkpoint is being written, wait a little more, kill; the newest
+    checkpoint there was.
+    """
     process = subprocess.Popen(
         [*worker(), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

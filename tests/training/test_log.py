@@ -1,4 +1,6 @@
-"""The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads the same numbers."""
+"""The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads
+the same numbers.
+"""
 
 import json
 import re
@@ -137,7 +139,9 @@ def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
 
 
 def watched(folder, steps, bad_samples=list, before=0):
-    """What the log has after `Watch` saw steps: number, skipped and nonfinite so far, loss, norm of the gradient."""
+    """What the log has after `Watch` saw steps: number, skipped and nonfinite so far, loss, norm of
+    the gradient.
+    """
     names = ("skipped", "nonfinite", "loss", "grad_norm")
     state = TrainState(
         jnp.asarray(0), {}, {}, GuardState(*[jnp.asarray(before)] * 2, jnp.zeros(()), ()), None

@@ -1,4 +1,6 @@
-"""The loop: resume is bitwise, signals save, people it never saw are looked at, nothing is left out in silence."""
+"""The loop: resume is bitwise, signals save, people it never saw are looked at, nothing is left out
+in silence.
+"""
 
 import dataclasses
 import json

@@ -1,4 +1,6 @@
-"""The gradient of every loss term against differences, in float64: relative error of derivatives in random directions."""
+"""The gradient of every loss term against differences, in float64: relative error of derivatives in
+random directions.
+"""
 
 import dataclasses
 
@@ -21,16 +23,18 @@ from humangs_jax.training.forward import draw_targets, reconstruct_example, whit
 from humangs_jax.training.step import subject_loss
 
 OWN = 1e-7
-"""Central differences of step h: h^2 of truncation and 1e-16 / h of rounding; terms with corners have some within a step."""
+"""Central differences of step h: h^2 of truncation and 1e-16 / h of rounding; terms with corners
+have some within a step.
+"""
 WHOLE = 1e-4
-"""Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha) within a step, and some
-Gaussians exchange places in the depth order."""
+"""Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha)
+within a step, and some Gaussians exchange places in the depth order."""
 NETWORKS = ("perceptual", "vgg16", "lpips")
 """Terms that need a network of their own."""
 SIDE, TARGETS, VERTICES = 32, 2, 800
 STEP_SIZES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
-"""Of central differences, relative to the size of what is varied. Thousands of Gaussians move: within the longer steps some
-exchange places in the depth order, and colors jump."""
+"""Of central differences, relative to the size of what is varied. Thousands of Gaussians move:
+within the longer steps some exchange places in the depth order, and colors jump."""
 TERMS = [
     each.name
     for each in dataclasses.fields(LossConfig)
@@ -46,7 +50,9 @@ def loss_of(names):
 
 
 def agreement(values, point, names, directions=3, steps=STEP_SIZES):
-    """{term: relative error of its derivatives}. values: point -> {term: number}; differentiable. point: a tree of float64."""
+    """{term: relative error of its derivatives}. values: point -> {term: number}; differentiable.
+    point: a tree of float64.
+    """
     vector = jax.jit(lambda point: jnp.stack([values(point)[name] for name in names]))
     gradient = jax.jit(jax.grad(lambda point, weights: jnp.dot(weights, vector(point))))
     rng = np.random.default_rng(0)

@@ -1,7 +1,7 @@
 """One subject, overfitted: what the network and its training are able to say at all.
 
-A synthetic person of the package, four photos of 128 x 128, which are inputs and targets alike. The network is
-small, has its upsampler, and starts from nothing.
+A synthetic person of the package, four photos of 128 x 128, which are inputs and targets alike. The
+network is small, has its upsampler, and starts from nothing.
 """
 
 import dataclasses
@@ -30,7 +30,9 @@ SIZE, STEPS = 128, 280
 GOAL = 35.0
 """dB, mean over the views."""
 CPU_SECONDS = 1200.0
-"""Limit, CPU seconds of all threads, with compilation: 342 on an idle machine, 814 beside three other programs."""
+"""Limit, CPU seconds of all threads, with compilation: 342 on an idle machine, 814 beside three
+other programs.
+"""
 
 
 def configuration() -> TrainConfig:

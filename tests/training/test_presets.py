@@ -1,4 +1,6 @@
-"""Every preset makes a step on all kinds of people that `humangs train` accepts: on disk, in a data set, made on the fly."""
+"""Every preset makes a step on all kinds of people that `humangs train` accepts: on disk, in a data
+set, made on the fly.
+"""
 
 import dataclasses
 import logging
@@ -32,7 +34,9 @@ KINDS = ("captures", "data set", "mixture")
 
 
 def shrunk(name):
-    """The preset with its losses, conventions and schedule, and a network, views and bodies of the smallest sizes."""
+    """The preset with its losses, conventions and schedule, and a network, views and bodies of the
+    smallest sizes.
+    """
     config = fitting_losses(PRESETS[name](), NO_NETWORKS)
     parts = config.model.architecture
     upsampler = parts.encoder.upsampler and dataclasses.replace(parts.encoder.upsampler, hidden=8)

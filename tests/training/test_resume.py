@@ -1,4 +1,6 @@
-"""A run that is interrupted and continued is the run that was not, on one device, on several, and of several processes."""
+"""A run that is interrupted and continued is the run that was not, on one device, on several, and
+of several processes.
+"""
 
 import signal
 
@@ -13,7 +15,8 @@ from humangs_jax.training.checkpoint import Checkpoints
 from humangs_jax.training.state import init_state
 
 ACROSS = 1e-5
-"""Between arrangements of devices, whose sums run in other orders; parameters move by 1e-4 a step."""
+"""Between arrangements of devices, whose sums run in other orders; parameters move by 1e-4 a step.
+"""
 
 
 def state_of(out, step):

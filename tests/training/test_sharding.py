@@ -1,4 +1,6 @@
-"""Divided states: what is gathered is whole, gradients come back as parts of the mean, eight devices agree with one."""
+"""Divided states: what is gathered is whole, gradients come back as parts of the mean, eight
+devices agree with one.
+"""
 
 import inspect
 import subprocess

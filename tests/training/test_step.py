@@ -176,7 +176,8 @@ def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradien
     # without batch statistics, which are meant to differ
     config = dataclasses.replace(CONFIG, model=without_upsampler(CONFIG.model))
     variables = init_humangs(jax.random.key(0), config.model)
-    # in float32 the last bit decides whether a Gaussian counts in a pixel, which is 0.3 % of the gradient of a bias here
+    # in float32 the last bit decides whether a Gaussian counts in a pixel, which is 0.3 % of the
+    # gradient of a bias here
     double = lambda x: x.astype(jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
     with jax.enable_x64(True):
         params, body, batch = jax.tree.map(double, (variables["params"], body, batch))
@@ -242,7 +243,8 @@ def test_fewer_photos_have_their_share_of_the_token_capacity():
     ]
 
 
-# what a step does with its parts, each of which is exchanged for a plain one; types are not checked there
+# what a step does with its parts, each of which is exchanged for a plain one; types are not checked
+# there
 
 
 PLAIN = dataclasses.replace(
@@ -254,8 +256,8 @@ PLAIN = dataclasses.replace(
 
 @pytest.fixture
 def plain_update(monkeypatch):
-    """f(state, loss) -> the state after `update` with a gradient of 1 and statistics that are larger by 1, and the keys that it
-    gave to the subjects of a batch of 2.
+    """f(state, loss) -> the state after `update` with a gradient of 1 and statistics that are
+    larger by 1, and the keys that it gave to the subjects of a batch of 2.
     """
 
     def updated(state, loss=0.0):

@@ -1,4 +1,6 @@
-"""The comparison systems overfit to one person, by the same training step as the paper's network."""
+"""The comparison systems overfit to one person, by the same training step as the paper's
+network.
+"""
 
 import dataclasses
 

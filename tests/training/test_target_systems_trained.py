@@ -1,4 +1,6 @@
-"""Systems that run again for every target learn one person by the same loop, losses, validation and evaluator as all others."""
+"""Systems that run again for every target learn one person by the same loop, losses, validation and
+evaluator as all others.
+"""
 
 import dataclasses
 import json
@@ -26,7 +28,9 @@ STEPS, VIEWS, SIZE = 80, 4, 32
 MORE_STEPS = {"lca": 240}
 """Points that attend to tokens learn slowly."""
 FALL = 2.0
-"""Least factor by which the squared error falls; measured: lvsm 4.9, humanram 4.2, giga 4.6, animatable 3.4, lca 2.9."""
+"""Least factor by which the squared error falls; measured: lvsm 4.9, humanram 4.2, giga 4.6,
+animatable 3.4, lca 2.9.
+"""
 
 
 def configuration(name: str) -> TrainConfig:

@@ -1,4 +1,6 @@
-"""What no run should die of: nothing to see, one view, one Gaussian per vertex, Gaussians far away, bad photos, wild rates."""
+"""What no run should die of: nothing to see, one view, one Gaussian per vertex, Gaussians far away,
+bad photos, wild rates.
+"""
 
 import dataclasses
 
@@ -38,7 +40,9 @@ def step_without_harm(state, batch, body, config=CONFIG):
 
 
 def without_person(views, which):
-    """Views (leading axis of subjects) of which some show background alone: nobody in the photo, the body beside it."""
+    """Views (leading axis of subjects) of which some show background alone: nobody in the photo,
+    the body beside it.
+    """
     cameras = views.cameras
     return replace(
         views,
@@ -134,7 +138,9 @@ def test_a_bad_photo_costs_its_step_and_the_run_goes_on(body, batch, variables, 
 
 
 def with_geometry(state, free_offset=0.0, log_scale=None):
-    """A state whose free Gaussians start at an offset from their vertex, and all of them at a scale (its softplus)."""
+    """A state whose free Gaussians start at an offset from their vertex, and all of them at a scale
+    (its softplus).
+    """
     bias = state.params["decoder"]["geometry_out"]["bias"]
     rows = bias.reshape(-1, 10)
     rows = rows.at[1:, :3].set(free_offset)

@@ -1,4 +1,6 @@
-"""Validation: the same views every time, as many as in the middle of the training's counts, and how they are laid out."""
+"""Validation: the same views every time, as many as in the middle of the training's counts, and how
+they are laid out.
+"""
 
 import dataclasses
 

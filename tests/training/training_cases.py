@@ -1,4 +1,6 @@
-"""A body of 64 vertices, made-up captures of it, and what runs on them: enough to train on in seconds."""
+"""A body of 64 vertices, made-up captures of it, and what runs on them: enough to train on in
+seconds.
+"""
 
 import dataclasses
 
@@ -54,7 +56,9 @@ def tube():
 
 
 def draw_points(points, colors, camera):
-    """Points painted far to near into an image on white, with its mask; numpy, so that nothing needs compiling."""
+    """Points painted far to near into an image on white, with its mask; numpy, so that nothing
+    needs compiling.
+    """
     K, cam_from_world = np.asarray(camera.K), np.asarray(camera.cam_from_world)
     seen = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
     order = np.argsort(-seen[:, 2])

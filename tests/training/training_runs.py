@@ -29,7 +29,9 @@ def run(*arguments):
 
 @contextlib.contextmanager
 def several(count, *arguments):
-    """So many processes that train together, as `Popen`s whose output can be read; killed on the way out."""
+    """So many processes that train together, as `Popen`s whose output can be read; killed on the
+    way out.
+    """
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]

@@ -1,4 +1,5 @@
-"""The page in a browser: its images against `hg.render`, motions dropped onto it, its controls. Software WebGL.
+"""The page in a browser: its images against `hg.render`, motions dropped onto it, its controls.
+Software WebGL.
 
 On Debian: `apt-get install chromium chromium-driver`.
 """
@@ -29,8 +30,8 @@ pytestmark = [
 ]
 
 WHOLE, PERSON = 55.0, 48.0
-"""dB. Asked for are 38 and 30; measured 65 and 56, which is what 8 bits of the screenshot leave (10 log10(12 255^2) = 58.9 where
-there is anything to round)."""
+"""dB. Asked for are 38 and 30; measured 65 and 56, which is what 8 bits of the screenshot leave (10
+log10(12 255^2) = 58.9 where there is anything to round)."""
 SIZE = 384
 ANGLE = 2e-3
 """Radians: motions are stored in steps of a ten thousandth, and a chain of joints adds them up."""
@@ -111,18 +112,19 @@ def test_localhost_shows_the_same_page(page_file):
 
 
 def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
-    """The taller person's joints are where the body model has them, and the person stands on the floor."""
-    browser.run(
-        """document.querySelector("[data-mode=rest]").click();
+    """The taller person's joints are where the body model has them, and the person stands on the
+    floor.
+    """
+    browser.run("""document.querySelector("[data-mode=rest]").click();
         document.querySelector("#shape-section details").open = true;
         const slider = document.querySelector("#shape input[title=height]");
         slider.value = Number(slider.value) + 1;
         slider.dispatchEvent(new Event("input"));
-        await humangs.settle();"""
-    )
+        await humangs.settle();""")
     taller, view = content_height(browser), browser.run("return humangs.view()")
     said = browser.run(
-        "return [...document.querySelectorAll('#shape .slider')].map((row) => row.innerText.split(/\\s*\\n\\s*/))"
+        "return [...document.querySelectorAll('#shape .slider')].map((row) =>"
+        " row.innerText.split(/\\s*\\n\\s*/))"
     )
     browser.run("document.getElementById('reset-shape').click(); await humangs.settle();")
     assert taller > content_height(browser) * 1.01
@@ -146,15 +148,13 @@ def content_height(browser):
 
 
 def test_a_joint_slider_turns_its_joint_and_reset_turns_it_back(browser):
-    browser.run(
-        """document.querySelector("[data-mode=rest]").click();
+    browser.run("""document.querySelector("[data-mode=rest]").click();
         for (const group of document.querySelectorAll("#joints details")) group.open = true;
         await new Promise((resolve) => setTimeout(resolve, 300));
         const slider = document.querySelector("#joints input[title^='left elbow, about y']");
         slider.value = -40;
         slider.dispatchEvent(new Event("input"));
-        await humangs.settle();"""
-    )
+        await humangs.settle();""")
     turned = np.asarray(browser.run("return humangs.view().rotations"))
     expected = np.zeros_like(turned)
     expected[JOINT_NAMES.index("left_elbow"), 1] = np.radians(-40)
@@ -192,14 +192,16 @@ def test_keys_and_mouse_do_what_the_help_says(browser):
     )
     drag.move_by_offset(120, 0).release().perform()
     turned = np.asarray(state()["cam_from_world"])
-    # to the right: the camera goes to the left about the vertical axis, at the same distance from the target
+    # to the right: the camera goes to the left about the vertical axis, at the same distance from
+    # the target
     assert np.degrees(np.arccos(np.clip(turned[2, :3] @ before[2, :3], -1, 1))) > 10
     assert turned[2, 3] == pytest.approx(before[2, 3], abs=1e-4)
     ActionChains(browser.driver).double_click(canvas).perform()
     np.testing.assert_allclose(state()["cam_from_world"], before, atol=1e-6)
 
 
-# ---- motions that are dropped onto the page ----------------------------------------------------------------------------
+# ---- motions that are dropped onto the page
+# ----------------------------------------------------------------------------
 
 
 def drop(browser, name, content):

@@ -1,4 +1,7 @@
-"""The page as a file, on localhost and in a notebook; the commands that make it. What it draws: test_browser.py."""
+"""The page as a file, on localhost and in a notebook; the commands that make it.
+
+What it draws: test_browser.py.
+"""
 
 import html
 import json
@@ -67,7 +70,9 @@ def test_a_joint_may_have_any_name():
 
 
 def test_shape_sliders_come_with_the_shipped_body_and_vertex_major_gaussians():
-    """Also where those between the legs have weights of their own; not where refinement has added Gaussians."""
+    """Also where those between the legs have weights of their own; not where refinement has added
+    Gaussians.
+    """
     body, each = load_body(), 3
     rest = shape_body(body, jnp.zeros(body.shape_directions.shape[-1]))
     means = jnp.repeat(rest.vertices, each, axis=0)
@@ -171,7 +176,8 @@ def test_view_opens_the_browser_and_ends_quietly(avatar_file, monkeypatch, capsy
     )
 
 
-# Live: what is followed, and, where a browser is at hand, that it shows the newest Gaussians ---------------------------------
+# Live: what is followed, and, where a browser is at hand, that it shows the newest Gaussians
+# ---------------------------------
 
 
 class Shown(page.LiveView):
@@ -305,7 +311,8 @@ def test_a_browser_sees_the_person_and_the_next_one(person):
         assert wait_for(browser, 0)
         near = browser.run(
             inside
-            + "const kept = page.state(); kept.orbit.distance *= 0.8; page.restore(kept); return kept"
+            + "const kept = page.state(); kept.orbit.distance *= 0.8; page.restore(kept); return"
+            " kept"
         )
         view.show(blue)
         assert wait_for(browser, 2) and share(browser, 0) < 0.01

@@ -1,4 +1,6 @@
-"""What people do with the page in a browser: save, record, ask for help, embed it; and where it cannot work."""
+"""What people do with the page in a browser: save, record, ask for help, embed it; and where it
+cannot work.
+"""
 
 import base64
 import io
@@ -156,7 +158,8 @@ def test_an_image_has_the_size_of_the_page_though_it_plays_at_half_of_it(browser
     assert lower_the_resolution(browser) == [WIDTH / 2, HEIGHT / 2]
     if not playing:
         browser.run(
-            "document.getElementById('play').click(); await new Promise((resolve) => setTimeout(resolve, 600));"
+            "document.getElementById('play').click(); await new Promise((resolve) =>"
+            " setTimeout(resolve, 600));"
         )
     assert saved_image(browser, 1, False).shape == (HEIGHT, WIDTH, 4)
     size = browser.run(
@@ -214,7 +217,8 @@ def frames_of(video):
 
 def test_a_video_shows_the_motion_without_controls(browser, tmp_path):
     browser.run(
-        "document.getElementById('record-video').click(); await new Promise((resolve) => setTimeout(resolve, 2500));"
+        "document.getElementById('record-video').click(); await new Promise((resolve) =>"
+        " setTimeout(resolve, 2500));"
     )
     assert visible(browser, CONTROLS) == [] and visible(browser, ["stop-video"]) == ["stop-video"]
     assert "playing" in browser.run("return document.body.className")
@@ -350,8 +354,7 @@ def test_a_motion_without_a_rate_is_a_question_not_an_end(browser, size):
 
 
 def test_another_rate_may_be_given_at_any_time(browser):
-    seconds = browser.run(
-        """const field = document.getElementById("fps"), shown = async () => {
+    seconds = browser.run("""const field = document.getElementById("fps"), shown = async () => {
           await new Promise((resolve) => setTimeout(resolve, 300));
           return document.getElementById("time").textContent.split("/")[1];
         };
@@ -361,12 +364,12 @@ def test_another_rate_may_be_given_at_any_time(browser):
           field.dispatchEvent(new Event("change"));
           found.push(await shown());
         }
-        return found;"""
-    )
+        return found;""")
     assert seconds == [" 2.0 s", " 1.0 s", " 1.0 s"]
 
 
-# In another page ---------------------------------------------------------------------------------------------------------
+# In another page
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -419,8 +422,10 @@ def test_an_address_may_ask_for_a_colour_a_pose_and_a_time(embedded):
 def test_an_option_that_is_wrong_is_named_and_others_are_ignored(embedded):
     browser = embedded("background=sky&time=-1&v=3&constructor=1")
     said = browser.run("return document.getElementById('message').textContent")
-    assert said == (
-        "background=sky: expected transparent, or six digits such as ffcc00; time=-1: expected seconds of the motion, such as 1.5"
+    assert (
+        said
+        == "background=sky: expected transparent, or six digits such as ffcc00; time=-1: expected"
+        " seconds of the motion, such as 1.5"
     )
     assert browser.run("return humangs.view()")["frame"] < 48 and "#f6f5f2" in browser.run(
         "return document.querySelector('#swatches [aria-pressed=true]').title"

@@ -1,4 +1,6 @@
-"""The page's own readers of motions against Python's, on the same files: node runs the scripts as they are put into the page."""
+"""The page's own readers of motions against Python's, on the same files: node runs the scripts as
+they are put into the page.
+"""
 
 import functools
 import io
@@ -43,7 +45,8 @@ scene.order = jointOrder(scene.parents);
 
 
 def page_reads(files, names=JOINT_NAMES, parents=PARENTS, rest=None):
-    """What the page makes of files, [(name, bytes)]; frames per second and the index of the clip may follow.
+    """What the page makes of files, [(name, bytes)]; frames per second and the index of the clip
+    may follow.
 
     Motions as JSON, or {"error": ..., "asksRate": ...}.
     """
@@ -83,7 +86,9 @@ def dance(frames=4, names=MIXAMO, seed=0):
 
 
 def other_person():
-    """Longer shins, shorter thighs, wider hips; the lowest joint of the spine lies in the pelvis."""
+    """Longer shins, shorter thighs, wider hips; the lowest joint of the spine lies in the
+    pelvis.
+    """
     rest, stretch = (
         shipped_joints(),
         {"knee": 0.85, "ankle": 1.2, "hip": 1.3, "elbow": 1.1, "spine1": 0.0},
@@ -132,13 +137,15 @@ def skeletons():
         "Hips": "J_Hips",
     }
     for kind, names in {
-        "Unity": {ours: unity.get(theirs, theirs) for ours, theirs in CMU.items()}
-        | {
-            ours: theirs[: -len(w)] + unity[w]
-            for w in unity
-            for ours, theirs in CMU.items()
-            if theirs in ("Left" + w, "Right" + w)
-        },
+        "Unity": (
+            {ours: unity.get(theirs, theirs) for ours, theirs in CMU.items()}
+            | {
+                ours: theirs[: -len(w)] + unity[w]
+                for w in unity
+                for ours, theirs in CMU.items()
+                if theirs in ("Left" + w, "Right" + w)
+            }
+        ),
         "unknown": {ours: f"part {i}" for i, ours in enumerate(CMU)},
         "Rigify": CMU | {"pelvis": "spine", "neck": "spine.004", "head": "spine.006"},
         "no toes": {ours: theirs for ours, theirs in CMU.items() if not ours.endswith("_foot")},
@@ -203,10 +210,10 @@ def array_files():
         },
         "parts": parts | hands,
         "parts of SMPL": parts | {"body_pose": np.pad(parts["body_pose"], ((0, 0), (0, 6)))},
-        "matrices": {
-            key: matrices(x).reshape(4, -1, 3, 3) for key, x in parts.items() if key != "transl"
-        }
-        | {"transl": trans},
+        "matrices": (
+            {key: matrices(x).reshape(4, -1, 3, 3) for key, x in parts.items() if key != "transl"}
+            | {"transl": trans}
+        ),
         "no places": {key: x for key, x in parts.items() if key != "transl"},
         "smplcodec": {
             "bodyPose": poses[:, :66].reshape(4, 22, 3),
@@ -245,7 +252,9 @@ def array_files():
 
 
 def glb_files(folder):
-    """Skeletons as programs write them: below a turned node in centimetres, keys of all kinds, names of VRM, no skin."""
+    """Skeletons as programs write them: below a turned node in centimetres, keys of all kinds,
+    names of VRM, no skin.
+    """
     rest, moves = other_person(), np.random.default_rng(2).normal(size=(5, 3))
     quarter = Rotation.from_euler("x", 90, degrees=True)
     matrix = np.eye(4)
@@ -308,7 +317,9 @@ def test_any_of_the_animations_in_a_file_can_be_had(tmp_path):
 
 
 def animation_file(folder, times=None, turns=None, wrong=None, **document):
-    """A GLB file of one node that turns, or of something near it. wrong: changes what the writer's views say."""
+    """A GLB file of one node that turns, or of something near it. wrong: changes what the writer's
+    views say.
+    """
     writer = GlbWriter()
     times = writer.array("SCALAR", np.arange(2.0) if times is None else np.asarray(times, float))
     turns = writer.array(
@@ -418,7 +429,10 @@ def test_the_page_reads_arrays_as_python_does(tmp_path, caplog):
 
 
 POSES = {"poses": np.zeros((2, 66)), "trans": np.zeros((2, 3))}
-HEAD = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
+HEAD = (
+    "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd"
+    " Site\n{\nOFFSET 0 0 0\n}\n}\n"
+)
 MOVED = b"MOTION\nFrames: 1\nFrame Time: 1\n0 0 0"
 BAD = {
     "rate": (

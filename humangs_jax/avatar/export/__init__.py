@@ -1,6 +1,8 @@
-"""An avatar in the files that other people's programs open (docs/export.md), and videos of it: the tables of their formats.
+"""An avatar in the files that other people's programs open (docs/export.md), and videos of it: the
+tables of their formats.
 
-`gaussians` has what reads and writes, `splats` and `spz` the formats of Gaussians, `mesh` those of the body.
+`gaussians` has what reads and writes, `splats` and `spz` the formats of Gaussians, `mesh` those of
+the body.
 """
 
 import dataclasses
@@ -16,7 +18,9 @@ HERE = "humangs_jax.avatar.export"
 
 @dataclasses.dataclass(frozen=True)
 class ExportFormat(Format):
-    """One format. code: called as code(path, gaussians), of meshes as code(paths, avatar, poses or motion, up, name)."""
+    """One format. code: called as code(path, gaussians), of meshes as code(paths, avatar, poses or
+    motion, up, name).
+    """
 
     up: Up = "y"
     """The axis that the readers of this format take for up."""
@@ -25,16 +29,20 @@ class ExportFormat(Format):
     animated: bool = False
     """One file holds all frames of a motion."""
     rest_fields: bool = False
-    """It may have all 45 `f_rest_*` fields, which some importers (Unity) require: code(path, gaussians, rest_fields)."""
+    """It may have all 45 `f_rest_*` fields, which some importers (Unity) require: code(path,
+    gaussians, rest_fields).
+    """
     versions: tuple[int, ...] = ()
-    """Those that are written, where one may be chosen, the usual one first: code(path, gaussians, version)."""
+    """Those that are written, where one may be chosen, the usual one first: code(path, gaussians,
+    version).
+    """
     backwards: bool = False
     """Its axes are to the right, up and back: half a turn about y from ours."""
     beside: tuple[str, ...] = ()
     """Suffixes of further files, of the same name, that are written with it."""
     reader: str | Callable[[bytes], Any] = ""
-    """Of Gaussians, called with the bytes of a file and a list that takes what is to be said of it; raises
-    `io.reading.Refused`."""
+    """Of Gaussians, called with the bytes of a file and a list that takes what is to be said of it;
+    raises `io.reading.Refused`."""
     magic: tuple[bytes, ...] = ()
     """How its files may begin; empty: that does not tell."""
 
@@ -83,8 +91,9 @@ EXPORTS = Formats(
 
 _CONVERT = "`npx @playcanvas/splat-transform {} scene.ply` makes a .ply of it"
 _CHECKPOINT = (
-    "a checkpoint of torch: write a .ply with the program that trained it (gsplat: `simple_trainer.py --save_ply`, or "
-    "`gsplat.export_splats`; nerfstudio: `ns-export gaussian-splat`)"
+    "a checkpoint of torch: write a .ply with the program that trained it (gsplat:"
+    " `simple_trainer.py --save_ply`, or `gsplat.export_splats`; nerfstudio: `ns-export"
+    " gaussian-splat`)"
 )
 OTHERS = {
     ".sog": f"a bundle of PlayCanvas' SOG: {_CONVERT.format('scene.sog')}",
@@ -123,7 +132,9 @@ VIDEOS = Formats(
 
 
 def chosen_format(suffix: str, mesh: bool = False) -> ExportFormat | None:
-    """The format of files with this suffix, None for none. mesh: of meshes alone, else of Gaussians where there is one."""
+    """The format of files with this suffix, None for none. mesh: of meshes alone, else of Gaussians
+    where there is one.
+    """
     found = [
         each for each in EXPORTS.values() if suffix.lower() in each.suffixes and each.mesh >= mesh
     ]

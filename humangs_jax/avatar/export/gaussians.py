@@ -1,9 +1,11 @@
-"""Gaussians and avatars in the files of other programs: what all formats share. `EXPORTS` has a row for each format.
+"""Gaussians and avatars in the files of other programs: what all formats share. `EXPORTS` has a row
+for each format.
 
-Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and colors in [0, 1]. glTF's world is
-the same. Viewers of `.ply` and `.splat` take y for down: SuperSplat and PlayCanvas turn what they read by half a turn about z.
-`.spz` has axes to the right, up and back, half a turn about y from ours. So converters make the same of all of them.
-`export` turns avatars so; `load_gaussians` and `save_gaussians` do with `y_up`.
+Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and
+colors in [0, 1]. glTF's world is the same. Viewers of `.ply` and `.splat` take y for down:
+SuperSplat and PlayCanvas turn what they read by half a turn about z. `.spz` has axes to the right,
+up and back, half a turn about y from ours. So converters make the same of all of them. `export`
+turns avatars so; `load_gaussians` and `save_gaussians` do with `y_up`.
 """
 
 import logging
@@ -56,11 +58,15 @@ _HALF = float(np.sqrt(0.5))
 _TURNS = {"y": (1.0, 0.0, 0.0, 0.0), "-y": (0.0, 0.0, 0.0, 1.0), "z": (_HALF, _HALF, 0.0, 0.0)}
 
 
-# Worlds ---------------------------------------------------------------------------------------------------------------
+# Worlds
+# --------------------------------------------------------------------------------------------------
 
 
 def up_turn(up: Up) -> tuple[float, float, float, float]:
-    """The rotation (quaternion, wxyz) that turns +y to the named axis: -y about z, z about x. Raises: ValueError."""
+    """The rotation (quaternion, wxyz) that turns +y to the named axis: -y about z, z about x.
+
+    Raises: ValueError.
+    """
     if up not in _TURNS:
         raise ValueError(f"up: expected {', '.join(get_args(Up))}, got {up!r}")
     return _TURNS[up]
@@ -97,7 +103,9 @@ def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]
 
 
 def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
-    """Moved along y so that the lowest centre of a Gaussian that is seen (opacity 0.5 and more) lies on y = 0."""
+    """Moved along y so that the lowest centre of a Gaussian that is seen (opacity 0.5 and more)
+    lies on y = 0.
+    """
     means, opacities = np.asarray(gaussians.means), np.asarray(gaussians.opacities)
     seen = opacities >= min(SEEN, opacities.max(initial=0.0))
     lowest = means[seen, 1].min(initial=np.inf)
@@ -106,13 +114,15 @@ def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
 
 
 def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
-    """Means, unit quaternions (wxyz), scales, opacities, colors and harmonics (k = 0 for none) in float64, without deformations
-    and without low-pass.
+    """Means, unit quaternions (wxyz), scales, opacities, colors and harmonics (k = 0 for none) in
+    float64, without deformations and without low-pass.
 
-    Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain a low-pass
-    (`Gaussians.low_pass`). It is taken out, so that both draw the same in images of the size that the Gaussians were fitted to.
+    Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain
+    a low-pass (`Gaussians.low_pass`). It is taken out, so that both draw the same in images of the
+    size that the Gaussians were fitted to.
 
-    Raises: ValueError for numbers that files cannot hold: not finite, or of more than `checks.LARGEST`.
+    Raises: ValueError for numbers that files cannot hold: not finite, or of more than
+    `checks.LARGEST`.
     """
     names = ("means", "quats", "scales", "colors", "harmonics")
     check_values("export", gaussian_values(gaussians))
@@ -129,7 +139,9 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
 
 
 def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
-    """Coefficients of the constant spherical harmonic: files of Gaussians hold rgb = 1/2 + Y00 f."""
+    """Coefficients of the constant spherical harmonic: files of Gaussians hold rgb = 1/2 + Y00
+    f.
+    """
     return (colors - 0.5) / SH_C0
 
 
@@ -139,26 +151,32 @@ def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-# Files ----------------------------------------------------------------------------------------------------------------
+# Files
+# --------------------------------------------------------------------------------------------------
 
 
 @checked_arguments
 def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gaussians:
-    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas), `.splat`, `.spz`, `.glb`.
+    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas),
+    `.splat`, `.spz`, `.glb`.
 
     Args:
-        path: The file. How it begins decides the format; where that does not tell (`.splat`), its suffix.
-        y_up: Turn them from the world that viewers of the format expect (y down in `.ply` and `.splat`) to one with y up, as
-            `orbit` has it. False: the numbers stay those of the file, and its cameras fit.
+        path: The file. How it begins decides the format; where that does not tell (`.splat`), its
+            suffix.
+        y_up: Turn them from the world that viewers of the format expect (y down in `.ply` and
+            `.splat`) to one with y up, as `orbit` has it. False: the numbers stay those of the
+            file, and its cameras fit.
 
     Returns:
-        Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1], colors 1/2 + Y00 f_dc, and
-        harmonics (g, 3, 3), (g, 8, 3) or (g, 15, 3) if the file has them.
+        Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1],
+        colors 1/2 + Y00 f_dc, and harmonics (g, 3, 3), (g, 8, 3) or (g, 15, 3) if the file has
+        them.
 
     Raises:
         FileNotFoundError: There is no such file.
-        FileError: It cannot be read, is larger than the limits allow, or has other numbers than it should: file and property.
-            Gaussians with numbers that are not finite are left out, with a warning; so is what a file says and is not used.
+        FileError: It cannot be read, is larger than the limits allow, or has other numbers than it
+            should: file and property. Gaussians with numbers that are not finite are left out, with
+            a warning; so is what a file says and is not used.
 
     Examples:
         >>> scene = hg.load_gaussians("garden.ply", y_up=True)
@@ -191,15 +209,18 @@ def save_gaussians(
     Deformations become quaternions and scales. A low-pass is taken out of the scales.
 
     Args:
-        path: Ends in `.ply` (3DGS), `.splat` (8-bit colors, the largest Gaussians first), `.spz` (8-bit colors, scales in steps
-            of 6 %, harmonics from -1 to 1) or `.glb` (KHR_gaussian_splatting).
-        gaussians: With or without harmonics, which `.splat` does not hold (`hg.replace(gaussians, harmonics=None)`).
-        y_up: They have y up, and are turned to the world that viewers of the format expect: y down in `.ply` and `.splat`, up in
-            `.spz` and `.glb`. False: the numbers stay as they are.
+        path: Ends in `.ply` (3DGS), `.splat` (8-bit colors, the largest Gaussians first), `.spz`
+            (8-bit colors, scales in steps of 6 %, harmonics from -1 to 1) or `.glb`
+            (KHR_gaussian_splatting).
+        gaussians: With or without harmonics, which `.splat` does not hold (`hg.replace(gaussians,
+            harmonics=None)`).
+        y_up: They have y up, and are turned to the world that viewers of the format expect: y down
+            in `.ply` and `.splat`, up in `.spz` and `.glb`. False: the numbers stay as they are.
         version: Of a `.spz`: 3, which more programs read, or 4. None: 3.
 
     Raises:
-        ValueError: Another suffix or version, numbers that files cannot hold, or harmonics that the format does not.
+        ValueError: Another suffix or version, numbers that files cannot hold, or harmonics that the
+            format does not.
 
     Examples:
         >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply", y_up=True), y_up=True)
@@ -229,7 +250,9 @@ def _versioned(version: int | None) -> dict[str, int]:
 
 
 def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
-    """From a world with y up to the one that viewers of a format expect, or back: half turns are their own inverse."""
+    """From a world with y up to the one that viewers of a format expect, or back: half turns are
+    their own inverse.
+    """
     turned = rotated(gaussians, up_turn(form.up))
     return rotated(turned, BACKWARDS) if form.backwards else turned
 
@@ -239,7 +262,8 @@ def _suffixes() -> str:
 
 
 def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) -> Gaussians:
-    """Gaussians of means, quaternions (wxyz), scales, opacities, colors and perhaps harmonics, each named as in its file.
+    """Gaussians of means, quaternions (wxyz), scales, opacities, colors and perhaps harmonics, each
+    named as in its file.
 
     Those with a number that is not finite are left out, and `said` takes how many.
 
@@ -280,7 +304,9 @@ def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, n
 
 
 def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[np.ndarray, "g 4"]:
-    """Unit quaternions of all components but one, which is not negative, and of its place among them."""
+    """Unit quaternions of all components but one, which is not negative, and of its place among
+    them.
+    """
     rest = np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
     quats = np.empty((len(three), 4))
     for i in range(4):
@@ -299,7 +325,8 @@ def unit_quats(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
 
 
-# An avatar to a file, or a motion to a sequence of files -------------------------------------------------------------
+# An avatar to a file, or a motion to a sequence of files
+# -------------------------------------------------------------
 
 
 DIGITS = 4
@@ -307,7 +334,10 @@ DIGITS = 4
 
 
 def frame_range(text: str, count: int) -> range:
-    """The frames that "a:b:step" names as Python does, of `count`; each part may be missing. Raises: ValueError."""
+    """The frames that "a:b:step" names as Python does, of `count`; each part may be missing.
+
+    Raises: ValueError.
+    """
     parts = text.split(":")
     if not 2 <= len(parts) <= 3 or not all(
         re.fullmatch(r"\s*(-?\d{1,9})?\s*", part) for part in parts
@@ -335,14 +365,15 @@ def export(
     version: int | None = None,
     name: str = "motion",
 ) -> list[Path]:
-    """Write an avatar in T-pose, in one pose, or in the poses of a motion. Each file appears whole or not at all.
+    """Write an avatar in T-pose, in one pose, or in the poses of a motion. Each file appears whole
+    or not at all.
 
     Args:
         path: with a suffix of `EXPORTS`.
         avatar: one person.
         motion: None for the T-pose. A `.glb` of the mesh holds all of it as animation.
-        numbers: of the motion's frames: "x.ply" becomes "x_0007.ply". All stand on one floor: who jumps leaves it. None:
-            the motion has one frame, whose feet are on 0.
+        numbers: of the motion's frames: "x.ply" becomes "x_0007.ply". All stand on one floor: who
+            jumps leaves it. None: the motion has one frame, whose feet are on 0.
         mesh: as a mesh where the suffix has formats of Gaussians, too.
         up: the axis that points up; None for the format's own.
         rest_fields: see `write_ply`.
@@ -353,7 +384,8 @@ def export(
         The files, without those that a format puts beside them (`.mtl` and `.png` of an `.obj`).
 
     Raises:
-        ValueError: for another suffix, a format without what is asked for, or if `numbers` are not one for each frame.
+        ValueError: for another suffix, a format without what is asked for, or if `numbers` are not
+            one for each frame.
 
     Examples:
         >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)
@@ -364,7 +396,8 @@ def export(
     if form is None:
         known = EXPORTS.where(lambda each: each.mesh >= mesh).suffixes
         raise ValueError(
-            f"{path}: expected a name ending in {alternatives(known)}{' for a mesh' if mesh else ''}"
+            f"{path}: expected a name ending in"
+            f" {alternatives(known)}{' for a mesh' if mesh else ''}"
         )
     if rest_fields and not form.rest_fields:
         holding = EXPORTS.where(lambda each: each.rest_fields).suffixes

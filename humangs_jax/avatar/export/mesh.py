@@ -1,13 +1,16 @@
 """The body of an avatar as a textured mesh: for programs that know no Gaussians.
 
-The texture is what the Gaussians show to someone who looks at each point of the skin along its normal: those near the line of
-sight are blended front to back, as a renderer blends them. So clothes end up on the skin, as a bodysuit: the mesh is that of the
-body. The atlas is our own (`rendering.mesh.atlas`), for any body.
+The texture is what the Gaussians show to someone who looks at each point of the skin along its
+normal: those near the line of sight are blended front to back, as a renderer blends them. So
+clothes end up on the skin, as a bodysuit: the mesh is that of the body. The atlas is our own
+(`rendering.mesh.atlas`), for any body.
 
-    .glb    https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#skins: mesh, skin and motion, as Blender, Unity, Unreal and
-            three.js open it. The texture holds the photos' light, so the material is unlit (KHR_materials_unlit). Joints have
-            our names; in T-pose none is turned. y is up, metres
-    .obj    https://www.loc.gov/preservation/digital/formats/fdd/fdd000507.shtml, with .mtl and a texture in .png beside it
+    .glb    https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#skins: mesh, skin and motion,
+            as Blender, Unity, Unreal and three.js open it. The texture holds the photos' light, so
+            the material is unlit (KHR_materials_unlit). Joints have our names; in T-pose none is
+            turned. y is up, metres
+    .obj    https://www.loc.gov/preservation/digital/formats/fdd/fdd000507.shtml, with .mtl and a
+            texture in .png beside it
 """
 
 import dataclasses
@@ -52,10 +55,12 @@ WEIGHTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class BodyMesh:
-    """A textured mesh in T-pose. A vertex of the body stands once for each chart of the texture that it is in.
+    """A textured mesh in T-pose. A vertex of the body stands once for each chart of the texture
+    that it is in.
 
-    vertices: (u, 3) metres. normals: (u, 3). faces: (f, 3), counter-clockwise from outside. uvs: (u, 2), v up. texture: (t, t, 3)
-    bytes, row 0 on top (v = 1). weights: (u, j) skinning weights, rows sum to 1.
+    vertices: (u, 3) metres. normals: (u, 3). faces: (f, 3), counter-clockwise from outside. uvs:
+    (u, 2), v up. texture: (t, t, 3) bytes, row 0 on top (v = 1). weights: (u, j) skinning weights,
+    rows sum to 1.
     """
 
     vertices: Float[np.ndarray, "u 3"]
@@ -66,7 +71,9 @@ class BodyMesh:
     weights: Float[np.ndarray, "u j"]
 
     def posed(self, avatar: Avatar, pose: BodyPose) -> "BodyMesh":
-        """The mesh in a pose of the avatar's joints; normals by the rotations of blended transforms."""
+        """The mesh in a pose of the avatar's joints; normals by the rotations of blended
+        transforms.
+        """
         transforms = joint_transforms(
             avatar.rest_joints, avatar.parents, pose.rotations, pose.translation
         )
@@ -80,8 +87,8 @@ class BodyMesh:
 def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     """The body of an avatar in T-pose, with the colors of its Gaussians as a texture.
 
-    Raises: ValueError for an avatar without faces or Gaussians, or with numbers that files cannot hold, or a size that is no
-    multiple of 128.
+    Raises: ValueError for an avatar without faces or Gaussians, or with numbers that files cannot
+    hold, or a size that is no multiple of 128.
     """
     vertices, faces = (
         np.asarray(avatar.rest_vertices, np.float32),
@@ -128,10 +135,11 @@ def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
 def skin_colors(
     avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, "p 3"]:
-    """What the Gaussians show at points of the skin to someone who looks along the normals, from outside.
+    """What the Gaussians show at points of the skin to someone who looks along the normals, from
+    outside.
 
-    On the line x(t) = p + t n, a Gaussian of precision A and mean m is densest at t = n.A(m - p) / n.A n and there has the alpha
-    o exp(-q / 2) with q = (m - p).A(m - p) - t n.A(m - p).
+    On the line x(t) = p + t n, a Gaussian of precision A and mean m is densest at t = n.A(m - p) /
+    n.A n and there has the alpha o exp(-q / 2) with q = (m - p).A(m - p) - t n.A(m - p).
     """
     count = min(NEIGHBOURS, len(avatar.gaussians.means))
     g, tree = avatar.gaussians, KDTree(np.asarray(avatar.gaussians.means))
@@ -160,7 +168,8 @@ def skin_colors(
     return out
 
 
-# glTF -----------------------------------------------------------------------------------------------------------------
+# glTF
+# --------------------------------------------------------------------------------------------------
 
 
 def write_animation(
@@ -180,7 +189,8 @@ def write_mesh_glb(
 ) -> None:
     """Write mesh, skin and motion; the file appears whole or not at all.
 
-    Arguments: motion: as it is to be played (`grounded`); without one the person stands in T-pose, feet on 0. name: the motion's.
+    Arguments: motion: as it is to be played (`grounded`); without one the person stands in T-pose,
+    feet on 0. name: the motion's.
     """
     writer = GlbWriter()
     skeleton = len(avatar.parents) + 1  # nodes: the joints, then what they hang on, then the mesh
@@ -224,7 +234,9 @@ def write_mesh_glb(
 def strongest(
     weights: Float[np.ndarray, "n j"],
 ) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
-    """The four joints of most weight of each row, strongest first, and their weights scaled to sum 1; joint 0 where that is 0."""
+    """The four joints of most weight of each row, strongest first, and their weights scaled to sum
+    1; joint 0 where that is 0.
+    """
     weights = np.pad(weights, ((0, 0), (0, max(0, WEIGHTS - weights.shape[1]))))
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :WEIGHTS]
     kept = np.take_along_axis(weights, joints, axis=1)
@@ -309,14 +321,17 @@ def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> 
 
 
 def _continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]:
-    """Quaternions (m, j, 4) of unit length, each on the side of the one before: some players interpolate numbers."""
+    """Quaternions (m, j, 4) of unit length, each on the side of the one before: some players
+    interpolate numbers.
+    """
     quats = quats / np.linalg.norm(quats, axis=-1, keepdims=True)
     jumps = (quats[1:] * quats[:-1]).sum(axis=-1, keepdims=True) < 0
     signs = np.concatenate([np.ones_like(jumps[:1], float), np.where(jumps, -1.0, 1.0)])
     return quats * np.cumprod(signs, axis=0)
 
 
-# OBJ ------------------------------------------------------------------------------------------------------------------
+# OBJ
+# --------------------------------------------------------------------------------------------------
 
 
 WRITTEN = "# written by humangs_jax"
@@ -332,7 +347,10 @@ def _is_ours(file: Path) -> bool:
 
 
 def check_beside(path: Path) -> None:
-    """Whether the texture and the material of an `.obj` replace no file of others. Raises: ValueError."""
+    """Whether the texture and the material of an `.obj` replace no file of others.
+
+    Raises: ValueError.
+    """
     advice = (
         "it would become the texture or material: choose another name for the .obj, or move it away"
     )
@@ -342,7 +360,9 @@ def check_beside(path: Path) -> None:
 def write_poses(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
-    """An `.obj` for each pose of a motion, or of the T-pose with its feet on 0; all share the texture beside `path`."""
+    """An `.obj` for each pose of a motion, or of the T-pose with its feet on 0; all share the
+    texture beside `path`.
+    """
     check_beside(path)
     mesh = body_mesh(avatar)
     material = write_material(path, mesh)
@@ -355,7 +375,10 @@ def write_poses(
 
 
 def write_material(path: Path, mesh: BodyMesh) -> Path:
-    """Write the `.mtl` and the `.png` that an `.obj` of this path names; several poses share them. Returns the `.mtl`'s path."""
+    """Write the `.mtl` and the `.png` that an `.obj` of this path names; several poses share them.
+
+    Returns the `.mtl`'s path.
+    """
     texture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
     write_png(texture, mesh.texture.astype(np.float32) / 255, mark=DRAWN)
     write_text(
@@ -366,7 +389,9 @@ def write_material(path: Path, mesh: BodyMesh) -> Path:
 
 
 def write_obj(path: Path, mesh: BodyMesh, material: Path, up: Up) -> None:
-    """Write a mesh. material: what `write_material` wrote beside it. up: the axis that points up in the file."""
+    """Write a mesh. material: what `write_material` wrote beside it. up: the axis that points up in
+    the file.
+    """
     turn = up_matrix(up)
     rows = lambda key, values: [
         f"{key} " + " ".join(f"{x:.6g}" for x in row) for row in values.tolist()

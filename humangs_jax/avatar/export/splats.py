@@ -2,12 +2,14 @@
 
 `.ply` is that of 3DGS, or the compressed one of PlayCanvas, which is read only.
 
-3DGS (https://github.com/graphdeco-inria/gaussian-splatting): x y z, nx ny nz (zeros), f_dc_* = (rgb - 1/2) / Y00, f_rest_* of
-degrees 1 to 3 (all of red, then of green, then of blue), logit opacity, log scales, quaternion wxyz.
+3DGS (https://github.com/graphdeco-inria/gaussian-splatting): x y z, nx ny nz (zeros), f_dc_* = (rgb
+- 1/2) / Y00, f_rest_* of degrees 1 to 3 (all of red, then of green, then of blue), logit opacity,
+log scales, quaternion wxyz.
 
-Compressed (https://github.com/playcanvas/splat-transform): for each 256 Gaussians a chunk with the bounds of positions, log
-scales and perhaps colors; for each Gaussian four words: position and scale between them in 11, 10 and 11 bits, the quaternion
-without its largest component in 2 bits and three times 10, color and opacity in 8 bits each; f_rest_* from -4 to 4 in a byte.
+Compressed (https://github.com/playcanvas/splat-transform): for each 256 Gaussians a chunk with the
+bounds of positions, log scales and perhaps colors; for each Gaussian four words: position and scale
+between them in 11, 10 and 11 bits, the quaternion without its largest component in 2 bits and three
+times 10, color and opacity in 8 bits each; f_rest_* from -4 to 4 in a byte.
 """
 
 import io
@@ -77,7 +79,8 @@ def write_ply(
 ) -> None:
     """Write a 3DGS `.ply`; the file appears whole or not at all.
 
-    rest_fields: all 45 `f_rest_*` fields, on which some importers (Unity) insist, zeros where there are no such harmonics.
+    rest_fields: all 45 `f_rest_*` fields, on which some importers (Unity) insist, zeros where there
+    are no such harmonics.
     """
     import plyfile
 
@@ -101,7 +104,10 @@ def write_ply(
 
 
 def read_ply(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused; what damaged numbers raise."""
+    """Gaussians of the bytes of a file. said: takes lines.
+
+    Raises: Refused; what damaged numbers raise.
+    """
     elements = _elements(data)
     said += _unused(elements)
     vertex = elements.get("vertex", {})
@@ -125,9 +131,11 @@ def _fused(
     opacities: Float[np.ndarray, " g"],
     smoothing: Float[np.ndarray, "g 1"],
 ) -> tuple[Float[np.ndarray, "g 3"], Float[np.ndarray, " g"]]:
-    """Scales and opacities with the 3D smoothing filter of Mip-Splatting, a Gaussian of that scale in metres.
+    """Scales and opacities with the 3D smoothing filter of Mip-Splatting, a Gaussian of that scale
+    in metres.
 
-    s' = sqrt(s^2 + f^2) and o' = o prod(s / s'), so that the integral over space stays (arXiv 2311.16493, equation 9).
+    s' = sqrt(s^2 + f^2) and o' = o prod(s / s'), so that the integral over space stays (arXiv
+    2311.16493, equation 9).
     """
     wide = np.hypot(scales, smoothing)
     shares = np.divide(scales, wide, out=np.ones_like(wide), where=wide > 0)
@@ -223,11 +231,15 @@ def _bits(words: np.ndarray, lowest: int, width: int) -> Float[np.ndarray, " g"]
 
 
 def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64) -> np.ndarray:
-    """Properties (g, names) as numbers of a type. Raises: Refused for one that is missing, or not of the bytes it is made of."""
+    """Properties (g, names) as numbers of a type.
+
+    Raises: Refused for one that is missing, or not of the bytes it is made of.
+    """
     for name in names:
         if name not in columns:
             raise Refused(
-                f"{name}: missing: expected Gaussians (x, y, z, f_dc_*, opacity, scale_*, rot_* or packed_*)"
+                f"{name}: missing: expected Gaussians (x, y, z, f_dc_*, opacity, scale_*, rot_* or"
+                " packed_*)"
             )
         if issubclass(dtype, np.integer) and columns[name].dtype.newbyteorder("=") != dtype:
             raise Refused(f"{name}: expected {np.dtype(dtype).name}, got {columns[name].dtype}")
@@ -236,7 +248,10 @@ def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64
 
 
 def _elements(data: bytes) -> dict[str, Columns]:
-    """Columns of the elements, up to one with lists. Nothing is made before it is known that the file is long enough."""
+    """Columns of the elements, up to one with lists.
+
+    Nothing is made before it is known that the file is long enough.
+    """
     end = re.compile(rb"end_header[ \t]*\r?\n").search(data, 0, LONGEST_HEADER)
     if end is None:
         raise Refused("no PLY file: expected a header that ends in end_header")
@@ -282,14 +297,15 @@ def _elements(data: bytes) -> dict[str, Columns]:
             rows = np.loadtxt(itertools.islice(lines, count), comments=None, ndmin=2)
             if rows.shape != (count, len(dtype.names)):
                 raise Refused(
-                    f"element {name}: expected {count} lines of {len(dtype.names)} numbers, got {rows.shape}"
+                    f"element {name}: expected {count} lines of {len(dtype.names)} numbers, got"
+                    f" {rows.shape}"
                 )
             found[name] = dict(zip(dtype.names, rows.T, strict=True))
     return found
 
 
-# `.splat` (https://github.com/antimatter15/splat): 32 bytes a Gaussian, position and scales in float32, RGBA and quaternion
-# wxyz in uint8, the largest and most opaque first. It has no header.
+# `.splat` (https://github.com/antimatter15/splat): 32 bytes a Gaussian, position and scales in
+# float32, RGBA and quaternion wxyz in uint8, the largest and most opaque first. It has no header.
 
 
 ROW = [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
@@ -297,14 +313,16 @@ ROW_BYTES = 32
 
 
 def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.splat`; the file appears whole or not at all. Colors and opacities lose to 8 bits, quaternions to 7.
+    """Write a `.splat`; the file appears whole or not at all. Colors and opacities lose to 8 bits,
+    quaternions to 7.
 
     Raises: ValueError for Gaussians with harmonics.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     if harmonics.size:
         raise ValueError(
-            f"{path}: .splat holds one color for each Gaussian: expected no harmonics (replace(gaussians, harmonics=None))"
+            f"{path}: .splat holds one color for each Gaussian: expected no harmonics"
+            " (replace(gaussians, harmonics=None))"
         )
     rows = np.empty(len(means), ROW)
     rows["position"], rows["scale"] = means, scales
@@ -338,7 +356,8 @@ def read_splat(data: bytes, said: list[str]) -> Gaussians:
 
 
 # `.glb`: glTF 2.0 with KHR_gaussian_splatting
-# (https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting): quaternions xyzw, linear scales.
+# (https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting):
+# quaternions xyzw, linear scales.
 
 
 EXTENSION, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
@@ -359,7 +378,8 @@ ATTRIBUTES = (*NEEDED, *COEFFICIENTS)
 def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.glb` with KHR_gaussian_splatting; the file appears whole or not at all.
 
-    Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the extension's coefficients.
+    Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the
+    extension's coefficients.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     if not len(means):
@@ -429,7 +449,8 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     spaces = {shown(part["extensions"][EXTENSION].get("colorSpace", SRGB)) for part, _ in placed}
     if spaces != {shown(SRGB)}:
         said.append(
-            f"colors of {', '.join(sorted(spaces))} are taken as they are: images of them have these colors, too"
+            f"colors of {', '.join(sorted(spaces))} are taken as they are: images of them have"
+            " these colors, too"
         )
     said += _other_parts(placed)
     parts = [_part(content, binary, part["attributes"], place, said) for part, place in placed]

@@ -1,12 +1,14 @@
-"""`.spz` of Niantic (https://github.com/nianticlabs/spz#file-format): a header and six arrays, 20 bytes a Gaussian and 3 more
-for each harmonic.
+"""`.spz` of Niantic (https://github.com/nianticlabs/spz#file-format): a header and six arrays, 20
+bytes a Gaussian and 3 more for each harmonic.
 
-Positions are in 24-bit fixed point, opacities k / 255, f_dc = (k / 255 - 1/2) / 0.15, scales exp(k / 16 - 10) metres, harmonics
-k / 128 - 1, the channels of each together. Quaternions have their three smallest components in 10 bits each; before version 3
-x, y, z in a byte each. Version 1 has positions in 16-bit floats.
+Positions are in 24-bit fixed point, opacities k / 255, f_dc = (k / 255 - 1/2) / 0.15, scales exp(k
+/ 16 - 10) metres, harmonics k / 128 - 1, the channels of each together. Quaternions have their
+three smallest components in 10 bits each; before version 3 x, y, z in a byte each. Version 1 has
+positions in 16-bit floats.
 
-Up to version 3 all of it is one gzip. Version 4 has a header of 32 bytes that is not compressed, perhaps records of others behind
-it, a table of (bytes, bytes unpacked) at the offset that the header names, and one zstd frame for each array that is not empty.
+Up to version 3 all of it is one gzip. Version 4 has a header of 32 bytes that is not compressed,
+perhaps records of others behind it, a table of (bytes, bytes unpacked) at the offset that the
+header names, and one zstd frame for each array that is not empty.
 
 Libraries that write it bring a compiler (gsply) or do not install (PyPI's spz).
 """
@@ -40,7 +42,9 @@ SPZ_MAGIC = 0x5053474E
 WITH_TABLE = 4
 """The version from which on the arrays are compressed one by one."""
 HEADER = struct.Struct("<IIIBBBB")
-"""Magic, version, number of Gaussians, degree, fractional bits, flags, number of streams (before version 4 nothing)."""
+"""Magic, version, number of Gaussians, degree, fractional bits, flags, number of streams (before
+version 4 nothing).
+"""
 TABLE_PLACE = struct.Struct("<I12x")
 """What version 4 has behind it: where the table begins."""
 TABLE_ROW = struct.Struct("<QQ")
@@ -72,19 +76,23 @@ class _Header(NamedTuple):
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Bytes of a Gaussian in each array: positions, opacities, colors, scales, quaternions, harmonics."""
+        """Bytes of a Gaussian in each array: positions, opacities, colors, scales, quaternions,
+        harmonics.
+        """
         positions = 6 if self.version == 1 else 9
         quats = 3 if self.version < 3 else 4
         return positions, 1, 3, 3, quats, 3 * COUNTS[self.degree]
 
 
-# Writing --------------------------------------------------------------------------------------------------------------
+# Writing
+# --------------------------------------------------------------------------------------------------
 
 
 def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Version = 3) -> None:
     """Write a `.spz`; the file appears whole or not at all.
 
-    Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to 10. Harmonics are from -1 to 1.
+    Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to
+    10. Harmonics are from -1 to 1.
 
     Raises: ValueError for Gaussians farther than 8,000 km from the origin.
     """
@@ -126,7 +134,9 @@ def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
 
 
 def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
-    """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a size out of 1 / sqrt(2)."""
+    """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a
+    size out of 1 / sqrt(2).
+    """
     xyzw = quats[:, [1, 2, 3, 0]]
     largest = np.argmax(np.abs(xyzw), axis=1)
     xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
@@ -142,15 +152,20 @@ def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g
     return packed
 
 
-# Reading --------------------------------------------------------------------------------------------------------------
+# Reading
+# --------------------------------------------------------------------------------------------------
 
 
 def read_spz(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused; what gzip and zstd raise for damaged files."""
+    """Gaussians of the bytes of a file. said: takes lines.
+
+    Raises: Refused; what gzip and zstd raise for damaged files.
+    """
     header, parts = _with_table(data, said) if data.startswith(b"NGSP") else _of_gzip(data)
     if header.flags & ANTIALIASED:
         said.append(
-            "trained antialiased, as Mip-Splatting does; drawn without that it looks thicker from afar"
+            "trained antialiased, as Mip-Splatting does; drawn without that it looks thicker from"
+            " afar"
         )
     if header.flags & MORE_BEHIND and header.version < WITH_TABLE:
         said.append("records of other programs at its end are not used")
@@ -160,12 +175,14 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
         for part, width in zip(parts, header.widths, strict=True)
     )
     arrays = {
-        "positions": positions.view("<f2")
-        if version == 1
-        else _fixed_point(positions, header.bits),
-        "rotations": with_largest(quats / 127.5 - 1, np.zeros(count))
-        if version < 3
-        else _smallest_three(quats),
+        "positions": (
+            positions.view("<f2") if version == 1 else _fixed_point(positions, header.bits)
+        ),
+        "rotations": (
+            with_largest(quats / 127.5 - 1, np.zeros(count))
+            if version < 3
+            else _smallest_three(quats)
+        ),
         "scales": np.exp(scales / SCALE_STEPS - SCALE_ZERO),
         "alphas": opacities[:, 0] / 255,
         "colors": colors_of((colors / 255 - 0.5) / COLOR_SCALE),
@@ -178,11 +195,15 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
 
 
 def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
-    """The header at the start of a file of that many bytes, if it may unpack to what it says. Raises: Refused."""
+    """The header at the start of a file of that many bytes, if it may unpack to what it says.
+
+    Raises: Refused.
+    """
     header = _Header(*HEADER.unpack(start[: HEADER.size].ljust(HEADER.size, b"\0")))
     if header.magic != SPZ_MAGIC or header.version not in versions:
         raise Refused(
-            f"no .spz of version 1 to 4: version {header.version} in what begins as version {versions[-1]} does"
+            f"no .spz of version 1 to 4: version {header.version} in what begins as version"
+            f" {versions[-1]} does"
         )
     if header.degree >= len(COUNTS):
         raise Refused(f"harmonics of degree {header.degree}: expected .spz of degree 0 to 3")
@@ -206,13 +227,14 @@ def _check_size(size: int, header: _Header, more: bool = False) -> None:
     expected = header.count * sum(header.widths)
     if size < expected or (size > expected and not more):
         raise Refused(
-            f"expected {header.count:,} Gaussians in {expected:,} bytes, got {'more' if size > expected else 'less'}"
+            f"expected {header.count:,} Gaussians in {expected:,} bytes, got"
+            f" {'more' if size > expected else 'less'}"
         )
 
 
 def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
-    """The header and the six arrays of a file of version 4. What the table says must fit the file and the number of Gaussians
-    before anything is unpacked, so nothing becomes larger than it may.
+    """The header and the six arrays of a file of version 4. What the table says must fit the file
+    and the number of Gaussians before anything is unpacked, so nothing becomes larger than it may.
     """
     header = _checked_header(data, (WITH_TABLE,), len(data))
     begin = HEADER.size + TABLE_PLACE.size
@@ -222,7 +244,8 @@ def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
     end = place + header.streams * TABLE_ROW.size
     if not begin <= place <= end <= len(data):
         raise Refused(
-            f"table of {header.streams} streams at {place:,}: expected it within {len(data):,} bytes"
+            f"table of {header.streams} streams at {place:,}: expected it within {len(data):,}"
+            " bytes"
         )
     said += _records(data[begin:place])
     rows = list(TABLE_ROW.iter_unpack(data[place:end]))
@@ -269,7 +292,8 @@ def _unpacked(stream: bytes, size: int) -> bytes:
     content = zstd.ZstdDecompressor().decompress(stream, size + 1)
     if len(content) != size:
         raise Refused(
-            f"a stream unpacks to {'more' if len(content) > size else 'less'} than the {size:,} bytes of the table"
+            f"a stream unpacks to {'more' if len(content) > size else 'less'} than the {size:,}"
+            " bytes of the table"
         )
     return content
 

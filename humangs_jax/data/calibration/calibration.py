@@ -1,7 +1,9 @@
-"""A calibration in memory, of whatever format: cameras, conversion to the convention of captures, lens distortion, checks.
+"""A calibration in memory, of whatever format: cameras, conversion to the convention of captures,
+lens distortion, checks.
 
-Readers return a `Calibration`: OpenCV axes (x right, y down, z forward), but lengths, the world's up axis and the place of
-pixel centres still those of the source. `in_capture_convention` makes metres, y up and pixel centres at +0.5 of them.
+Readers return a `Calibration`: OpenCV axes (x right, y down, z forward), but lengths, the world's
+up axis and the place of pixel centres still those of the source. `in_capture_convention` makes
+metres, y up and pixel centres at +0.5 of them.
 """
 
 import dataclasses
@@ -25,7 +27,9 @@ from humangs_jax.data.formats import CAMERAS, CameraFormat
 from humangs_jax.io.reading import limits, reading
 
 ROUNDED_ROTATION = 5e-3
-"""R R^T of matrices written with three decimals (EasyMocap) is this far from 1; they are replaced by the nearest rotation."""
+"""R R^T of matrices written with three decimals (EasyMocap) is this far from 1; they are replaced
+by the nearest rotation.
+"""
 LARGEST_COEFFICIENT = 1e100
 """Of a lens: products of larger ones are not finite."""
 ROTATION_TO_Y_UP = {
@@ -50,8 +54,8 @@ CONVENTIONS = {
     CAM_FROM_WORLD_OPENGL: lambda matrix: OPENGL_FROM_OPENCV @ matrix,
     WORLD_FROM_CAM_OPENGL: lambda matrix: OPENGL_FROM_OPENCV @ np.linalg.inv(matrix),
 }
-"""What a matrix in a file may mean, and the cam_from_world with OpenCV's axes that follows. OpenCV: x right,
-y down, z forward; OpenGL: x right, y up, z backwards."""
+"""What a matrix in a file may mean, and the cam_from_world with OpenCV's axes that follows. OpenCV:
+x right, y down, z forward; OpenGL: x right, y up, z backwards."""
 PixelCenters = Literal["integer", "half"]
 """Where the centre of the first pixel is: at (0, 0), as OpenCV has it, or at (0.5, 0.5)."""
 
@@ -60,9 +64,12 @@ PixelCenters = Literal["integer", "half"]
 class CalibratedCamera:
     """One camera, or one image's camera where the format has one per image.
 
-    name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world: (4, 4), OpenCV axes.
-    width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of OpenCV, or None.
-    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera for each image.
+    name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world:
+    (4, 4), OpenCV axes.
+    width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of
+    OpenCV, or None.
+    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera
+    for each image.
     """
 
     name: str
@@ -77,9 +84,11 @@ class CalibratedCamera:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Observations:
-    """Points that the calibration saw, one row for each time: the evidence that reprojection is checked against.
+    """Points that the calibration saw, one row for each time: the evidence that reprojection is
+    checked against.
 
-    points: (n, 3) in the world. cameras: (n,) which camera saw it. pixels: (n, 2) where, distortion included.
+    points: (n, 3) in the world. cameras: (n,) which camera saw it. pixels: (n, 2) where, distortion
+    included.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -91,11 +100,14 @@ class Observations:
 class Calibration:
     """Everything that a calibration says.
 
-    format: what it was read as. file: the one that errors name. cameras: at least one. per_image: one camera for each
-    image, not one for each camera. pixel_centers, up: what the format means by default.
-    observations: None where the format has none. convention: what the matrices in the file mean, of `CONVENTIONS`.
-    stations: how many cameras took the images, where the format says; None: one for each of `cameras`. mask_key: where the file
-    names masks, None if it does not. upright: whether cameras are of photos that obey their EXIF orientation; else sizes tell.
+    format: what it was read as. file: the one that errors name. cameras: at least one. per_image:
+    one camera for each image, not one for each camera. pixel_centers, up: what the format means by
+    default.
+    observations: None where the format has none. convention: what the matrices in the file mean, of
+    `CONVENTIONS`.
+    stations: how many cameras took the images, where the format says; None: one for each of
+    `cameras`. mask_key: where the file names masks, None if it does not. upright: whether cameras
+    are of photos that obey their EXIF orientation; else sizes tell.
     estimated: whether the cameras were found from the person.
     """
 
@@ -205,7 +217,8 @@ def in_capture_convention(
     """The same cameras and points in metres, y up, pixel centres at +0.5, rotations orthonormal.
 
     Arguments:
-        scale: metres per unit of the source. up: the source's axis that points up, a key of `ROTATION_TO_Y_UP`.
+        scale: metres per unit of the source. up: the source's axis that points up, a key of
+            `ROTATION_TO_Y_UP`.
         pixel_centers: "integer" adds 0.5 to the principal point, "half" leaves it.
     """
     turn = np.asarray(ROTATION_TO_Y_UP[up], float)
@@ -228,14 +241,17 @@ def in_capture_convention(
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation nearest to a rounded one; a matrix that is further from one than rounding explains is left as it is."""
+    """The rotation nearest to a rounded one; a matrix that is further from one than rounding
+    explains is left as it is.
+    """
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDED_ROTATION or np.linalg.det(matrix) < 0:
         return matrix
     u, _, vt = np.linalg.svd(matrix)
     return u @ vt
 
 
-# Values of files ------------------------------------------------------------------------------------------------------
+# Values of files
+# --------------------------------------------------------------------------------------------------
 
 
 def image_size(value: Any, file: object, field: str) -> tuple[int, int]:
@@ -268,7 +284,9 @@ def pose_matrix(
 
 
 def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
-    """A rotation given as 9 numbers of its matrix, or as the 3 of a rotation vector (cv2.Rodrigues)."""
+    """A rotation given as 9 numbers of its matrix, or as the 3 of a rotation vector
+    (cv2.Rodrigues).
+    """
     from scipy.spatial.transform import Rotation
 
     values = file_numbers(value, file, field)
@@ -279,9 +297,10 @@ def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
     )
 
 
-# Lenses ---------------------------------------------------------------------------------------------------------------
-# Brown and Conrady's distortion with OpenCV's coefficients k1 k2 p1 p2 k3 (calib3d): of a point (x, y) = (X / Z, Y / Z) in
-# front of the camera, with r^2 = x^2 + y^2, the lens makes
+# Lenses
+# --------------------------------------------------------------------------------------------------
+# Brown and Conrady's distortion with OpenCV's coefficients k1 k2 p1 p2 k3 (calib3d): of a point (x,
+# y) = (X / Z, Y / Z) in front of the camera, with r^2 = x^2 + y^2, the lens makes
 #
 #     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
 #     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -290,13 +309,16 @@ UNDISTORT_BEFORE = (
     "undistort the photos before (cv2.undistort, cv2.fisheye or colmap image_undistorter)"
 )
 COUNTS = (4, 5, 8, 12, 14)
-"""Numbers of coefficients that OpenCV's calibration writes: from the sixth on they are k4 k5 k6, s1..s4, tx ty."""
+"""Numbers of coefficients that OpenCV's calibration writes: from the sixth on they are k4 k5 k6,
+s1..s4, tx ty.
+"""
 
 
 def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5"] | None:
     """k1 k2 p1 p2 k3 of OpenCV's list of coefficients; None if all are 0.
 
-    Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or others than the first five are not 0.
+    Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or others than the first five are not
+    0.
     """
     values = file_numbers(values, file, field).ravel()
     if len(values) not in COUNTS:
@@ -330,9 +352,11 @@ def undistort(
     fill: float,
     box: tuple[slice, slice] = (slice(None), slice(None)),
 ) -> Float[np.ndarray, "h w *c"]:
-    """The photo that a pinhole of the same K (pixel centres at +0.5) would have taken, bilinear, float32.
+    """The photo that a pinhole of the same K (pixel centres at +0.5) would have taken, bilinear,
+    float32.
 
-    Pixels that the photo does not show, and those outside of `box` (rows, columns), get the value `fill`.
+    Pixels that the photo does not show, and those outside of `box` (rows, columns), get the value
+    `fill`.
     """
     from skimage.transform import warp
 
@@ -356,7 +380,9 @@ def undistort_person(
     K: Float[np.ndarray, "3 3"],
     coefficients: Float[np.ndarray, "5"],
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """A photo on white and its mask without distortion: `undistort`, in the box around the person alone, which is faster."""
+    """A photo on white and its mask without distortion: `undistort`, in the box around the person
+    alone, which is faster.
+    """
     step = 16
     rows, columns = (np.arange(0.0, size + step, step) for size in mask.shape)
     source = _in_photo(np.stack(np.meshgrid(columns, rows), axis=-1), K, coefficients)
@@ -382,7 +408,9 @@ def _in_photo(
     K: Float[np.ndarray, "3 3"],
     coefficients: Float[np.ndarray, "5"],
 ) -> Float[np.ndarray, "*n 2"]:
-    """Where the lens puts pixels (edges of the photo at whole numbers); far outside if it does not show them."""
+    """Where the lens puts pixels (edges of the photo at whole numbers); far outside if it does not
+    show them.
+    """
     plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
     source = distort(plane, coefficients) * np.diag(K)[:2] + K[:2, 2]
     source[(plane**2).sum(axis=-1) >= _squared_reach(coefficients)] = -1e4
@@ -390,7 +418,10 @@ def _in_photo(
 
 
 def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
-    """r^2 up to which r (1 + k1 r^2 + ..) grows. Beyond it the formula folds the image back over itself."""
+    """r^2 up to which r (1 + k1 r^2 + ..) grows.
+
+    Beyond it the formula folds the image back over itself.
+    """
     k1, k2, _, _, k3 = np.clip(coefficients, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
     roots = np.roots(
         [1, 3 * k1, 5 * k2, 7 * k3]
@@ -399,9 +430,10 @@ def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
     return 1 / real.max() if len(real) else np.inf
 
 
-# Whether it makes sense -----------------------------------------------------------------------------------------------
-# A wrong convention gives plausible numbers, but not cameras around a person that all look at the person. Some cameras do stand
-# otherwise: these checks only warn.
+# Whether it makes sense
+# ----------------------------------------------------------------------------------------------- A
+# wrong convention gives plausible numbers, but not cameras around a person that all look at the
+# person. Some cameras do stand otherwise: these checks only warn.
 
 REPROJECTION_LIMIT = 2.0
 """Pixels; calibrations are usually good to less than one."""
@@ -414,13 +446,19 @@ USUAL_DISTANCE = 2.5
 NEARLY_PARALLEL = np.sin(np.radians(2.0)) ** 2
 """Axes within about 2 degrees of each other do not define a point where they meet."""
 MISS = 0.5
-"""Axes of cameras around a person pass within this share of the distance: some look at the feet, others at the face."""
+"""Axes of cameras around a person pass within this share of the distance: some look at the feet,
+others at the face.
+"""
 TILT_LIMIT = 45.0
 """Degrees between the mean upward direction of the photos and +y."""
 OFF_CENTER = 0.25
-"""Share of the image from its middle beyond which a principal point belongs to an image of another size."""
+"""Share of the image from its middle beyond which a principal point belongs to an image of another
+size.
+"""
 COINCIDENT = 1e-3
-"""Cameras that meet within this share of their distance to the world's origin stand all in one place."""
+"""Cameras that meet within this share of their distance to the world's origin stand all in one
+place.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -432,12 +470,16 @@ class Checks:
     observations: int
     """How many."""
     distance: float | None
-    """Median from the cameras to where their axes meet, metres; None where they are parallel (one camera)."""
+    """Median from the cameras to where their axes meet, metres; None where they are parallel (one
+    camera).
+    """
     warnings: tuple[str, ...]
 
 
 def check_calibration(source: Calibration, converted: Calibration, up: str) -> Checks:
-    """Check cameras as their source has them, and as they came into the capture's convention with that axis up."""
+    """Check cameras as their source has them, and as they came into the capture's convention with
+    that axis up.
+    """
     matrices = lambda calibration: np.stack(
         [camera.cam_from_world for camera in calibration.cameras]
     )
@@ -453,7 +495,10 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
     warnings += _convention_warnings(matrices(source), source.convention)
     low, high = DISTANCES
     if distance is not None and not low <= distance <= high:
-        stand = f"the cameras stand {distance:.3g} m from where they look (expected {low:g} to {high:g})"
+        stand = (
+            f"the cameras stand {distance:.3g} m from where they look (expected {low:g} to"
+            f" {high:g})"
+        )
         warnings.append(
             f"{stand}: is scale, the metres in a unit of the source, right? Measure one distance"
         )
@@ -468,8 +513,8 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
 def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     """Metres in a unit of a calibration, and a line about it unless it is 1, or said by nothing.
 
-    The format's unit is taken where it has one, else metres. If the cameras then stand too near to a person or too far, it is the
-    unit that puts them there, if one does.
+    The format's unit is taken where it has one, else metres. If the cameras then stand too near to
+    a person or too far, it is the unit that puts them there, if one does.
     """
     known = calibration.unit or 1.0
     matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
@@ -478,19 +523,26 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     distance = None if depths is None else float(np.median(np.abs(depths)))
     low, high = DISTANCES
     if distance is None or low <= known * distance <= high:
-        line = f"{calibration.format} is in {UNITS.get(known, 'units of its own')}: taken (--scale says otherwise)"
+        line = (
+            f"{calibration.format} is in {UNITS.get(known, 'units of its own')}: taken (--scale"
+            " says otherwise)"
+        )
         return known, line if known != 1 else None
     fitting = [unit for unit in UNITS if low <= unit * distance <= high]
     if not fitting:
         return known, None
     best = min(fitting, key=lambda unit: abs(np.log(unit * distance / USUAL_DISTANCE)))
     before, after = f"{known * distance:.3g} m", f"{best * distance:.3g} m"
-    why = f"in {UNITS.get(known, 'its unit')} the cameras stand {before} from where they look, so {after}"
+    why = (
+        f"in {UNITS.get(known, 'its unit')} the cameras stand {before} from where they look, so"
+        f" {after}"
+    )
     return best, f"the unit is taken for {UNITS[best]}: {why} (--scale says otherwise)"
 
 
 def mean_reprojection_error(calibration: Calibration) -> float | None:
-    """Pixels between where the calibration's points were seen and where its cameras see them; None without points.
+    """Pixels between where the calibration's points were seen and where its cameras see them; None
+    without points.
 
     Infinite where a point lies behind a camera that saw it.
     """
@@ -513,9 +565,11 @@ def mean_reprojection_error(calibration: Calibration) -> float | None:
 def axes_meeting(
     poses: Float[np.ndarray, "v 4 4"],
 ) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
-    """Depth of the point nearest to all optical axes before each camera, and its distance from each axis.
+    """Depth of the point nearest to all optical axes before each camera, and its distance from each
+    axis.
 
-    (None, None) if the axes are nearly parallel: they meet nowhere. `poses` are cam_from_world, in any unit.
+    (None, None) if the axes are nearly parallel: they meet nowhere. `poses` are cam_from_world, in
+    any unit.
     """
     rotations, axes = poses[:, :3, :3], poses[:, 2, :3]
     centers = -np.einsum("vji,vj->vi", rotations, poses[:, :3, 3])
@@ -530,7 +584,9 @@ def axes_meeting(
 
 
 def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
-    """How far axes pass the point where they meet before all cameras, as a share of its distance; infinite if none is."""
+    """How far axes pass the point where they meet before all cameras, as a share of its distance;
+    infinite if none is.
+    """
     depths, misses = axes_meeting(poses)
     farthest = np.linalg.norm(poses[:, :3, 3], axis=-1).max()
     if (
@@ -545,7 +601,9 @@ def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
 
 
 def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> list[str]:
-    """Whether another meaning of the matrices in the file would let the cameras look at one place."""
+    """Whether another meaning of the matrices in the file would let the cameras look at one
+    place.
+    """
     if axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
         return []
     matrices = (
@@ -556,13 +614,16 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
     problem = "the cameras do not look at one place before them"
     if np.isfinite(misses[best]):
         return [
-            f"{problem}; they would if the matrices in the file were {best} (the format says {convention})"
+            f"{problem}; they would if the matrices in the file were {best} (the format says"
+            f" {convention})"
         ]
     return [f"{problem}: is this calibration of photos around a person?"]
 
 
 def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
-    """The photos are upright, most of them: the mean of their upward directions tells which axis is up."""
+    """The photos are upright, most of them: the mean of their upward directions tells which axis is
+    up.
+    """
     direction = -poses[:, 1, :3].mean(axis=0)
     length = np.linalg.norm(direction)
     if length < 0.5 or direction[1] / length >= np.cos(np.radians(TILT_LIMIT)):
@@ -572,7 +633,8 @@ def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
         ROTATION_TO_Y_UP, key=lambda axis: float(f"{axis[0]}1") * in_source["xyz".index(axis[1])]
     )
     return [
-        f"the photos do not stand upright with {up} up: --up={best} fits best (or were they taken sideways?)"
+        f"the photos do not stand upright with {up} up: --up={best} fits best (or were they taken"
+        " sideways?)"
     ]
 
 

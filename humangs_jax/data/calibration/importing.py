@@ -1,7 +1,8 @@
-"""`import_cameras`: photos and the calibration that another tool made of their cameras -> a capture folder without body.
+"""`import_cameras`: photos and the calibration that another tool made of their cameras -> a capture
+folder without body.
 
-docs/cameras.md describes the formats and their conventions. Photos are copied as they are, or undistorted where the lens
-asks for it; capture.json names body.npz, which `humangs fit` makes.
+docs/cameras.md describes the formats and their conventions. Photos are copied as they are, or
+undistorted where the lens asks for it; capture.json names body.npz, which `humangs fit` makes.
 """
 
 import dataclasses
@@ -63,7 +64,10 @@ from humangs_jax.io.reading import check_limit, reading, write_json
 SIZES_SHOWN = 5
 """In a report."""
 NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with a pose of its own"
-NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one frame must have the same file name"
+NO_COMMON_FRAME = (
+    "no two cameras have a photo of the same frame: photos of one frame must have the same file"
+    " name"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,20 +134,25 @@ def import_cameras(
     overwrite: bool = False,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
-    """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is still to be made.
+    """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is
+    still to be made.
 
     Arguments:
         source: file or folder of any format in docs/cameras.md; its content decides which one.
-        images: folder of the photos, or of a video of each camera (CAMERA.mp4). masks: folder of their masks, named alike.
+        images: folder of the photos, or of a video of each camera (CAMERA.mp4). masks: folder of
+            their masks, named alike.
         out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
-        scale: metres per unit of the source; None: the format's unit, else the one that puts the cameras near a person.
+        scale: metres per unit of the source; None: the format's unit, else the one that puts the
+            cameras near a person.
         up: the axis of the source's world that points up, "+y", "-z", ...; None: the format's.
         every, frames: of videos, the frame step and the largest number of frames.
-        pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0), "half": (0.5, 0.5);
+        pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0),
+            "half": (0.5, 0.5);
             None: as the format says.
         also: name -> content of JSON files that appear in the folder together with the capture.
 
-    Raises: ValueError for an option, CaptureError (one line: file, field, what was expected) for everything else.
+    Raises: ValueError for an option, CaptureError (one line: file, field, what was expected) for
+    everything else.
     """
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
@@ -175,7 +184,10 @@ def import_cameras(
 
 
 def _size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
-    """Width and height of the photo of that name. A name without photo gets those of another: its camera is left out later."""
+    """Width and height of the photo of that name.
+
+    A name without photo gets those of another: its camera is left out later.
+    """
     try:
         return photo_size(photo_of(images, name, source))
     except CaptureError:
@@ -253,7 +265,8 @@ def import_calibration(
     replace_folder(out, write, mark="capture.json")
     if cut:
         warnings.append(
-            f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background"
+            f"the person is cut off where white was added to {few(cut, 1)}: it is taken for"
+            " background"
         )
     centers = "whole numbers (0.5 added to cx and cy)" if pixel_centers == "integer" else "+0.5"
     said = f"{calibration.format} ({calibration.file}): {calibration.convention}"
@@ -297,14 +310,18 @@ def _check_options(
 def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[int, int]:
     """Width and height of what is written: the largest of all photos, upright.
 
-    Raises: CaptureError if the photos of one camera have several sizes, or if so much may not be read together.
+    Raises: CaptureError if the photos of one camera have several sizes, or if so much may not be
+    read together.
     """
     first = {}
     for photo, turn in zip(photos, turns, strict=True):
         other, size = first.setdefault(photo.camera, (photo, turn.size))
         if turn.size != size:
             own, known = (_by(*each) for each in (turn.size, size))
-            problem = f"{own}, but {other.image.name} of the same camera has {known}: expected one size of a camera"
+            problem = (
+                f"{own}, but {other.image.name} of the same camera has {known}: expected one size"
+                " of a camera"
+            )
             raise CaptureError(photo.image, "size", problem)
     width, height = (max(turn.size[axis] for turn in turns) for axis in (0, 1))
     if any(turn.size != (width, height) for turn in turns):
@@ -333,12 +350,14 @@ def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> list[str]:
     )
     more = ", ..." if len(counts) > SIZES_SHOWN else ""
     return [
-        f"photos of {len(counts)} sizes ({sizes}{more}): white was added on the right and below, so that all have "
-        f"{_by(*canvas)}; pixels keep their places: keypoints of the upright photos still fit"
+        f"photos of {len(counts)} sizes ({sizes}{more}): white was added on the right and below, so"
+        f" that all have {_by(*canvas)}; pixels keep their places: keypoints of the upright photos"
+        " still fit"
     ]
 
 
-# Writing -------------------------------------------------------------------------------------------------------------
+# Writing
+# --------------------------------------------------------------------------------------------------
 
 
 def _write(
@@ -376,7 +395,9 @@ def _write(
 
 
 def _of_phones(photo: Photo) -> bool:
-    """Whether the photo or its mask is HEIC, which captures have none of: other programs cannot read it."""
+    """Whether the photo or its mask is HEIC, which captures have none of: other programs cannot
+    read it.
+    """
     return any(
         file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask)
     )
@@ -400,11 +421,13 @@ def _rewrite(
     transparent: bool,
     canvas: tuple[int, int],
 ) -> tuple[dict[str, str], bool]:
-    """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it does not see are white and
-    background.
+    """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it
+    does not see are white and background.
 
-    A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`, is left out.
-    Returns: the paths for capture.json, and whether the person reaches a rim where the photo is padded.
+    A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`,
+    is left out.
+    Returns: the paths for capture.json, and whether the person reaches a rim where the photo is
+    padded.
     """
     image, alpha = read_checked(read_image, photo.image)
     image = turn.upright(image, turn.photo)
@@ -441,7 +464,9 @@ def _rewrite(
 def _padded(
     pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float
 ) -> Float[np.ndarray, "height width *c"]:
-    """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added are opaque white."""
+    """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added
+    are opaque white.
+    """
     (height, width), (right, below) = pixels.shape[:2], canvas
     margins = ((0, below - height), (0, right - width), *((0, 0),) * (pixels.ndim - 2))
     return (

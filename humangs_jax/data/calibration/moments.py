@@ -1,7 +1,8 @@
-"""Which frames of several videos show one moment: by time, because rates differ and phones drop frames.
+"""Which frames of several videos show one moment: by time, because rates differ and phones drop
+frames.
 
-All videos begin at the same moment, time 0 of their files. The slowest one says which moments there are; each other camera gives
-the frame that is nearest in time, or none, where it has a gap.
+All videos begin at the same moment, time 0 of their files. The slowest one says which moments there
+are; each other camera gives the frame that is nearest in time, or none, where it has a gap.
 """
 
 import itertools
@@ -20,8 +21,8 @@ GAP = 1.5
 SAME_RATE = 0.01
 """Share by which the steps of cameras of one rate differ."""
 LATE, MOST_LATE = 0.1, 3.0
-"""Seconds after the first frames of others, between which a camera lacks its first ones: encoders shift them by less, and what
-counts time from elsewhere by more."""
+"""Seconds after the first frames of others, between which a camera lacks its first ones: encoders
+shift them by less, and what counts time from elsewhere by more."""
 USUAL_STEP = 1 / 30
 """Seconds between two frames, where no video tells."""
 
@@ -40,7 +41,9 @@ class Moments(NamedTuple):
 
 
 def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
-    """The moments of some cameras, of the seconds at which each has its frames (NaN where that is not known)."""
+    """The moments of some cameras, of the seconds at which each has its frames (NaN where that is
+    not known).
+    """
     steps = {camera: _step(each) for camera, each in times.items()}
     known = [step for step in steps.values() if step is not None]
     slowest = max(known, default=USUAL_STEP)
@@ -65,7 +68,9 @@ def _step(times: Float[np.ndarray, " n"]) -> float | None:
 def _clock(
     times: Float[np.ndarray, " n"], step: float | None, slowest: float, first: float
 ) -> Float[np.ndarray, " n"]:
-    """Seconds after the first frame, or after the `first` one of all; a video that does not tell is as fast as the slowest."""
+    """Seconds after the first frame, or after the `first` one of all; a video that does not tell is
+    as fast as the slowest.
+    """
     if step is None:
         return np.arange(len(times)) * slowest
     late = times[0] - first
@@ -75,7 +80,9 @@ def _clock(
 def _all_moments(
     clocks: Mapping[str, Float[np.ndarray, " n"]], steps: Mapping[str, float]
 ) -> Float[np.ndarray, " m"]:
-    """The times of the slowest camera, with those that it lacks at its start, in its gaps and behind its end."""
+    """The times of the slowest camera, with those that it lacks at its start, in its gaps and
+    behind its end.
+    """
     slowest = max(steps.values())
     slow = [camera for camera, step in steps.items() if step > (1 - SAME_RATE) * slowest]
     own = max((clocks[camera] for camera in slow), key=lambda each: len(each))
@@ -90,7 +97,9 @@ def _all_moments(
 
 
 def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) -> list[int | None]:
-    """The frame of a camera at each moment, None where the nearest one is too far, or nearer to another moment."""
+    """The frame of a camera at each moment, None where the nearest one is too far, or nearer to
+    another moment.
+    """
     step = float(np.median(np.diff(times))) if len(times) > 1 else USUAL_STEP
     found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)
     off = np.abs(times[found] - moments)
@@ -122,7 +131,10 @@ def _notes(
         apart = max(apart, float(np.ptp(seen))) if seen else apart
     rates = " and ".join(dict.fromkeys(f"{1 / step:.3g}" for step in sorted(steps)))
     return (
-        f"videos of {rates} frames a second: paired by time, views of one moment are at most {apart:.3f} s apart",
+        (
+            f"videos of {rates} frames a second: paired by time, views of one moment are at most"
+            f" {apart:.3f} s apart"
+        ),
     )
 
 
@@ -131,7 +143,9 @@ def _warnings(
     frames: Mapping[str, Sequence[int | None]],
     moments: Float[np.ndarray, " m"],
 ) -> tuple[str, ...]:
-    """A line for each camera that has no frame at a moment before its end, or that ends before others."""
+    """A line for each camera that has no frame at a moment before its end, or that ends before
+    others.
+    """
     found = []
     for camera, numbers in frames.items():
         without = moments[[number is None for number in numbers]]
@@ -139,17 +153,21 @@ def _warnings(
         if len(inside):
             where = f"{inside[0]:.2f} to {inside[-1]:.2f} s"
             found.append(
-                f"{camera}: no frame at {counted(len(inside), 'moment')} ({where}): left out there; were frames dropped?"
+                f"{camera}: no frame at {counted(len(inside), 'moment')} ({where}): left out there;"
+                " were frames dropped?"
             )
         if len(behind := without[without >= clocks[camera][-1]]) > 1:
             found.append(
-                f"{camera}: ends at {clocks[camera][-1]:.2f} s, {counted(len(behind), 'moment')} before the last video"
+                f"{camera}: ends at {clocks[camera][-1]:.2f} s, {counted(len(behind), 'moment')}"
+                " before the last video"
             )
     return tuple(found)
 
 
 def progressions(numbers: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Arithmetic progressions (first, step, last) that ascending numbers are made of; the step of a single number is 0."""
+    """Arithmetic progressions (first, step, last) that ascending numbers are made of; the step of a
+    single number is 0.
+    """
     found: list[tuple[int, int, int]] = []
     for number in numbers:
         first, step, last = found[-1] if found else (number, -1, number)

@@ -1,8 +1,10 @@
-"""Which photo belongs to which camera and to which frame, by file names; which way up it is, by its EXIF orientation; its mask.
+"""Which photo belongs to which camera and to which frame, by file names; which way up it is, by its
+EXIF orientation; its mask.
 
-Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it. What an import writes has none:
-pixels are turned upright, and with them the camera, if it was calibrated for the pixels as stored (COLMAP). A calibration of the
-turned photo (OpenCV) is told by its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
+Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it.
+What an import writes has none: pixels are turned upright, and with them the camera, if it was
+calibrated for the pixels as stored (COLMAP). A calibration of the turned photo (OpenCV) is told by
+its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
 """
 
 import dataclasses
@@ -37,7 +39,9 @@ from humangs_jax.io.images import (
 )
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
-"""File types of photos that are looked for by a name without one; with one, any mix of cases will do."""
+"""File types of photos that are looked for by a name without one; with one, any mix of cases will
+do.
+"""
 LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
 
 
@@ -62,9 +66,11 @@ NO_PHOTO_SHOWN = 4
 
 
 def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, str | None]:
-    """The calibration without those cameras that have no photo, and a line about them; None where all have one.
+    """The calibration without those cameras that have no photo, and a line about them; None where
+    all have one.
 
-    Raises: CaptureError if no camera has a photo, or if a file that names its images lacks one while other photos are there.
+    Raises: CaptureError if no camera has a photo, or if a file that names its images lacks one
+    while other photos are there.
     """
     if calibration.per_image:
         there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]
@@ -86,7 +92,10 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
             )  # their names do not match: which photo is meant?
     noun = "image" if calibration.per_image else "camera"
     whole = counted(len(there), noun)
-    line = f"left out, without a photo: {len(missing)} of {whole} of {calibration.file.name} ({few(missing, NO_PHOTO_SHOWN)})"
+    line = (
+        f"left out, without a photo: {len(missing)} of {whole} of {calibration.file.name}"
+        f" ({few(missing, NO_PHOTO_SHOWN)})"
+    )
     return kept, line
 
 
@@ -103,7 +112,8 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
     """The photos of a calibration, frame after frame.
 
     masks: a folder; None: where the calibration names masks that are there, these.
-    Raises: CaptureError if an image of the calibration, or all of a camera, or a mask, is not there, or some of the named ones.
+    Raises: CaptureError if an image of the calibration, or all of a camera, or a mask, is not
+    there, or some of the named ones.
     """
     if calibration.per_image:
         owners: dict[Path, str] = {}
@@ -146,7 +156,9 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
 
 
 def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
-    """The masks that a calibration names, by camera: in its folder, in that of the photos or in the one around. All or none."""
+    """The masks that a calibration names, by camera: in its folder, in that of the photos or in the
+    one around. All or none.
+    """
     found: dict[int, Path] = {}
     for i, name in (
         (i, camera.mask) for i, camera in enumerate(calibration.cameras) if camera.mask
@@ -165,9 +177,11 @@ def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
 
 
 def photo_of(folder: Path, name: str, file: Path) -> Path:
-    """The photo that a file names, by a path that may lack its suffix, have another one, or begin with folders above `folder`.
+    """The photo that a file names, by a path that may lack its suffix, have another one, or begin
+    with folders above `folder`.
 
-    Raises: CaptureError if there is none, and for a link to what is outside of the folder, see `io.reading.inside`.
+    Raises: CaptureError if there is none, and for a link to what is outside of the folder, see
+    `io.reading.inside`.
     """
     photo = _photo_at(folder, name)
     if photo is None:
@@ -195,16 +209,21 @@ def _any_suffix(path: Path) -> Path | None:
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, of the file's head alone. Raises: CaptureError if it is no image."""
+    """Width and height in pixels, of the file's head alone.
+
+    Raises: CaptureError if it is no image.
+    """
     return read_checked(image_size, path)
 
 
 def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
-    """A function that finds the mask of a photo of `images`: at the same path in the folder of masks.
+    """A function that finds the mask of a photo of `images`: at the same path in the folder of
+    masks.
 
-    Its name is the photo's, perhaps with one more suffix (COLMAP) or with a word for masks (RealityScan's IMG.jpg.mask.png,
-    Metashape's IMG_mask.png). AvatarReX has it in mask/pha beside the photo; photos and masks are in one folder there, so that
-    the photo itself can be what is found first. The function raises CaptureError where there is none.
+    Its name is the photo's, perhaps with one more suffix (COLMAP) or with a word for masks
+    (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). AvatarReX has it in mask/pha beside
+    the photo; photos and masks are in one folder there, so that the photo itself can be what is
+    found first. The function raises CaptureError where there is none.
     """
     listed: dict[Path, dict[str, Path]] = {}
 
@@ -235,7 +254,9 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
 
 
 def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
-    """Name of the frame -> photo, for each camera, in the first of the layouts of which there is a photo."""
+    """Name of the frame -> photo, for each camera, in the first of the layouts of which there is a
+    photo.
+    """
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         checked_path(images, name, images)
@@ -279,7 +300,8 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
     ]
 
 
-# Orientation ----------------------------------------------------------------------------------------------------------
+# Orientation
+# --------------------------------------------------------------------------------------------------
 
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
 """Clockwise quarter turns that a flag asks for."""
@@ -319,8 +341,9 @@ class Turn:
 def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn, ...]:
     """One for each photo.
 
-    Raises: CaptureError unless photos have the size that was calibrated, and masks that of their photo; and for a camera that was
-    calibrated for pixels as stored, but whose photos have different flags.
+    Raises: CaptureError unless photos have the size that was calibrated, and masks that of their
+    photo; and for a camera that was calibrated for pixels as stored, but whose photos have
+    different flags.
     """
     turns = tuple(
         _find_turn(calibration.cameras[photo.camera], photo, calibration.upright)
@@ -330,7 +353,10 @@ def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn,
     for photo, turn in zip(photos, turns, strict=True):
         other, known = first.setdefault(photo.camera, (photo, turn))
         if known.quarters != turn.quarters:
-            problem = f"EXIF orientation {turn.photo}, but {other.image.name} of the same camera has {known.photo}"
+            problem = (
+                f"EXIF orientation {turn.photo}, but {other.image.name} of the same camera has"
+                f" {known.photo}"
+            )
             raise CaptureError(
                 photo.image, "", f"{problem}: expected one; turn the photos before calibrating"
             )
@@ -361,7 +387,8 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
 def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
     """A mask with a flag, or of the size of the turned photo, shows it as turned; else as stored.
 
-    Where both sizes are the same it is taken to be turned: most tools that make masks obey the flag.
+    Where both sizes are the same it is taken to be turned: most tools that make masks obey the
+    flag.
     """
     own, size = read_checked(orientation, mask), photo_size(mask)
     size = size if own < 5 else size[::-1]
@@ -376,7 +403,10 @@ def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int,
 
 
 def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h w"]:
-    """Reads the mask of a photo, as the photo is shown. Raises: CaptureError if there is none, or one of another size."""
+    """Reads the mask of a photo, as the photo is shown.
+
+    Raises: CaptureError if there is none, or one of another size.
+    """
     file = _masks_of(masks, images)(image)
     flag, stored = read_checked(orientation, image), photo_size(image)
     shown = stored if flag < 5 else stored[::-1]
@@ -386,7 +416,9 @@ def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h
 def turned_cameras(
     calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn]
 ) -> Calibration:
-    """The calibration, in the convention of captures, of the photos as they are imported, sizes included."""
+    """The calibration, in the convention of captures, of the photos as they are imported, sizes
+    included.
+    """
     cameras, seen = list(calibration.cameras), calibration.observations
     pixels = None if seen is None else seen.pixels.copy()
     for i, turn in {photo.camera: turn for photo, turn in zip(photos, turns, strict=True)}.items():
@@ -404,7 +436,9 @@ def turned_cameras(
 
 
 def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
-    """The camera of the photo turned clockwise: pixel (x, y) moves to (height - y, x), and so do the camera's axes."""
+    """The camera of the photo turned clockwise: pixel (x, y) moves to (height - y, x), and so do
+    the camera's axes.
+    """
     assert camera.width is not None and camera.height is not None
     turn = np.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     move = turn.copy()
@@ -440,8 +474,9 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
         which = few([photo.image.name for photo, _ in unsure], 1)
         of_masks = ", the mask to be of the turned photo" if unsure[0][0].mask is not None else ""
         warnings.append(
-            f"EXIF orientation {unsure[0][1].photo} of {which}: the calibration is taken to be of the stored pixels{of_masks}; "
-            "their sizes do not tell. If that is wrong, save the photos turned"
+            f"EXIF orientation {unsure[0][1].photo} of {which}: the calibration is taken to be of"
+            f" the stored pixels{of_masks}; their sizes do not tell. If that is wrong, save the"
+            " photos turned"
         )
     if mirrored := [photo.image.name for photo, turn in flagged if turn.mirrored]:
         warnings.append(
@@ -450,7 +485,8 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
     return notes, warnings
 
 
-# Masks ----------------------------------------------------------------------------------------------------------------
+# Masks
+# --------------------------------------------------------------------------------------------------
 
 AROUND = 0.8
 """Share of a photo's border that no person covers: a mask that does is inverted."""
@@ -462,10 +498,11 @@ INVERTED = (
 
 
 def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
-    """Warnings about masks, files or alpha channels, one line for each kind of fault, naming the photos.
+    """Warnings about masks, files or alpha channels, one line for each kind of fault, naming the
+    photos.
 
-    Raises: CaptureError for a mask that no capture may have, for masks none of which shows anybody, and, where there are no mask
-    files, for an alpha channel in some of the photos only.
+    Raises: CaptureError for a mask that no capture may have, for masks none of which shows anybody,
+    and, where there are no mask files, for an alpha channel in some of the photos only.
     """
     masked = photos[0].mask is not None
     if not masked:
@@ -513,6 +550,9 @@ def has_alpha(photo: Path) -> bool:
 
 
 def is_transparent(photo: Path) -> bool:
-    """Whether a photo has transparent pixels; an opaque alpha channel is no mask. Raises: CaptureError."""
+    """Whether a photo has transparent pixels; an opaque alpha channel is no mask.
+
+    Raises: CaptureError.
+    """
     alpha = read_checked(read_image, photo)[1] if read_checked(has_alpha, photo) else None
     return alpha is not None and bool(alpha.min() < 1)

@@ -1,12 +1,15 @@
-"""Formats with a camera for each camera: OpenCV's K, R and T (AvatarReX, THuman4.0), EasyMocap, Panoptic, TOML, Qualisys.
+"""Formats with a camera for each camera: OpenCV's K, R and T (AvatarReX, THuman4.0), EasyMocap,
+Panoptic, TOML, Qualisys.
 
-A world point X is at R X + T in the camera, pixel centres are at whole numbers. The values of a camera stand in a map of its own,
-`{"cam00": {"K": .., "R": .., "T": .., "imgSize": [W, H]}}`, or beside those of others with its name behind: `K_01`, `dist_01`,
-`Rot_01` or `R_01` (matrix or rotation vector), `T_01`, with the list `names`, as in EasyMocap's intri.yml and extri.yml
+A world point X is at R X + T in the camera, pixel centres are at whole numbers. The values of a
+camera stand in a map of its own, `{"cam00": {"K": .., "R": .., "T": .., "imgSize": [W, H]}}`, or
+beside those of others with its name behind: `K_01`, `dist_01`, `Rot_01` or `R_01` (matrix or
+rotation vector), `T_01`, with the list `names`, as in EasyMocap's intri.yml and extri.yml
 (https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
 
-FileStorage's YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps have no space after a colon ({ x:1 }). Matrices are
-`!!opencv-matrix` with rows, cols, dt and data. https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
+FileStorage's YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps have no space after a
+colon ({ x:1 }). Matrices are `!!opencv-matrix` with rows, cols, dt and data.
+https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
 """
 
 import functools
@@ -92,7 +95,9 @@ def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
 def _flat_cameras(
     values: Mapping[str, Any], file_of: Callable[[str], Path]
 ) -> list[CalibratedCamera]:
-    """Cameras whose names stand behind their keys: those of the list `names`, else those that have a K."""
+    """Cameras whose names stand behind their keys: those of the list `names`, else those that have
+    a K.
+    """
     names = list(values.get("names") or (key[2:] for key in values if key.startswith("K_")))
     if not names:
         raise CaptureError(
@@ -117,7 +122,10 @@ def _flat_cameras(
 def _renamed_camera(
     name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str
 ) -> CalibratedCamera:
-    """A camera of an entry in which OpenCV's keys have these names: theirs -> OpenCV's. Others are not looked at."""
+    """A camera of an entry in which OpenCV's keys have these names: theirs -> OpenCV's.
+
+    Others are not looked at.
+    """
     theirs = {ours: key for key, ours in keys.items()} | {
         keys[key]: key for key in entry if key in keys
     }
@@ -158,7 +166,9 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
 
 
 def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
-    """Shelf and Campus (VoxelPose): focal lengths and centres by name, a lens as k and p; T is where the camera stands."""
+    """Shelf and Campus (VoxelPose): focal lengths and centres by name, a lens as k and p; T is
+    where the camera stands.
+    """
     numbers = lambda key, *shape: floats(values[key], *where(key), shape)
     turn, lens = rotation(values["R"], *where("R")), {}
     if "k" in values:
@@ -169,7 +179,8 @@ def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
     return others | lens | {"K": K, "R": turn, "T": -turn @ numbers("T", 3)}
 
 
-# FileStorage -----------------------------------------------------------------------------------------------------------
+# FileStorage
+# --------------------------------------------------------------------------------------------------
 
 MATRIX = "opencv-matrix"
 YAML_TAG = "tag:yaml.org,2002:"
@@ -180,7 +191,10 @@ TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
 
 
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
-    """The values of a FileStorage text; matrices are (rows, cols) arrays. Raises: CaptureError naming the line."""
+    """The values of a FileStorage text; matrices are (rows, cols) arrays.
+
+    Raises: CaptureError naming the line.
+    """
     with reading(file, "YAML file", CaptureError):
         values = (
             _matrices(parse_json(text), file, "")
@@ -222,7 +236,9 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, file: Path) -> Any:
-    """The value of a node; numbers are read here, because YAML takes the camera's name 01 for one."""
+    """The value of a node; numbers are read here, because YAML takes the camera's name 01 for
+    one.
+    """
     if isinstance(node, yaml.ScalarNode):
         value = _scalar(node.value) if node.style is None else node.value
     elif isinstance(node, yaml.SequenceNode):
@@ -269,7 +285,8 @@ def _matrices(value: Any, file: Path, field: str) -> Any:
     return {key: _matrices(item, file, f"{field}.{key}".lstrip(".")) for key, item in value.items()}
 
 
-# CMU Panoptic: a list `cameras` of K, distCoef, R, t (centimetres) and resolution --------------------------------------
+# CMU Panoptic: a list `cameras` of K, distCoef, R, t (centimetres) and resolution
+# --------------------------------------
 
 PANOPTIC_KEYS = {
     "K": "K",
@@ -301,10 +318,13 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
     return source.calibration(format, cameras)
 
 
-# multical: `cameras` with lenses, and `camera_poses` from one camera to another -------------------------------------------
+# multical: `cameras` with lenses, and `camera_poses` from one camera to another
+# -------------------------------------------
 
 RELATIVE = "_to_"
-"""Between the names of two cameras: the pose of the first, in the axes of the second, as X_first = R X_second + T."""
+"""Between the names of two cameras: the pose of the first, in the axes of the second, as X_first =
+R X_second + T.
+"""
 
 
 def recognizes_multical(source: Source) -> bool:
@@ -315,7 +335,10 @@ def recognizes_multical(source: Source) -> bool:
 
 
 def read_multical(source: Source, format: CameraFormat) -> Calibration:
-    """The cameras of both maps; the world is the camera that has a pose of its own. Raises: CaptureError naming the key."""
+    """The cameras of both maps; the world is the camera that has a pose of its own.
+
+    Raises: CaptureError naming the key.
+    """
     file, lenses = source.path, source.json["cameras"]
     poses: dict[str, Float[np.ndarray, "4 4"]] = {}
     waiting: dict[str, tuple[str, Float[np.ndarray, "4 4"]]] = {}
@@ -354,7 +377,9 @@ def read_multical(source: Source, format: CameraFormat) -> Calibration:
 
 
 def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
-    """The camera that a key of `camera_poses` is of, and the one in whose axes it is, None for the world's."""
+    """The camera that a key of `camera_poses` is of, and the one in whose axes it is, None for the
+    world's.
+    """
     parts = key.split(RELATIVE)
     for i in range(1, len(parts)):
         name, base = RELATIVE.join(parts[:i]), RELATIVE.join(parts[i:])
@@ -363,7 +388,8 @@ def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
     return key, None
 
 
-# TOML of Caliscope, Anipose and Pose2Sim: a table of each camera -------------------------------------------------------
+# TOML of Caliscope, Anipose and Pose2Sim: a table of each camera
+# -------------------------------------------------------
 
 TOML_KEYS = {
     "matrix": "K",
@@ -381,7 +407,10 @@ def recognizes_toml(source: Source) -> bool:
 
 
 def read_toml(source: Source, format: CameraFormat) -> Calibration:
-    """The cameras of a file, but for those to be ignored or never placed. Raises: CaptureError naming the key."""
+    """The cameras of a file, but for those to be ignored or never placed.
+
+    Raises: CaptureError naming the key.
+    """
     cameras, file = [], source.path
     for key, table in _tables(source).items():
         if table.get("ignore") is True:
@@ -410,7 +439,8 @@ def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
     return found
 
 
-# Qualisys Track Manager's XML ------------------------------------------------------------------------------------------
+# Qualisys Track Manager's XML
+# ------------------------------------------------------------------------------------------
 
 SUBPIXELS = 64.0
 METRES = 1e-3

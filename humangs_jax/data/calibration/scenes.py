@@ -1,8 +1,10 @@
-"""Formats with a camera for each image: COLMAP's models, and transforms.json (NeRF, nerfstudio, GaussianAvatars, VHAP).
+"""Formats with a camera for each image: COLMAP's models, and transforms.json (NeRF, nerfstudio,
+GaussianAvatars, VHAP).
 
 COLMAP: a folder with cameras.txt, images.txt and, optionally, points3D.txt, or the same as .bin
-(https://colmap.github.io/format.html). images.txt has two lines for each image: the pose (world to camera, OpenCV axes,
-quaternion wxyz) and the points seen, which may be empty. Pixel centres are at +0.5; unit and axes of the world are arbitrary.
+(https://colmap.github.io/format.html). images.txt has two lines for each image: the pose (world to
+camera, OpenCV axes, quaternion wxyz) and the points seen, which may be empty. Pixel centres are at
++0.5; unit and axes of the world are arbitrary.
 """
 
 import dataclasses
@@ -39,7 +41,9 @@ from humangs_jax.data.formats import CameraFormat
 from humangs_jax.io.reading import Refused, read_bytes, reading, shown
 
 Registered = tuple[str, str, str, Sequence[float], np.ndarray]
-"""Of an image: where it stands, its name, the number of the camera, quaternion and translation, (n, 3) points as x y id."""
+"""Of an image: where it stands, its name, the number of the camera, quaternion and translation, (n,
+3) points as x y id.
+"""
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -47,11 +51,16 @@ PARAMETERS = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-"""Camera models and their parameters in cameras.txt; in cameras.bin they are numbered in this order."""
+"""Camera models and their parameters in cameras.txt; in cameras.bin they are numbered in this
+order.
+"""
 
 
 def read_colmap(source: Source, format: CameraFormat) -> Calibration:
-    """The registered images of a model, in the order of its file. Raises: CaptureError naming the file and, of text, the line."""
+    """The registered images of a model, in the order of its file.
+
+    Raises: CaptureError naming the file and, of text, the line.
+    """
     binary = not any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
     suffix = ".bin" if binary else ".txt"
     cameras_file, file, points_file = (
@@ -120,7 +129,8 @@ def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, 
     return pose_matrix(Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), translation)
 
 
-# Text -----------------------------------------------------------------------------------------------------------------
+# Text
+# --------------------------------------------------------------------------------------------------
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
@@ -177,11 +187,15 @@ def _text_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
             )
 
 
-# Binary: read inside `reading`, which names the file -------------------------------------------------------------------
+# Binary: read inside `reading`, which names the file
+# -------------------------------------------------------------------
 
 
 class _Bytes:
-    """Numbers of a file, little-endian, one after the other. Raises: Refused where it ends before."""
+    """Numbers of a file, little-endian, one after the other.
+
+    Raises: Refused where it ends before.
+    """
 
     def __init__(self, file: Path):
         self.data, self.at = read_bytes(file, "mesh_bytes"), 0
@@ -237,7 +251,8 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
             yield point, floats(place, file, f"point {i}", (3,)).tolist()
 
 
-# transforms.json -------------------------------------------------------------------------------------------------------
+# transforms.json
+# --------------------------------------------------------------------------------------------------
 
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 MASK_KEYS = ("fg_mask_path", "mask_path")
@@ -334,7 +349,8 @@ def _frame_camera(
     )
 
 
-# Moments ---------------------------------------------------------------------------------------------------------------
+# Moments
+# --------------------------------------------------------------------------------------------------
 
 MOMENT_KEYS = (
     "timestep_index",
@@ -356,8 +372,9 @@ def _find_moments(
 ) -> tuple[list[int], int]:
     """The frame of each image, counted from 0 in the order of time, and how many cameras there are.
 
-    Raises: CaptureError naming the key, for a value in some images only, for what is no time, for two images of one camera and
-    one moment, and for several images of a camera where nothing tells which were taken together.
+    Raises: CaptureError naming the key, for a value in some images only, for what is no time, for
+    two images of one camera and one moment, and for several images of a camera where nothing tells
+    which were taken together.
     """
     key, times = _values(frames, MOMENT_KEYS, file)
     owner, owners = _values(frames, CAMERA_KEYS, file)
@@ -373,7 +390,10 @@ def _find_moments(
         return list(range(len(frames))), 1
     if not key and repeated is not None:
         which = f"the {owner} {owners[repeated[0]]}" if owner else "the same camera pose"
-        problem = f"frames[{repeated[0]}] and frames[{repeated[1]}] have {which}, so they show different moments"
+        problem = (
+            f"frames[{repeated[0]}] and frames[{repeated[1]}] have {which}, so they show different"
+            " moments"
+        )
         raise CaptureError(
             file,
             "frames",
@@ -383,7 +403,10 @@ def _find_moments(
     taken: dict[Any, int] = {}
     for i, moment in enumerate(zip(owners, ranks, strict=True)):
         if owner and (other := taken.setdefault(moment, i)) != i:
-            problem = f"the {owner} and {key} of frames[{other}]: expected one photo of a camera at a moment"
+            problem = (
+                f"the {owner} and {key} of frames[{other}]: expected one photo of a camera at a"
+                " moment"
+            )
             raise CaptureError(file, f"frames[{i}]", problem)
     return ranks, len(first)
 
@@ -391,7 +414,9 @@ def _find_moments(
 def _values(
     frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
 ) -> tuple[str, list[Any]]:
-    """The first key that an image has, and its value in all of them, numbers or names; "" if there is none."""
+    """The first key that an image has, and its value in all of them, numbers or names; "" if there
+    is none.
+    """
     key = next((key for key in keys if any(key in frame for frame in frames)), "")
     values = []
     for i, frame in enumerate(frames if key else ()):

@@ -38,9 +38,11 @@ def binary_kind(file: Path) -> str | None:
     known = (kind for start, kind in BINARIES.items() if head.startswith(start))
     return next(
         known,
-        "a binary file"
-        if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff"))
-        else None,
+        (
+            "a binary file"
+            if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff"))
+            else None
+        ),
     )
 
 
@@ -50,7 +52,10 @@ def described(text: str) -> str:
         return ""
     keys = KEY.findall(text.replace("{", "\n").replace(",", "\n"))
     if "T_cn_cnm1" in keys or ("distortion_model" in keys and "intrinsics" in keys):
-        return "a camchain of Kalibr: write R and T of each camera into calibration.json, docs/cameras.md"
+        return (
+            "a camchain of Kalibr: write R and T of each camera into calibration.json,"
+            " docs/cameras.md"
+        )
     if any(key in INTRINSICS for key in keys):
         return (
             "the lens of one camera, without where it stands: K, R and T of each camera are needed"

@@ -1,15 +1,20 @@
-"""Videos -> photos: of synchronised cameras, a folder for each; of one camera, its best frames. By ffmpeg (imageio-ffmpeg).
+"""Videos -> photos: of synchronised cameras, a folder for each; of one camera, its best frames. By
+ffmpeg (imageio-ffmpeg).
 
-    CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0, every, 2 every ...
+    CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0,
+                                                 every, 2 every ...
 
-All videos of several cameras have to begin at the same moment. Where their rates differ, or one lacks frames, those of one
-moment are found by time (`moments`), and the numbers are those of moments. Masks are videos of the same names.
+All videos of several cameras have to begin at the same moment. Where their rates differ, or one
+lacks frames, those of one moment are found by time (`moments`), and the numbers are those of
+moments. Masks are videos of the same names.
 
-What a video says about itself is obeyed: pixels that are not square are scaled to square ones, and colors of high dynamic range
-or of wide primaries are converted to those of sRGB. Other videos keep their values.
+What a video says about itself is obeyed: pixels that are not square are scaled to square ones, and
+colors of high dynamic range or of wide primaries are converted to those of sRGB. Other videos keep
+their values.
 
-Of one video, of a phone that goes around a person or of a person who turns, frames are taken that are sharp and differ: each of
-equal windows of time offers its sharpest one, and that is taken which differs most from all that were taken, until none does.
+Of one video, of a phone that goes around a person or of a person who turns, frames are taken that
+are sharp and differ: each of equal windows of time offers its sharpest one, and that is taken which
+differs most from all that were taken, until none does.
 """
 
 import contextlib
@@ -32,13 +37,18 @@ from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
 
 CONTAINERS = "mov,matroska,avi,mpegts"
-"""Formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat, playlists)."""
+"""Formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat,
+playlists).
+"""
 LONGEST_SECONDS = 3600
 """After which ffmpeg is stopped."""
 
 
 def find_videos(folder: Path) -> dict[str, Path]:
-    """Name of the camera -> its video, of the videos in a folder. Raises: CaptureError for two videos of one camera."""
+    """Name of the camera -> its video, of the videos in a folder.
+
+    Raises: CaptureError for two videos of one camera.
+    """
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if is_video(path):
@@ -81,13 +91,16 @@ class VideoPhotos(NamedTuple):
 def photos_of_videos(
     images: Path, masks: Path | None, place: Path, every: int = 1, most: int | None = None
 ) -> Generator[VideoPhotos]:
-    """Folders of photos and masks. Those of videos are written beside `place` and removed in the end; others are as given.
+    """Folders of photos and masks. Those of videos are written beside `place` and removed in the
+    end; others are as given.
 
-    Where photos and videos are in one folder, as a phone stores the clips of Live Photos, the photos are what is meant.
+    Where photos and videos are in one folder, as a phone stores the clips of Live Photos, the
+    photos are what is meant.
 
-    Arguments: every: step of frames, or of moments, from 0. most: photos of a camera, None: all. Who asks for these means the
-    videos.
-    Raises: CaptureError naming the video, also if every or most ask something of folders that hold none.
+    Arguments: every: step of frames, or of moments, from 0. most: photos of a camera, None: all.
+    Who asks for these means the videos.
+    Raises: CaptureError naming the video, also if every or most ask something of folders that hold
+    none.
     """
     asked = every != 1 or most is not None
     given = {"images": images} if masks is None else {"images": images, "masks": masks}
@@ -147,7 +160,8 @@ def _has_photos(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def named_after(temporary: Path, folder: Path) -> Generator[None]:
-    """Errors about a temporary folder name the folder that it was made of, since the temporary one is gone when they are read.
+    """Errors about a temporary folder name the folder that it was made of, since the temporary one
+    is gone when they are read.
 
     Raises: CaptureError.
     """
@@ -163,7 +177,9 @@ def named_after(temporary: Path, folder: Path) -> Generator[None]:
 def _moments(
     videos: Mapping[str, Path], every: int, most: int | None
 ) -> tuple[Moments | None, float | None]:
-    """The moments of several videos, or None of one, or of the first frames; and the seconds that were looked at, None: all."""
+    """The moments of several videos, or None of one, or of the first frames; and the seconds that
+    were looked at, None: all.
+    """
     if len(videos) < 2 or most == 1:
         return None, None
     rates = []
@@ -171,15 +187,18 @@ def _moments(
         with reading(path, "video", CaptureError):
             rates += filter(None, [_shown(path).rate])
     seconds = None if most is None or not rates else (most * every + 1) / min(rates)
-    return find_moments(
-        {camera: frame_times(path, seconds) for camera, path in videos.items()}
-    ), seconds
+    return (
+        find_moments({camera: frame_times(path, seconds) for camera, path in videos.items()}),
+        seconds,
+    )
 
 
 def _mask_frames(
     path: Path, camera: str, moments: Moments, seconds: float | None
 ) -> list[int | None]:
-    """The numbers of a camera's masks at the moments: those of its photos if there are as many, else by their own times."""
+    """The numbers of a camera's masks at the moments: those of its photos if there are as many,
+    else by their own times.
+    """
     times = frame_times(path, seconds)
     if len(times) == moments.counts[camera] or not np.isfinite(times).all():
         return moments.frames[camera]
@@ -191,7 +210,8 @@ def _mask_frames(
 
 
 def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, " n"]:
-    """Seconds of its file at which the frames of a video are shown, in order, up to some; NaN where it does not say.
+    """Seconds of its file at which the frames of a video are shown, in order, up to some; NaN where
+    it does not say.
 
     Raises: CaptureError naming the video.
     """
@@ -218,9 +238,10 @@ def split_video(
 ) -> int:
     """Write frames of a video as 00000000.png, ... into a new folder.
 
-    Arguments: before: pixels of the frames of other videos, which count towards the limit `video_pixels`. chosen: in place of
-    `every` and `most`, the frame for each file, ascending; there is no file for None. mask_of: the video whose masks these are:
-    its shape is theirs, and their values are no colors.
+    Arguments: before: pixels of the frames of other videos, which count towards the limit
+    `video_pixels`. chosen: in place of `every` and `most`, the frame for each file, ascending;
+    there is no file for None. mask_of: the video whose masks these are: its shape is theirs, and
+    their values are no colors.
     Returns: pixels of all frames so far.
     Raises: CaptureError naming the video.
     """
@@ -253,7 +274,8 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
         raise Refused("has no frame at the moments of the others")
     if _run(path, folder, _expression(numbers), len(numbers), shown) != len(numbers):
         raise Refused(
-            f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it goes with"
+            f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it"
+            " goes with"
         )
     for i, place in reversed(
         list(enumerate(places))
@@ -266,11 +288,16 @@ MOST_RUNS = 2000
 
 
 def _expression(numbers: Sequence[int]) -> str:
-    """ffmpeg's condition for frames of these numbers. Raises: Refused for too many that follow no rule."""
+    """ffmpeg's condition for frames of these numbers.
+
+    Raises: Refused for too many that follow no rule.
+    """
     terms = [
-        f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))"
-        if step
-        else f"eq(n\\,{first})"
+        (
+            f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))"
+            if step
+            else f"eq(n\\,{first})"
+        )
         for first, step, last in progressions(numbers)
     ]
     if len(terms) > MOST_RUNS:
@@ -292,11 +319,14 @@ def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
         return image.size
 
 
-# What a video says about itself ---------------------------------------------------------------------------------------
+# What a video says about itself
+# ---------------------------------------------------------------------------------------
 
 STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
 COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
-"""Matrix, primaries and curve, behind the format of pixels: yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67, progressive)."""
+"""Matrix, primaries and curve, behind the format of pixels: yuv420p10le(tv,
+bt2020nc/bt2020/arib-std-b67, progressive).
+"""
 PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
 RATE = re.compile(r", ([\d.]+)(k?) fps\b")
 PRIMARIES = {"bt2020": 9, "smpte432": 12}
@@ -326,7 +356,10 @@ def _shown(path: Path) -> _Shown:
     if shape is not None and shape[1] != shape[2]:
         wide, high = int(shape[1]), int(shape[2])
         if max(wide, high) > WIDEST_PIXEL * min(wide, high):
-            problem = f"its pixels are {wide} to {high} wide to high: expected at most {WIDEST_PIXEL} to 1, or square ones"
+            problem = (
+                f"its pixels are {wide} to {high} wide to high: expected at most {WIDEST_PIXEL} to"
+                " 1, or square ones"
+            )
             raise Refused(problem)
         found = found._replace(shape=SQUARE)
     return found if colors is None else _with_colors(found, *colors.groups())
@@ -345,7 +378,9 @@ def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _
 
 
 def _shown_as_mask(path: Path, photos: Path) -> _Shown:
-    """Of a video of masks: the shape of its photos' pixels if frames have the size of theirs and say nothing; no colors."""
+    """Of a video of masks: the shape of its photos' pixels if frames have the size of theirs and
+    say nothing; no colors.
+    """
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()
     if (
@@ -376,7 +411,8 @@ def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
 
 
 def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
-    """Write these frames of a video, counted from 0 and in order, as frame_00000017.png, ... into a new folder.
+    """Write these frames of a video, counted from 0 and in order, as frame_00000017.png, ... into a
+    new folder.
 
     Raises: CaptureError naming the video.
     """
@@ -391,7 +427,10 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
 
 
 def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"]]:
-    """All frames of a video, one after the other, grey and no larger than that. Raises: CaptureError naming the video."""
+    """All frames of a video, one after the other, grey and no larger than that.
+
+    Raises: CaptureError naming the video.
+    """
     with reading(path, "video", CaptureError):
         width, height = _frame_size(path, _shown(path))
         room, scale = (
@@ -433,7 +472,8 @@ def _opened(path: Path, verbosity: str = "error") -> list[str]:
         "-nostdin",
         "-xerror",
     ]
-    # a playlist in disguise may name other files and hosts; pictures may be larger than what is read later
+    # a playlist in disguise may name other files and hosts; pictures may be larger than what is
+    # read later
     command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
     return [*command, "-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
 
@@ -443,7 +483,9 @@ def _ffmpeg(path: Path, filters: str) -> list[str]:
 
 
 def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int:
-    """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there are."""
+    """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there
+    are.
+    """
     table, filters = folder / TABLE, [f"select={select}", *filter(None, [shown.shape])]
     if shown.encoding is not None:
         table.write_text(cube(shown.encoding))
@@ -488,7 +530,8 @@ def _said(path: Path, text: bytes) -> ValueError:
     return ValueError(said.replace(f"file:{path.resolve()}", path.name))
 
 
-# Which frames become photos -------------------------------------------------------------------------------------------
+# Which frames become photos
+# -------------------------------------------------------------------------------------------
 
 PHOTOS = 8
 """A person from all sides."""
@@ -506,9 +549,11 @@ NOTHING_NEW = 0.05
 def looked_at(
     frames: Iterable[UInt[np.ndarray, "h w"]],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
-    """Sharpness and thumbnail of each grey frame; the thumbnails have mean 0 and variance 1, or are 0 where nothing is shown.
+    """Sharpness and thumbnail of each grey frame; the thumbnails have mean 0 and variance 1, or are
+    0 where nothing is shown.
 
-    Sharpness is the mean square of the Laplacian over the variance of the frame: exposure does not change it.
+    Sharpness is the mean square of the Laplacian over the variance of the frame: exposure does not
+    change it.
     """
     sharpness, thumbnails = [], []
     for frame in frames:

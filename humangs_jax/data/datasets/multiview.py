@@ -5,25 +5,32 @@
     AvatarReX   4 subjects, 16 cameras of 1500 x 2048 (https://github.com/ZhengZerong/AvatarReX)
                 avatarrex_*/SERIAL/%08d.jpg    SERIAL/mask/pha/%08d.jpg    calibration_full.json
     both        smpl_params.npz    missing_img_files.txt (not always)
-    ActorsHQ    8 actors, 160 cameras (https://actors-hq.com; calibration as HumanRF's reader has it)
+    ActorsHQ    8 actors, 160 cameras (https://actors-hq.com), calibration as in HumanRF's reader
                 ActorNN/SequenceN/{1x,2x,4x}/calibration.csv
-                rgbs/CamNNN/CamNNN_rgb%06d.jpg (background removed)    masks/CamNNN/CamNNN_mask%06d.png
-                ActorNN/SequenceN/smpl_params.npz, of some sequences by the authors of Animatable Gaussians
-    DNA-Rendering   60 cameras, in HDF5 (https://dna-rendering.github.io; as the official SMCReader has it)
-                main/NAME.smc    Camera_5mp/0..47/color/FRAME, Camera_12mp/48..59/color/FRAME: encoded photos
+                rgbs/CamNNN/CamNNN_rgb%06d.jpg (background removed)
+                masks/CamNNN/CamNNN_mask%06d.png
+                ActorNN/SequenceN/smpl_params.npz, of some sequences, by the authors of
+                Animatable Gaussians
+    DNA-Rendering   60 cameras, in HDF5 (https://dna-rendering.github.io), as the official
+                SMCReader has it
+                main/NAME.smc    encoded photos: Camera_5mp/0..47/color/FRAME and
+                                 Camera_12mp/48..59/color/FRAME
                 annotations/NAME_annots.smc    Camera_Parameter/CC/{K,D,RT}, Mask/C/mask/FRAME,
                 SMPLx/{betas,expression,fullpose,transl}
 
-Photos are numbered by frame, and a frame's number is the row of its pose. Masks are above 128 on the person.
-smpl_params.npz: global_orient, transl (m, 3), body_pose (m, 63), jaw_pose (m, 3), left/right_hand_pose (m, 45), betas and
-expression (1 or m, 10): SMPL-X, neutral, no principal components, flat_hand_mean TRUE (unlike THuman2.1), no poses of the eyes.
+Photos are numbered by frame, and a frame's number is the row of its pose. Masks are above 128 on
+the person. smpl_params.npz: global_orient, transl (m, 3), body_pose (m, 63), jaw_pose (m, 3),
+left/right_hand_pose (m, 45), betas and expression (1 or m, 10): SMPL-X, neutral, no principal
+components, flat_hand_mean TRUE (unlike THuman2.1), no poses of the eyes.
 
-ActorsHQ's csv has name,w,h,rx,ry,rz,tx,ty,tz,fx,fy,px,py: rotation vector and centre of world_from_cam in metres with OpenCV's
-axes, focal lengths and principal point as shares of width and height. Each scale has its own. Portrait and landscape are mixed.
+ActorsHQ's csv has name,w,h,rx,ry,rz,tx,ty,tz,fx,fy,px,py: rotation vector and centre of
+world_from_cam in metres with OpenCV's axes, focal lengths and principal point as shares of width
+and height. Each scale has its own. Portrait and landscape are mixed.
 
-DNA-Rendering: CC has two digits, C and FRAME have no zeros before. RT is world_from_cam, D is k1 k2 p1 p2 k3: photos and masks
-are undistorted. The mask is the greatest channel. fullpose: 55 x 3, hands relative to the mean hand (flat_hand_mean False),
-gendered model. `scale` and color calibration are unused, as in the readers of others. Needs the package h5py.
+DNA-Rendering: CC has two digits, C and FRAME have no zeros before. RT is world_from_cam, D is k1 k2
+p1 p2 k3: photos and masks are undistorted. The mask is the greatest channel. fullpose: 55 x 3,
+hands relative to the mean hand (flat_hand_mean False), gendered model. `scale` and color
+calibration are unused, as in the readers of others. Needs the package h5py.
 """
 
 import csv
@@ -96,7 +103,8 @@ _ANGLES = {
 def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     """Shape and all poses of smpl_params.npz. Raises: CaptureError naming file and key.
 
-    Where shape or expression differ between frames, those of the first are taken: one person has one shape.
+    Where shape or expression differ between frames, those of the first are taken: one person has
+    one shape.
     """
     values = open_arrays(file)
     count = len(values.numbers("global_orient", (None, 3), LARGEST_ANGLE))
@@ -122,7 +130,10 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
 
 
 def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
-    """The cameras of a file, pixel centres at +0.5; the world's axes stay. Raises: CaptureError naming file and camera."""
+    """The cameras of a file, pixel centres at +0.5; the world's axes stay.
+
+    Raises: CaptureError naming file and camera.
+    """
 
     def no_size(name: str) -> tuple[int, int]:
         raise CaptureError(file, f"{name}.imgSize", "missing")
@@ -132,13 +143,17 @@ def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
 
 
 def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
-    """Cameras of known sizes, rigid, no farther than `FARTHEST` from the origin, with names that can be those of folders.
+    """Cameras of known sizes, rigid, no farther than `FARTHEST` from the origin, with names that
+    can be those of folders.
 
     Raises: CaptureError naming the camera.
     """
     for camera in calibration.cameras:
         if not re.fullmatch(r"[\w-][\w.-]*", camera.name):
-            problem = "expected a name of letters, digits, '.', '_' and '-', since photos lie in a folder of that name"
+            problem = (
+                "expected a name of letters, digits, '.', '_' and '-', since photos lie in a folder"
+                " of that name"
+            )
             raise CaptureError(calibration.file, camera.name, problem)
         if camera.width is None or camera.height is None:
             raise CaptureError(calibration.file, f"{camera.name}.imgSize", "missing")
@@ -151,13 +166,18 @@ def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
             camera.name,
         )
         if (away := float(np.linalg.norm(camera.cam_from_world[:3, 3]))) > FARTHEST:
-            problem = f"the camera stands {away:.4g} m from the origin: expected metres and at most {FARTHEST:g}"
+            problem = (
+                f"the camera stands {away:.4g} m from the origin: expected metres and at most"
+                f" {FARTHEST:g}"
+            )
             raise CaptureError(calibration.file, f"{camera.name}.T", problem)
     return calibration.cameras
 
 
 def numbered(folder: Path) -> dict[int, Path]:
-    """Frame -> its file, of the photos in a folder that are called by a number; empty if it does not exist."""
+    """Frame -> its file, of the photos in a folder that are called by a number; empty if it does
+    not exist.
+    """
     names = [
         name
         for name in (os.listdir(folder) if folder.is_dir() else ())
@@ -167,7 +187,10 @@ def numbered(folder: Path) -> dict[int, Path]:
 
 
 def read_missing(file: Path) -> set[tuple[str, int]]:
-    """(camera, frame) of the photos that the authors list as missing; both kinds of slashes. Empty without the file."""
+    """(camera, frame) of the photos that the authors list as missing; both kinds of slashes.
+
+    Empty without the file.
+    """
     if not file.is_file():
         return set()
     found = set()
@@ -192,10 +215,12 @@ def video_subject(
     listed: Set[tuple[str, int]] = frozenset(),
     digits: int = 8,
 ) -> Subject:
-    """The photos of some cameras that have a mask and a pose, frame after frame and camera after camera.
+    """The photos of some cameras that have a mask and a pose, frame after frame and camera after
+    camera.
 
-    photos, masks: of each camera by frame. read: a photo and its mask -> image on white and mask as 0 and 1. listed: (camera,
-    frame) that are known to be missing. digits: of a frame in the name of a view.
+    photos, masks: of each camera by frame. read: a photo and its mask -> image on white and mask as
+    0 and 1. listed: (camera, frame) that are known to be missing. digits: of a frame in the name of
+    a view.
     Raises: CaptureError if there is no photo.
     """
     count, missing = (
@@ -254,7 +279,10 @@ def folder_subject(
 def on_white(
     photo: Path, mask: Path
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """A photo on white where its mask is at most 128, and the mask as 0 and 1. Raises: CaptureError naming the file."""
+    """A photo on white where its mask is at most 128, and the mask as 0 and 1.
+
+    Raises: CaptureError naming the file.
+    """
     return _cut_out(
         read_checked(read_image, photo)[0], read_checked(read_grey, mask) > ON_PERSON, mask, "size"
     )
@@ -264,7 +292,10 @@ def _cut_out(
     image: Float[np.ndarray, "h w 3"], person: Bool[np.ndarray, "mh mw"], file: Path, field: str
 ) -> Photo:
     if person.shape != image.shape[:2]:
-        got = f"{person.shape[1]} x {person.shape[0]}, but its photo has {image.shape[1]} x {image.shape[0]}"
+        got = (
+            f"{person.shape[1]} x {person.shape[0]}, but its photo has {image.shape[1]} x"
+            f" {image.shape[0]}"
+        )
         raise CaptureError(file, field, f"{got}: expected the same")
     return np.where(person[..., None], image, np.float32(1)), person.astype(np.float32)
 
@@ -299,7 +330,10 @@ def subfolders(
 
 
 def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Subject:
-    """One subject; nothing but calibration, poses and names of files is read. Raises: CaptureError naming file and key."""
+    """One subject; nothing but calibration, poses and names of files is read.
+
+    Raises: CaptureError naming file and key.
+    """
     folder = Path(folder)
     cameras = read_cameras(folder / layout.calibration)
     place = lambda part, camera: folder / part.replace("NAME", camera.name)
@@ -321,14 +355,17 @@ find_avatarrex, open_avatarrex = (
 )
 
 
-# ActorsHQ --------------------------------------------------------------------------------------------------------------
+# ActorsHQ
+# --------------------------------------------------------------------------------------------------
 
 CALIBRATION, SCALES = "calibration.csv", ("4x", "2x", "1x")
 COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
 
 
 def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
-    """The sequences in a folder (of one actor or of several), sorted, or the folder itself; empty if there are none."""
+    """The sequences in a folder (of one actor or of several), sorted, or the folder itself; empty
+    if there are none.
+    """
     return subfolders(
         folder,
         lambda path: any((path / scale / CALIBRATION).is_file() for scale in SCALES),
@@ -337,7 +374,10 @@ def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
 
 
 def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
-    """One sequence, in the smallest images that are there. Raises: CaptureError naming file and key."""
+    """One sequence, in the smallest images that are there.
+
+    Raises: CaptureError naming file and key.
+    """
     folder = Path(folder)
     scale = next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
     cameras = read_csv_cameras(folder / scale / CALIBRATION)
@@ -391,7 +431,8 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
     return checked_cameras(Calibration("ActorsHQ", file, tuple(cameras), False, "half", "+y"))
 
 
-# DNA-Rendering ---------------------------------------------------------------------------------------------------------
+# DNA-Rendering
+# --------------------------------------------------------------------------------------------------
 
 GROUPS = ("Camera_5mp", "Camera_12mp")
 
@@ -402,7 +443,10 @@ def find_dna_rendering(folder: str | Path) -> tuple[Path, ...]:
 
 
 class Smc:
-    """An HDF5 file whose every value is checked for its size before it is read. Raises: CaptureError naming file and key."""
+    """An HDF5 file whose every value is checked for its size before it is read.
+
+    Raises: CaptureError naming file and key.
+    """
 
     def __init__(self, path: Path):
         self.path = path

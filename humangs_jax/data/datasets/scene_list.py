@@ -1,13 +1,17 @@
-"""The layout of the published network's data: lists of scenes with cameras, and the body of each frame as arrays.
+"""The layout of the published network's data: lists of scenes with cameras, and the body of each
+frame as arrays.
 
     train.json, test.json   [{"scene_name", "mesh_transform" 4 x 4,
-                              "frames": [{"image_path", "w2c" 4 x 4 OpenCV, "fxfycxcy", "smpl_path"}]}]
-    smpl_path               npz of v_posed (n, 3), v_cano (n, 3), faces (f, 3), joint_transforms (55, 4, 4)
+                              "frames": [{"image_path", "w2c" 4 x 4 OpenCV, "fxfycxcy",
+                              "smpl_path"}]}]
+    smpl_path               npz of v_posed (n, 3), v_cano (n, 3), faces (f, 3), joint_transforms
+                            (55, 4, 4)
     evaluation_N.json       {scene: {"context": [views], "target": [views]}}, N input views
 
-Paths are relative to the list. Images are square, on white. The arrays are in the units of the scene, and `v_posed` is `v_cano`
-moved by `joint_transforms`, pose correctives apart. Unit, shape and pose are recovered from them, so that lists of other programs
-need nothing more; cameras become metric. We also write `mask_path`; where it is missing, what is not white is the person.
+Paths are relative to the list. Images are square, on white. The arrays are in the units of the
+scene, and `v_posed` is `v_cano` moved by `joint_transforms`, pose correctives apart. Unit, shape
+and pose are recovered from them, so that lists of other programs need nothing more; cameras become
+metric. We also write `mask_path`; where it is missing, what is not white is the person.
 """
 
 import functools
@@ -45,7 +49,9 @@ from humangs_jax.io.reading import shown
 
 LISTS = ("train.json", "test.json")
 WHITE = 250 / 255
-"""A pixel with a channel below is the person where there is no mask; 8-bit JPEG images ripple by a few levels."""
+"""A pixel with a channel below is the person where there is no mask; 8-bit JPEG images ripple by a
+few levels.
+"""
 KEPT_FRAMES = 64
 """Poses of a scene that are kept in memory."""
 SIGNIFICANT = 9
@@ -53,7 +59,10 @@ SIGNIFICANT = 9
 
 
 class SceneFrame(NamedTuple):
-    """A view of a scene. image, mask, arrays: paths relative to the list. K: (3, 3) pixels. cam_from_world: (4, 4)."""
+    """A view of a scene. image, mask, arrays: paths relative to the list. K: (3, 3) pixels.
+
+    cam_from_world: (4, 4).
+    """
 
     image: str
     cam_from_world: Float[np.ndarray, "4 4"]
@@ -82,7 +91,8 @@ def _list_of(path: str | Path) -> Path:
 
 
 def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
-    """The scenes of a list by name, as they stand in it. path: the JSON file, or a folder (train.json, else test.json).
+    """The scenes of a list by name, as they stand in it. path: the JSON file, or a folder
+    (train.json, else test.json).
 
     Raises: CaptureError naming file and key.
     """
@@ -103,7 +113,8 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
 def open_scene_list(
     path: str | Path, body: FileBody, size: int | None = None
 ) -> tuple[Person, ...]:
-    """The people of a list, each opened when it is asked for. size: of the stored squares; None: that of the images.
+    """The people of a list, each opened when it is asked for. size: of the stored squares; None:
+    that of the images.
 
     Raises: CaptureError if the list cannot be read.
     """
@@ -125,7 +136,10 @@ def open_scene_list(
 
 
 def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
-    """One scene of a list in metres. Images that are not there are left out and counted. Raises: CaptureError."""
+    """One scene of a list in metres. Images that are not there are left out and counted.
+
+    Raises: CaptureError.
+    """
     views, missing = _present(file, name, scene)
     smpl, frames = np.unique([view.arrays for view in views], return_inverse=True)
     arrays = [_inside(file, name, path) for path in smpl.tolist()]
@@ -230,7 +244,8 @@ def not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     return np.asarray(binary_fill_holes(image.min(axis=-1) < WHITE))
 
 
-# Writing --------------------------------------------------------------------------------------------------------------
+# Writing
+# --------------------------------------------------------------------------------------------------
 
 
 def scene_entry(

@@ -1,8 +1,10 @@
-"""One person of a data set, and the body of the data set: its model file, parameters, what a pose makes of it.
+"""One person of a data set, and the body of the data set: its model file, parameters, what a pose
+makes of it.
 
-A view is one photo: a camera at one frame. Opening a subject lists folders and reads calibration and body parameters, so that a
-sequence of 5,000 frames opens in well under a second. Photos come on white, padded to a centred square and resized. Values of
-files are checked one by one (`open_arrays`, `checked_numbers`): a fault is a `CaptureError` that names file and key.
+A view is one photo: a camera at one frame. Opening a subject lists folders and reads calibration
+and body parameters, so that a sequence of 5,000 frames opens in well under a second. Photos come on
+white, padded to a centred square and resized. Values of files are checked one by one
+(`open_arrays`, `checked_numbers`): a fault is a `CaptureError` that names file and key.
 """
 
 import concurrent.futures
@@ -41,12 +43,16 @@ checked_numbers = functools.partial(file_numbers, some=True)
 FIRST_HAND_JOINT = 25
 """In the order of SMPL-X: 30 finger joints follow."""
 RECOVERED_TOLERANCE = 3e-3
-"""Metres, root mean square over vertices, up to which arrays of a scene list are those of a body model."""
+"""Metres, root mean square over vertices, up to which arrays of a scene list are those of a body
+model.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FileBody:
-    """The body model that the parameters of a data set belong to, and the file that it was read from."""
+    """The body model that the parameters of a data set belong to, and the file that it was read
+    from.
+    """
 
     model: BodyModel
     file: str = DEFAULT_BODY
@@ -58,9 +64,15 @@ class FileBody:
 
     @functools.cached_property
     def hands(self) -> HandBasis:
-        """Mean and components of its hand poses. Raises: CaptureError for the package's own body, which has none."""
+        """Mean and components of its hand poses.
+
+        Raises: CaptureError for the package's own body, which has none.
+        """
         if self.file == DEFAULT_BODY:
-            problem = "these hand poses are relative to SMPL-X's mean hand: expected the path of an SMPL-X model for body"
+            problem = (
+                "these hand poses are relative to SMPL-X's mean hand: expected the path of an"
+                " SMPL-X model for body"
+            )
             raise CaptureError("body", DEFAULT_BODY, problem)
         return load_hands(self.file)
 
@@ -84,7 +96,9 @@ class FileBody:
 
 
 class BodyParameters(NamedTuple):
-    """Shape and poses of a person: coefficients (s,), axis-angle (m, j, 3) radians, translations (m, 3) metres."""
+    """Shape and poses of a person: coefficients (s,), axis-angle (m, j, 3) radians, translations
+    (m, 3) metres.
+    """
 
     betas: Float[np.ndarray, " s"]
     rotations: Float[np.ndarray, "m j 3"]
@@ -100,7 +114,8 @@ class BodyParameters(NamedTuple):
 class PosedPerson:
     """What a pose makes of a person.
 
-    rest: (n, 3) T-pose. vertices: (n, 3), joints: (j, 3) and joint_transforms: (j, 4, 4), rest -> posed, translation included.
+    rest: (n, 3) T-pose. vertices: (n, 3), joints: (j, 3) and joint_transforms: (j, 4, 4), rest ->
+    posed, translation included.
     """
 
     rest: Float[np.ndarray, "n 3"]
@@ -139,13 +154,17 @@ def coefficients(
     expression: Float[np.ndarray, " e"],
     file: object,
 ) -> Float[np.ndarray, " all"]:
-    """Coefficients of all of the body's directions: shape, then expression. Those that a file has not are 0.
+    """Coefficients of all of the body's directions: shape, then expression. Those that a file has
+    not are 0.
 
-    Raises: CaptureError for more numbers than the body has directions, unless they are 0; and for a body whose directions mean
-    something else than SMPL-X's.
+    Raises: CaptureError for more numbers than the body has directions, unless they are 0; and for a
+    body whose directions mean something else than SMPL-X's.
     """
     if not any(name.startswith("shape_") for name in body.shape_names):
-        problem = f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model for body"
+        problem = (
+            f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an"
+            " SMPL-X model for body"
+        )
         raise CaptureError(file, "betas", problem)
     names = [
         f"{kind}_{i}"
@@ -159,7 +178,10 @@ def coefficients(
 def turned(
     parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis: Float[np.ndarray, "3"]
 ) -> BodyParameters:
-    """The same poses in a world that a rigid transform moved. pelvis: (3,) its place in the T-pose of the person."""
+    """The same poses in a world that a rigid transform moved.
+
+    pelvis: (3,) its place in the T-pose of the person.
+    """
     from scipy.spatial.transform import Rotation
 
     R, t = matrix[:3, :3], matrix[:3, 3]
@@ -173,14 +195,18 @@ def turned(
 def recover_shape(
     body: FileBody, rest: Float[np.ndarray, "n 3"], file: object
 ) -> tuple[float, Float[np.ndarray, " s"]]:
-    """Scale and shape coefficients of a T-pose `v_cano`, by least squares: rest = scale (template + directions betas).
+    """Scale and shape coefficients of a T-pose `v_cano`, by least squares: rest = scale (template +
+    directions betas).
 
     Where all vertices do not fit, the hands are left out, which the release bends by accident.
     Raises: CaptureError if the arrays are not of this body.
     """
     template = body.arrays[0]
     if len(rest) != len(template):
-        problem = f"{len(rest)} vertices, but body '{body.model.name}' has {len(template)}: expected the model of the arrays"
+        problem = (
+            f"{len(rest)} vertices, but body '{body.model.name}' has {len(template)}: expected the"
+            " model of the arrays"
+        )
         raise CaptureError(file, "v_cano", problem)
     for solve, columns, kept in _shape_solvers(body):
         solution = solve @ rest[kept].reshape(-1)
@@ -189,7 +215,10 @@ def recover_shape(
         error = float(np.sqrt((missed**2).sum(axis=1).mean())) / max(abs(scale), 1e-12)
         if scale > 0 and error < RECOVERED_TOLERANCE:
             return scale, solution[1:] / scale
-    problem = f"{1e3 * error:.3g} mm from body '{body.model.name}': expected the model that the arrays were made with"
+    problem = (
+        f"{1e3 * error:.3g} mm from body '{body.model.name}': expected the model that the arrays"
+        " were made with"
+    )
     raise CaptureError(file, "v_cano", problem)
 
 
@@ -199,8 +228,8 @@ def _shape_solvers(
 ) -> tuple[
     tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...
 ]:
-    """(pseudo-inverse, columns, which vertices) of the least-squares problem of `recover_shape`: of all vertices, then
-    without the hands.
+    """(pseudo-inverse, columns, which vertices) of the least-squares problem of `recover_shape`: of
+    all vertices, then without the hands.
     """
     columns = np.concatenate([body.arrays[0][..., None], body.arrays[1]], axis=-1)
     of_hands = np.asarray(body.model.skinning_weights)[:, FIRST_HAND_JOINT:].sum(axis=1) > 1e-6
@@ -218,7 +247,8 @@ def recover_pose(
     transforms: Float[np.ndarray, "j 4 4"],
     file: object,
 ) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "3"]]:
-    """Rotations and translation (metres) of a person from `joint_transforms`, which take the scaled T-pose to the pose.
+    """Rotations and translation (metres) of a person from `joint_transforms`, which take the scaled
+    T-pose to the pose.
 
     Raises: CaptureError if one of them is no rotation.
     """
@@ -235,10 +265,12 @@ def recover_pose(
     return rotations, transforms[0, :3, 3] / scale - pelvis + R[0] @ pelvis
 
 
-# Subjects --------------------------------------------------------------------------------------------------------------
+# Subjects
+# --------------------------------------------------------------------------------------------------
 
 STORED_SIZE = 512
-"""Pixels a side of the squares that photos of data sets become; 256 and 128 are box averages of it."""
+"""Pixels a side of the squares that photos of data sets become; 256 and 128 are box averages of it.
+"""
 Photo = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
 """An image on white and its mask."""
 THREADS = os.cpu_count() or 1
@@ -249,10 +281,12 @@ THREADS = os.cpu_count() or 1
 class Subject:
     """One person, see the module.
 
-    name: what errors and manifests call it. K: (v, 3, 3) pixels of the photo as it is, centres at +0.5. cam_from_world:
-    (v, 4, 4), metres, OpenCV. sizes: (v, 2) width and height. frames: (v,) the pose that a view shows, counted from 0.
+    name: what errors and manifests call it. K: (v, 3, 3) pixels of the photo as it is, centres at
+    +0.5. cam_from_world: (v, 4, 4), metres, OpenCV. sizes: (v, 2) width and height. frames: (v,)
+    the pose that a view shows, counted from 0.
     frame_count: number of poses. view_name: view -> a name such as "cam03_00000120".
-    read: view -> image on white (h, w, 3) and mask (h, w), both in [0, 1]. parameters: frames -> shape and these poses.
+    read: view -> image on white (h, w, 3) and mask (h, w), both in [0, 1]. parameters: frames ->
+    shape and these poses.
     missing: reason -> how many photos are left out for it.
     """
 
@@ -284,7 +318,10 @@ class Subject:
         return K
 
     def photo(self, view: int, size: int) -> Photo:
-        """Image on white and mask of one view, padded to a centred square and resized. Raises: ValueError naming the file."""
+        """Image on white and mask of one view, padded to a centred square and resized.
+
+        Raises: ValueError naming the file.
+        """
         image, mask = self.read(view)
         width, height = self.sizes[view].tolist()
         if image.shape[:2] != (height, width) or mask.shape != (height, width):
@@ -331,7 +368,8 @@ class Subject:
         body: FileBody,
         size: int = STORED_SIZE,
     ) -> Capture:
-        """These views as a `Capture`, to reconstruct and to animate; its poses are those of the frames that are seen.
+        """These views as a `Capture`, to reconstruct and to animate; its poses are those of the
+        frames that are seen.
 
         Raises: ValueError naming file and field.
         """
@@ -359,9 +397,11 @@ class Subject:
 
 @dataclasses.dataclass(eq=False)
 class Person:
-    """A subject that is opened when it is first asked for, as `loading.captures.PeopleCache` wants it.
+    """A subject that is opened when it is first asked for, as `loading.captures.PeopleCache` wants
+    it.
 
-    name: of the subject. open: makes the `Subject`, and raises ValueError if it cannot be used. size: of the stored squares.
+    name: of the subject. open: makes the `Subject`, and raises ValueError if it cannot be used.
+    size: of the stored squares.
     """
 
     name: str
@@ -389,7 +429,10 @@ class Person:
         return self.subject.photos(views, self.size)
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """These views with the poses that they show alone. Raises: ValueError naming file and field."""
+        """These views with the poses that they show alone.
+
+        Raises: ValueError naming file and field.
+        """
         seen, frames = np.unique(subject.frames, return_inverse=True)
         _, rotations, translations = self.subject.parameters(seen.tolist())
         rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
@@ -399,9 +442,11 @@ class Person:
 
 
 def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tuple[Person, ...]:
-    """The people of a data set of any layout that has photos (`data.formats.DATASETS`); each is opened when it is asked for.
+    """The people of a data set of any layout that has photos (`data.formats.DATASETS`); each is
+    opened when it is asked for.
 
-    Arguments: size: pixels a side of the stored squares; None: that of the images of a scene list, else `STORED_SIZE`.
+    Arguments: size: pixels a side of the stored squares; None: that of the images of a scene list,
+    else `STORED_SIZE`.
     Raises: CaptureError if the folder has none of the layouts.
     """
     path = Path(path)

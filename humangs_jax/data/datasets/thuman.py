@@ -1,16 +1,19 @@
-"""THuman2.0 and 2.1: textured scans with SMPL-X fits (https://github.com/ytrock/THuman2.0-Dataset). Static, not metric.
+"""THuman2.0 and 2.1: textured scans with SMPL-X fits (https://github.com/ytrock/THuman2.0-Dataset).
+Static, not metric.
 
-    model/<id>/<id>.obj with its .mtl and JPEG texture      smplx/<id>/smplx_param.pkl and mesh_smplx.obj
+    model/<id>/<id>.obj with its .mtl and JPEG texture
+    smplx/<id>/smplx_param.pkl and mesh_smplx.obj
 
 Three kinds of fits exist; the keys and the length of the hand poses tell which one a file is:
 
-    kind   keys                hands                              model     scan coordinates of a model vertex V
+    kind   keys                hands                              model     model vertex V in scan
     A      scale, translation  12 principal components            male      V scale + translation
     B      scale, translation  45 axis-angle                      male      V scale + translation
     C      scale, transl       45 axis-angle                      neutral   (V + transl) scale
 
-In all of them hand poses are relative to the mean hand (flat_hand_mean False). mesh_smplx.obj is the fitted body as the authors
-posed it: the error of our body against it says whether fit, kind and model file belong together.
+In all of them hand poses are relative to the mean hand (flat_hand_mean False). mesh_smplx.obj is
+the fitted body as the authors posed it: the error of our body against it says whether fit, kind and
+model file belong together.
 """
 
 import dataclasses
@@ -40,16 +43,17 @@ Kind = Literal["A", "B", "C"]
 PCA_NUMBERS, HAND_NUMBERS = 12, 45
 FIT, FIT_MESH = "smplx_param.pkl", "mesh_smplx.obj"
 TOLERANCE = 2e-3
-"""Metres of the body, mean over vertices, up to which a fit reproduces mesh_smplx.obj. Rounding of OBJ files is far below;
-another gender moves vertices by centimetres, a wrong hand convention the fingers by as much."""
+"""Metres of the body, mean over vertices, up to which a fit reproduces mesh_smplx.obj. Rounding of
+OBJ files is far below; another gender moves vertices by centimetres, a wrong hand convention the
+fingers by as much."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
     """The body of a scan.
 
-    kind: see the module. parameters: of one pose. scale: scan units per metre. A vertex V of the posed body (translation
-    included) lies at V scale in the scan.
+    kind: see the module. parameters: of one pose. scale: scan units per metre. A vertex V of the
+    posed body (translation included) lies at V scale in the scan.
     """
 
     file: Path
@@ -80,7 +84,8 @@ def scan_files(folder: Path, name: str) -> tuple[Path, Path]:
 
 
 def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
-    """The names of the scans in a folder that holds model/ and smplx/, sorted; and why others cannot be used, by name.
+    """The names of the scans in a folder that holds model/ and smplx/, sorted; and why others
+    cannot be used, by name.
 
     Raises: CaptureError if there are none.
     """
@@ -106,11 +111,15 @@ def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
     return names, skipped
 
 
-# Fits -----------------------------------------------------------------------------------------------------------------
+# Fits
+# --------------------------------------------------------------------------------------------------
 
 
 def read_fit(file: str | Path, body: FileBody) -> Fit:
-    """Read smplx_param.pkl, without running anything in it. Raises: CaptureError naming file and key."""
+    """Read smplx_param.pkl, without running anything in it.
+
+    Raises: CaptureError naming file and key.
+    """
     values = open_arrays(file)
     file = values.path
     if ("transl" in values) == ("translation" in values):
@@ -129,7 +138,8 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
             raise CaptureError(
                 file,
                 key,
-                f"expected {' or '.join(map(str, lengths))} numbers beside {of_kind}, got {len(hand)}",
+                f"expected {' or '.join(map(str, lengths))} numbers beside {of_kind}, got"
+                f" {len(hand)}",
             )
     kind: Kind = "C" if of_kind == "transl" else "A" if length == PCA_NUMBERS else "B"
     scale = values.number("scale")
@@ -158,28 +168,37 @@ _ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "
 
 
 def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> tuple[float, float]:
-    """Mean and largest distance between the vertices of the fitted body and mesh_smplx.obj, metres of the body.
+    """Mean and largest distance between the vertices of the fitted body and mesh_smplx.obj, metres
+    of the body.
 
-    Raises: CaptureError, saying the error, if the mean is above `TOLERANCE` or the numbers of vertices differ.
+    Raises: CaptureError, saying the error, if the mean is above `TOLERANCE` or the numbers of
+    vertices differ.
     """
     file = fit.file.with_name(FIT_MESH)
     if len(mesh) != len(fitted.vertices):
-        problem = f"{len(mesh)} vertices, but the body model has {len(fitted.vertices)}: expected the model of the fit"
+        problem = (
+            f"{len(mesh)} vertices, but the body model has {len(fitted.vertices)}: expected the"
+            " model of the fit"
+        )
         raise CaptureError(file, "", problem)
     apart = np.linalg.norm(mesh - fitted.vertices, axis=1) / fit.scale
     mean, largest = float(apart.mean()), float(apart.max())
     if mean > TOLERANCE:
         gender = "neutral" if fit.kind == "C" else "male"
         problem = (
-            f"the fit (kind {fit.kind}) is {1e3 * mean:.3g} mm from this mesh on average, {1e3 * largest:.3g} mm at most: "
-            f"expected below {1e3 * TOLERANCE:g} mm on average; fits of this kind need the {gender} model"
+            f"the fit (kind {fit.kind}) is {1e3 * mean:.3g} mm from this mesh on average,"
+            f" {1e3 * largest:.3g} mm at most: expected below {1e3 * TOLERANCE:g} mm on average;"
+            f" fits of this kind need the {gender} model"
         )
         raise CaptureError(file, "", problem)
     return mean, largest
 
 
 def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and triangles of an OBJ file, every vertex once and in the order of the file. Raises: CaptureError."""
+    """Vertices and triangles of an OBJ file, every vertex once and in the order of the file.
+
+    Raises: CaptureError.
+    """
     with reading(file, "mesh", CaptureError):
         vertices, faces = [], []
         for number, line in enumerate(read_text(file).splitlines(), 1):
@@ -201,7 +220,8 @@ def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
         return points, corners
 
 
-# Scans ----------------------------------------------------------------------------------------------------------------
+# Scans
+# --------------------------------------------------------------------------------------------------
 
 
 def read_scan(file: str | Path) -> Scan:
@@ -219,7 +239,8 @@ def read_scan(file: str | Path) -> Scan:
             image is None or max(image.size) <= 2
         ):  # trimesh leaves out what it cannot read, or puts a placeholder there
             raise Refused(
-                "no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file"
+                "no texture image: expected a material (.mtl) beside the scan that names a PNG or"
+                " JPEG file"
             )
         vertices, uvs = np.asarray(mesh.vertices, np.float64), np.asarray(uvs, np.float32)
         check_array("vertices", vertices, (None, 3))

@@ -1,14 +1,17 @@
-"""Files of keypoints: ours, OpenPose's, EasyMocap's, COCO's (AlphaPose's, COCO-WholeBody's) and MMPose's.
+"""Files of keypoints: ours, OpenPose's, EasyMocap's, COCO's (AlphaPose's, COCO-WholeBody's) and
+MMPose's.
 
-In ours alone the centre of the first pixel is at (0.5, 0.5). The keypoints of one person, by `save_keypoints`: an npz of points
-(v, k, 2), confidences (v, k), the set's name, and the names of the v views. The people in photos, by `humangs detect`:
+In ours alone the centre of the first pixel is at (0.5, 0.5). The keypoints of one person, by
+`save_keypoints`: an npz of points (v, k, 2), confidences (v, k), the set's name, and the names of
+the v views. The people in photos, by `humangs detect`:
 
     {"format": "humangs-people", "version": 1, "set": "mediapipe33", "images": [
         {"image": "front.jpg", "width": 1920, "height": 1080, "people": [
-            {"presence": 0.99, "pixels": [[x, y], ...], "visibility": [...], "world": [[x, y, z], ...]}, null]}]}
+            {"presence": 0.99, "pixels": [[x, y], ...], "visibility": [...], "world": [[x, y, z],
+            ...]}, null]}]}
 
-world: metres from the middle of the hips in the camera's axes (x right, y down, z away), of a person of average size. The i-th of
-every image is one and the same person; null: not in it.
+world: metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
+person of average size. The i-th of every image is one and the same person; null: not in it.
 """
 
 import dataclasses
@@ -55,7 +58,9 @@ def recognizes_own(source: Source) -> bool:
 
 
 def read_own(source: Source, format: SourceFormat) -> Detections:
-    """The keypoints of one person, or all people, with confidence 0 where they are not in the image. Raises: CaptureError."""
+    """The keypoints of one person, or all people, with confidence 0 where they are not in the
+    image. Raises: CaptureError.
+    """
     if source.path.suffix.lower() == ".npz":
         return _saved(source.path)
     kind, images = read_people(source.path, source.json)
@@ -71,7 +76,8 @@ def read_own(source: Source, format: SourceFormat) -> Detections:
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
-    """Write our own format (.npz). names: of the views, as in the capture. `read_keypoints` reads exactly these back.
+    """Write our own format (.npz). names: of the views, as in the capture. `read_keypoints` reads
+    exactly these back.
 
     Raises: ValueError if the path does not end in .npz, or there is not one name per view.
     """
@@ -111,12 +117,16 @@ def _set_of(name: str, file: Path) -> KeypointSet:
     return KEYPOINT_SETS[name]
 
 
-# People in photos ------------------------------------------------------------------------------------------------------
+# People in photos
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SeenPerson:
-    """A person in an image. points: (k, 3) pixels and visibility. world: (k, 3) metres. presence: in [0, 1]."""
+    """A person in an image. points: (k, 3) pixels and visibility. world: (k, 3) metres.
+
+    presence: in [0, 1].
+    """
 
     points: Float[np.ndarray, "k 3"]
     world: Float[np.ndarray, "k 3"]
@@ -163,7 +173,10 @@ def _described(person: SeenPerson) -> dict[str, Any]:
 
 
 def read_people(path: Path, content: Any = None) -> tuple[KeypointSet, tuple[ImagePeople, ...]]:
-    """The set and the images of a file. content: its JSON value, if it is known. Raises: CaptureError naming file and field."""
+    """The set and the images of a file. content: its JSON value, if it is known.
+
+    Raises: CaptureError naming file and field.
+    """
     content = checked_json(path) if content is None else content
     if not _is_people_file(content):
         raise CaptureError(path, "format", f"expected {FORMAT!r}")
@@ -202,7 +215,8 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
     return SeenPerson(np.column_stack([pixels, visibility]), world, float(values[-1]))
 
 
-# OpenPose's --write_json -----------------------------------------------------------------------------------------------
+# OpenPose's --write_json
+# -----------------------------------------------------------------------------------------------
 
 SUFFIX = "_keypoints"
 """What OpenPose adds to the name of the image."""
@@ -221,7 +235,9 @@ def recognizes_openpose(source: Source) -> bool:
 
 
 def read_openpose(source: Source, format: SourceFormat) -> Detections:
-    """The people of one image, or of the frames of a video, which programs with nodes write as a list. Raises: CaptureError."""
+    """The people of one image, or of the frames of a video, which programs with nodes write as a
+    list. Raises: CaptureError.
+    """
     listed, frames = isinstance(source.json, list), source.json
     frames = frames if listed else [frames]
     own = not any("canvas_width" in frame for frame in frames) and any(
@@ -278,7 +294,9 @@ def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np
 def _parts(
     person: dict[str, Any], counts: dict[str, int], file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """The points of the parts of a person; those that were not detected are left out, null, or empty lists."""
+    """The points of the parts of a person; those that were not detected are left out, null, or
+    empty lists.
+    """
     points = [
         np.zeros((count, 3))
         if person.get(key) in (None, [])
@@ -288,7 +306,8 @@ def _parts(
     return np.concatenate(points)
 
 
-# EasyMocap's annots ----------------------------------------------------------------------------------------------------
+# EasyMocap's annots
+# --------------------------------------------------------------------------------------------------
 
 EASYMOCAP_HANDS = ("handl2d", "handr2d")
 MOST_PEOPLE = 64
@@ -301,7 +320,9 @@ def recognizes_easymocap(source: Source) -> bool:
 
 
 def read_easymocap(source: Source, format: SourceFormat) -> Detections:
-    """The people of one image: person I is the one with that personID, where these are small numbers. Raises: CaptureError."""
+    """The people of one image: person I is the one with that personID, where these are small
+    numbers. Raises: CaptureError.
+    """
     content, file, people = source.json, source.path, {}
     for i, entry in enumerate(content["annots"]):
         field = f"annots[{i}]"
@@ -334,7 +355,8 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
     return detections_of([image], OPENPOSE_67)
 
 
-# COCO ------------------------------------------------------------------------------------------------------------------
+# COCO
+# --------------------------------------------------------------------------------------------------
 
 COCO_PARTS = {
     "keypoints": 17,
@@ -360,7 +382,10 @@ def recognizes_coco(source: Source) -> bool:
 
 
 def read_coco(source: Source, format: SourceFormat) -> Detections:
-    """The images of a file, those of results in the order in which they first appear. Raises: CaptureError."""
+    """The images of a file, those of results in the order in which they first appear.
+
+    Raises: CaptureError.
+    """
     of_kind = _annotated_images if isinstance(source.json, dict) else _result_images
     return detections_of(of_kind(source.json, source.path))
 
@@ -414,7 +439,9 @@ def _image_label(value: Any, file: Path, field: str) -> str | int:
 
 
 def _whole_body(entries: list[Any]) -> bool:
-    """Whether some person has a part of COCO-WholeBody; those who lack it have its points with confidence 0."""
+    """Whether some person has a part of COCO-WholeBody; those who lack it have its points with
+    confidence 0.
+    """
     return any(
         isinstance(entry, dict) and len(COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
     )
@@ -434,7 +461,10 @@ def _coco_person(
 def _by_visibility(
     person: Float[np.ndarray, "k 3"], file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """Confidences from visibilities. Fractions occur in COCO-WholeBody, where any value above 0 means reliable."""
+    """Confidences from visibilities.
+
+    Fractions occur in COCO-WholeBody, where any value above 0 means reliable.
+    """
     visibility = person[:, 2]
     if not np.isnan(visibility).all() and (
         np.nanmin(visibility) < 0 or np.nanmax(visibility) > LARGEST_VISIBILITY
@@ -458,7 +488,8 @@ def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-# MMPose's inferencer and demo scripts ----------------------------------------------------------------------------------
+# MMPose's inferencer and demo scripts
+# ----------------------------------------------------------------------------------
 
 PREFIX = "results_"
 """What the demo scripts put before the name of the image."""

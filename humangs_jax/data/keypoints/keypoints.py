@@ -1,17 +1,21 @@
-"""Keypoints in memory: of the views of a capture, and as files have them; and the sets of points that detectors are trained on.
+"""Keypoints in memory: of the views of a capture, and as files have them; and the sets of points
+that detectors are trained on.
 
 The names of points, for `side` left or right (the person's own):
 
-nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel; neck and mid_hip (the
-    middle of the shoulders and of the hips, OpenPose and Halpe); head_top (Halpe and BODY_25B); upper_neck (BODY_25B)
-`side`_foot_index: the tip of the foot, between big and second toe (BlazePose only)
-face_0 to face_67: 300-W's landmarks; 0 is the jaw under the person's right ear
-`side`_hand_root; `side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
+nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel;
+neck and mid_hip (the
+    middle of the shoulders and of the hips, OpenPose and Halpe); head_top (Halpe and BODY_25B);
+    upper_neck (BODY_25B)
+`side`_foot_index: the tip of the foot, between big and second toe (BlazePose only) face_0 to
+face_67: 300-W's landmarks; 0 is the jaw under the person's right ear `side`_hand_root;
+`side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
 
-A point has the same name in every set that has it, though annotators of different sets do not mean quite the same by "hip".
+A point has the same name in every set that has it, though annotators of different sets do not mean
+quite the same by "hip".
 
-Sources: COCO's person_keypoints annotations; Fang-Haoshu/Halpe-FullBody; jin-s13/COCO-WholeBody's data format; OpenPose's
-"Demo - Output" page; MediaPipe's "Pose landmark detection" page.
+Sources: COCO's person_keypoints annotations; Fang-Haoshu/Halpe-FullBody; jin-s13/COCO-WholeBody's
+data format; OpenPose's "Demo - Output" page; MediaPipe's "Pose landmark detection" page.
 """
 
 import dataclasses
@@ -48,11 +52,13 @@ _BODY_25 = (
 
 @dataclasses.dataclass(frozen=True)
 class KeypointSet:
-    """The points of a detector: their names in its order, and for each the index of its mirror image.
+    """The points of a detector: their names in its order, and for each the index of its mirror
+    image.
 
-    A point in the middle of the body is its own mirror image. places: on the body, of points that may lie elsewhere than
-    `body.landmarks` has them: where the detector is known to see them, or a fit has found that it does. certainty: (k,) of the
-    points, the reciprocal of their noise over that of all, if a fit has found it; none: as usual.
+    A point in the middle of the body is its own mirror image. places: on the body, of points that
+    may lie elsewhere than `body.landmarks` has them: where the detector is known to see them, or a
+    fit has found that it does. certainty: (k,) of the points, the reciprocal of their noise over
+    that of all, if a fit has found it; none: as usual.
     """
 
     name: str
@@ -70,7 +76,9 @@ class KeypointSet:
     def adapted(
         self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]
     ) -> "KeypointSet":
-        """The set as a detector is found to use it: with these offsets of the places, metres, and this certainty."""
+        """The set as a detector is found to use it: with these offsets of the places, metres, and
+        this certainty.
+        """
         own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
         places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
         return dataclasses.replace(
@@ -108,7 +116,9 @@ COCO_WHOLEBODY_133 = _keypoint_set(
         *hand_names("right"),
     ),
 )
-"""COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21 of the right hand."""
+"""COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21
+of the right hand.
+"""
 
 HALPE_26 = _keypoint_set(
     "halpe26",
@@ -120,7 +130,8 @@ HALPE_26 = _keypoint_set(
         *(f"{side}_{part}" for part in _FOOT for side in SIDES),
     ),
 )
-"""Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet."""
+"""Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet.
+"""
 
 HALPE_136 = _keypoint_set(
     "halpe136",
@@ -134,7 +145,10 @@ HALPE_136 = _keypoint_set(
 """Halpe's 136, of AlphaPose: the 26, 68 of the face, 21 of the left and 21 of the right hand."""
 
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
-"""OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
+"""OpenPose's BODY_25 with its left and right hand.
+
+Its 70 points of the face are ignored: they are not in this set.
+"""
 
 OPENPOSE_60 = _keypoint_set(
     "openpose60",
@@ -146,10 +160,14 @@ OPENPOSE_67B = _keypoint_set(
     "openpose_b67",
     (*_COCO, "upper_neck", "head_top", *_FEET, *hand_names("left"), *hand_names("right")),
 )
-"""OpenPose's BODY_25B with its left and right hand. Files do not say which of both they have, see `orders`."""
+"""OpenPose's BODY_25B with its left and right hand.
 
-# millimetres. The mean over 12 synthetic people (`python -m experiments landmark_places`); those of hips, wrists, knees,
-# ankles and feet are the mean of these and of a barefoot man's, since synthetic people wear shoes
+Files do not say which of both they have, see `orders`.
+"""
+
+# millimetres. The mean over 12 synthetic people (`python -m experiments landmark_places`); those of
+# hips, wrists, knees, ankles and feet are the mean of these and of a barefoot man's, since
+# synthetic people wear shoes
 _MIRRORED = lambda part: (f"left_{part}", f"right_{part}")
 _BLAZEPOSE_PLACES = (
     place("nose", "nose", ("head",), (0, 13, -12)),
@@ -198,7 +216,9 @@ MEDIAPIPE_33 = _keypoint_set(
     ),
     _BLAZEPOSE_PLACES,
 )
-"""MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
+"""MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth
+are points of the face.
+"""
 
 _DETECTORS = (
     COCO_17,
@@ -215,10 +235,14 @@ KEYPOINT_SETS = {each.name: each for each in _DETECTORS}
 SETS_BY_COUNT = {
     len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)
 }
-"""The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""
+"""The set of a list of points without names.
+
+OpenPose's 67 are not in it: its files keep body and hands apart.
+"""
 
 
-# Keypoints -------------------------------------------------------------------------------------------------------------
+# Keypoints
+# --------------------------------------------------------------------------------------------------
 
 HALF_PIXEL = 0.5
 """Every tool that we read counts pixels: the centre of the first one is at 0. Ours is at 0.5."""
@@ -228,11 +252,12 @@ HALF_PIXEL = 0.5
 class Keypoints:
     """One person's keypoints in each of v views (numpy on the host).
 
-    points: (v, k, 2) float32 pixels, x right and y down, the centre of the first pixel at (0.5, 0.5); finite, and to be
-        ignored where the confidence is 0.
+    points: (v, k, 2) float32 pixels, x right and y down, the centre of the first pixel at (0.5,
+        0.5); finite, and to be ignored where the confidence is 0.
     confidences: (v, k) float32 in [0, 1]; 0: the point is missing.
-    set: what the k points are. world: (v, k, 3) metres, where the detector has said it: a person of average size, in axes whose z
-        is the ray to the person, up to a translation. missing: names of the views that the file has nothing for.
+    set: what the k points are. world: (v, k, 3) metres, where the detector has said it: a person of
+        average size, in axes whose z is the ray to the person, up to a translation. missing: names
+        of the views that the file has nothing for.
     warnings: problems of a file that could be read, a line each.
     """
 
@@ -250,8 +275,8 @@ class DetectedImage:
 
     image: its name or path as the file has it, or a number where the file has no more.
     file: that the people are from. size: (width, height) in pixels where the file states it.
-    people: each (k, 3): x and y in pixels of the tool, confidence; not yet checked, so that NaN and null are NaN. Or (k, 6), with
-        `Keypoints.world`.
+    people: each (k, 3): x and y in pixels of the tool, confidence; not yet checked, so that NaN and
+        null are NaN. Or (k, 6), with `Keypoints.world`.
     """
 
     image: str | int
@@ -262,10 +287,11 @@ class DetectedImage:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Detections:
-    """The images of a file or folder. offset: pixels to add to x and y so that pixel centres are at +0.5.
+    """The images of a file or folder. offset: pixels to add to x and y so that pixel centres are at
+    +0.5.
 
-    set: None if no image has a person. warnings: what is to be said, a line each. tool: that has written the files, where they
-    say so.
+    set: None if no image has a person. warnings: what is to be said, a line each. tool: that has
+    written the files, where they say so.
     """
 
     set: KeypointSet | None
@@ -284,16 +310,22 @@ class Source:
     name: str
     """Of the image or video that it may be of: the path in its folder without the suffix."""
     alone: bool
-    """Whether no other file is read with it: the frames of a video are known by their number, else by name/number."""
+    """Whether no other file is read with it: the frames of a video are known by their number, else
+    by name/number.
+    """
 
     @functools.cached_property
     def json(self) -> Any:
-        """The value of the file, None where its suffix is that of another format. Raises: CaptureError."""
+        """The value of the file, None where its suffix is that of another format.
+
+        Raises: CaptureError.
+        """
         return None if self.path.suffix.lower() in KEYPOINTS.suffixes else checked_json(self.path)
 
 
 def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detections:
-    """Detections of one keypoint set, chosen by the number of points of a person. more: sets beside `SETS_BY_COUNT`.
+    """Detections of one keypoint set, chosen by the number of points of a person. more: sets beside
+    `SETS_BY_COUNT`.
 
     Raises: CaptureError for other numbers, and for two sets.
     """
@@ -303,7 +335,10 @@ def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detect
     known, (count, first) = SETS_BY_COUNT | {len(each.names): each for each in more}, people[0]
     for other, image in people:
         if other != count:
-            problem = f"a person of {other} points, but another has {count}: expected one set of keypoints"
+            problem = (
+                f"a person of {other} points, but another has {count}: expected one set of"
+                " keypoints"
+            )
             raise CaptureError(image.file, f"image {image.image}", problem)
     if count not in known:
         counts = " or ".join(f"{number} ({each.name})" for number, each in known.items())
@@ -316,7 +351,8 @@ def triples(
 ) -> Float[np.ndarray, "k 3"]:
     """x, y and confidence of each point, from a flat list of them; null is NaN.
 
-    Raises: CaptureError if these are no numbers, or not 3 * count (any multiple of 3 if count is None).
+    Raises: CaptureError if these are no numbers, or not 3 * count (any multiple of 3 if count is
+    None).
     """
     array = file_numbers(value, file, field, nulls=True)
     wanted = "a multiple of 3" if count is None else f"{3 * count} ({count} times x, y, confidence)"

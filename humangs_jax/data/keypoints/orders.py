@@ -1,7 +1,8 @@
-"""The order of OpenPose's points, which its files do not tell: BODY_25 and BODY_25B both have 25 of them, and 18 are either those
-of its COCO model or COCO's own 17 with a neck behind them.
+"""The order of OpenPose's points, which its files do not tell: BODY_25 and BODY_25B both have 25 of
+them, and 18 are either those of its COCO model or COCO's own 17 with a neck behind them.
 
-The order is that in which the bones are shortest on average. In another one they lead from a knee to a wrist.
+The order is that in which the bones are shortest on average. In another one they lead from a knee
+to a wrist.
 """
 
 import dataclasses
@@ -29,7 +30,10 @@ class Order(NamedTuple):
     name: str
     points: tuple[str, ...]
     set: KeypointSet
-    """What they become, with hands. It has the same points of the body, perhaps in its own order."""
+    """What they become, with hands.
+
+    It has the same points of the body, perhaps in its own order.
+    """
 
 
 ORDERS = {
@@ -61,11 +65,11 @@ BONES = (
 )
 """Pairs of points that are near each other on a person."""
 CLEARLY_SHORTER = 1.15
-"""How much longer the bones must be on average in any other order. 99 % of single people in random poses, seen from anywhere,
-with errors of 1 % of their height, have more."""
+"""How much longer the bones must be on average in any other order. 99 % of single people in random
+poses, seen from anywhere, with errors of 1 % of their height, have more."""
 LONGEST_BONES = 0.36
-"""Of the size of a person on average. Of people in random poses it is 0.13 to 0.3, where only the trunk is seen 0.25 to 0.35; of
-points without an order 0.52."""
+"""Of the size of a person on average. Of people in random poses it is 0.13 to 0.3, where only the
+trunk is seen 0.25 to 0.35; of points without an order 0.52."""
 FEWEST_BONES = 6
 """Bones of all people together below which no order is known."""
 CONFIDENT = 0.1
@@ -73,7 +77,8 @@ CONFIDENT = 0.1
 
 
 def in_order(detections: Detections, count: int) -> Detections:
-    """Detections of that many points of the body, perhaps with hands behind them, as those of the set that they are found to be.
+    """Detections of that many points of the body, perhaps with hands behind them, as those of the
+    set that they are found to be.
 
     A warning says which order was found, where it is not the usual one, or that none was.
     """
@@ -100,7 +105,10 @@ def _said(order: Order, known: bool, count: int) -> str:
     if known:
         return f"{count} points in the order of {order.name}, by where they lie"
     others = " or ".join(each.name for each in ORDERS[count] if each is not order)
-    return f"the order of the {count} points is not clear from where they lie: taken for {order.name}, not {others}"
+    return (
+        f"the order of the {count} points is not clear from where they lie: taken for {order.name},"
+        f" not {others}"
+    )
 
 
 def _mean_bone(

@@ -1,4 +1,6 @@
-"""Keypoints of a capture's views: from a detector's file, the image of each view and the one person in it."""
+"""Keypoints of a capture's views: from a detector's file, the image of each view and the one person
+in it.
+"""
 
 import collections
 import dataclasses
@@ -26,18 +28,25 @@ from humangs_jax.data.keypoints.orders import in_order
 from humangs_jax.io.reading import check_limit, reading, walk
 
 NORMALIZED = 2.0
-"""If no coordinate of any view reaches this many pixels, they are no pixels but shares of the image."""
+"""If no coordinate of any view reaches this many pixels, they are no pixels but shares of the
+image.
+"""
 OVERSHOOT, LARGEST_SCORE = 1.1, 20.0
-"""Heat maps overshoot 1 a little (1.02 is common) and undershoot 0. Larger scores are of another scale, such as the maxima of
-SimCC heads (RTMPose, RTMW, DWPose), and are divided by the largest of the file; those beyond that are no scores."""
+"""Heat maps overshoot 1 a little (1.02 is common) and undershoot 0. Larger scores are of another
+scale, such as the maxima of SimCC heads (RTMPose, RTMW, DWPose), and are divided by the largest of
+the file; those beyond that are no scores."""
 SMALLEST_CONFIDENCE = -1.0
 CLEAR_CONFIDENCE, CLEAR_SHARE = 0.3, 0.25
-"""A detection of more than this mean confidence and share of the points of `TRUNK_AND_LIMBS` is a person, others are a detector's
-ghosts. Hands, face and feet do not count: detectors leave them out where they are small, or were not asked for them.
+"""A detection of more than this mean confidence and share of the points of `TRUNK_AND_LIMBS` is a
+person, others are a detector's ghosts. Hands, face and feet do not count: detectors leave them out
+where they are small, or were not asked for them.
 """
 TRUNK_AND_LIMBS = frozenset(COCO_17.names)
 FAR_OUTSIDE = 0.5
-"""Detectors extrapolate a little beyond the image. Points further out than this share of its size mean nothing."""
+"""Detectors extrapolate a little beyond the image.
+
+Points further out than this share of its size mean nothing.
+"""
 LARGEST_PIXEL = 1e6
 """Coordinates beyond it mean nothing, and are not to become inf in float32."""
 UNSORTED = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
@@ -57,7 +66,8 @@ IMAGE_SUFFIXES = (
 
 
 def read_detections(path: Path) -> Detections:
-    """The people in the images of a file or folder of one of the `KEYPOINTS`; its content decides which one.
+    """The people in the images of a file or folder of one of the `KEYPOINTS`; its content decides
+    which one.
 
     A folder, with its sub-folders, is all of its JSON files together. Raises: CaptureError.
     """
@@ -120,16 +130,19 @@ def read_keypoints(
 
     Arguments:
         path: a file or folder of one of the `KEYPOINTS`.
-        names: of the capture's views. Images of the file are matched by name, or by the number in the name where the file
-            has only numbers; images of no view are ignored.
-        width, height: pixels of the capture's photos, which the keypoints have to be of; or of the photos of several sizes that
-            were padded to these when they were imported.
-        person: which one to take where several people are seen, counted from 0 in the order of the file.
+        names: of the capture's views. Images of the file are matched by name, or by the number in
+            the name where the file has only numbers; images of no view are ignored.
+        width, height: pixels of the capture's photos, which the keypoints have to be of; or of the
+            photos of several sizes that were padded to these when they were imported.
+        person: which one to take where several people are seen, counted from 0 in the order of the
+            file.
 
-    Returns: v views of k points. Views of which the file has nothing have confidence 0 and are in `missing`.
+    Returns: v views of k points. Views of which the file has nothing have confidence 0 and are in
+    `missing`.
 
-    Raises: CaptureError, one line naming file and field: a file of no known format, damaged, of no view of this capture,
-        of photos of another size, of several people (without `person`), or without any usable point.
+    Raises: CaptureError, one line naming file and field: a file of no known format, damaged, of no
+        view of this capture, of photos of another size, of several people (without `person`), or
+        without any usable point.
     """
     path = Path(path)
     if person is not None and person < 0:
@@ -162,7 +175,10 @@ def _read(
         clear = sum(map(_is_clear, usable[:, body, 2]))
         if person is None and clear > 1:
             choice = "Person I is the I-th of each view, counted from 0 in the order of the file"
-            problem = f"{clear} people: expected one. {choice}; or crop the photos, or delete the others from the file"
+            problem = (
+                f"{clear} people: expected one. {choice}; or crop the photos, or delete the others"
+                " from the file"
+            )
             raise CaptureError(image.file, f"view {name}", problem)
         which = int(usable[..., 2].sum(axis=1).argmax()) if person is None else person
         if which < len(people):
@@ -182,7 +198,10 @@ def _read(
         int((finite & (raw[..., 2] > 0) & (confidences == 0)).sum()),
     )
     if not confidences.any():
-        problem = f"no point has a confidence above 0 (not finite: {dropped}, far outside of the photos: {far})"
+        problem = (
+            f"no point has a confidence above 0 (not finite: {dropped}, far outside of the photos:"
+            f" {far})"
+        )
         raise CaptureError(path, "", f"{problem}: expected keypoints of these photos")
     if np.abs(points[confidences > 0]).max() < NORMALIZED:
         problem = f"no coordinate exceeds {NORMALIZED:g}: expected pixels, not shares of the image"
@@ -193,7 +212,10 @@ def _read(
         (missing, f"no keypoints of {len(missing)} views: {few(missing)}"),
         (
             shifted,
-            f"frames and photos are counted from different numbers and were matched in order: {shifted}",
+            (
+                "frames and photos are counted from different numbers and were matched in order:"
+                f" {shifted}"
+            ),
         ),
         (
             largest > 1,
@@ -202,7 +224,10 @@ def _read(
         (dropped, f"{dropped} keypoints are not finite numbers and are ignored"),
         (
             far,
-            f"{far} keypoints lie far outside of their photo and are ignored: of photos of another size?",
+            (
+                f"{far} keypoints lie far outside of their photo and are ignored: of photos of"
+                " another size?"
+            ),
         ),
     )
     world = values[..., 3:].astype(np.float32) if columns > 3 else None
@@ -211,7 +236,9 @@ def _read(
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
-    """An image and its view whose numbers differ, because one is counted from 0 and the other from 1; "" if there is none."""
+    """An image and its view whose numbers differ, because one is counted from 0 and the other from
+    1; "" if there is none.
+    """
     for image, name in zip(images, names, strict=True):
         if image is not None:
             numbers = [
@@ -234,7 +261,8 @@ def _images_of_views(
     images: list[DetectedImage | None] = [None] * len(names)
     seen = [image for image, view in zip(detections.images, views, strict=True) if view is not None]
     sizes = [image.size for image in seen if image.size is not None]
-    # an import pads photos of several sizes, each at its right and below, to the largest: pixels keep their places
+    # an import pads photos of several sizes, each at its right and below, to the largest: pixels
+    # keep their places
     before_padding = bool(sizes) and tuple(max(side) for side in zip(*sizes, strict=True)) == (
         width,
         height,
@@ -244,7 +272,10 @@ def _images_of_views(
             continue
         if not before_padding and image.size not in (None, (width, height)):
             size = " x ".join(map(str, image.size or ()))
-            problem = f"{size}, but the capture's photos have {width} x {height}: expected keypoints of these"
+            problem = (
+                f"{size}, but the capture's photos have {width} x {height}: expected keypoints of"
+                " these"
+            )
             raise CaptureError(image.file, f"size of {image.image}", problem)
         images[view] = image
     if not any(images):
@@ -255,7 +286,8 @@ def _images_of_views(
     return images
 
 
-# Which person ---------------------------------------------------------------------------------------------------------
+# Which person
+# --------------------------------------------------------------------------------------------------
 
 
 def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
@@ -273,7 +305,9 @@ def _usable(
     file: Path,
     view: str,
 ) -> Float[np.ndarray, "p k columns"]:
-    """Pixels with centres at +0.5, finite, and confidences in [0, 1], 0 for points that cannot be used."""
+    """Pixels with centres at +0.5, finite, and confidences in [0, 1], 0 for points that cannot be
+    used.
+    """
     finite = np.logical_and.reduce(np.isfinite(people), axis=-1)
     known = people[np.isfinite(people[..., 2]), 2]
     if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_SCORE):
@@ -286,19 +320,22 @@ def _usable(
     return values
 
 
-# Which view -----------------------------------------------------------------------------------------------------------
+# Which view
+# --------------------------------------------------------------------------------------------------
 
 
 def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int | None]:
     """For each image the index of its view, None for images that are of no view.
 
-    Views have names like "front", "000012" or, where that would be ambiguous, "images_cam0_000012" (folders joined by _).
-    Images of keypoint files have names like "front.jpg", "cam0/000012.png" and "cam0_000000000012" (OpenPose counts a video's
-    frames in twelve digits), or are mere numbers (COCO's image ids, the frames of a video).
+    Views have names like "front", "000012" or, where that would be ambiguous, "images_cam0_000012"
+    (folders joined by _). Images of keypoint files have names like "front.jpg", "cam0/000012.png"
+    and "cam0_000000000012" (OpenPose counts a video's frames in twelve digits), or are mere numbers
+    (COCO's image ids, the frames of a video).
 
-    Where a video's frames are counted from 0 and its photos from 1 (ffmpeg), or the other way round, there are as many of
-    either, without gaps, and they are matched in order, for each video by itself. Mere numbers are matched in order, wherever
-    they begin, if there is one for every view, and the last numbers in the views' names have no gaps either.
+    Where a video's frames are counted from 0 and its photos from 1 (ffmpeg), or the other way
+    round, there are as many of either, without gaps, and they are matched in order, for each video
+    by itself. Mere numbers are matched in order, wherever they begin, if there is one for every
+    view, and the last numbers in the views' names have no gaps either.
 
     Raises: ValueError if two images are of one view, or a number could mean two views.
     """
@@ -341,7 +378,8 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     for image, view in zip(images, matched, strict=True):
         if view in owner:
             raise ValueError(
-                f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one entry a view"
+                f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one"
+                " entry a view"
             )
         if view is not None:
             owner[view] = image
@@ -366,7 +404,8 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
         if isinstance(image, int):
             return numbers.get(image, [])
         parts = _stem(image).parts
-        # the names of views are made from paths in this way; with as many of the folders as fit, then numbers as numbers
+        # the names of views are made from paths in this way; with as many of the folders as fit,
+        # then numbers as numbers
         keys = [
             re.sub(r"[^\w.-]", "_", "_".join(parts[i:])).lstrip("._") for i in range(len(parts))
         ]

@@ -1,9 +1,12 @@
-"""The loader: which views of whom come when is a pure function of (seed, step); a run that resumes sees the same batches.
+"""The loader: which views of whom come when is a pure function of (seed, step); a run that resumes
+sees the same batches.
 
-A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written synthetic sets, data sets),
-`GeneratedSource` (people made on the fly from keys) and `Mixture` (several of these by weight). `Loader` makes batches of one:
-each process the rows of its devices, some batches ahead of the loop. Several threads make examples in order, one prepares the
-batches that are asked for next. Threads suffice: decoding and jitted functions release the interpreter's lock.
+A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written
+synthetic sets, data sets), `GeneratedSource` (people made on the fly from keys) and `Mixture`
+(several of these by weight). `Loader` makes batches of one: each process the rows of its devices,
+some batches ahead of the loop. Several threads make examples in order, one prepares the batches
+that are asked for next. Threads suffice: decoding and jitted functions release the interpreter's
+lock.
 """
 
 import collections
@@ -38,7 +41,9 @@ AHEAD = 2
 
 @dataclasses.dataclass
 class Waiting:
-    """How long a loop waited for its data: total seconds, of `items` items, of which the first took `first_seconds`."""
+    """How long a loop waited for its data: total seconds, of `items` items, of which the first took
+    `first_seconds`.
+    """
 
     seconds: float = 0.0
     first_seconds: float = 0.0
@@ -57,9 +62,11 @@ class Loader:
     """Batches from a source.
 
     batch_size: subjects of the global batch, over all processes. seed: of order and views.
-    sharding: how a batch lies on the devices (only its first axis may be split); a process makes the rows that its own
-        devices hold, so that replicas hold equal rows. None: everything on the default device.
-    first_step, first_example: where the numbering of examples starts: those of steps before had other batches.
+    sharding: how a batch lies on the devices (only its first axis may be split); a process makes
+        the rows that its own devices hold, so that replicas hold equal rows. None: everything on
+        the default device.
+    first_step, first_example: where the numbering of examples starts: those of steps before had
+    other batches.
     threads: that make examples.
     """
 
@@ -113,9 +120,11 @@ class Loader:
     def batches(
         self, start: int, stop: int, waiting: Waiting | None = None
     ) -> Generator[tuple[int, Example], None, None]:
-        """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices by threads meanwhile.
+        """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices
+        by threads meanwhile.
 
-        Errors of the threads are raised here, in their turn. Closing the generator (or leaving the loop over it) ends them.
+        Errors of the threads are raised here, in their turn. Closing the generator (or leaving the
+        loop over it) ends them.
         waiting: the time that the loop waited for batches is added to it.
         """
         rows, begun = self.rows, collections.deque[list[Future]]()

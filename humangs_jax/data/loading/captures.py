@@ -1,4 +1,6 @@
-"""People on disk as a source: images are kept decoded as bytes; who cannot be used is left out, and reported."""
+"""People on disk as a source: images are kept decoded as bytes; who cannot be used is left out, and
+reported.
+"""
 
 import dataclasses
 import logging
@@ -36,7 +38,8 @@ logger = logging.getLogger("humangs_jax.data.loading")
 
 
 def find_captures(root: str | Path) -> tuple[Path, ...]:
-    """The capture folders directly inside a folder, sorted by name; the folder itself if it is a capture.
+    """The capture folders directly inside a folder, sorted by name; the folder itself if it is a
+    capture.
 
     Raises: ValueError if there is none.
     """
@@ -55,13 +58,15 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
 def read_summary(
     path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> StoredSubject:
-    """All of a capture but its pixels: parameters that belong to `body`, images and masks of no views but of the right size.
+    """All of a capture but its pixels: parameters that belong to `body`, images and masks of no
+    views but of the right size.
 
-    Images are opened and their sizes compared; PNG files are checked by their checksums, others by decoding them.
+    Images are opened and their sizes compared; PNG files are checked by their checksums, others by
+    decoding them.
 
     Arguments: body_file: where `body` comes from, see `Capture`.
-    Raises: ValueError naming file and field; without masks a capture cannot be learned from, and shape and poses of another
-    body mean nothing to this one.
+    Raises: ValueError naming file and field; without masks a capture cannot be learned from, and
+    shape and poses of another body mean nothing to this one.
     """
     folder = Path(path)
     file = folder / "capture.json"
@@ -69,7 +74,10 @@ def read_summary(
     parameter_file = folder / description["body"]
     name, parameters = read_parameters(parameter_file)
     if not _same_body(name, folder, body_file):
-        problem = f"{name!r}, but all captures of a run have one body, {str(body_file)!r}: expected parameters of that"
+        problem = (
+            f"{name!r}, but all captures of a run have one body, {str(body_file)!r}: expected"
+            " parameters of that"
+        )
         raise CaptureError(parameter_file, "body", problem)
     betas, rotations, translations, _ = body_parameters(
         body, **parameters, file=parameter_file
@@ -119,7 +127,10 @@ class StoredPerson(Protocol):
         ...
 
     def summary(self) -> StoredSubject:
-        """All of it but pixels, perhaps without poses. Raises: ValueError or OSError if it cannot be used."""
+        """All of it but pixels, perhaps without poses.
+
+        Raises: ValueError or OSError if it cannot be used.
+        """
         ...
 
     def decode(
@@ -129,7 +140,10 @@ class StoredPerson(Protocol):
         ...
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """Some views of the summary, with at least the poses that they show. Raises: as `summary`."""
+        """Some views of the summary, with at least the poses that they show.
+
+        Raises: as `summary`.
+        """
         ...
 
 
@@ -162,9 +176,11 @@ class CaptureFolder:
 
 
 class PeopleCache:
-    """People on disk: each is checked when first asked for; images are decoded when needed, and kept as bytes up to a limit.
+    """People on disk: each is checked when first asked for; images are decoded when needed, and
+    kept as bytes up to a limit.
 
-    Several threads may ask at once. broken: name -> what is wrong with it, in the order in which it was found.
+    Several threads may ask at once. broken: name -> what is wrong with it, in the order in which it
+    was found.
     """
 
     def __init__(self, people: Sequence[StoredPerson], limit_bytes: int = 4 << 30):
@@ -185,7 +201,9 @@ class PeopleCache:
         return self.people[index].name
 
     def summary(self, index: int) -> StoredSubject | None:
-        """Person `index` without images, see `StoredPerson`; None if it is broken, which is reported once."""
+        """Person `index` without images, see `StoredPerson`; None if it is broken, which is
+        reported once.
+        """
         name = self.name(index)
         with self._lock:
             if name in self._summaries:
@@ -199,7 +217,10 @@ class PeopleCache:
             return self._summaries.setdefault(name, summary)
 
     def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
-        """Person `index` with these views alone, in this order. Raises: ValueError naming file and field."""
+        """Person `index` with these views alone, in this order.
+
+        Raises: ValueError naming file and field.
+        """
         person, name = self.people[index], self.name(index)
         with self._lock:
             summary = self._summaries.get(name)
@@ -222,7 +243,9 @@ class PeopleCache:
         return person.posed(summary._replace(images=images, masks=masks, **of_views))
 
     def note(self, index: int, problem: str) -> None:
-        """Record person `index` as broken, and log it the first time; other views of it are still used."""
+        """Record person `index` as broken, and log it the first time; other views of it are still
+        used.
+        """
         name = self.name(index)
         with self._lock:
             known = name in self.broken
@@ -234,7 +257,8 @@ class PeopleCache:
             )
 
     def report(self, index: int, problem: str) -> None:
-        """Leave person `index` out from now on. The reason must depend on the files alone, so that the order stays reproducible.
+        """Leave person `index` out from now on. The reason must depend on the files alone, so that
+        the order stays reproducible.
 
         Raises: ValueError, naming the last problem, once everybody is left out.
         """
@@ -285,10 +309,12 @@ class CaptureCache(PeopleCache):
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
-    """People on disk as a `Source`. Example e shows subject e mod n of a permutation drawn for each pass over the n people.
+    """People on disk as a `Source`. Example e shows subject e mod n of a permutation drawn for each
+    pass over the n people.
 
-    input_size, target_size: pixels a side of the square views. depths: examples have depths, all unknown, to be mixed with others
-    that are known. A broken person is replaced by the next one in the order.
+    input_size, target_size: pixels a side of the square views. depths: examples have depths, all
+    unknown, to be mixed with others that are known. A broken person is replaced by the next one in
+    the order.
     """
 
     cache: PeopleCache
@@ -346,7 +372,8 @@ class CaptureSource:
                         f"views[{empty}]", "mask", "empty: no photo to reconstruct the person from"
                     )
             except (ValueError, OSError) as error:
-                # this example goes to the next subject; others, of other views, do not: the order depends on files alone
+                # this example goes to the next subject; others, of other views, do not: the order
+                # depends on files alone
                 self.cache.note(subject_index, str(error))
                 continue
             first, last = range(len(inputs)), range(len(inputs), len(seen.images))

@@ -1,7 +1,9 @@
-"""Examples to learn from: some views of a subject are the input, others the targets; their order, and mixtures of sources.
+"""Examples to learn from: some views of a subject are the input, others the targets; their order,
+and mixtures of sources.
 
-All of it is numpy, and pure functions of (seed, number): example e = step * batch + i is the i-th of its batch, so that a run
-resumes from its step alone. Each purpose draws from a stream of its own.
+All of it is numpy, and pure functions of (seed, number): example e = step * batch + i is the i-th
+of its batch, so that a run resumes from its step alone. Each purpose draws from a stream of its
+own.
 """
 
 import dataclasses
@@ -19,7 +21,9 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import resized
 
 WINDOW = (25, 59)
-"""Rule "window": least and greatest distance of the two ends of a window, in views of a subject that has `WINDOW_OF`."""
+"""Rule "window": least and greatest distance of the two ends of a window, in views of a subject
+that has `WINDOW_OF`.
+"""
 WINDOW_OF = 60
 
 
@@ -38,14 +42,17 @@ class ViewSampling:
     mixed_pose_share: Share = 0.3
     """Of examples whose inputs may each show another pose (frame)."""
     rule: Literal["random", "window"] = "random"
-    """"random": inputs stand around the subject, targets are drawn from all other views, of any pose. "window": the release's. Of
-    a random window in the order of the views, whose ends are 25 to 59 views apart where a subject has 60 (in proportion for other
-    counts), take the two ends, then random views inside; the first of these are input, the last targets. jitter, scattered_share
-    and mixed_pose_share are not used."""
+    """"random": inputs stand around the subject, targets are drawn from all other views, of any
+    pose. "window": the release's. Of a random window in the order of the views, whose ends are 25
+    to 59 views apart where a subject has 60 (in proportion for other counts), take the two ends,
+    then random views inside; the first of these are input, the last targets. jitter,
+    scattered_share and mixed_pose_share are not used."""
 
 
 class StoredSubject(NamedTuple):
-    """A decoded capture as bytes on the host; azimuths (v,) of the cameras, radians, are what views are chosen by."""
+    """A decoded capture as bytes on the host; azimuths (v,) of the cameras, radians, are what views
+    are chosen by.
+    """
 
     images: UInt8[np.ndarray, "v h w 3"]
     masks: UInt8[np.ndarray, "v h w"]
@@ -66,7 +73,9 @@ class StoredSubject(NamedTuple):
         frames: np.ndarray,
         *body: np.ndarray,
     ) -> "StoredSubject":
-        """A subject of no photos yet, of that height and width. body: rotations, translations, betas."""
+        """A subject of no photos yet, of that height and width. body: rotations, translations,
+        betas.
+        """
         centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
         offsets = centers - centers.mean(axis=0)
         images, masks = np.zeros((0, *size, 3), np.uint8), np.zeros((0, *size), np.uint8)
@@ -87,10 +96,12 @@ class Example:
 
 @runtime_checkable
 class Source(Protocol):
-    """Examples by number: capture folders, written sets, people made on the fly, and mixtures of these.
+    """Examples by number: capture folders, written sets, people made on the fly, and mixtures of
+    these.
 
-    `example` is a pure function of its arguments and of the files behind the source: the same on every host, in every thread,
-    in any order. Its leaves are numpy arrays, or arrays on a device if they were made there.
+    `example` is a pure function of its arguments and of the files behind the source: the same on
+    every host, in every thread, in any order. Its leaves are numpy arrays, or arrays on a device if
+    they were made there.
     """
 
     @property
@@ -108,7 +119,8 @@ class Source(Protocol):
         ...
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
-        """The index-th example that a run of this seed takes from this source, with `input_count` input views.
+        """The index-th example that a run of this seed takes from this source, with `input_count`
+        input views.
 
         Raises: ValueError if nothing of the source can be used.
         """
@@ -130,8 +142,8 @@ def draw_views(
 ) -> tuple[list[int], list[int]]:
     """Disjoint indices of input and target views.
 
-    Raises: ValueError if the subject has too few views for the largest of the input counts, whichever this one is: a
-    subject is usable or not, independent of the step.
+    Raises: ValueError if the subject has too few views for the largest of the input counts,
+    whichever this one is: a subject is usable or not, independent of the step.
     """
     count, needed = len(subject.frames), max(sampling.input_counts) + sampling.target_count
     if count < needed:
@@ -169,7 +181,10 @@ def _draw_from_window(generator: np.random.Generator, count: int, wanted: int) -
 
 
 def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray, "v size size *c"]:
-    """Bytes averaged by area to size x size, in [0, 1]. Raises: ValueError unless they are squares of at least that size."""
+    """Bytes averaged by area to size x size, in [0, 1].
+
+    Raises: ValueError unless they are squares of at least that size.
+    """
     height, width = images.shape[1:3]
     if not size <= height == width:
         raise ValueError(f"images of {width} x {height} cannot be averaged to {size} x {size}")
@@ -182,7 +197,8 @@ def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray
 def subject_views(
     subject: StoredSubject, indices: Sequence[int], size: int, depths: bool = False
 ) -> SubjectViews:
-    """Some views of a stored subject at size x size pixels, numpy leaves. depths: whether they have any, all unknown.
+    """Some views of a stored subject at size x size pixels, numpy leaves. depths: whether they have
+    any, all unknown.
 
     Raises: ValueError, see `shrink`.
     """
@@ -216,13 +232,17 @@ def _on_host(cls: type, **fields: Any) -> Any:
     return tree
 
 
-# Order ----------------------------------------------------------------------------------------------------------------
+# Order
+# --------------------------------------------------------------------------------------------------
 
 ORDER_STREAM, VIEW_STREAM, BATCH_STREAM, MIX_STREAM, SUBJECT_STREAM = range(5)
-"""First entry of the seeds: what a generator is for, so that no two purposes share random numbers."""
+"""First entry of the seeds: what a generator is for, so that no two purposes share random numbers.
+"""
 
 MIX_BLOCK = 256
-"""Examples over which the shares of mixed sources are exact; smaller shares than one in a block are made one."""
+"""Examples over which the shares of mixed sources are exact; smaller shares than one in a block are
+made one.
+"""
 
 
 def subject_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " count"]:
@@ -266,8 +286,8 @@ def block_counts(weights: Sequence[float | int]) -> Int[np.ndarray, " sources"]:
 def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tuple[int, int]:
     """(which source the index-th example comes from, its number among the examples of that source).
 
-    Blocks of `MIX_BLOCK` examples are permutations of the same multiset: shares are exact over every block, and each source
-    provides its own examples 0, 1, 2, ... without a gap.
+    Blocks of `MIX_BLOCK` examples are permutations of the same multiset: shares are exact over
+    every block, and each source provides its own examples 0, 1, 2, ... without a gap.
     """
     block, position = divmod(index, MIX_BLOCK)
     labels = np.repeat(np.arange(len(counts)), counts)
@@ -278,10 +298,11 @@ def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tup
 
 @dataclasses.dataclass(frozen=True)
 class Mixture:
-    """Sources mixed by weight, see `source_at`; weights: one positive number each, relative to each other.
+    """Sources mixed by weight, see `source_at`; weights: one positive number each, relative to each
+    other.
 
-    Raises: ValueError if there are not as many weights as sources, one is not positive, or the sources disagree on
-    `input_counts` (a step has one).
+    Raises: ValueError if there are not as many weights as sources, one is not positive, or the
+    sources disagree on `input_counts` (a step has one).
     """
 
     sources: tuple[Source, ...]

@@ -1,8 +1,9 @@
-"""Motions: one body pose per frame, read from the files that people have. `load_motion` is the one door.
+"""Motions: one body pose per frame, read from the files that people have. `load_motion` is the one
+door.
 
-In memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up. Readers (`data.formats.MOTIONS` is their table): `arrays`, by
-key; `clips`, skeletons of other programs, which `skeleton` brings to our joints. `rules`: what all of them and the page know, as
-tables.
+In memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up. Readers (`data.formats.MOTIONS`
+is their table): `arrays`, by key; `clips`, skeletons of other programs, which `skeleton` brings to
+our joints. `rules`: what all of them and the page know, as tables.
 """
 
 import functools
@@ -35,11 +36,17 @@ __all__ = ["PELVIS", "UPRIGHT", "Motion", "MotionError", "grounded", "load_motio
 logger = logging.getLogger(__name__)
 WALK = "walk.npz"
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif")
-_OF_A_VIDEO = ", a video: GVHMR, WHAM or TRAM find the motion of the person in it, and their files are read (docs/motions.md)"
+_OF_A_VIDEO = (
+    ", a video: GVHMR, WHAM or TRAM find the motion of the person in it, and their files are read"
+    " (docs/motions.md)"
+)
 OTHERS = {
     **dict.fromkeys(VIDEOS, _OF_A_VIDEO),
     ".fbx": ": open it in Blender and export a .bvh or .glb",
-    ".c3d": ", markers without a skeleton: solve them with the program that recorded them, and export a .bvh",
+    ".c3d": (
+        ", markers without a skeleton: solve them with the program that recorded them, and export a"
+        " .bvh"
+    ),
 }
 """What else is said of files that are not read, by suffix."""
 SLOWEST = 0.01
@@ -47,12 +54,17 @@ SLOWEST = 0.01
 
 
 class MotionError(FileError):
-    """Something is wrong with a motion file; the message is one line: file, key, and what was expected."""
+    """Something is wrong with a motion file; the message is one line: file, key, and what was
+    expected.
+    """
 
 
 @pytree_dataclass
 class Motion:
-    """Poses over time. rotations: (m, j, 3) axis-angle. translations: (m, 3) metres, applied last. fps: static."""
+    """Poses over time. rotations: (m, j, 3) axis-angle. translations: (m, 3) metres, applied last.
+
+    fps: static.
+    """
 
     rotations: Float[Array, "m j 3"]
     translations: Float[Array, "m 3"]
@@ -63,7 +75,8 @@ class Motion:
         return BodyPose(self.rotations[frame], self.translations[frame])
 
     def at_rate(self, fps: float | int) -> "Motion":
-        """The motion at another frame rate, between two frames interpolated: rotations on the shortest way, positions linearly.
+        """The motion at another frame rate, between two frames interpolated: rotations on the
+        shortest way, positions linearly.
 
         Raises: ValueError for a rate that is not positive, or more frames than the limit.
         """
@@ -109,10 +122,13 @@ class Reading(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """What a reader finds: rotations (m, 55, 3), translations (m, 3) and rate, in the world of the file, of which `up` is up.
+    """What a reader finds: rotations (m, 55, 3), translations (m, 3) and rate, in the world of the
+    file, of which `up` is up.
 
-    fixed: whatever the poses look like; also: other axes that are up in some files of the format, see `rules.up_axis`.
-    frames: (m,) numbers of the frames, whose gaps are filled; None: consecutive. said: lines for the user about the file.
+    fixed: whatever the poses look like; also: other axes that are up in some files of the format,
+    see `rules.up_axis`.
+    frames: (m,) numbers of the frames, whose gaps are filled; None: consecutive. said: lines for
+    the user about the file.
     """
 
     rotations: Float[np.ndarray, "m j 3"]
@@ -139,12 +155,13 @@ def load_motion(
 
     Args:
         path: None for the shipped walk; else a file or a folder of one of `data.formats.MOTIONS`.
-        up: axis of the file's world that points up ("y", "-y", "z" and so on); the motion is turned so that y does. "auto":
-            the format's own, or another one along which people stand on a floor, which is logged as a warning
-            (`rules.up_axis`).
+        up: axis of the file's world that points up ("y", "-y", "z" and so on); the motion is turned
+            so that y does. "auto": the format's own, or another one along which people stand on a
+            floor, which is logged as a warning (`rules.up_axis`).
         fps: frames per second in place of those in the file.
-        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres: skeletons of other
-            programs are brought to it, and a motion of another number of joints is refused. None: the shipped body.
+        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres:
+            skeletons of other programs are brought to it, and a motion of another number of joints
+            is refused. None: the shipped body.
         person: the number of the person, in a file of several.
         clip: of the animations of a GLB file, its name or number. None: the first.
 
@@ -219,7 +236,9 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
 
 
 def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motion, str]:
-    """The motion with the frames in which nobody was seen, between those before and after, and what is to be said."""
+    """The motion with the frames in which nobody was seen, between those before and after, and what
+    is to be said.
+    """
     steps = np.diff(np.asarray(frames, float))
     if not len(steps):
         return motion, ""
@@ -236,7 +255,10 @@ def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motio
 
 
 def _reader(path: Path) -> MotionFormat:
-    """The format of a file, of its suffix or, of archives of arrays, of its content. Raises: MotionError."""
+    """The format of a file, of its suffix or, of archives of arrays, of its content.
+
+    Raises: MotionError.
+    """
     if not path.exists():
         raise MotionError(path, "", "no such file")
     found = MOTIONS.recognized(path)
@@ -275,10 +297,12 @@ def save_motion(path: str | Path, motion: Motion) -> None:
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
-    """The motion moved by a constant so that the person starts at x = z = 0 and, at its lowest, stands on y = 0.
+    """The motion moved by a constant so that the person starts at x = z = 0 and, at its lowest,
+    stands on y = 0.
 
     Arguments:
-        rest, parents: of the body that will move. Its lowest joint is asked, and as far below it as in T-pose is the sole.
+        rest, parents: of the body that will move. Its lowest joint is asked, and as far below it as
+        in T-pose is the sole.
     """
     joints = _joint_paths(rest.joints, parents, motion.rotations, motion.translations)
     sole = rest.joints[:, 1].min() - rest.vertices[:, 1].min()

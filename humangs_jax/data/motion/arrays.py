@@ -1,7 +1,9 @@
-"""Motions in files of arrays: the keys decide the format (`data.formats`), whose rows say what is under them.
+"""Motions in files of arrays: the keys decide the format (`data.formats`), whose rows say what is
+under them.
 
-SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole hands; 22 (66) are the body.
-Rotations are axis-angles or matrices (three times as many numbers). What a file does not have (fingers, eyes) is 0.
+SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole
+hands; 22 (66) are the body. Rotations are axis-angles or matrices (three times as many numbers).
+What a file does not have (fingers, eyes) is 0.
 """
 
 from pathlib import Path
@@ -95,7 +97,8 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
     raise MotionError(
         path,
         "",
-        f"{len(people)} people: {counted}: expected the option or argument person, the number of one",
+        f"{len(people)} people: {counted}: expected the option or argument person, the number"
+        " of one",
     )
 
 
@@ -104,7 +107,8 @@ def _frames(person: Person) -> int:
     return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys) if form else 0
 
 
-# Rotations ------------------------------------------------------------------------------------------------------------
+# Rotations
+# --------------------------------------------------------------------------------------------------
 
 
 def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
@@ -170,7 +174,9 @@ def _all(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> Rotations:
-    """Of a pose under one key: what is behind the body of SMPL is left out, of SMPL-H it is the fingers."""
+    """Of a pose under one key: what is behind the body of SMPL is left out, of SMPL-H it is the
+    fingers.
+    """
     count, width = flat.shape
     if form.pivot == "head" and width == 3 * 53:  # root, body, hands and jaw
         pose = flat.reshape(count, 53, 3)
@@ -213,7 +219,8 @@ def _axis_angles(
     return Rotation.from_matrix(matrices).as_rotvec().reshape(len(flat), joints, 3)
 
 
-# Positions ------------------------------------------------------------------------------------------------------------
+# Positions
+# --------------------------------------------------------------------------------------------------
 
 
 def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float[np.ndarray, "m 3"]:
@@ -266,7 +273,9 @@ def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float
 def _cameras(
     file: "_MotionFile", count: int
 ) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]] | None:
-    """Rotations and places of the cameras in the world for each frame, where files tell; None: they do not."""
+    """Rotations and places of the cameras in the world for each frame, where files tell; None: they
+    do not.
+    """
     if "cam2world" in file.values:
         matrices = file.numbers(
             "cam2world", (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)
@@ -334,15 +343,34 @@ class _MotionFile(ArrayFile):
         return form.fps
 
 
-# Points in space: SAM 3D Body ------------------------------------------------------------------------------------------
+# Points in space: SAM 3D Body
+# ------------------------------------------------------------------------------------------
 
 RIG = {
-    1: ("pelvis", -1), 2: ("left_hip", 1), 3: ("left_knee", 2), 4: ("left_ankle", 3), 8: ("left_foot", 4),
-    18: ("right_hip", 1), 19: ("right_knee", 18), 20: ("right_ankle", 19), 24: ("right_foot", 20),
-    34: ("spine0", 1), 35: ("spine1", 34), 36: ("spine2", 35), 37: ("spine3", 36), 110: ("neck", 37), 113: ("head", 110),
-    74: ("left_collar", 37), 75: ("left_shoulder", 74), 76: ("left_elbow", 75), 78: ("left_wrist", 76),
-    38: ("right_collar", 37), 39: ("right_shoulder", 38), 40: ("right_elbow", 39), 42: ("right_wrist", 40),
-}  # fmt: skip
+    1: ("pelvis", -1),
+    2: ("left_hip", 1),
+    3: ("left_knee", 2),
+    4: ("left_ankle", 3),
+    8: ("left_foot", 4),
+    18: ("right_hip", 1),
+    19: ("right_knee", 18),
+    20: ("right_ankle", 19),
+    24: ("right_foot", 20),
+    34: ("spine0", 1),
+    35: ("spine1", 34),
+    36: ("spine2", 35),
+    37: ("spine3", 36),
+    110: ("neck", 37),
+    113: ("head", 110),
+    74: ("left_collar", 37),
+    75: ("left_shoulder", 74),
+    76: ("left_elbow", 75),
+    78: ("left_wrist", 76),
+    38: ("right_collar", 37),
+    39: ("right_shoulder", 38),
+    40: ("right_elbow", 39),
+    42: ("right_wrist", 40),
+}
 """Of the rig's 127: name and the joint above."""
 RIG_JOINTS = 127
 RIG_Y_UP = np.array([1.0, -1.0, -1.0])
@@ -389,7 +417,9 @@ def _of_frames(
 def _carried(
     places: Float[np.ndarray, "m s 3"], parents: tuple[int, ...]
 ) -> Float[np.ndarray, "m s 3 3"]:
-    """Rotations of bones from the first frame on, where a file has none: the smallest turns down the tree."""
+    """Rotations of bones from the first frame on, where a file has none: the smallest turns down
+    the tree.
+    """
     turns = np.tile(np.eye(3), (*places.shape[:2], 1, 1))
     for i, p in enumerate(parents):
         if p >= 0:

@@ -1,13 +1,15 @@
 """Skeletons in motion of other programs: BVH files, and the animations of GLB files.
 
-BVH (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html): a tree of joints with offsets and channels, then
-one line of numbers per frame. Rotations are degrees about the axes of the channels, in their order: R = R_first R_second R_third.
-Position channels replace the offset. In the rest pose all rotations are 0. A joint's name may have spaces: it ends with its line
-or before a brace.
+BVH (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html): a tree of joints with
+offsets and channels, then one line of numbers per frame. Rotations are degrees about the axes of
+the channels, in their order: R = R_first R_second R_third. Position channels replace the offset. In
+the rest pose all rotations are 0. A joint's name may have spaces: it ends with its line or before a
+brace.
 
-GLB (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations): one of its animations, on the joints of its skin.
-The rest pose is the one in which the skin was bound to the mesh (inverse bind matrices), without a skin that of the nodes.
-Splines are taken at their keys and interpolated linearly.
+GLB (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations): one of its animations,
+on the joints of its skin. The rest pose is the one in which the skin was bound to the mesh (inverse
+bind matrices), without a skin that of the nodes. Splines are taken at their keys and interpolated
+linearly.
 """
 
 import re
@@ -38,7 +40,10 @@ _MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
 
 
 def read_bvh(path: Path, options: object = None) -> Clip:
-    """The skeleton of a file in motion. Raises: OSError; Refused or FileError, which say what was expected."""
+    """The skeleton of a file in motion.
+
+    Raises: OSError; Refused or FileError, which say what was expected.
+    """
     text = read_text(path)
     if text.split(maxsplit=1)[:1] != ["HIERARCHY"]:
         raise Refused("not a BVH file: expected HIERARCHY first")
@@ -57,7 +62,8 @@ def read_bvh(path: Path, options: object = None) -> Clip:
     numbers = _numbers(text[found.end() :])
     if width == 0 or len(numbers) != count * width:
         raise Refused(
-            f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers: cut short?"
+            f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers: cut"
+            " short?"
         )
     check_unpacked(len(text), bytes_of_clip(int(count), len(names)))
     turns, places = _posed(parents, offsets, channels, numbers.reshape(int(count), width))
@@ -180,7 +186,8 @@ def _posed(
     return turns, places
 
 
-# GLB -------------------------------------------------------------------------------------------------------------------
+# GLB
+# --------------------------------------------------------------------------------------------------
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 
@@ -193,7 +200,10 @@ Tracks = dict[tuple[int, str], Track]
 
 
 def read_animation(path: Path, options: Reading | None = None) -> Clip:
-    """The skeleton of a GLB file in motion. Raises: OSError; Refused and what damaged numbers raise."""
+    """The skeleton of a GLB file in motion.
+
+    Raises: OSError; Refused and what damaged numbers raise.
+    """
     data = read_bytes(path, "mesh_bytes")
     content, binary = parse_glb(data, "text_bytes")
     nodes, animations = content.get("nodes", []), content.get("animations", [])
@@ -224,11 +234,17 @@ SHOWN = 12
 
 
 def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
-    """The animation of a name or number, the first if none is asked for, and what is to be said. Raises: Refused."""
+    """The animation of a name or number, the first if none is asked for, and what is to be said.
+
+    Raises: Refused.
+    """
     names = [str(each.get("name", i)) for i, each in enumerate(animations)]
     listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
     if clip is None:
-        said = f"{len(names)} animations ({listed}): the first is taken; the option or argument clip takes another"
+        said = (
+            f"{len(names)} animations ({listed}): the first is taken; the option or argument clip"
+            " takes another"
+        )
         return animations[0], said if len(names) > 1 else ""
     plain = [name.casefold() for name in names]
     if clip.casefold() in plain:
@@ -239,7 +255,9 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
 
 
 def _humanoid(content: dict[str, Any]) -> dict[int, str]:
-    """Names of the bones by node, of files that say them (VRM and its animations): nodes may be called anything."""
+    """Names of the bones by node, of files that say them (VRM and its animations): nodes may be
+    called anything.
+    """
     extensions = content.get("extensions")
     for each in extensions.values() if isinstance(extensions, dict) else ():
         bones = each.get("humanoid", {}).get("humanBones", {}) if isinstance(each, dict) else {}
@@ -269,7 +287,9 @@ def _parents(nodes: Nodes) -> list[int]:
 def _joints(
     content: dict[str, Any], binary: bytes, nodes: Nodes
 ) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
-    """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far as the file tells."""
+    """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far
+    as the file tells.
+    """
     skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
     if not skins:
         return list(range(len(nodes))), {}
@@ -288,7 +308,10 @@ def _joints(
 
 
 def _with_ancestors(joints: Iterable[int], parents: Sequence[int]) -> list[int]:
-    """Joints and the nodes above them, parents first. Raises: Refused for nodes that are above themselves."""
+    """Joints and the nodes above them, parents first.
+
+    Raises: Refused for nodes that are above themselves.
+    """
     order: list[int] = []
     placed: set[int] = set()
     for joint in joints:
@@ -371,7 +394,10 @@ def _world(
 
 
 def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
-    """Where the nodes of a GLB file lie when nothing moves. Raises: Refused; what damaged numbers raise."""
+    """Where the nodes of a GLB file lie when nothing moves.
+
+    Raises: Refused; what damaged numbers raise.
+    """
     parents = _parents(nodes)
     world = _world(nodes, parents, _with_ancestors(range(len(nodes)), parents), {}, np.zeros(1))
     return [world[i][0] for i in range(len(nodes))]

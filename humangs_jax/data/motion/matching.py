@@ -1,7 +1,8 @@
 """Which joint of a file's skeleton is which of ours: by names that are known, else by the tree.
 
-By the tree: two limbs of like bones below a joint are legs, two others above it are arms; what hangs between the arms ends in
-the head. A knee or elbow is where the two longest consecutive bones of a limb meet. Names or places tell left from right.
+By the tree: two limbs of like bones below a joint are legs, two others above it are arms; what
+hangs between the arms ends in the head. A knee or elbow is where the two longest consecutive bones
+of a limb meet. Names or places tell left from right.
 """
 
 import re
@@ -33,7 +34,8 @@ Pair = tuple[list[int], list[int]]
 def matched(
     names: Sequence[str], parents: Sequence[int], rest: Places, posed: Places
 ) -> dict[str, int]:
-    """Index of the file's joint for each of ours that it has. rest, posed: places in the rest pose and in the first frame.
+    """Index of the file's joint for each of ours that it has. rest, posed: places in the rest pose
+    and in the first frame.
 
     Raises: Refused if neither names nor the tree tell where those are that are needed.
     """
@@ -69,11 +71,14 @@ def matched(
     return source
 
 
-# Names ------------------------------------------------------------------------------------------------------------------
+# Names
+# --------------------------------------------------------------------------------------------------
 
 
 def _plain(names: Sequence[str]) -> list[str]:
-    """Lower-case letters and digits, without the prefixes that all or many names share: "Model:Bip01_L_Thigh" is "lthigh"."""
+    """Lower-case letters and digits, without the prefixes that all or many names share:
+    "Model:Bip01_L_Thigh" is "lthigh".
+    """
     words = [re.findall(r"[a-z0-9]+", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
     words = [[word for word in each if word not in NOISE] for each in words]
     plain = [re.sub(r"^mixamorig\d*", "", "".join(each)) for each in words]
@@ -132,7 +137,8 @@ def _descends(source: dict[str, int], parents: Sequence[int]) -> bool:
     )
 
 
-# The tree ---------------------------------------------------------------------------------------------------------------
+# The tree
+# --------------------------------------------------------------------------------------------------
 
 
 def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]:
@@ -145,7 +151,9 @@ def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]
 def _limbs(
     plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: Places
 ) -> dict[str, int] | None:
-    """The joints of arms, legs, pelvis and head by the tree; None where it is not one of a person."""
+    """The joints of arms, legs, pelvis and head by the tree; None where it is not one of a
+    person.
+    """
     children: list[list[int]] = [[] for _ in parents]
     for i, p in enumerate(parents):
         if p >= 0:
@@ -190,7 +198,9 @@ def _limbs(
 
 
 def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
-    """Of the joints of a limb: where its two longest bones in a row begin, meet and end, and the next."""
+    """Of the joints of a limb: where its two longest bones in a row begin, meet and end, and the
+    next.
+    """
     bones = lengths[path[1:]]
     if len(bones) < 2:
         return None
@@ -243,7 +253,8 @@ def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
     return ""
 
 
-# What follows from limbs --------------------------------------------------------------------------------------------------
+# What follows from limbs
+# --------------------------------------------------------------------------------------------------
 
 
 def _match_toes(source: dict[str, int], parents: Sequence[int], rest: Places) -> None:
@@ -261,7 +272,9 @@ def _match_toes(source: dict[str, int], parents: Sequence[int], rest: Places) ->
 
 
 def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[int]) -> None:
-    """What hangs between the arms: the first joint is the neck, the last the head, but for ends of bones."""
+    """What hangs between the arms: the first joint is the neck, the last the head, but for ends of
+    bones.
+    """
     if "neck" in source or "head" in source:
         return
     arms = [_ancestors(parents, source[f"{side}_shoulder"])[1:] for side in SIDES]
@@ -282,7 +295,9 @@ def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[
 
 
 def _match_spine(source: dict[str, int], parents: Sequence[int]) -> None:
-    """Spines have one to five joints, called differently everywhere: ours are the first, middle and last of the file's."""
+    """Spines have one to five joints, called differently everywhere: ours are the first, middle and
+    last of the file's.
+    """
     chain = []
     at = (
         parents[source["neck"]]

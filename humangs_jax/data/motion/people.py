@@ -1,7 +1,8 @@
 """The people in a file or a folder of a motion, and what it says of each: arrays by name.
 
-Estimators put people into dicts by their number, into a list for each frame, along a first axis, into files of their own, or into
-one file a frame; and what they found of a person into dicts by coordinates. Of these those of the world are taken first.
+Estimators put people into dicts by their number, into a list for each frame, along a first axis,
+into files of their own, or into one file a frame; and what they found of a person into dicts by
+coordinates. Of these those of the world are taken first.
 """
 
 import re
@@ -47,11 +48,15 @@ OTHER_FILES = {
 """What other files of ours are, by keys that they have."""
 DEEPEST, SHOWN = 6, 12
 NEARLY_ORTHONORMAL = 0.1
-"""3 x 3 matrices this close to rotations are those of one person, not vectors of three people; `ORTHONORMAL` is checked later."""
+"""3 x 3 matrices this close to rotations are those of one person, not vectors of three people;
+`ORTHONORMAL` is checked later.
+"""
 
 
 class Person(NamedTuple):
-    """A person of a file. name: as the file has it. frames: in which the person was seen, None for all."""
+    """A person of a file. name: as the file has it. frames: in which the person was seen, None for
+    all.
+    """
 
     name: str
     values: Mapping[str, Any]
@@ -66,7 +71,10 @@ def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
 
 
 def read_people(path: Path) -> list[Person]:
-    """The people of a file or a folder. Raises: FileError; Refused if it has nothing of any format."""
+    """The people of a file or a folder.
+
+    Raises: FileError; Refused if it has nothing of any format.
+    """
     files, alone = (
         _files(path) if path.is_dir() else [path],
         not path.is_dir() and path.suffix.lower() != ".json",
@@ -124,7 +132,8 @@ def _numbers(file: Path) -> list[str]:
     return re.findall(r"\d+", file.stem)
 
 
-# People in values -----------------------------------------------------------------------------------------------------
+# People in values
+# --------------------------------------------------------------------------------------------------
 
 
 def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
@@ -177,7 +186,9 @@ def _word(value: Any) -> str:
 
 
 def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person]:
-    """People along the first axis of the arrays of their roots, if they have one more than those of one person."""
+    """People along the first axis of the arrays of their roots, if they have one more than those of
+    one person.
+    """
     place, key = next(iter(form.poses.items()))
     if place not in ("root", "all") or form.kind != "poses" or key not in values:
         return [Person(name, values)]
@@ -224,11 +235,14 @@ def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
         return None
 
 
-# Frames with people ---------------------------------------------------------------------------------------------------
+# Frames with people
+# --------------------------------------------------------------------------------------------------
 
 
 def _listed_frames(content: Any) -> list[list[Person]] | None:
-    """The people of each frame in a list of lists, or in PHALP's dict by image; None for anything else."""
+    """The people of each frame in a list of lists, or in PHALP's dict by image; None for anything
+    else.
+    """
     content = objects(content)
     if (
         isinstance(content, list)
@@ -260,7 +274,10 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
 
 
 def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
-    """The people of each frame. A file whose name ends in two numbers, of which the first changes, is of a frame and a person."""
+    """The people of each frame.
+
+    A file whose name ends in two numbers, of which the first changes, is of a frame and a person.
+    """
     numbers = [_numbers(file) for file in files]
     apart = all(len(each) > 1 for each in numbers) and len({each[-2] for each in numbers}) > 1
     frames: dict[str, tuple[str, list[Person]]] = {}

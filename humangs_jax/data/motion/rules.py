@@ -1,7 +1,8 @@
-"""What the readers of motions know beside `data.formats`, as tables: names of joints, axes, limits of decisions; and which way is
-up in the world of a motion.
+"""What the readers of motions know beside `data.formats`, as tables: names of joints, axes, limits
+of decisions; and which way is up in the world of a motion.
 
-The page reads motions too. `page_rules` is put into it when it is assembled (viewer/page.py); it has no tables of its own.
+The page reads motions too. `page_rules` is put into it when it is assembled (viewer/page.py); it
+has no tables of its own.
 """
 
 import dataclasses
@@ -18,7 +19,8 @@ from humangs_jax.data.capture_checks import LARGEST_DISTANCE
 from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS, PLACES
 from humangs_jax.geometry import quaternion
 
-# Files of arrays --------------------------------------------------------------------------------------------------------
+# Files of arrays
+# --------------------------------------------------------------------------------------------------
 
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
 HAND_NUMBERS = 45
@@ -35,13 +37,16 @@ ORTHONORMAL = 0.05
 NO_RATE = "the file says no frames per second: taken for {:g}"
 NO_PLACES = "the file has no positions ({}): people stay in place"
 
-# Names of joints --------------------------------------------------------------------------------------------------------
+# Names of joints
+# --------------------------------------------------------------------------------------------------
 
 _BONES = (("proximal",), ("intermediate",), ("distal",))
 
 
 def _finger(finger: str, i: int) -> tuple[str, ...]:
-    """Names of the i-th joint of a finger, from 1 at the palm; Biped counts fingers from the thumb."""
+    """Names of the i-th joint of a finger, from 1 at the palm; Biped counts fingers from the
+    thumb.
+    """
     number = ("thumb", "index", "middle", "ring", "pinky").index(finger)
     words = (finger, "little") if finger == "pinky" else (finger,)
     plain = [
@@ -79,9 +84,10 @@ SIDED = {
     "eye": ("eye",),
     **{f"{finger}{i}": _finger(finger, i) for finger in FINGERS for i in (1, 2, 3)},
 }
-"""Joints with a side by the names of others, without it, lower case, letters and digits alone: CMU (cgspeed), Mixamo, LaFAN,
-MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco, Xsens, SOMA, Rigify, Daz, Advanced Skeleton. A joint
-of the file is taken once, by the first that wants it: "shoulder" is the upper arm where there is no other, else the collar."""
+"""Joints with a side by the names of others, without it, lower case, letters and digits alone: CMU
+(cgspeed), Mixamo, LaFAN, MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco,
+Xsens, SOMA, Rigify, Daz, Advanced Skeleton. A joint of the file is taken once, by the first that
+wants it: "shoulder" is the upper arm where there is no other, else the collar."""
 MIDDLE = {
     "pelvis": ("hips", "hip", "pelvis"),
     "neck": ("neck", "neck1", "neck01", "necklower"),
@@ -135,7 +141,10 @@ _CHAINS = (
         )
     ),
 )
-"""Bones: each joint points to the next of its last chain that the file has. Others are moved as their parents are."""
+"""Bones: each joint points to the next of its last chain that the file has.
+
+Others are moved as their parents are.
+"""
 NEXT = {name: chain[i + 1 :] for chain in _CHAINS for i, name in enumerate(chain)}
 NEEDED = (
     "pelvis",
@@ -145,24 +154,32 @@ TOPS = ("spine3", "neck", "left_shoulder")
 """Where the trunk ends: the first that the file has."""
 FEET = tuple(tuple(f"{side}_{name}" for side in SIDES) for name in ("ankle", "foot"))
 """Joints that may touch the floor, of both sides by kind."""
-EXPECTED_NAMES = "expected the names of CMU, Mixamo, Unity or another known program, or two legs and two arms of a person"
+EXPECTED_NAMES = (
+    "expected the names of CMU, Mixamo, Unity or another known program, or two legs and two arms of"
+    " a person"
+)
 FEW = 5
 """Joints that have to share the beginning of their names for it to be no part of them."""
 
-# Decisions --------------------------------------------------------------------------------------------------------------
+# Decisions
+# --------------------------------------------------------------------------------------------------
 
 STANDING = -0.5
 """Cosine between legs and spine below which a person can stand in a rest pose."""
 BETTER_TILT = np.radians(10)
-"""How much better the joints that carry the hips must agree with the trunk than the pelvis's own, on average, to stand for it."""
+"""How much better the joints that carry the hips must agree with the trunk than the pelvis's own,
+on average, to stand for it.
+"""
 LARGEST_BEND = np.radians(60)
-"""Between pelvis and lowest spine, on average over the frames: beyond it the pelvis's rotation is not that of a pelvis."""
+"""Between pelvis and lowest spine, on average over the frames: beyond it the pelvis's rotation is
+not that of a pelvis.
+"""
 RATE_ROUNDING = 1e-4
 """Relative error of a frame rate: BVH files have as few as four digits of the time of a frame."""
 
 PELVIS = np.array([0.0, -0.35, 0.0])
-"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about it. Other
-bodies are off by a constant, which `grounded` removes."""
+"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about
+it. Other bodies are off by a constant, which `grounded` removes."""
 UPRIGHT = {
     "y": (1.0, 0.0, 0.0, 0.0),
     "-y": (0.0, 1.0, 0.0, 0.0),
@@ -173,16 +190,22 @@ UPRIGHT = {
 }
 """The rotation (quaternion, wxyz) that turns the named axis to +y."""
 CLEARLY_UP = 0.5
-"""Mean cosine between a person's own up and an axis from which on the person stands along that axis."""
+"""Mean cosine between a person's own up and an axis from which on the person stands along that
+axis.
+"""
 FLOOR_BAND = 0.05
 """Metres from the usual height of the lowest joint within which that joint is on the floor."""
 STILL = (0.1, 0.3)
-"""A joint rests on the floor if it moves by less than this many metres a second, or than this share of the joints' mean speed."""
+"""A joint rests on the floor if it moves by less than this many metres a second, or than this share
+of the joints' mean speed.
+"""
 ON_THE_FLOOR = 0.5
-"""Share of the frames with a joint on the floor from which on an axis has a floor; another axis has none at less than half of
-that axis's share."""
+"""Share of the frames with a joint on the floor from which on an axis has a floor; another axis has
+none at less than half of that axis's share."""
 TREADMILL = 0.8
-"""Share of the frames with the lowest joint at one height from which on another axis has a floor where nothing rests."""
+"""Share of the frames with the lowest joint at one height from which on another axis has a floor
+where nothing rests.
+"""
 MOST_FRAMES = 1000
 """Of a motion, evenly spread, that are asked for a floor."""
 HANDS = tuple(
@@ -191,7 +214,8 @@ HANDS = tuple(
 """Joints that carry a person who is upside down."""
 
 
-# Which way is up ------------------------------------------------------------------------------------------------------
+# Which way is up
+# --------------------------------------------------------------------------------------------------
 
 
 def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
@@ -206,7 +230,8 @@ def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
 
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
-    """The axis of the world that the pelvis's own y axis points along on average; None if none is clear.
+    """The axis of the world that the pelvis's own y axis points along on average; None if none is
+    clear.
 
     Arguments: root: axis-angle of the pelvis in each frame.
     """
@@ -216,7 +241,9 @@ def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
 
 
 def sampled_frames(count: int) -> np.ndarray:
-    """Frames that are asked for a floor, evenly spread, each followed by its next: 0, 1, 40, 41, ..."""
+    """Frames that are asked for a floor, evenly spread, each followed by its next: 0, 1, 40, 41,
+    ...
+    """
     first = np.unique(
         np.linspace(0, max(count - 2, 0), min(max(count - 1, 1), MOST_FRAMES)).astype(int)
     )
@@ -232,13 +259,15 @@ def up_axis(
 ) -> tuple[str, str]:
     """The axis that is up, and what is to be said about it ("": nothing).
 
-    It is the usual one of the format. Another has to be the one along which the person stands, and the floor must agree: things
-    rest on a floor, so that the lowest joint stays at one height and still. Lying, crawling and upside-down people stand along
-    other axes, but rest on no floor there.
+    It is the usual one of the format. Another has to be the one along which the person stands, and
+    the floor must agree: things rest on a floor, so that the lowest joint stays at one height and
+    still. Lying, crawling and upside-down people stand along other axes, but rest on no floor
+    there.
 
-    Arguments: points: joints in space, metres, pairs of frames as `sampled_frames` has them. stands: the axis along which the
-    person stands on average, if any. usual: the format's. also: axes that are up in other files of the format; they are believed
-    unless the floor contradicts. Someone who is upside down on the hands stands on them.
+    Arguments: points: joints in space, metres, pairs of frames as `sampled_frames` has them.
+    stands: the axis along which the person stands on average, if any. usual: the format's. also:
+    axes that are up in other files of the format; they are believed unless the floor contradicts.
+    Someone who is upside down on the hands stands on them.
     """
     if stands is None or stands == usual:
         return usual, ""
@@ -246,7 +275,10 @@ def up_axis(
     if here < ON_THE_FLOOR <= there and here <= 0.5 * there:
         return (
             stands,
-            f"{stands} is up, not {usual} as usual in such files: people stand and step on a floor below it",
+            (
+                f"{stands} is up, not {usual} as usual in such files: people stand and step on a"
+                " floor below it"
+            ),
         )
     contradicted = there < ON_THE_FLOOR <= here and there <= 0.5 * here
     if (
@@ -264,7 +296,9 @@ def up_axis(
 def _floors(
     points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int
 ) -> list[float]:
-    """Share of the frames in which something is on the floor, for the usual axis and for another, which has to be surer."""
+    """Share of the frames in which something is on the floor, for the usual axis and for another,
+    which has to be surer.
+    """
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))
     level, resting = [], []
@@ -314,7 +348,9 @@ def turned_upright(
     up: str,
     pelvis: Float[np.ndarray, "3"] = PELVIS,
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """Poses and positions in a world turned so that the axis `up` becomes +y. pelvis: the root joint in T-pose, metres."""
+    """Poses and positions in a world turned so that the axis `up` becomes +y. pelvis: the root
+    joint in T-pose, metres.
+    """
     if up == "y":
         return rotations, translations
     turn = upright_matrix(up)
@@ -330,9 +366,10 @@ def turned_upright(
 
 def page_rules() -> dict[str, Any]:
     """All of it as JSON has it, for the page."""
-    names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT NEEDED TOPS FEET EXPECTED_NAMES
-    FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES
-    HANDS ORTHONORMAL NO_RATE NO_PLACES"""
+    names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT
+    NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT
+    CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE
+    NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}
     formats = [

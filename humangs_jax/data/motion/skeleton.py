@@ -1,22 +1,25 @@
 """Skeletons of other programs in motion, brought to our joints: BVH and glTF.
 
-Bones point where the file's bones point. Every joint of ours has a rotation A_j from our rest frame to the file's. It turns our
-bone into the file's bone of the rest pose, and is the smallest such turn after that of the parent. With D_j(t) the rotation of
-the file's joint j from its rest pose to frame t, in the world, ours is
+Bones point where the file's bones point. Every joint of ours has a rotation A_j from our rest frame
+to the file's. It turns our bone into the file's bone of the rest pose, and is the smallest such
+turn after that of the parent. With D_j(t) the rotation of the file's joint j from its rest pose to
+frame t, in the world, ours is
 
     G_j(t) = C_j(t) D_j(t) A_j,    R_j = G_parent(j)^T G_j.
 
-C_j(t) is the smallest turn that makes the bone point where the file's points in the frame: none as long as the file's child hangs
-on the joint itself, but files have joints in between that turn on their own. The pelvis has a line, that of the hips, and the
-trunk for the turn about it: some files turn the pelvis's joint by any rotation and the joints that carry hips and spine back.
+C_j(t) is the smallest turn that makes the bone point where the file's points in the frame: none as
+long as the file's child hangs on the joint itself, but files have joints in between that turn on
+their own. The pelvis has a line, that of the hips, and the trunk for the turn about it: some files
+turn the pelvis's joint by any rotation and the joints that carry hips and spine back.
 
-Twists about a bone are therefore relative to the file's rest pose. Where nobody can stand like that (in LaFAN's files all offsets
-lie along one axis, the legs folded onto the spine), the smallest turn says nothing about twists. A_j is then turned about the
-bone so that the twist of R_j is 0 on average over the frames.
+Twists about a bone are therefore relative to the file's rest pose. Where nobody can stand like that
+(in LaFAN's files all offsets lie along one axis, the legs folded onto the spine), the smallest turn
+says nothing about twists. A_j is then turned about the bone so that the twist of R_j is 0 on
+average over the frames.
 
-Steps become as much longer as the legs are. Feet stay where the file's are: the pelvis moves up or down so that the lower foot is
-as high above the floor as in the file, whatever the shares of thighs, shins and hips in the legs. The page does the same
-(viewer/page/motion_files.js).
+Steps become as much longer as the legs are. Feet stay where the file's are: the pelvis moves up or
+down so that the lower foot is as high above the floor as in the file, whatever the shares of
+thighs, shins and hips in the legs. The page does the same (viewer/page/motion_files.js).
 """
 
 import dataclasses
@@ -41,9 +44,10 @@ from humangs_jax.io.reading import Refused
 class Clip:
     """A skeleton in motion, in the units and the world of its file.
 
-    names: of its s joints. parents: -1 for roots; parents come first. rest: (s, 3) places in the rest pose. turns: (m, s, 3, 3)
-    rotation of each joint from the rest pose to the frame, in the world. places: (m, s, 3). fps: frames per second. up: the axis
-    that the format says is up; None: found from the rest pose. said: lines for the user about the file.
+    names: of its s joints. parents: -1 for roots; parents come first. rest: (s, 3) places in the
+    rest pose. turns: (m, s, 3, 3) rotation of each joint from the rest pose to the frame, in the
+    world. places: (m, s, 3). fps: frames per second. up: the axis that the format says is up; None:
+    found from the rest pose. said: lines for the user about the file.
     """
 
     names: tuple[str, ...]
@@ -62,7 +66,9 @@ def bytes_of_clip(frames: int, joints: int) -> int:
 
 
 def whole_rate(fps: float) -> float:
-    """Frames per second, a whole number where they are one up to the rounding of the file: BVH has 0.0083333 for 120."""
+    """Frames per second, a whole number where they are one up to the rounding of the file: BVH has
+    0.0083333 for 120.
+    """
     return float(round(fps)) if abs(fps - round(fps)) < rules.RATE_ROUNDING * fps else fps
 
 
@@ -77,14 +83,17 @@ def shipped_joints() -> Float[np.ndarray, "j 3"]:
 def retargeted(
     clip: Clip, joints: Float[np.ndarray, "j 3"], up: str = "auto"
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], str]:
-    """Rotations (axis-angle) and translations of a body of SMPL-X's joints that moves as the clip, and what to say about up.
+    """Rotations (axis-angle) and translations of a body of SMPL-X's joints that moves as the clip,
+    and what to say about up.
 
     Arguments: joints: of the body in T-pose, metres. up: as in `load_motion`.
-    Raises: Refused if joints of the clip that are needed have no name we know, or the body is no body of SMPL-X's joints.
+    Raises: Refused if joints of the clip that are needed have no name we know, or the body is no
+    body of SMPL-X's joints.
     """
     if joints.shape != (len(JOINT_NAMES), 3):
         raise Refused(
-            f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has {len(joints)}"
+            f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has"
+            f" {len(joints)}"
         )
     source = matched(clip.names, clip.parents, clip.rest, clip.places[0])
     standing, said = _stands(clip, source), ""
@@ -114,7 +123,9 @@ Source = Mapping[str, int]
 
 
 def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[str, str]:
-    """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people stand does."""
+    """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people
+    stand does.
+    """
     usual = nearest_axis(_spine(clip, source))[0] if standing else "y"
     trunk = clip.places[:, source[_top(source)]] - clip.places[:, source["pelvis"]]
     axis, cosine = nearest_axis(unit(trunk).mean(axis=0))
@@ -126,7 +137,8 @@ def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[st
 _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
 
 
-# Rest poses -------------------------------------------------------------------------------------------------------------
+# Rest poses
+# --------------------------------------------------------------------------------------------------
 
 
 def _top(source: Source) -> str:
@@ -192,8 +204,8 @@ def _pelvis_turns(
     turns: Float[np.ndarray, "m s 3 3"],
     places: Float[np.ndarray, "m s 3"],
 ) -> Float[np.ndarray, "m 3 3"]:
-    """(m, 3, 3) from the rest pose to the frames: of the joint, or of those that carry the hips if these agree better with the
-    trunk, turned so that the line of the hips is the file's.
+    """(m, 3, 3) from the rest pose to the frames: of the joint, or of those that carry the hips if
+    these agree better with the trunk, turned so that the line of the hips is the file's.
     """
     pelvis, left, right = (source[name] for name in ("pelvis", "left_hip", "right_hip"))
     rest_line, line = clip.rest[left] - clip.rest[right], places[:, left] - places[:, right]
@@ -202,7 +214,9 @@ def _pelvis_turns(
         return smallest_turns(unit(candidate @ rest_line), unit(line)) @ candidate
 
     def tilts(candidate, top):
-        """(m,) angle about the line of the hips from the rest pose's direction of a joint above to the frame's."""
+        """(m,) angle about the line of the hips from the rest pose's direction of a joint above to
+        the frame's.
+        """
         axis = unit(line)
         across = lambda v: v - np.sum(v * axis, axis=-1, keepdims=True) * axis
         a = across(candidate @ (clip.rest[top] - clip.rest[pelvis]))
@@ -258,14 +272,16 @@ def _untwist(
 ) -> Float[np.ndarray, "3 3"]:
     """The rotation about a bone that takes the mean twist about it out of rotations (m, 3, 3).
 
-    The twist of a quaternion (w, v) about b is 2 arg(w + i v.b); the square has no sign and weighs those less that swing far.
+    The twist of a quaternion (w, v) about b is 2 arg(w + i v.b); the square has no sign and weighs
+    those less that swing far.
     """
     q = Rotation.from_matrix(turns).as_quat()
     twist = np.angle(np.sum((q[:, 3] + 1j * (q[:, :3] @ bone)) ** 2))
     return Rotation.from_rotvec(-twist * bone).as_matrix()
 
 
-# Steps and the floor ----------------------------------------------------------------------------------------------------
+# Steps and the floor
+# --------------------------------------------------------------------------------------------------
 
 
 def _leg_length(places: Float[np.ndarray, "s 3"], index: Source) -> float:
@@ -279,7 +295,9 @@ def _feet(source: Source) -> list[list[str]]:
 
 
 def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
-    """How high the joints of the file's feet are above the lowest of them in a rest pose that stands, in our metres."""
+    """How high the joints of the file's feet are above the lowest of them in a rest pose that
+    stands, in our metres.
+    """
     axis, _ = nearest_axis(_spine(clip, source))
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.rest, source), 1e-9)
     heights = scale * clip.rest @ upright_matrix(axis)[1]
@@ -292,7 +310,8 @@ def _steps(
 ) -> Float[np.ndarray, " m"]:
     """(m,) how high the feet are above the floor, which is where they are lowest.
 
-    soles: of each joint of the feet, how high it is when the foot stands; None: each kind as high as in its lowest frame.
+    soles: of each joint of the feet, how high it is when the foot stands; None: each kind as high
+    as in its lowest frame.
     """
     if soles is None:
         lowest = [

@@ -1,8 +1,10 @@
-"""Motions in a single array, by the number of its columns; and rotations of six numbers, in the order in which MDM writes them.
+"""Motions in a single array, by the number of its columns; and rotations of six numbers, in the
+order in which MDM writes them.
 
-A row of Motion-X has 322 numbers (https://github.com/IDEA-Research/Motion-X): root 3, body 63, hands 90, jaw 3, expression 50,
-shape of the face 100, translation 3, shape 10. Six numbers are the first two rows of a rotation matrix, before they are made
-orthonormal (Zhou et al., arXiv 1812.07035).
+A row of Motion-X has 322 numbers (https://github.com/IDEA-Research/Motion-X): root 3, body 63,
+hands 90, jaw 3, expression 50, shape of the face 100, translation 3, shape 10. Six numbers are the
+first two rows of a rotation matrix, before they are made orthonormal (Zhou et al., arXiv
+1812.07035).
 """
 
 from collections.abc import Mapping
@@ -51,7 +53,8 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
         return {POSES: array}
     if array.ndim == 2 and columns in FEATURES:
         raise Refused(
-            f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints and {_RENDER}"
+            f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints"
+            f" and {_RENDER}"
         )
     if array.ndim == 3 and columns == 3:
         whose = f" ({JOINTS[shape[1]]})" if shape[1] in JOINTS else ""
@@ -61,7 +64,8 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
         )
     known = ", ".join(map(str, (COLUMNS_OF_MOTION_X, *COLUMNS)))
     raise Refused(
-        f"an array of shape {shape}: expected (frames, columns) with {known} columns, or a dict of arrays by name"
+        f"an array of shape {shape}: expected (frames, columns) with {known} columns, or a dict of"
+        " arrays by name"
     )
 
 
@@ -75,7 +79,8 @@ def hint_for(values: Mapping[Any, Any]) -> str:
 
 
 def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[str, Any]:
-    """Values with matrices (m, j, 3, 3) and positions (m, 3), of six numbers a joint with the frames last, or first.
+    """Values with matrices (m, j, 3, 3) and positions (m, 3), of six numbers a joint with the
+    frames last, or first.
 
     Raises: Refused for other shapes, naming the key.
     """

@@ -1,11 +1,14 @@
-"""The published protocol: alignment, cameras around a scan, splits, evaluation indices (numpy, float64); photos of a scan.
+"""The published protocol: alignment, cameras around a scan, splits, evaluation indices (numpy,
+float64); photos of a scan.
 
-Scans: the middle of the raw scan's bounding box becomes the origin, then the smallest rotation takes pelvis -> neck of the fitted
-body to +y. Videos: the same rotation of frame 0 first, then the middle of the bounding box of the rotated body of frame 0.
+Scans: the middle of the raw scan's bounding box becomes the origin, then the smallest rotation
+takes pelvis -> neck of the fitted body to +y. Videos: the same rotation of frame 0 first, then the
+middle of the bounding box of the rotated body of frame 0.
 
-Photos of a scan: our rasterizer, several samples a pixel, a texture shrunk to the samples. Color = texture (ambient + headlight
-|n . v|), n the smooth normal and v the direction to the camera, both sides alike. The published protocol names an ambient light
-of 0.3 and one headlight, and no strength of the latter: with 0.7 a surface that faces the camera has the color of its texture.
+Photos of a scan: our rasterizer, several samples a pixel, a texture shrunk to the samples. Color =
+texture (ambient + headlight |n . v|), n the smooth normal and v the direction to the camera, both
+sides alike. The published protocol names an ambient light of 0.3 and one headlight, and no strength
+of the latter: with 0.7 a surface that faces the camera has the color of its texture.
 """
 
 import dataclasses
@@ -37,7 +40,10 @@ VERTICAL_FOV = np.deg2rad(60.0)
 ELEVATIONS = (-5.0, 15.0)
 """Degrees, uniform."""
 FACTORS = (1.0, 1.75)
-"""Camera distance in bounding radii, uniform, as the paper has it. At 60 degrees below 1.7 the frame cuts heads and feet."""
+"""Camera distance in bounding radii, uniform, as the paper has it.
+
+At 60 degrees below 1.7 the frame cuts heads and feet.
+"""
 NEAR_FACTORS = (2.0, 2.0)
 """The paper's "near" test set; also what the release uses for all sets."""
 VIEWS, SIZE = 60, 512
@@ -52,7 +58,10 @@ EVERY = 10
 def smallest_rotation(
     start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The rotation about start x end that takes the direction of `start` to that of `end`. Raises: ValueError for a zero."""
+    """The rotation about start x end that takes the direction of `start` to that of `end`.
+
+    Raises: ValueError for a zero.
+    """
     lengths = np.linalg.norm(start), np.linalg.norm(end)
     if not min(lengths) > 0:
         raise ValueError("the direction from pelvis to neck has no length")
@@ -74,7 +83,9 @@ def moved(
 def scan_alignment(
     scan: Float[np.ndarray, "n 3"], pelvis: Float[np.ndarray, "3"], neck: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`mesh_transform` of a scan, R @ T: first the middle of its bounding box to the origin, then upright."""
+    """`mesh_transform` of a scan, R @ T: first the middle of its bounding box to the origin, then
+    upright.
+    """
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
     return calibration.pose_matrix(R, -R @ box_middle(scan))
 
@@ -82,7 +93,9 @@ def scan_alignment(
 def video_alignment(
     body: Float[np.ndarray, "n 3"], pelvis: Float[np.ndarray, "3"], neck: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`mesh_transform` of a video, T @ R: upright first, then the middle of the turned body of frame 0 to the origin."""
+    """`mesh_transform` of a video, T @ R: upright first, then the middle of the turned body of
+    frame 0 to the origin.
+    """
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
     return calibration.pose_matrix(R, -box_middle(body @ R.T))
 
@@ -96,9 +109,11 @@ def intrinsics(size: int) -> Float[np.ndarray, "3 3"]:
 def scan_cameras(
     number: int, radius: float, views: int, factors: tuple[float, float]
 ) -> Float[np.ndarray, "v 4 4"]:
-    """cam_from_world of cameras that look at the origin, y up; azimuth, elevation and distance are drawn uniformly.
+    """cam_from_world of cameras that look at the origin, y up; azimuth, elevation and distance are
+    drawn uniformly.
 
-    number: of the scan, so that its cameras depend on nothing else. Equal factors: all at that distance.
+    number: of the scan, so that its cameras depend on nothing else. Equal factors: all at that
+    distance.
     """
     rng = np.random.default_rng([CAMERA_SEED, number])
     azimuths = np.deg2rad(rng.uniform(0, 360, views))
@@ -118,16 +133,20 @@ def scan_cameras(
 
 
 def split_ids(names: Sequence[T], train: int = TRAIN, test: int = TEST) -> tuple[list[T], list[T]]:
-    """numpy's shuffle of seed 42 of all sorted names: the first `train` of them, and the next `test`."""
+    """numpy's shuffle of seed 42 of all sorted names: the first `train` of them, and the next
+    `test`.
+    """
     order = sorted(names)  # ty: ignore[invalid-argument-type]  strings
     np.random.RandomState(SPLIT_SEED).shuffle(order)  # the published one
     return order[:train], order[train : train + test]
 
 
 def evaluation_indices(counts: Mapping[str, int], inputs: int) -> dict[str, dict[str, list[int]]]:
-    """{scene: {"context": [...], "target": [...]}} of scenes in file order with their numbers of views.
+    """{scene: {"context": [...], "target": [...]}} of scenes in file order with their numbers of
+    views.
 
-    Python's generator of seed 777: `inputs` views, then `TARGETS` of the others. Raises: ValueError for a scene of too few.
+    Python's generator of seed 777: `inputs` views, then `TARGETS` of the others. Raises: ValueError
+    for a scene of too few.
     """
     generator, found = random.Random(EVALUATION_SEED), {}
     for name, count in counts.items():
@@ -141,7 +160,8 @@ def evaluation_indices(counts: Mapping[str, int], inputs: int) -> dict[str, dict
     return found
 
 
-# Photos of a scan -----------------------------------------------------------------------------------------------------
+# Photos of a scan
+# --------------------------------------------------------------------------------------------------
 
 
 AMBIENT, HEADLIGHT = 0.3, 0.7
@@ -153,7 +173,8 @@ STEP = 1 << 15
 class ScanRenderer:
     """A scan on the device, aligned, with a texture for each view's distance.
 
-    vertices, normals: (n, 3), faces: (f, 3), padded. uvs: (n, 2). scan: where the texture comes from. texel: scan units a texel.
+    vertices, normals: (n, 3), faces: (f, 3), padded. uvs: (n, 2). scan: where the texture comes
+    from. texel: scan units a texel.
     textures: the texture by the number of times it was halved; made when first used.
     """
 
@@ -212,7 +233,10 @@ class ScanRenderer:
 def smooth_normals(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit normals; vertices at one place, which texture seams double, share theirs. Zero where there is no face."""
+    """Unit normals; vertices at one place, which texture seams double, share theirs.
+
+    Zero where there is no face.
+    """
     places, place = np.unique(vertices, axis=0, return_inverse=True)
     place = place.reshape(-1)
     return unit(vertex_crosses(places, place[faces]))[place]

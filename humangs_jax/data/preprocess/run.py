@@ -1,14 +1,18 @@
-"""A whole set: which subjects are due, what is written of each, and the lists and the manifest over all of it.
+"""A whole set: which subjects are due, what is written of each, and the lists and the manifest over
+all of it.
 
-    OUT/manifest.json            settings, finished scenes with what is known of them, skipped ones with the reason, the split
-    OUT/NAME/                    a scene with the arrays of the published layout, or a capture of ours
+    OUT/manifest.json            settings, finished scenes with what is known of them, skipped ones
+                                 with the reason, the split
+    OUT/NAME/                    a scene with the arrays of the published layout, or a capture of
+                                 ours
     OUT/skipped/NAME.json        why one was skipped; it is tried again by the next run
     OUT/train.json, test.json, evaluation_N.json    of the layout "scenes"
 
-A scene's folder holds images/ and masks/ of each view, smpl/ of each frame, and scene.json: its entry for the list, and what is
-known of it. Everything is written under a temporary name first, so that the folder is whole or not there. Finished folders are
-kept, so that the same command continues an interrupted set (`data.sets`). Shards of one set may run at the same time. A run
-without shards, after them, finds nothing to make and lists everything.
+A scene's folder holds images/ and masks/ of each view, smpl/ of each frame, and scene.json: its
+entry for the list, and what is known of it. Everything is written under a temporary name first, so
+that the folder is whole or not there. Finished folders are kept, so that the same command continues
+an interrupted set (`data.sets`). Shards of one set may run at the same time. A run without shards,
+after them, finds nothing to make and lists everything.
 """
 
 import dataclasses
@@ -109,7 +113,9 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What is in a set after a run. made: in this run. scenes, views: in all. skipped: name -> reason."""
+    """What is in a set after a run. made: in this run. scenes, views: in all. skipped: name ->
+    reason.
+    """
 
     out: Path
     made: int
@@ -137,9 +143,11 @@ def preprocess(
 ) -> Report:
     """Make or continue a set.
 
-    Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file: the model of its
-    fits. shard: (i, n): the i-th of n parts, from 0. workers: processes, for scans.
-    Raises: ValueError if there is nobody, `out` holds another set, or (at the end) nobody could be made.
+    Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file:
+    the model of its fits. shard: (i, n): the i-th of n parts, from 0. workers: processes, for
+    scans.
+    Raises: ValueError if there is nobody, `out` holds another set, or (at the end) nobody could be
+    made.
     """
     source, out = Path(source).resolve(), Path(out)
     index, count = shard
@@ -200,11 +208,15 @@ def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[s
     return {named(path): path for path in folders}, {}
 
 
-# Lists and manifest -----------------------------------------------------------------------------------------------------
+# Lists and manifest
+# --------------------------------------------------------------------------------------------------
 
 
 def _made_with(source: Path, body: FileBody, settings: Settings) -> dict[str, Any]:
-    """What the scenes depend on. The data set by the name of its folder: it may lie elsewhere on another machine."""
+    """What the scenes depend on.
+
+    The data set by the name of its folder: it may lie elsewhere on another machine.
+    """
     shipped = body.file == DEFAULT_BODY
     known = {
         "source": source.name,
@@ -300,11 +312,15 @@ def _write_lists(
     )
 
 
-# One scene ------------------------------------------------------------------------------------------------------------
+# One scene
+# --------------------------------------------------------------------------------------------------
 
 
 class View(NamedTuple):
-    """A view to be written. photo: None once it is written. frame: which of the poses it shows. Lengths: of the scene."""
+    """A view to be written. photo: None once it is written. frame: which of the poses it shows.
+
+    Lengths: of the scene.
+    """
 
     name: str
     frame: int
@@ -322,8 +338,9 @@ class View(NamedTuple):
 class Content:
     """What is written of a scene.
 
-    transform: (4, 4) `mesh_transform`. posed: of each frame, before it. parameters: of each frame, in metres. scale: units per
-    metre. views: in the world after the transform, in units. known: for the manifest; complete when the views have run out.
+    transform: (4, 4) `mesh_transform`. posed: of each frame, before it. parameters: of each frame,
+    in metres. scale: units per metre. views: in the world after the transform, in units. known: for
+    the manifest; complete when the views have run out.
     """
 
     transform: Float[np.ndarray, "4 4"]
@@ -343,7 +360,10 @@ def _make_scan(
 
 
 def scan_content(source: Path, name: str, body: FileBody, settings: Settings) -> Content:
-    """What is written of a scan; its views are rendered when they are asked for. Raises: ValueError naming file and key."""
+    """What is written of a scan; its views are rendered when they are asked for.
+
+    Raises: ValueError naming file and key.
+    """
     scan_file, fit_file = scan_files(source, name)
     fit = read_fit(fit_file, body)
     fitted = next(posed_people(body.model, fit.parameters, fit.scale))
@@ -424,7 +444,8 @@ def _write(
             views.append(view._replace(photo=None))
         if not views:
             raise ValueError(
-                f"{folder.name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}"
+                f"{folder.name}: no photo can be read:"
+                f" {next(iter(content.known['unreadable'].values()), '')}"
             )
         known = {"views": len(views), "frames": len(content.parameters.rotations), **content.known}
         described: dict[str, Any] = {"known": known, "made_from": made_from}

@@ -1,4 +1,6 @@
-"""Keypoints as evidence: observations of fixed shapes, so that frames and people can be vmapped, and their residuals."""
+"""Keypoints as evidence: observations of fixed shapes, so that frames and people can be vmapped,
+and their residuals.
+"""
 
 import dataclasses
 import functools
@@ -32,9 +34,13 @@ AnyArray = Float[Array, "m c ..."] | Float[np.ndarray, "m c ..."]
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
 NOISE, LEAST_NOISE = 0.005, 0.3
-"""Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and a lower bound, pixels."""
+"""Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and a
+lower bound, pixels.
+"""
 OUTER = (0.03, 0.97)
-"""Quantiles of the coordinates between which a person's size is measured, so that outliers do not count."""
+"""Quantiles of the coordinates between which a person's size is measured, so that outliers do not
+count.
+"""
 NOISE_RANGE = (0.5, 8.0)
 """Bounds of the noise that a fit finds, multiples of the expected noise."""
 PLACE_STD = 0.02
@@ -50,9 +56,11 @@ RAYLEIGH_MEDIAN = 1.1774
 class Observations(Batchable):
     """Keypoints of one frame in c views; a missing view has confidence 0.
 
-    points: (c, k, 2) pixels, centres at +0.5. confidences: (c, k) in [0, 1]; 0: not seen. K: (c, 3, 3) pixels.
-    cam_from_world: (c, 4, 4), metres. noise: () std of the detections, pixels. world: (c, k, 3) where the detector sees the
-    landmarks in space, in the camera's axes, up to a translation and a scale.
+    points: (c, k, 2) pixels, centres at +0.5. confidences: (c, k) in [0, 1]; 0: not seen. K: (c, 3,
+    3) pixels.
+    cam_from_world: (c, 4, 4), metres. noise: () std of the detections, pixels. world: (c, k, 3)
+    where the detector sees the landmarks in space, in the camera's axes, up to a translation and a
+    scale.
     """
 
     points: Float[Array, "c k 2"]
@@ -77,7 +85,9 @@ def make_observations(
 
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
-    """Keypoints of photos in pixels of resized cameras: a batch of views, each with one view (c = 1), and the noise of all."""
+    """Keypoints of photos in pixels of resized cameras: a batch of views, each with one view (c =
+    1), and the noise of all.
+    """
     scale = np.asarray(
         [cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype
     )
@@ -93,7 +103,9 @@ def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -
 def group_by_frame(
     photos: Photos | Capture, keypoints: Keypoints
 ) -> tuple[Observations, Int[np.ndarray, "m c"]]:
-    """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where there is none."""
+    """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where
+    there is none.
+    """
     frames, count = np.asarray(photos.frames), photos.frame_count
     members = [np.flatnonzero(frames == frame) for frame in range(count)]
     views = np.full((count, max(len(own) for own in members)), -1)
@@ -122,7 +134,9 @@ def in_camera_axes(
     weights: Float[np.ndarray, "*b k"],
     K: Float[np.ndarray, "*b 3 3"],
 ) -> Float[np.ndarray, "*b k 3"]:
-    """Landmarks whose z axis is the ray to the mean of the weighted points, in the axes of the camera."""
+    """Landmarks whose z axis is the ray to the mean of the weighted points, in the axes of the
+    camera.
+    """
     total = weights.sum(-1, keepdims=True)
     middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
     focal, center = np.diagonal(K, axis1=-2, axis2=-1)[..., :2], K[..., :2, 2]
@@ -152,7 +166,9 @@ def expected_noise(
 
 
 def found_noise(lengths: Array, expected: Array) -> Array:
-    """Pixels, from the median of errors, which outliers hardly change; NaN is none, and without any it is as expected."""
+    """Pixels, from the median of errors, which outliers hardly change; NaN is none, and without any
+    it is as expected.
+    """
     median = jnp.nanmedian(lengths)
     found = jnp.where(jnp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
     return jnp.clip(found, NOISE_RANGE[0] * expected, NOISE_RANGE[1] * expected)
@@ -234,7 +250,9 @@ def world_residuals(
     landmarks: Float[Array, "k 3"],
     scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k"]:
-    """Depths of landmarks against those that the detector sees, of a person of the same size, in standard deviations."""
+    """Depths of landmarks against those that the detector sees, of a person of the same size, in
+    standard deviations.
+    """
     weights = observations.confidences * np.asarray(model.known, np.float32)
     centered = lambda x: (
         x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
@@ -250,7 +268,9 @@ def world_residuals(
 
 @pytree_dataclass
 class Targets:
-    """Triangulated landmarks: points (k, 3) metres; known: (k,) their weights; pixel: () metres per pixel there."""
+    """Triangulated landmarks: points (k, 3) metres; known: (k,) their weights; pixel: () metres per
+    pixel there.
+    """
 
     points: Float[Array, "k 3"]
     known: Float[Array, " k"] | Bool[Array, " k"]

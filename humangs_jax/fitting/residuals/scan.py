@@ -1,12 +1,15 @@
-"""A scan as evidence: pairs of scan points and body vertices, and the residuals of a body against fixed pairs.
+"""A scan as evidence: pairs of scan points and body vertices, and the residuals of a body against
+fixed pairs.
 
-Pairs are nearest points with like normals, searched from either side with k-d trees of positions and normals: a difference of
-normals counts like some centimetres, so that a sleeve is not paired with the waist behind it. Pairs that are far apart, or face
-different ways, have no weight; others fade with distance.
+Pairs are nearest points with like normals, searched from either side with k-d trees of positions
+and normals: a difference of normals counts like some centimetres, so that a sleeve is not paired
+with the waist behind it. Pairs that are far apart, or face different ways, have no weight; others
+fade with distance.
 
-Of a pair, d = n . (scan point - body vertex) is the distance by which the scan is outside of the skin, n the normal of the
-surface that was searched. On a bare person d is noise on both sides. Clothes are outside: d > 0 is usual and counts little;
-d < 0 means that the body pokes out of its clothes, and counts in full. Hands are usually bare and count in full on both sides.
+Of a pair, d = n . (scan point - body vertex) is the distance by which the scan is outside of the
+skin, n the normal of the surface that was searched. On a bare person d is noise on both sides.
+Clothes are outside: d > 0 is usual and counts little; d < 0 means that the body pokes out of its
+clothes, and counts in full. Hands are usually bare and count in full on both sides.
 """
 
 import jax
@@ -54,14 +57,16 @@ LIKE = 0.3
 """Least cosine between the normals of a pair."""
 
 
-# The body ------------------------------------------------------------------------------------------------------------
+# The body
+# --------------------------------------------------------------------------------------------------
 
 
 @pytree_dataclass
 class BodySurface:
     """n vertices of a body with j joints.
 
-    points: the vertices. faces: (f, 3). order: (n,) vertices with a number below m are a mesh of m vertices, evenly spread.
+    points: the vertices. faces: (f, 3). order: (n,) vertices with a number below m are a mesh of m
+    vertices, evenly spread.
     covered: (n,) 0 on hands, 1 where clothes may be. landmarks: of the same body, with its joints.
     """
 
@@ -73,7 +78,8 @@ class BodySurface:
 
 
 def body_surface(body: BodyModel, names: tuple[str, ...], vertices: int = VERTICES) -> BodySurface:
-    """The surface of a body by `vertices` of its vertices (all, if it has fewer), with the landmarks of these names.
+    """The surface of a body by `vertices` of its vertices (all, if it has fewer), with the
+    landmarks of these names.
 
     Raises: ValueError if its joints have other names than SMPL-X's.
     """
@@ -93,7 +99,9 @@ def body_surface(body: BodyModel, names: tuple[str, ...], vertices: int = VERTIC
 def pose_vertices(
     surface: BodySurface, rows: Int[Array, " r"], betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "r 3"], Float[Array, "k 3"], Float[Array, "j 3"]]:
-    """Some vertices (r, 3), the landmarks (k, 3) and the joints (j, 3) of a person in a pose, metres."""
+    """Some vertices (r, 3), the landmarks (k, 3) and the joints (j, 3) of a person in a pose,
+    metres.
+    """
     model, count = surface.landmarks, rows.shape[0]
     transforms, joints = pose_joints(model, betas, pose)
     wanted = jax.tree.map(
@@ -112,12 +120,15 @@ def pose_surface(
     return vertices, vertex_normals(vertices, surface.faces)
 
 
-# Residuals -----------------------------------------------------------------------------------------------------------
+# Residuals
+# --------------------------------------------------------------------------------------------------
 
 
 @pytree_dataclass
 class ScanProblem:
-    """What stays the same. surface: of the body. origin: of the state. ends: static, highest and lowest vertex at rest."""
+    """What stays the same. surface: of the body. origin: of the state. ends: static, highest and
+    lowest vertex at rest.
+    """
 
     surface: BodySurface
     origin: Origin
@@ -145,8 +156,8 @@ def scan_problem(surface: BodySurface, names: tuple[str, ...], coefficients: int
 
 @pytree_dataclass
 class ScanMatches:
-    """r pairs. rows: (r,) vertices of the body. points, normals: (r, 3) in the scan's frame. outside: (r,) std of positive
-    distances. weights: (r,), 0: no pair.
+    """r pairs. rows: (r,) vertices of the body. points, normals: (r, 3) in the scan's frame.
+    outside: (r,) std of positive distances. weights: (r,), 0: no pair.
     """
 
     rows: Int[Array, " r"]
@@ -165,8 +176,8 @@ class ScanMatches:
 
 @pytree_dataclass
 class Given:
-    """Known landmarks and height. points: (k, 3) in the scan's frame. weights: (k,) 0: not known. std: () metres. height: ()
-    metres, and height_weight: () 1 if it is known, else 0.
+    """Known landmarks and height. points: (k, 3) in the scan's frame. weights: (k,) 0: not known.
+    std: () metres. height: () metres, and height_weight: () 1 if it is known, else 0.
     """
 
     points: Float[Array, "k 3"]
@@ -178,8 +189,8 @@ class Given:
 
 @pytree_dataclass
 class Tolerances:
-    """Each (). inside, outside: std of d on either side, in units of the frame, about metres; outside holds where the skin is
-    usually covered. prior: weight of the pose prior.
+    """Each (). inside, outside: std of d on either side, in units of the frame, about metres;
+    outside holds where the skin is usually covered. prior: weight of the pose prior.
     """
 
     inside: Float[Array, ""]
@@ -199,7 +210,8 @@ def scan_residuals(
     vertices, landmarks, _ = pose_vertices(problem.surface, matches.rows, betas, pose)
     # in the scan's frame: in metres, a smaller scan would be nearer
     apart = matches.points - vertices / scale_of(state)
-    # term by term: XLA's CPU compiler (jaxlib 0.10.2) makes wrong Jacobians of `jnp.sum(normals * apart, axis=-1)` under jacfwd
+    # term by term: XLA's CPU compiler (jaxlib 0.10.2) makes wrong Jacobians of `jnp.sum(normals *
+    # apart, axis=-1)` under jacfwd
     along = matches.normals * apart
     away = along[:, 0] + along[:, 1] + along[:, 2]
     off = (landmarks / scale_of(state) - given.points) / given.std
@@ -230,14 +242,16 @@ def _height(problem: ScanProblem, betas: Float[Array, " s"]) -> Float[Array, ""]
     return top - bottom
 
 
-# Pairs ---------------------------------------------------------------------------------------------------------------
+# Pairs
+# --------------------------------------------------------------------------------------------------
 
 
 class Target:
     """A scan in a frame about as large as a person in metres, ready to be searched.
 
-    Arguments: align: to the frame. count: how many points, and body vertices, look for partners. effective: weight of all pairs
-    together. normal: metres that a difference of 1 between normals counts like.
+    Arguments: align: to the frame. count: how many points, and body vertices, look for partners.
+    effective: weight of all pairs together. normal: metres that a difference of 1 between normals
+    counts like.
     """
 
     def __init__(
@@ -256,10 +270,11 @@ class Target:
         robust_scale: float,
         tolerances: Tolerances,
     ) -> ScanMatches:
-        """The pairs of a body in a state: first those that scan points found, `count` of them, then those that vertices found.
+        """The pairs of a body in a state: first those that scan points found, `count` of them, then
+        those that vertices found.
 
-        Arguments: gate: pairs that are farther apart, in units of the frame, have no weight. robust_scale: distance along the
-        normal at which weights have fallen to a quarter.
+        Arguments: gate: pairs that are farther apart, in units of the frame, have no weight.
+        robust_scale: distance along the normal at which weights have fallen to a quarter.
         """
         rows, points, facing, away, good = self._pairs(problem, state, gate)
         fading = np.square(
@@ -279,12 +294,16 @@ class Target:
     def distances(
         self, problem: ScanProblem, state: FitState, gate: float
     ) -> tuple[Float[np.ndarray, " r"], float]:
-        """How far scan points are outside of the skin (r,), in units of the frame; the share of them that has a partner."""
+        """How far scan points are outside of the skin (r,), in units of the frame; the share of
+        them that has a partner.
+        """
         away, good = (x[: self.count] for x in self._pairs(problem, state, gate)[3:])
         return away[good], float(good.mean())
 
     def _pairs(self, problem: ScanProblem, state: FitState, gate: float) -> tuple[np.ndarray, ...]:
-        """Vertices (r,), points (r, 3), normals (r, 3), distances (r,), and which pairs are near and alike (r,)."""
+        """Vertices (r,), points (r, 3), normals (r, 3), distances (r,), and which pairs are near
+        and alike (r,).
+        """
         vertices, normals = (
             np.asarray(x, np.float64) for x in pose_surface(problem.surface, *problem.body(state))
         )

@@ -1,13 +1,15 @@
 """Silhouettes as evidence: that of a posed body against that of a mask.
 
-A body's silhouette consists of mesh edges between a face that looks at the camera and one that looks away (Sander et al. 2000,
-"Silhouette clipping"), as far as the image shows no body outside of them: known functions of the pose. A mask's is where its
-coverage crosses one half. Both are found on the host and held fixed while a solver moves the body.
+A body's silhouette consists of mesh edges between a face that looks at the camera and one that
+looks away (Sander et al. 2000, "Silhouette clipping"), as far as the image shows no body outside of
+them: known functions of the pose. A mask's is where its coverage crosses one half. Both are found
+on the host and held fixed while a solver moves the body.
 
-As in edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's silhouette looks along its normal for the
-nearest end of the mask, and each point of the mask's for the nearest point of the body's that faces the same way. Both give an
-equation n . x = n . q: x, a point of the body in the image, may slide along the mask's silhouette. People wear clothes and hair:
-distances outwards count in full, and distances inwards count less and less the larger they are.
+As in edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's silhouette looks
+along its normal for the nearest end of the mask, and each point of the mask's for the nearest point
+of the body's that faces the same way. Both give an equation n . x = n . q: x, a point of the body
+in the image, may slide along the mask's silhouette. People wear clothes and hair: distances
+outwards count in full, and distances inwards count less and less the larger they are.
 """
 
 import dataclasses
@@ -34,7 +36,9 @@ PROBE = 1.5
 NEAREST_EDGE = 0.05
 """Metres: edges of faces nearer to the camera than this, or behind it, are no silhouette."""
 BORDER = 1.0
-"""Pixels from the image border within which nothing is a silhouette: the image ends there, not the person."""
+"""Pixels from the image border within which nothing is a silhouette: the image ends there, not the
+person.
+"""
 SPECK = 0.03
 """Contours shorter than this share of a mask's longest are noise."""
 SMOOTHING = 1.5
@@ -49,8 +53,8 @@ class MeshEdges(NamedTuple):
 
 
 class BodyView(NamedTuple):
-    """A posed body as a camera sees it. pixels: (n, 2) and depths: (n,) of its vertices. normals: (n, 2) of the surface at the
-    vertices as unit directions in the image. covered: (h, w).
+    """A posed body as a camera sees it. pixels: (n, 2) and depths: (n,) of its vertices. normals:
+    (n, 2) of the surface at the vertices as unit directions in the image. covered: (h, w).
     """
 
     pixels: Float[np.ndarray, "n 2"]
@@ -61,10 +65,11 @@ class BodyView(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Boundary:
-    """Points of a silhouette, evenly spread over it. positions: (p, 2) pixels. normals: (p, 2) unit, outwards.
+    """Points of a silhouette, evenly spread over it. positions: (p, 2) pixels. normals: (p, 2)
+    unit, outwards.
 
-    ends: (p, 2), shares: (p,): for a body, the vertices of each point's edge and its position between them in [0, 1].
-    A silhouette may be empty.
+    ends: (p, 2), shares: (p,): for a body, the vertices of each point's edge and its position
+    between them in [0, 1]. A silhouette may be empty.
     """
 
     positions: Float[np.ndarray, "p 2"]
@@ -137,7 +142,10 @@ def body_boundary(
 
 
 def mask_boundary(mask: Float[np.ndarray, "h w"], count: int) -> Boundary:
-    """`count` points where coverage crosses one half, or none. The image border is no silhouette."""
+    """`count` points where coverage crosses one half, or none.
+
+    The image border is no silhouette.
+    """
     from skimage.filters import gaussian
     from skimage.measure import find_contours
 
@@ -184,7 +192,9 @@ def _covered(
 def _spread(
     lengths: Float[np.ndarray, " l"], count: int
 ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Points evenly along pieces of a line: (count,) the piece of each and its position there in [0, 1]; none without length."""
+    """Points evenly along pieces of a line: (count,) the piece of each and its position there in
+    [0, 1]; none without length.
+    """
     ends = np.cumsum(lengths)
     if len(ends) == 0 or ends[-1] <= 0:
         return np.zeros(0, int), np.zeros(0)
@@ -201,9 +211,11 @@ FACING = 0.5
 
 @pytree_dataclass
 class Matches:
-    """Equations of one view: points[i] of the body's silhouette shall lie on the line normals[i] . x = offsets[i].
+    """Equations of one view: points[i] of the body's silhouette shall lie on the line normals[i] .
+    x = offsets[i].
 
-    points: (e,) indices. normals: (e, 2) unit, outwards. offsets: (e,) pixels. weights: (e,) 0: no equation.
+    points: (e,) indices. normals: (e, 2) unit, outwards. offsets: (e,) pixels. weights: (e,) 0: no
+    equation.
     """
 
     points: Int[Array, " e"]
@@ -215,7 +227,9 @@ class Matches:
 def match(
     body: Boundary, mask: Float[np.ndarray, "h w"], boundary: Boundary, reach: float, count: int
 ) -> Matches:
-    """At most 2 `count` equations of a mask and its boundary, padded with weight 0. reach: pixels, how far points look."""
+    """At most 2 `count` equations of a mask and its boundary, padded with weight 0. reach: pixels,
+    how far points look.
+    """
     pairs = zip(_ends_of_mask(body, mask, reach), _nearest(body, boundary, reach), strict=True)
     rows = [np.concatenate(pair) for pair in pairs]
     points, normals, offsets = (padded(x, 2 * count) for x in rows)
@@ -282,9 +296,10 @@ def silhouette_residuals(
 ) -> Float[Array, " e"]:
     """Distances of silhouettes in standard deviations.
 
-    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of a silhouette, pixels. scales: robust
-    scales outwards and inwards, pixels. independent: number of independent equations that all of a view count for, because
-    neighbours on a silhouette err together.
+    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of a
+    silhouette, pixels. scales: robust scales outwards and inwards, pixels. independent: number of
+    independent equations that all of a view count for, because neighbours on a silhouette err
+    together.
     """
     off = distances(matches, pixels) + clothes[matches.points]
     scale = jnp.where(off > 0, *scales)
@@ -293,13 +308,16 @@ def silhouette_residuals(
     return jnp.sqrt(matches.weights * jnp.minimum(share, 1.0)) * bounded
 
 
-# Points of silhouettes on the body --------------------------------------------------------------------------------------
+# Points of silhouettes on the body
+# --------------------------------------------------------------------------------------
 
 
 def boundary_points(
     body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int
 ) -> SurfacePoints:
-    """The points of v silhouettes as functions of shape and pose, (v, count, ...), padded with points that no equation uses."""
+    """The points of v silhouettes as functions of shape and pose, (v, count, ...), padded with
+    points that no equation uses.
+    """
     ends, shares = (
         np.stack([padded(getattr(each, name), count) for each in boundaries])
         for name in ("ends", "shares")

@@ -1,9 +1,11 @@
-"""UV atlases: a mesh cut into charts that lie flat without folding over, packed into the unit square.
+"""UV atlases: a mesh cut into charts that lie flat without folding over, packed into the unit
+square.
 
-A chart is a connected set of faces of one piece that look towards about the same side, projected along the mean of their
-normals. Where a chart folds over itself, the hidden faces become charts of their own: they are found by rasterizing the charts
-front to back and back to front. Charts are placed as bitmaps, the largest first, at the first free place. All have one scale,
-times the density that the caller asks for.
+A chart is a connected set of faces of one piece that look towards about the same side, projected
+along the mean of their normals. Where a chart folds over itself, the hidden faces become charts of
+their own: they are found by rasterizing the charts front to back and back to front. Charts are
+placed as bitmaps, the largest first, at the first free place. All have one scale, times the density
+that the caller asks for.
 
 Texture coordinates follow `rendering.mesh.rasterizer.sample_texture`: u to the right, v up.
 """
@@ -43,9 +45,11 @@ VERTEX_STEP, FACE_STEP = 32768, 32768
 
 @dataclasses.dataclass(frozen=True)
 class Atlas:
-    """uvs: (u, 2) in [0, 1], v up. faces: (f, 3) indices into uvs. vertices: (u,) the mesh vertex of each uv.
+    """uvs: (u, 2) in [0, 1], v up. faces: (f, 3) indices into uvs. vertices: (u,) the mesh vertex
+    of each uv.
 
-    charts: (f,) chart of each face. size: texels a side. texel: metres of (flat) chart per texel where the density is 1.
+    charts: (f,) chart of each face. size: texels a side. texel: metres of (flat) chart per texel
+    where the density is 1.
     """
 
     uvs: Float[np.ndarray, "u 2"]
@@ -63,7 +67,8 @@ def unwrap(
     size: int,
     density: Float[np.ndarray, " f"],
 ) -> Atlas:
-    """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size texels.
+    """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size
+    texels.
 
     density: texels per metre of each face relative to others; the same all over a piece.
 
@@ -89,7 +94,9 @@ def unwrap(
 
 @dataclasses.dataclass(frozen=True)
 class _Flat:
-    """Charts before packing: points (u, 2) metres from the lower left corner of their chart, heights (u,) above its plane."""
+    """Charts before packing: points (u, 2) metres from the lower left corner of their chart,
+    heights (u,) above its plane.
+    """
 
     points: np.ndarray
     heights: np.ndarray
@@ -129,7 +136,9 @@ def _adjacent(faces: np.ndarray) -> np.ndarray:
 
 
 def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """(f,) side of each face: the one it looks at, unless its neighbours agree on another that it can see as well."""
+    """(f,) side of each face: the one it looks at, unless its neighbours agree on another that it
+    can see as well.
+    """
     cosines = normals @ SIDES.T
     allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))
     sides = np.argmax(cosines, axis=1)
@@ -160,7 +169,9 @@ def _flatten(
     sides: np.ndarray,
     density: np.ndarray,
 ) -> _Flat:
-    """Every chart in a plane across its mean normal, turned so that its box is small, as large as its density says."""
+    """Every chart in a plane across its mean normal, turned so that its box is small, as large as
+    its density says.
+    """
     count = int(charts.max()) + 1
     keys, inverse = np.unique(
         charts.repeat(3) * len(vertices) + faces.reshape(-1), return_inverse=True
@@ -189,7 +200,9 @@ def _flatten(
 
 
 def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) -> np.ndarray:
-    """Points (u, 2) with every chart turned by the one of a few angles that makes its bounding box smallest, wide side right."""
+    """Points (u, 2) with every chart turned by the one of a few angles that makes its bounding box
+    smallest, wide side right.
+    """
     best_area, best = np.full(count, np.inf), flat
     for angle in np.arange(angles) * (np.pi / angles):
         c, s = np.cos(angle), np.sin(angle)
@@ -230,7 +243,9 @@ def _hidden(flat: _Flat, size: int) -> np.ndarray:
 
 
 def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
-    """Rough places (charts, 2) in texels and the scale (texels per metre): rows of charts of falling height."""
+    """Rough places (charts, 2) in texels and the scale (texels per metre): rows of charts of
+    falling height.
+    """
     width, height = _sizes(flat)
     order = np.argsort(-height)
     scale = 0.9 * size / np.sqrt(np.sum(width * height))
@@ -250,7 +265,9 @@ def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
 def _rasterize(
     pixels: np.ndarray, depth: np.ndarray | np.floating, faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(size, size) face of every texel (-1: none) and (size, size, 3) its weights; y up, row 0 on top."""
+    """(size, size) face of every texel (-1: none) and (size, size, 3) its weights; y up, row 0 on
+    top.
+    """
     points = np.stack(
         [pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1
     )
@@ -264,7 +281,10 @@ def _rasterize(
 
 
 def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
-    """What every texel shows: its face (-1: none) and the weights of the face's corners. Row 0 is the top (v = 1)."""
+    """What every texel shows: its face (-1: none) and the weights of the face's corners.
+
+    Row 0 is the top (v = 1).
+    """
     return _rasterize(atlas.uvs * atlas.size, np.float32(1), atlas.faces, atlas.size)
 
 
@@ -305,7 +325,9 @@ def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
 
 
 def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
-    """(row, column) at which all cells of a bitmap are free, the lowest one; None if there is none."""
+    """(row, column) at which all cells of a bitmap are free, the lowest one; None if there is
+    none.
+    """
     rows, columns = (n - m + 1 for n, m in zip(free.shape, mask.shape, strict=True))
     if rows < 1 or columns < 1:
         return None
@@ -317,7 +339,9 @@ def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
 
 
 def _bitmaps(flat: _Flat, scale: float, cell: int) -> list[np.ndarray]:
-    """For every chart the cells (rows, columns) that the boxes of its faces touch, half a gutter around them included."""
+    """For every chart the cells (rows, columns) that the boxes of its faces touch, half a gutter
+    around them included.
+    """
     corners = (flat.points * scale)[flat.faces]
     low = np.floor(corners.min(1) / cell).astype(np.int64)
     high = np.floor((corners.max(1) + GUTTER) / cell).astype(np.int64)

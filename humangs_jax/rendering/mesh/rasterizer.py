@@ -1,21 +1,26 @@
-"""Triangle meshes to pixels: which face is seen at every pixel centre, where on that face, and how far away.
+"""Triangle meshes to pixels: which face is seen at every pixel centre, where on that face, and how
+far away.
 
-Conventions: OpenCV cameras, pixel centres at +0.5, depth is the camera's z. The nearest face wins, of equally near
-ones the one of lower index; both sides of a face are seen. A face covers the pixel centres inside it AND on its edges.
-Faces without area in the image cover nothing. Faces that reach behind the near plane are dropped whole; those that
-also reach in front of it may be missing from the image and are counted in `Fragments.overflow`.
+Conventions: OpenCV cameras, pixel centres at +0.5, depth is the camera's z. The nearest face wins,
+of equally near ones the one of lower index; both sides of a face are seen. A face covers the pixel
+centres inside it AND on its edges. Faces without area in the image cover nothing. Faces that reach
+behind the near plane are dropped whole; those that also reach in front of it may be missing from
+the image and are counted in `Fragments.overflow`.
 
-Method: scanlines. Faces of a body cover a few pixels or none, so that tiles of pixels times lists of faces would
-mostly test pixels that a face does not touch. Instead each face is expanded to its rows of pixel centres and each row
-to the pixels of its span (see `_window`); these fragments meet in a z-buffer by two scatters, first the least
-depth of a pixel, then the least face number at that depth. Both levels run in steps of a fixed number of slots, and as
-many steps as the mesh needs: shapes are static, and there is no capacity that a mesh could exceed.
+Method: scanlines. Faces of a body cover a few pixels or none, so that tiles of pixels times lists
+of faces would mostly test pixels that a face does not touch. Instead each face is expanded to its
+rows of pixel centres and each row to the pixels of its span (see `_window`); these fragments meet
+in a z-buffer by two scatters, first the least depth of a pixel, then the least face number at that
+depth. Both levels run in steps of a fixed number of slots, and as many steps as the mesh needs:
+shapes are static, and there is no capacity that a mesh could exceed.
 
-Watertight: an edge function is taken from the pixel's point of view, (a - p) x (b - p), the ends a and b in an order
-that depends on their positions alone. Two faces that share an edge therefore compute the same number with opposite signs,
-however the compiler contracts it, and close to a vertex the differences are exact: both may cover a pixel, but never neither.
+Watertight: an edge function is taken from the pixel's point of view, (a - p) x (b - p), the ends a
+and b in an order that depends on their positions alone. Two faces that share an edge therefore
+compute the same number with opposite signs, however the compiler contracts it, and close to a
+vertex the differences are exact: both may cover a pixel, but never neither.
 
-Derivatives: fragments are constants (`stop_gradient`); `interpolate_attributes` is differentiable with respect to the attributes.
+Derivatives: fragments are constants (`stop_gradient`); `interpolate_attributes` is differentiable
+with respect to the attributes.
 """
 
 import functools
@@ -35,7 +40,8 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
 
 SPAN_SLACK = 16
-"""Spans of pixels are widened by this many roundings of the coordinates; the edge functions decide."""
+"""Spans of pixels are widened by this many roundings of the coordinates; the edge functions decide.
+"""
 
 AREA_ROUNDING = 2
 """A face whose area is below this many roundings of the area's own computation has none."""
@@ -68,10 +74,11 @@ class Fragments(Batchable):
     """What a camera sees of a mesh.
 
     face_ids: (h, w) index of the face, -1 where there is none.
-    barycentrics: (h, w, 3) perspective-correct weights of the face's corners, >= 0, of sum 1; 0 where there is no face.
+    barycentrics: (h, w, 3) perspective-correct weights of the face's corners, >= 0, of sum 1; 0
+    where there is no face.
     depth: (h, w) z in the camera, in the units of the vertices; -1 where there is no face.
-    overflow: faces that may be missing from the image: they cross the near plane, are not finite numbers of pixels, or
-        come after the first 2^30 rows of pixels.
+    overflow: faces that may be missing from the image: they cross the near plane, are not finite
+        numbers of pixels, or come after the first 2^30 rows of pixels.
     """
 
     face_ids: Int[Array, "h w"]
@@ -119,10 +126,12 @@ def interpolate_attributes(
     attributes: Float[Array, "n c"],
     background: Float[Array, " c"],
 ) -> Float[Array, "h w c"]:
-    """Values at the corners of the faces, blended over the seen surface; `background` where there is no face.
+    """Values at the corners of the faces, blended over the seen surface; `background` where there
+    is no face.
 
-    Corners may have numbers of their own: with `faces` the texture indices of the same faces, in the same order, and
-    `attributes` the texture coordinates, this is the texture coordinate of every pixel.
+    Corners may have numbers of their own: with `faces` the texture indices of the same faces, in
+    the same order, and `attributes` the texture coordinates, this is the texture coordinate of
+    every pixel.
     """
     if faces.shape[0] == 0:
         return jnp.broadcast_to(background, (*fragments.face_ids.shape, background.shape[0]))
@@ -137,7 +146,10 @@ def interpolate_attributes(
 
 
 def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
-    """(n, 3): pixel position x, y and depth z. Written out: matrix products are of low precision on GPU and TPU."""
+    """(n, 3): pixel position x, y and depth z.
+
+    Written out: matrix products are of low precision on GPU and TPU.
+    """
     R, t, K = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3], camera.K
     x, y, z = (
         R[i, 0] * vertices[:, 0] + R[i, 1] * vertices[:, 1] + R[i, 2] * vertices[:, 2] + t[i]
@@ -163,7 +175,9 @@ def _pixel_centers(pixel: Array, width: int, dtype: np.dtype) -> tuple[Array, Ar
 
 
 def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
-    """Faces before the near plane that have an area in the image; and how many faces are left out that may be seen."""
+    """Faces before the near plane that have an area in the image; and how many faces are left out
+    that may be seen.
+    """
     z = corners[:, 2::3]
     ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
     area = jnp.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
@@ -178,7 +192,9 @@ def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
 def _rows(
     corners: Float[Array, "f 9"], drawn: Array, width: int, height: int
 ) -> tuple[Array, Array]:
-    """First row of pixel centres of every face, and how many; 0 rows if its bounding box holds no pixel centre."""
+    """First row of pixel centres of every face, and how many; 0 rows if its bounding box holds no
+    pixel centre.
+    """
     x, y = (jnp.where(drawn[:, None], corners[:, i::3], 0.0) for i in range(2))
     drawn &= _first_pixel(x.min(-1), width) <= _last_pixel(x.max(-1), width)
     first = _first_pixel(y.min(-1), height)
@@ -204,7 +220,9 @@ def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
 
 
 def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Array]:
-    """Perspective-correct weights (three arrays), depth, and whether the face covers the points (x, y)."""
+    """Perspective-correct weights (three arrays), depth, and whether the face covers the points (x,
+    y).
+    """
     corner_x, corner_y = (
         [corners[..., 3 * i] for i in range(3)],
         [corners[..., 3 * i + 1] for i in range(3)],
@@ -233,7 +251,10 @@ def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Arra
 
 
 def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_step: int) -> Array:
-    """(h w, 3) weights of the corners of each pixel's face. In steps: small buffers are several times faster on CPU."""
+    """(h w, 3) weights of the corners of each pixel's face.
+
+    In steps: small buffers are several times faster on CPU.
+    """
 
     def weights(pixel_and_face):
         pixel, face = pixel_and_face
@@ -244,7 +265,9 @@ def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_st
 
 
 def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, Array, Array]:
-    """Slots start .. start + size of items that own the slots first .. end: item of each, its place in the item, used or not."""
+    """Slots start .. start + size of items that own the slots first .. end: item of each, its place
+    in the item, used or not.
+    """
     item = owners(first, size, start)
     slot = start + jnp.arange(size, dtype=jnp.int32)
     return item, slot - first[item], slot < end[-1]
@@ -280,7 +303,8 @@ def _z_buffer(
             before = depth.at[drawn].get(mode="fill", fill_value=-1.0)
             depth = depth.at[drawn].min(z, mode="drop")
             nearest = depth.at[drawn].get(mode="fill", fill_value=-1.0)
-            # a pixel that came nearer forgets its face; then the lowest of the faces at its new depth takes it
+            # a pixel that came nearer forgets its face; then the lowest of the faces at its new
+            # depth takes it
             face_ids = face_ids.at[jnp.where(nearest < before, drawn, width * height)].set(
                 NO_FACE, mode="drop"
             )
@@ -303,11 +327,13 @@ def _z_buffer(
 def sample_texture(
     texture: Float[Array, "th tw c"], uv: Float[Array, "h w 2"]
 ) -> Float[Array, "h w c"]:
-    """Bilinear texture lookup. Differentiable with respect to the texture and, inside a texel, to uv.
+    """Bilinear texture lookup. Differentiable with respect to the texture and, inside a texel, to
+    uv.
 
-    As in OBJ files: u to the right, v UP, (0, 0) the lower left corner of the texture and (1, 1) its upper right one; row 0 is
-    the top. Texel (row, column) is at u = (column + 0.5) / width, v = 1 - (row + 0.5) / height. Beyond the outermost
-    centres the border texels continue (no repetition).
+    As in OBJ files: u to the right, v UP, (0, 0) the lower left corner of the texture and (1, 1)
+    its upper right one; row 0 is the top. Texel (row, column) is at u = (column + 0.5) / width, v =
+    1 - (row + 0.5) / height. Beyond the outermost centres the border texels continue (no
+    repetition).
     """
     height, width = texture.shape[:2]
     x = jnp.clip(uv[..., 0] * width - 0.5, 0, width - 1)
@@ -321,16 +347,19 @@ def sample_texture(
     return upper * (1 - along_y) + lower * along_y
 
 
-# Position maps: for every pixel, where the seen surface point is on the body in its canonical pose. The network looks its
-# neural texture up there. Lengths are in the network's normalised units: the caller divides vertices and camera centre by the
-# subject's scale. Pixels beside the body have the position (1, 1, 1) and depth -1. `plain_position_map` is the paper's:
-# canonical positions, interpolated. The released network was trained on `gouraud_position_map`: positions as colors, through a
-# Gouraud shader with a point light.
+# Position maps: for every pixel, where the seen surface point is on the body in its canonical pose.
+# The network looks its neural texture up there. Lengths are in the network's normalised units: the
+# caller divides vertices and camera centre by the subject's scale. Pixels beside the body have the
+# position (1, 1, 1) and depth -1. `plain_position_map` is the paper's: canonical positions,
+# interpolated. The released network was trained on `gouraud_position_map`: positions as colors,
+# through a Gouraud shader with a point light.
 
 BACKGROUND = 1.0
 BACKGROUND_DEPTH = -1.0
 LIGHT = (0.0, 1.0, 0.0)
-"""Place of the point light, normalised units; the default of PyTorch3D, whose shader the release used."""
+"""Place of the point light, normalised units; the default of PyTorch3D, whose shader the release
+used.
+"""
 AMBIENT, DIFFUSE, SPECULAR, SHININESS = 0.5, 0.3, 0.2, 64
 
 
@@ -352,7 +381,9 @@ def gouraud_position_map(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """The release's position map (lit by a point light) and depth map of one view; everything in normalised units."""
+    """The release's position map (lit by a point light) and depth map of one view; everything in
+    normalised units.
+    """
     albedo = (canonical_vertices + 1) / 2
     colors = _light(albedo, posed_vertices, vertex_normals(posed_vertices, faces), camera.center)
     return _map(posed_vertices, 2 * colors - 1, faces, camera, config)
@@ -360,7 +391,9 @@ def gouraud_position_map(
 
 @jax.jit
 def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "n 3"]:
-    """Unit normals: the sum of (v1 - v0) x (v2 - v0) over the faces at a vertex, as wound; 0 where that vanishes."""
+    """Unit normals: the sum of (v1 - v0) x (v2 - v0) over the faces at a vertex, as wound; 0 where
+    that vanishes.
+    """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = jnp.cross(b - a, c - a)
     total = jnp.zeros_like(vertices).at[faces.reshape(-1)].add(jnp.repeat(normals, 3, axis=0))
@@ -369,7 +402,9 @@ def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> F
 
 @jax.jit
 def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
-    """Phong's light at the vertices: ambient and diffuse times the albedo, and a white highlight."""
+    """Phong's light at the vertices: ambient and diffuse times the albedo, and a white
+    highlight.
+    """
     dot = lambda a, b: jnp.sum(a * b, axis=-1, keepdims=True)
     nowhere = jnp.zeros(3)
     to_light = safe_normalize(jnp.asarray(LIGHT, points.dtype) - points, nowhere)

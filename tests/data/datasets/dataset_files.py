@@ -1,4 +1,6 @@
-"""Tiny data sets in every layout, from random numbers: nobody would recognise a person, but every file is as it should be."""
+"""Tiny data sets in every layout, from random numbers: nobody would recognise a person, but every
+file is as it should be.
+"""
 
 import csv
 import io
@@ -67,7 +69,8 @@ def oracle(arrays, betas, rotations, translation):
     return rest, np.einsum("nab,nb->na", blended[:, :3, :3], shaped) + blended[:, :3, 3], transforms
 
 
-# THuman ---------------------------------------------------------------------------------------------------------------
+# THuman
+# --------------------------------------------------------------------------------------------------
 
 
 def fit_values(kind, seed=0):
@@ -149,12 +152,14 @@ def write_thuman(folder, arrays, kinds="ABC"):
     return folder
 
 
-# Videos ---------------------------------------------------------------------------------------------------------------
+# Videos
+# --------------------------------------------------------------------------------------------------
 
 
 class Recording(NamedTuple):
-    """A person seen by c cameras. K (3, 3) of all, pixel centres at whole numbers; R (c, 3, 3), T (c, 3) of OpenCV; shot(c, f):
-    photo and mask, 8 bits; parameters: by the names of smpl_params.npz, a row a frame.
+    """A person seen by c cameras. K (3, 3) of all, pixel centres at whole numbers; R (c, 3, 3), T
+    (c, 3) of OpenCV; shot(c, f): photo and mask, 8 bits; parameters: by the names of
+    smpl_params.npz, a row a frame.
     """
 
     K: np.ndarray
@@ -219,7 +224,9 @@ def calibration(names, made):
 
 
 def write_folders(folder, made, names, photos, masks, rig, every=1):
-    """A recording as photos in folders; `photos` and `masks` name those of a camera. every: photos show every n-th row."""
+    """A recording as photos in folders; `photos` and `masks` name those of a camera. every: photos
+    show every n-th row.
+    """
     for c, name in enumerate(names):
         for frame in range(made.frames):
             file = f"{every * frame:08d}.jpg"
@@ -331,11 +338,14 @@ def write_dna(folder, frames=FRAMES):
     return folder
 
 
-# Scene list -----------------------------------------------------------------------------------------------------------
+# Scene list
+# --------------------------------------------------------------------------------------------------
 
 
 def write_scenes(folder, arrays, scale=1.3, views=3):
-    """One scene of two frames in units of its own; returns the list and what the arrays were made from."""
+    """One scene of two frames in units of its own; returns the list and what the arrays were made
+    from.
+    """
     rng = np.random.default_rng(5)
     made = recording()
     betas = 0.5 * rng.normal(size=2 * COLUMNS)

@@ -28,8 +28,8 @@ from humangs_jax.people.writer import sample_motion, sample_pose
 SEEDS = (3_000_271, 3_000_584)
 """People who are written, of the split "demo"."""
 TIGHT = ("tank", "leggings", "socks")
-"""What all of them wear, with short hair: close to the skin, so that the body's silhouette tells whether it stands in its
-place."""
+"""What all of them wear, with short hair: close to the skin, so that the body's silhouette tells
+whether it stands in its place."""
 HANDS = slice(25, 40), slice(40, 55)
 BACKGROUND = 0.45
 """Grey of the room behind the people of videos."""
@@ -56,7 +56,9 @@ def write_body(path, people, body, hand_poses):
 
 
 def make_people(seeds, vertices=None):
-    """Synthetic people, and the body of the model file: that which they are made of, decimated to `vertices`."""
+    """Synthetic people, and the body of the model file: that which they are made of, decimated to
+    `vertices`.
+    """
     body = load_body()
     return [in_tight_clothes(seed, body) for seed in seeds], body if vertices is None else decimate(
         body, vertices
@@ -64,7 +66,9 @@ def make_people(seeds, vertices=None):
 
 
 def in_tight_clothes(seed, body):
-    """The person of a seed in `TIGHT` clothes of other people of the documentation, with hair that is buzzed."""
+    """The person of a seed in `TIGHT` clothes of other people of the documentation, with hair that
+    is buzzed.
+    """
     person, wanted, garments, haircut = describe(seed, body), set(TIGHT), {}, None
     for other in DEMO:
         seen = describe(other, body)
@@ -99,11 +103,13 @@ def random_rigid(rng):
     return matrix
 
 
-# THuman ---------------------------------------------------------------------------------------------------------------
+# THuman
+# --------------------------------------------------------------------------------------------------
 
 
 def write_thuman(out, seeds=SEEDS, kinds="AC", texture_size=1024, vertices=None):
-    """out/body.npz and out/thuman with a scan for each seed, fits of these kinds; returns the data set.
+    """out/body.npz and out/thuman with a scan for each seed, fits of these kinds; returns the data
+    set.
 
     Scans stand in a world of their own: turned, moved, and in other units for each person.
     """
@@ -153,12 +159,13 @@ def fit_values(parameters, kind, scale, arrays, person):
     return {key: np.asarray(value, np.float32) for key, value in values.items()}
 
 
-# Videos ---------------------------------------------------------------------------------------------------------------
+# Videos
+# --------------------------------------------------------------------------------------------------
 
 
 class Video:
-    """A person who moves, seen by cameras around, as a `Recording` in a world that is turned against ours, as calibrations leave
-    it; writes out/body.npz. posed, cameras: ours.
+    """A person who moves, seen by cameras around, as a `Recording` in a world that is turned
+    against ours, as calibrations leave it; writes out/body.npz. posed, cameras: ours.
     """
 
     def __init__(self, out, seed=SEEDS[0], frames=3, cameras=4, size=(150, 204), vertices=None):
@@ -211,14 +218,18 @@ class Video:
 
 
 def write_avatarrex(out, **how):
-    """out/body.npz and out/avatarrex_zzr with photos of every 10th frame; returns the subject's folder. how: of a `Video`."""
+    """out/body.npz and out/avatarrex_zzr with photos of every 10th frame; returns the subject's
+    folder. how: of a `Video`.
+    """
     video = Video(out, **how)
     serials = [f"220{i:05d}" for i in range(len(video.cameras))]
     return write_folders(out / "avatarrex_zzr", video, serials, *AVATARREX, every=10)
 
 
 def write_thuman4(out, size=(166, 144), **how):
-    """out/body.npz and out/subject00, a photo of which is listed as missing; returns the subject's folder. how: of a `Video`."""
+    """out/body.npz and out/subject00, a photo of which is listed as missing; returns the subject's
+    folder. how: of a `Video`.
+    """
     video = Video(out, size=size, **how)
     names, last = [f"cam{i:02d}" for i in range(len(video.cameras))], len(video.posed) - 1
     folder = write_folders(out / "subject00", video, names, *THUMAN4)

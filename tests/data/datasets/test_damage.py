@@ -1,6 +1,7 @@
 """Damage to every layout: one error line that names the file and, where there is one, the key.
 
-What can be done to any file (cut, other bytes, code in it, size) is done to these ones by `tests/hostile`.
+What can be done to any file (cut, other bytes, code in it, size) is done to these ones by
+`tests/hostile`.
 """
 
 import json
@@ -27,7 +28,9 @@ def body(tmp_path_factory):
 
 
 def read(layout, folder, body):
-    """Everything that is there; of scans all that preprocessing reads and computes before it renders."""
+    """Everything that is there; of scans all that preprocessing reads and computes before it
+    renders.
+    """
     missing = {}
     if layout == "thuman":
         names, missing = open_thuman(folder)
@@ -96,7 +99,8 @@ def swapped(path, one, other):
         edit_pickle(path, **{one: values[other], other: values[one]})
 
 
-# AvatarReX, whose readers THuman4.0 and, for poses and photos, ActorsHQ share -------------------------------------------
+# AvatarReX, whose readers THuman4.0 and, for poses and photos, ActorsHQ share
+# -------------------------------------------
 
 POSES, RIG, CAMERA = "smpl_params.npz", "calibration_full.json", "22010708"
 NO_SIZE = {"file_path": "a", "camera_angle_x": 1.0, "transform_matrix": np.eye(4).tolist()}
@@ -201,7 +205,8 @@ ACTORSHQ = {
     "a name that leads out": (text(CSV, "Cam001", "../../x"), CSV, "name"),
 }
 
-# THuman -----------------------------------------------------------------------------------------------------------------
+# THuman
+# --------------------------------------------------------------------------------------------------
 
 PKL, OBJ = "smplx_param.pkl", "mesh_smplx.obj"
 FIT, MESH, SCAN = "smplx/0001/smplx_param.pkl", "smplx/0001/mesh_smplx.obj", "model/0001/0001.obj"
@@ -268,7 +273,8 @@ THUMAN = {
     "no folder model": (lambda f: (f / "model").rename(f / "models"), "model", "no such folder"),
 }
 
-# Scene lists ------------------------------------------------------------------------------------------------------------
+# Scene lists
+# --------------------------------------------------------------------------------------------------
 
 LIST, ARRAYS = "train.json", "smpl/0.npz"
 frame = lambda change: jsn(LIST, lambda c: change(c[0]["frames"][1]))
@@ -332,7 +338,8 @@ SCENES = {
     ),
 }
 
-# DNA-Rendering ----------------------------------------------------------------------------------------------------------
+# DNA-Rendering
+# --------------------------------------------------------------------------------------------------
 
 TRANSL, FULL = "SMPLx/transl", "SMPLx/fullpose"
 MAIN, NOTES = "main/0001_01.smc", "annotations/0001_01_annots.smc"

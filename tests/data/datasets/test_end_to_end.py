@@ -1,4 +1,6 @@
-"""Synthetic people in the layouts of real data sets: preprocessed, loaded, reconstructed and animated; and in videos: fitted."""
+"""Synthetic people in the layouts of real data sets: preprocessed, loaded, reconstructed and
+animated; and in videos: fitted.
+"""
 
 import json
 

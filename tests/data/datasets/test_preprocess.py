@@ -1,4 +1,6 @@
-"""`humangs preprocess`: what is written, what is skipped and why; interrupted, resumed, in shards."""
+"""`humangs preprocess`: what is written, what is skipped and why; interrupted, resumed, in
+shards.
+"""
 
 import importlib
 import json
@@ -286,7 +288,9 @@ def test_the_split_is_that_of_all_scans_also_where_one_lacks_a_file(tmp_path, bo
 
 
 def test_a_data_set_is_one_line_of_the_table(tmp_path, body, monkeypatch, capsys):
-    """Known to the choices and the help of the command, to `preprocess`, and to what opens people for training."""
+    """Known to the choices and the help of the command, to `preprocess`, and to what opens people
+    for training.
+    """
     found = lambda folder: tuple(sorted(folder.glob("*.toy")))
     opened = lambda path, own: open_people(path.with_suffix(""), own)[0].subject
     monkeypatch.setitem(DATASETS, "toy", DataSetFormat("made up", opened, find=found))

@@ -1,4 +1,6 @@
-"""The published protocol: alignment, cameras, splits and evaluation indices, against independent computations."""
+"""The published protocol: alignment, cameras, splits and evaluation indices, against independent
+computations.
+"""
 
 import random
 
@@ -65,7 +67,8 @@ def test_cameras_look_at_the_origin_from_the_protocols_ranges():
 
 
 def test_the_split_is_that_of_numpys_seed_42():
-    # what np.random.seed(42), np.random.shuffle(list of 10) make of 0 .. 9 (numpy's legacy generator, frozen by NEP 19)
+    # what np.random.seed(42), np.random.shuffle(list of 10) make of 0 .. 9 (numpy's legacy
+    # generator, frozen by NEP 19)
     assert protocol.split_ids(range(10), 6, 3) == ([8, 1, 5, 0, 7, 2], [9, 4, 3])
     names = [f"{i:04d}" for i in range(2445)]
     train, test = protocol.split_ids(names[::-1])  # in any order
@@ -89,14 +92,17 @@ def test_evaluation_indices_are_those_of_pythons_seed_777():
 
 
 def test_preprocessing_reproduces_the_published_arrays(tmp_path):
-    """By an independent computation: SMPL-X's equations joint by joint, the protocol's steps one after the other."""
+    """By an independent computation: SMPL-X's equations joint by joint, the protocol's steps one
+    after the other.
+    """
     arrays, body = model_arrays(), write_model(tmp_path)
     folder = write_thuman(tmp_path / "thuman", arrays)
     for i, (name, kind) in enumerate(zip(open_thuman(folder)[0], "ABC", strict=True)):
         content = scan_content(folder, name, body, Settings("thuman"))
         assert content.known["fit_kind"] == kind and content.known["fit_error_mm"][1] < 0.01
         rest, mesh, transforms = scan_vertices(arrays, fit_values(kind, i))
-        # T: the middle of the raw scan's bounding box, here that of the mesh; R: pelvis -> neck upright
+        # T: the middle of the raw scan's bounding box, here that of the mesh; R: pelvis -> neck
+        # upright
         T, R = np.eye(4), np.eye(4)
         T[:3, 3] = -(mesh.min(0) + mesh.max(0)) / 2
         posed_joints = np.stack(

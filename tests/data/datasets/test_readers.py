@@ -1,4 +1,6 @@
-"""Every layout is read as it was written; nothing is decoded before it is asked for; what is missing is counted."""
+"""Every layout is read as it was written; nothing is decoded before it is asked for; what is
+missing is counted.
+"""
 
 import dataclasses
 import json
