@@ -281,7 +281,8 @@ def load_capture(
 
 
 def capture_checksum(path: str | Path) -> str:
-    """SHA-256, in hexadecimal, of all files that a capture is read from: capture.json, body.npz, the model, photos and masks.
+    """SHA-256, in hexadecimal, of all files that a capture is read from: capture.json, body.npz,
+    the model, photos and masks.
 
     Captures of the same name with other contents have other checksums.
 

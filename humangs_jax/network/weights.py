@@ -81,7 +81,9 @@ def save_weights(
 
 
 def shipped_checksum() -> str:
-    """SHA-256, in hexadecimal, of the shipped weights file; "none" where the installation has none."""
+    """SHA-256, in hexadecimal, of the shipped weights file; "none" where the installation has
+    none.
+    """
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
         return file_checksum(shipped) if shipped.exists() else "none"
 

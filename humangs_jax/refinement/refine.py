@@ -209,7 +209,9 @@ def _crops(
     config: RefineConfig,
     used: Int[np.ndarray, " n"] | None = None,
 ) -> Crops | None:
-    """Crops of the heads in some of the usable views (None: in all); None where no steps on the head are to be made."""
+    """Crops of the heads in some of the usable views (None: in all); None where no steps on the
+    head are to be made.
+    """
     unlimited = config.seconds is None or config.steps == 0
     if not (config.head_steps and unlimited and shows_heads(capture, config)):
         return None

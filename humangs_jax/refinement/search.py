@@ -221,7 +221,7 @@ def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
 
 
 # The search
-# --------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:

@@ -235,12 +235,18 @@ def _source_key(name: str, source: Path, settings: Settings) -> str:
 
 
 def _check_source(file: Path, name: str, source: Path, settings: Settings) -> None:
-    """A finished scene was made from what the data set holds now, if its scene.json says from what. Raises: CaptureError."""
+    """A finished scene was made from what the data set holds now, if its scene.json says from what.
+
+    Raises: CaptureError.
+    """
     if not file.is_file():
         return
     recorded = _read_scene(file, settings).get("made_from")
     if recorded not in (None, _source_key(name, source, settings)):
-        problem = f"made from other files than {source} has now: move the folder away, or choose another --out"
+        problem = (
+            f"made from other files than {source} has now: move the folder away, or choose another"
+            " --out"
+        )
         raise CaptureError(file, "made_from", problem)
 
 
