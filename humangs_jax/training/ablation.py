@@ -25,11 +25,13 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.configuration import ArgumentError, vary
 from humangs_jax.core.progress import bar, say, text_table
+from humangs_jax.data.loading.captures import CaptureSource
+from humangs_jax.data.loading.examples import Mixture
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.people.bank import build_bank
 from humangs_jax.people.subject import seeds_of
 from humangs_jax.training.config import TrainConfig, fitting_losses, missing_networks, read_config
-from humangs_jax.training.forward import METRICS, compared_as
+from humangs_jax.training.forward import METRICS, as_validated, compared_as
 from humangs_jax.training.loop import VALIDATED, train
 from humangs_jax.training.sources import MakeSource, captured_people, on_the_fly_people
 from humangs_jax.training.state import init_state
@@ -204,6 +206,11 @@ def ablate(
     body = load_body() if body is None else body
     learned = _source(people, body, base, "train")
     compared, count = _compared(validation, body, base)
+    if people and not isinstance(people, int):
+        _check_people(runs, learned, body)
+    if validation and not isinstance(validation, int):
+        shown = {name: as_validated(config.at(config.steps - 1)) for name, config in runs.items()}
+        _check_people(shown, compared, body)
     scores: dict[str, dict[int, float]] = {name: {} for name in runs}
     began, longest = time.monotonic(), 0.0
     order = [(name, seed) for seed in range(seeds) for name in runs]
@@ -266,6 +273,35 @@ def _checked_variants(
                 "variants", f"{name!r}: loss.{missing[0]}: expected its network in networks"
             )
     return runs
+
+
+def _check_people(
+    runs: Mapping[str, TrainConfig], people: Sequence[str | Path] | MakeSource, body: BodyModel
+) -> None:
+    """Whether each run, in all of its stages, can use the people on disk that the base can. No photo is decoded.
+
+    Raises: ArgumentError naming the variant; ValueError if nobody can be used.
+    """
+    make = captured_people(people, body) if isinstance(people, Sequence) else people
+    usual = _unusable(make, runs[BASE])
+    for name, config in runs.items():
+        lacking = {who: why for who, why in _unusable(make, config).items() if who not in usual}
+        if lacking:
+            who, why = next(iter(lacking.items()))
+            problem = f"{name!r}: {len(lacking)} of the people cannot be used, {who}: {why}"
+            raise ArgumentError("variants", problem)
+
+
+def _unusable(make: MakeSource, config: TrainConfig) -> dict[str, str]:
+    """Those people on disk that one of the stages of a run cannot use, and why."""
+    problems: dict[str, str] = {}
+    for first, _ in config.spans(0, config.steps):
+        source = make(config.at(first))
+        parts = source.sources if isinstance(source, Mixture) else (source,)
+        for part in parts:
+            if isinstance(part, CaptureSource):
+                problems |= part.unusable()
+    return problems
 
 
 def _folder_names(names: Sequence[str]) -> dict[str, str]:

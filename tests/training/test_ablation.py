@@ -2,9 +2,12 @@ import json
 
 import pytest
 
+from humangs_jax.body.library import load_body
 from humangs_jax.training import ablation
 from humangs_jax.training.ablation import Ablation, ablate
+from humangs_jax.training.config import Stage
 from humangs_jax.training.forward import as_validated
+from humangs_jax.training.sources import captured_people
 
 CLASS_TOKEN = "model.architecture.encoder.transformer.class_token"
 WITHOUT = {"no class token": {CLASS_TOKEN: False}}
@@ -140,9 +143,9 @@ def test_all_variants_are_compared_on_the_photos_and_targets_of_the_base(
         return Nobody()
 
     run(tmp_path, validation=make, seeds=1, variants={"larger": larger})
-    base, other = validated
+    base, other = validated[-2:]  # before, all of them are looked at without a photo
     assert asked == [(32, 8), (64, 8)]  # the photos that a network reads are of its own size
-    assert [config.model.conventions.image_size for config in validated] == [32, 64]
+    assert [config.model.conventions.image_size for config in validated[-2:]] == [32, 64]
     assert other.views == base.views and other.target_size == base.target_size == 32
     assert base.views.input_counts == (2,) and base.views.target_count == 2
 
@@ -164,6 +167,7 @@ def test_each_of_the_people_to_compare_on_is_looked_at(trained, tmp_path, monkey
 
     monkeypatch.setattr(ablation, "train", watched)
     run(tmp_path / "a", validation=20, seeds=1, variants={})
+    monkeypatch.setattr(ablation, "_check_people", lambda *_: None)
     run(tmp_path / "b", validation=["one", "two", "three"], seeds=1, variants={})
     assert counts == [20, 3] and made == [(20, True)]
 
@@ -197,6 +201,35 @@ def test_one_seed_has_no_interval():
 def test_what_cannot_be_meant_is_refused_before_the_first_run(how, said, trained, tmp_path):
     with pytest.raises(ValueError, match=said):
         run(tmp_path, validation=[], **how)
+    assert trained == [] and not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"target_size": 1024}, "512 x 512 cannot be averaged to 1024 x 1024"),
+        ({"model.conventions.image_size": 1024}, "512 x 512 cannot be averaged to 1024 x 1024"),
+        ({"views.target_count": 9}, "4 views, but inputs and targets need 11"),
+        (
+            {"stages": (Stage(start=2, target_size=1024),)},
+            "512 x 512 cannot be averaged to 1024 x 1024",
+        ),
+    ],
+)
+@pytest.mark.parametrize("kind", ["folders", "a source"])
+def test_photos_and_views_that_the_captures_lack_are_found_before_the_first_step(
+    changes, said, kind, trained, tmp_path, capture_folder
+):
+    people = [capture_folder]
+    if kind == "a source":
+        people = captured_people(people, load_body())
+    variants = {"usual": {}, "too large": changes}
+    with pytest.raises(ValueError, match=f"'too large': 1 of the people cannot be used.*{said}"):
+        run(tmp_path, people=people, validation=[], seeds=1, variants=variants)
+    if changes.keys() & {"target_size", "stages", "views.target_count"}:
+        return  # targets to compare on are those of the base
+    with pytest.raises(ValueError, match=f"'too large': 1 of the people cannot be used.*{said}"):
+        run(tmp_path, validation=people, seeds=1, variants=variants)
     assert trained == [] and not any(tmp_path.iterdir())
 
 

@@ -344,6 +344,31 @@ class CaptureSource:
         """See `Source`: the folder."""
         return str(self._found(seed, index, input_count)[0])
 
+    def unusable(self) -> dict[str, str]:
+        """The people of whom no example can be made, name -> what is wrong: their files, or views or sizes that they lack.
+
+        No photo is decoded.
+        """
+        problems = {}
+        for i in range(len(self.cache)):
+            summary = self.cache.summary(i)
+            if summary is None:
+                continue
+            try:
+                self._drawn(view_generator(0, 0), summary, max(self.input_counts))
+            except ValueError as error:
+                problems[str(self.cache.name(i))] = str(error)
+        return {**self.broken, **problems}
+
+    def _drawn(
+        self, generator: np.random.Generator, summary: StoredSubject, input_count: int
+    ) -> tuple[list[int], list[int]]:
+        """Input and target views of one person. Raises: ValueError where there are too few, or too small ones."""
+        views = draw_views(generator, summary, input_count, self.sampling)
+        for size in (self.input_size, self.target_size):
+            shrink(summary.images, size)  # of no views: whether images of this size can be shrunk
+        return views
+
     def _found(self, seed: int, index: int, input_count: int) -> tuple[Path | str, Example]:
         epoch, position = divmod(index, len(self.cache))
         order = subject_order(seed, epoch, len(self.cache))
@@ -352,13 +377,8 @@ class CaptureSource:
             if summary is None:
                 continue
             try:
-                inputs, targets = draw_views(
-                    view_generator(seed, index), summary, input_count, self.sampling
-                )
-                for size in (self.input_size, self.target_size):
-                    shrink(
-                        summary.images, size
-                    )  # without views: whether images of this size can be shrunk so
+                generator = view_generator(seed, index)
+                inputs, targets = self._drawn(generator, summary, input_count)
             except ValueError as error:
                 self.cache.report(subject_index, f"{self.cache.name(subject_index)}: {error}")
                 continue
