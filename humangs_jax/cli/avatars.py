@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format
+from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format, files_beside
 from humangs_jax.cli.options import (
     AVATAR,
     WHOLE,
@@ -553,7 +553,7 @@ class Export:
             str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
         )
         beside = (
-            f"; {' and '.join(out.with_suffix(suffix).name for suffix in form.beside)} belong to it"
+            f"; {' and '.join(file.name for file in files_beside(out, form))} belong to it"
             if form.beside
             else ""
         )

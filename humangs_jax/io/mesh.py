@@ -314,7 +314,9 @@ class _Folder:
         if key not in self.read and key not in self.faults:
             try:
                 check_limit("parts", len(self.read) + len(self.faults), "materials and textures")
-                self.read[key] = self._content(key.strip())
+                names = _names_in(key.strip())
+                found = [name for name in names if (self.folder / name).exists()]
+                self.read[key] = self._content(found[0] if found else names[0])
             except (ValueError, OSError) as error:
                 self.faults[key] = str(error)
         if key in self.faults:
@@ -344,6 +346,20 @@ class _Folder:
             key, why = next(iter(self.faults.items()))
             more = f" (and {len(self.faults) - 1} others)" if len(self.faults) > 1 else ""
             logger.warning("%s: %s", path, FileError("", f"left out {shown(key)}{more}", why))
+
+
+_OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+")
+"""Of a texture in an `.mtl`: `-s 1 1 1`, `-clamp on`, before its name."""
+
+
+def _names_in(text: str) -> list[str]:
+    """What the name of a material or texture may be, the likeliest first: as it stands, with spaces; without quotes, options of
+    textures and separators of Windows; and, of several materials in one line, the first.
+    """
+    plain = _OPTIONS.sub("", text).strip().strip("\"'").replace("\\ ", " ")
+    first = re.match(r"\S+\.mtl\b", plain, re.IGNORECASE)
+    names = [text, plain, plain.replace("\\", "/"), *([first[0]] if first else [])]
+    return list(dict.fromkeys(names))
 
 
 GREY = 153

@@ -5,6 +5,7 @@ name.
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -145,3 +146,15 @@ def test_check_takes_no_name_that_nobody_asked_for_from_a_picture(
         in capsys.readouterr().err
     )
     assert Path(name).read_bytes() == before
+
+
+def test_the_files_of_an_obj_have_names_without_spaces(tmp_path):
+    """Many readers of `.obj` end a name at a space."""
+    shown = np.zeros((4, 4, 3), np.uint8)
+    written = mesh.write_material(tmp_path / "me and  you.obj", SimpleNamespace(texture=shown))
+    assert written.name == "me_and_you.mtl"
+    assert "map_Kd me_and_you.png\n" in written.read_text()
+    mesh.check_beside(tmp_path / "me and  you.obj")
+    (tmp_path / "me_and_you.png").write_bytes(b"my photo")
+    with pytest.raises(ValueError, match=r"me_and_you\.png: exists"):
+        mesh.check_beside(tmp_path / "me and  you.obj")

@@ -304,6 +304,30 @@ def test_textures_outside_of_the_folder_of_a_mesh_are_left_out(tmp_path, caplog)
     assert "'../red.png' lies outside of" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("material", "texture"),
+    [
+        ("my scan.mtl", "my red.png"),
+        ('"my scan.mtl"', '"my red.png"'),
+        ("my\\ scan.mtl", "-s 1 1 1 -clamp on my red.png"),
+        ("my scan.mtl", "parts\\my red.png"),
+        ("plain.mtl other.mtl", "my red.png"),
+    ],
+)
+def test_materials_and_textures_are_found_by_names_with_spaces_quotes_and_options(
+    tmp_path, material, texture
+):
+    (tmp_path / "parts").mkdir()
+    for place in (tmp_path, tmp_path / "parts"):
+        Image.new("RGB", (4, 4), "red").save(place / "my red.png")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+    (tmp_path / "scan.obj").write_text(f"mtllib {material}\nusemtl skin\n{corners}")
+    for name in ("my scan.mtl", "plain.mtl"):
+        (tmp_path / name).write_text(f"newmtl skin\nmap_Kd {texture}\n")
+    (mesh,) = read_meshes(tmp_path / "scan.obj", colors=True)
+    assert (mesh.visual.vertex_colors == [255, 0, 0, 255]).all()
+
+
 def glb_that_requires(path, *extensions):
     """A box as GLB whose header requires glTF extensions."""
     data = trimesh.creation.box().export(file_type="glb")

@@ -7,6 +7,7 @@ the body.
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal
 
 from humangs_jax.core.registry import FOLDER, Format, Formats
@@ -129,6 +130,12 @@ VIDEOS = Formats(
         "frame_00000.png and so on", f"{_VIDEO}:write_images", (FOLDER,), transparent=True
     ),
 )
+
+
+def files_beside(path: Path, form: ExportFormat) -> list[Path]:
+    """The further files of an output. White space of its name becomes "_" in theirs: many readers of `.obj` end names there."""
+    stem = "_".join(path.stem.split())
+    return [path.with_name(stem + suffix) for suffix in form.beside]
 
 
 def chosen_format(suffix: str, mesh: bool = False) -> ExportFormat | None:

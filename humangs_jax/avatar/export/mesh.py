@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import Up
+from humangs_jax.avatar.export import EXPORTS, Up, files_beside
 from humangs_jax.avatar.export.gaussians import up_matrix, up_turn
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Float, Int, UInt8
@@ -354,7 +354,7 @@ def check_beside(path: Path) -> None:
     advice = (
         "it would become the texture or material: choose another name for the .obj, or move it away"
     )
-    check_ours((path.with_suffix(suffix) for suffix in (".png", ".mtl")), _is_ours, advice)
+    check_ours(files_beside(path, EXPORTS["obj"]), _is_ours, advice)
 
 
 def write_poses(
@@ -379,7 +379,7 @@ def write_material(path: Path, mesh: BodyMesh) -> Path:
 
     Returns the `.mtl`'s path.
     """
-    texture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
+    material, texture = files_beside(path, EXPORTS["obj"])
     write_png(texture, mesh.texture.astype(np.float32) / 255, mark=DRAWN)
     write_text(
         material,
