@@ -353,8 +353,10 @@ _OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+")
 
 
 def _names_in(text: str) -> list[str]:
-    """What the name of a material or texture may be, the likeliest first: as it stands, with spaces; without quotes, options of
-    textures and separators of Windows; and, of several materials in one line, the first.
+    """What the name of a material or texture may be, the likeliest first.
+
+    It may be meant as it stands, with spaces; without quotes, options of textures and separators of
+    Windows; and, of several materials in one line, the first may be meant.
     """
     plain = _OPTIONS.sub("", text).strip().strip("\"'").replace("\\ ", " ")
     first = re.match(r"\S+\.mtl\b", plain, re.IGNORECASE)

@@ -278,7 +278,9 @@ def _checked_variants(
 def _check_people(
     runs: Mapping[str, TrainConfig], people: Sequence[str | Path] | MakeSource, body: BodyModel
 ) -> None:
-    """Whether each run, in all of its stages, can use the people on disk that the base can. No photo is decoded.
+    """Checks that each run, in all of its stages, can use the people on disk that the base can.
+
+    No photo is decoded.
 
     Raises: ArgumentError naming the variant; ValueError if nobody can be used.
     """

@@ -5,7 +5,6 @@ name.
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -150,8 +149,16 @@ def test_check_takes_no_name_that_nobody_asked_for_from_a_picture(
 
 def test_the_files_of_an_obj_have_names_without_spaces(tmp_path):
     """Many readers of `.obj` end a name at a space."""
-    shown = np.zeros((4, 4, 3), np.uint8)
-    written = mesh.write_material(tmp_path / "me and  you.obj", SimpleNamespace(texture=shown))
+    written = mesh.write_material(
+        tmp_path / "me and  you.obj",
+        mesh.BodyMesh(
+            *(np.eye(3, dtype=np.float32) for _ in range(2)),
+            faces=np.asarray([[0, 1, 2]]),
+            uvs=np.zeros((3, 2), np.float32),
+            texture=np.zeros((4, 4, 3), np.uint8),
+            weights=np.ones((3, 1), np.float32),
+        ),
+    )
     assert written.name == "me_and_you.mtl"
     assert "map_Kd me_and_you.png\n" in written.read_text()
     mesh.check_beside(tmp_path / "me and  you.obj")

@@ -133,7 +133,10 @@ VIDEOS = Formats(
 
 
 def files_beside(path: Path, form: ExportFormat) -> list[Path]:
-    """The further files of an output. White space of its name becomes "_" in theirs: many readers of `.obj` end names there."""
+    """The further files of an output.
+
+    White space of its name becomes "_" in theirs: many readers of `.obj` end names there.
+    """
     stem = "_".join(path.stem.split())
     return [path.with_name(stem + suffix) for suffix in form.beside]
 

@@ -345,9 +345,9 @@ class CaptureSource:
         return str(self._found(seed, index, input_count)[0])
 
     def unusable(self) -> dict[str, str]:
-        """The people of whom no example can be made, name -> what is wrong: their files, or views or sizes that they lack.
+        """The people of whom no example can be made: name -> what is wrong.
 
-        No photo is decoded.
+        That are their files, or views or sizes that they lack. No photo is decoded.
         """
         problems = {}
         for i in range(len(self.cache)):
@@ -363,7 +363,10 @@ class CaptureSource:
     def _drawn(
         self, generator: np.random.Generator, summary: StoredSubject, input_count: int
     ) -> tuple[list[int], list[int]]:
-        """Input and target views of one person. Raises: ValueError where there are too few, or too small ones."""
+        """Input and target views of one person.
+
+        Raises: ValueError where there are too few, or too small ones.
+        """
         views = draw_views(generator, summary, input_count, self.sampling)
         for size in (self.input_size, self.target_size):
             shrink(summary.images, size)  # of no views: whether images of this size can be shrunk
