@@ -29,7 +29,6 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.folders import (
     ELSEWHERE,
-    PHOTO_SUFFIXES,
     VIDEO_SUFFIXES,
     FolderScan,
     Unused,
@@ -43,7 +42,7 @@ from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.geometry import quaternion
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import image_size
+from humangs_jax.io.images import PHOTO_SUFFIXES, image_size
 from humangs_jax.io.reading import read_json, reading, visible, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.refinement.config import RefineConfig

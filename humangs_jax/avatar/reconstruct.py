@@ -33,6 +33,7 @@ from humangs_jax.body.model import (
 )
 from humangs_jax.core.array_types import Array, Bool, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
+from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import Capture
@@ -113,6 +114,18 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     count = len(views.images)
     if (bucket := round_up(count, smallest=1)) > count:
         views = pad_views(views, bucket)
+    with compiling(("reconstruct", config, views.images.shape)):
+        return _alone(variables, config, body, views, turned)
+
+
+def _alone(
+    variables: Variables,
+    config: HumanGSConfig,
+    body: BodyModel,
+    views: SubjectViews,
+    turned: bool,
+) -> Avatar:
+    """The avatar that the network makes of views. turned: they were turned for it."""
     inputs = _prepare(body, views, config)
     check_values("reconstruct: capture", {POSED: (inputs.posed_vertices, FINITE)})
     avatar, _ = _reconstruct(
@@ -161,9 +174,10 @@ def _together(
     variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]
 ) -> list[Avatar]:
     body, views, config, turned = _stacked(config, captures)
-    avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(
-        variables, config, body, views
-    )
+    with compiling(("reconstruct_batch", config, views.images.shape)):
+        avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(
+            variables, config, body, views
+        )
     return [
         replace(avatar, light=None) if moved else avatar
         for avatar, moved in zip(avatars, turned, strict=True)

@@ -18,7 +18,7 @@ import threading
 import time
 import unicodedata
 import weakref
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Hashable, Iterable, Iterator, Sequence
 from typing import Any
 
 SHOWN = {"Zs", "Cn", "Co"}
@@ -190,6 +190,36 @@ seconds.
 """
 
 
+_compiled: set[Hashable] = set()
+"""The programs of this process whose first run has been shown by `compiling`."""
+
+
+@contextlib.contextmanager
+def compiling(program: Hashable = None) -> Generator[None]:
+    """Says `COMPILING` while what runs within is compiled: on open bars, or else as a stage.
+
+    Arguments: program: what is compiled: only its first run in a process says so. None: always.
+    """
+    if program is not None and program in _compiled:
+        yield
+        return
+    if program is not None:
+        _compiled.add(program)
+    bars = [each for each in _bars if not each.disable]
+    if not bars:
+        with stage(COMPILING):
+            yield
+        return
+    before = [each.postfix for each in bars]
+    for each in bars:
+        each.set_postfix_str(COMPILING)
+    try:
+        yield
+    finally:
+        for each, postfix in zip(bars, before, strict=True):
+            each.set_postfix_str(postfix or "", refresh=False)
+
+
 def bar(
     iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any
 ) -> Any:
@@ -246,12 +276,16 @@ def watched() -> bool:
 
 def _name(current: Progress, stop: threading.Event, _: float) -> None:
     if not stop.wait(LONG) and current.names:
-        say(f"{current.names[0]} ...", error=True)
+        say(f"{_named(current)} ...", error=True)
+
+
+def _named(current: Progress) -> str:
+    """The outermost and the innermost of the stages that run."""
+    return ": ".join(dict.fromkeys((current.names[0], current.names[-1])))
 
 
 def _tick(current: Progress, stop: threading.Event, started: float) -> None:
     while not stop.wait(TICK):
         if not current.paused and current.names:
-            name = ": ".join(dict.fromkeys((current.names[0], current.names[-1])))
-            sys.stderr.write(f"{CLEAR}{name} ... {time.perf_counter() - started:.0f} s")
+            sys.stderr.write(f"{CLEAR}{_named(current)} ... {time.perf_counter() - started:.0f} s")
             sys.stderr.flush()

@@ -12,11 +12,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from humangs_jax.data.capture_checks import CaptureError, counted, few
-from humangs_jax.io.images import is_own_picture
+from humangs_jax.io.images import PHOTO_SUFFIXES, is_own_picture
 from humangs_jax.io.reading import reading, walk
 
-PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
-"""File types of photos that are read, the likelier original first."""
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".avi")
 """File types of videos that are read."""
 OTHER_PICTURES = (

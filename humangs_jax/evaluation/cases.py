@@ -25,7 +25,7 @@ from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.photos import capture_folder
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.images import read_image
+from humangs_jax.io.images import PHOTO_SUFFIXES, read_image
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.reader import photo_colors, project_vertices, visible_vertices
@@ -39,7 +39,6 @@ them.
 DEFAULT_INPUTS = 4
 MOST_TARGETS = 2000
 """Views of one person that are compared: they are in memory together."""
-SUFFIXES = (".png", ".jpg", ".jpeg")
 Indices = Mapping[str, Mapping[str, Sequence[int]]]
 """By person: "context", the views that are inputs, and "target", those to compare with, by their
 numbers in the capture.
@@ -331,8 +330,9 @@ def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
 
 
 def predictions_method(folder: str | Path, people: int) -> Method:
-    """Images that another program rendered: FOLDER/PERSON/VIEW.png (or .jpg), FOLDER/VIEW.png where
-    there is one person.
+    """Images of another program: FOLDER/PERSON/VIEW.png, or FOLDER/VIEW.png of one person alone.
+
+    The suffix may be any of those of photos.
 
     VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render`
     numbers them. An alpha channel is the coverage, and the colors are put on the background;
@@ -376,9 +376,8 @@ def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | No
 
 
 def _prediction(place: Path, name: str, index: int) -> Path | None:
-    candidates = (
-        place / f"{stem}{suffix}" for stem in (name, f"view_{index:03d}") for suffix in SUFFIXES
-    )
+    stems = (name, f"view_{index:03d}")
+    candidates = (place / f"{stem}{suffix}" for stem in stems for suffix in PHOTO_SUFFIXES)
     return next((file for file in candidates if file.is_file()), None)
 
 

@@ -48,6 +48,8 @@ from humangs_jax.io.reading import Refused, check_limit, open_file, read_bytes, 
 
 logger = logging.getLogger(__name__)
 
+PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
+"""Suffixes of the photos, masks and images that are read, the likelier original first."""
 FORMATS = ("PNG", "JPEG")
 """Of textures. Pillow knows some forty more, one of which starts Ghostscript."""
 NAMES = {"HEIF": "HEIC", "AVIF": "AVIF", "WEBP": "WebP"}

@@ -26,6 +26,7 @@ from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.progress import bar as progress_bar
+from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.refinement.config import RefineConfig
@@ -91,7 +92,11 @@ class Clock:
         self.began, self.compile_seconds = time.perf_counter(), 0.0
         self.done, self.planned, self.late = 0, None, False
         self.bar = progress_bar(
-            total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}"
+            total=100,
+            desc="refine",
+            unit="%",
+            shown=progress,
+            bar_format="{l_bar}{bar}| {elapsed}{postfix}",
         )
 
     def elapsed(self) -> float:
@@ -103,7 +108,8 @@ class Clock:
         """Time spent within counts as compilation, not as refinement. May be nested."""
         before, began = self.compile_seconds, time.perf_counter()
         try:
-            yield
+            with compiling():
+                yield
         finally:
             self.compile_seconds = before + time.perf_counter() - began
 

@@ -345,7 +345,7 @@ def colmap(tmp_path, cameras=None, images=None):
         (
             None,
             lambda t: t.replace("b.png", "z.png"),
-            r"images\.txt: z\.png: no such photo \(PNG or JPEG\)",
+            r"images\.txt: z\.png: no such photo \(\.png, .*\.webp",
         ),
         (None, lambda t: t.replace("b.png", "sub/a.png"), r"a\.png is the photo of a\.png already"),
         (None, lambda t: "1 0 0 0 0 0 0 0 1 a.png\n\n", "line 1: expected a quaternion"),

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from evaluation_cases import capture_from, random_views
+from PIL import Image
 from small import small_body
 
 import humangs_jax as hg
@@ -254,7 +255,10 @@ def test_predictions_are_found_by_file_name(people, folders, tmp_path):
     for i, image in enumerate(people["bob"][1]):
         write_png(one / f"view_{i:03d}.png", image)
     assert len(hg.evaluate(folders / "bob", predictions=one).rows) == 4
-    (tmp_path / "theirsFalse" / "bob" / "left.png").unlink()
+    for image in tmp_path.glob("theirsFalse/bob/*.png"):  # any of the formats of photos
+        Image.open(image).save(image.with_suffix(".webp"), lossless=True)
+        image.unlink()
+    (tmp_path / "theirsFalse" / "bob" / "left.webp").unlink()
     found = hg.evaluate(folders, predictions=tmp_path / "theirsFalse")
     assert len(found.rows) == 7 and [file.endswith("bob/left.png") for file in found.missing] == [
         True

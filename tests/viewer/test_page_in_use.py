@@ -15,6 +15,7 @@ from small import small_avatar
 from experiments import chromium
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion
+from humangs_jax.io.images import DRAWN, MARK_KEY
 from humangs_jax.viewer import page
 
 pytestmark = [
@@ -116,7 +117,9 @@ def saved_image(browser, scale, transparent):
     )
     name, content = saved(browser, "save-image")
     assert name == "ball.png"
-    return np.asarray(Image.open(io.BytesIO(content)).convert("RGBA"), float) / 255
+    image = Image.open(io.BytesIO(content))
+    assert image.info[MARK_KEY] == DRAWN
+    return np.asarray(image.convert("RGBA"), float) / 255
 
 
 def redness(image):

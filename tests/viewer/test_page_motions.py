@@ -13,12 +13,14 @@ import pytest
 from bvh_files import CMU, INDEX, LAFAN, MIXAMO, frames_along_bones, rest_frames, write_bvh
 from glb_files import write_glb
 from motion_cases import FPS, UP, in_world, motions
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.formats import MOTIONS
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.io.images import is_own_picture, read_image, write_png
 from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.viewer.page import page_script
 
@@ -547,3 +549,21 @@ def test_the_page_has_no_tables_of_its_own():
     own = "".join(read_part(f"{name}.js") for name in ("motion_files", "skeletons"))
     for word in ("upleg", "toebase", "mocap", "smpl_", "body_pose", "clavicle", "0.35"):
         assert word not in own, word
+
+
+def test_pictures_of_the_page_are_marked_as_ours(tmp_path):
+    """So that no command takes them for photos, and outputs may replace them."""
+    write_png(tmp_path / "page.png", np.linspace(0, 1, 60).reshape(4, 5, 3))
+    assert not is_own_picture(tmp_path / "page.png")
+    program = f"""{page_script("saving")}
+    const fs = require("fs"), file = process.argv[1];
+    marked(new Blob([fs.readFileSync(file)])).then(async (blob) =>
+      fs.writeFileSync(file, Buffer.from(await blob.arrayBuffer())));"""
+    before = read_image(tmp_path / "page.png")[0]
+    command = [str(NODE), "--input-type=commonjs", "-e", program, str(tmp_path / "page.png")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert is_own_picture(tmp_path / "page.png")
+    with Image.open(tmp_path / "page.png") as image:
+        image.verify()  # the checksums of its chunks
+    np.testing.assert_array_equal(read_image(tmp_path / "page.png")[0], before)

@@ -14,11 +14,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.registry import alternatives
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_path, counted, few
 from humangs_jax.data.folders import (
-    PHOTO_SUFFIXES,
     SAME_NAME,
     SYSTEM_FOLDERS,
     Reason,
@@ -30,6 +30,7 @@ from humangs_jax.data.folders import (
 )
 from humangs_jax.data.photos import read_checked, read_mask
 from humangs_jax.io.images import (
+    PHOTO_SUFFIXES,
     image_size,
     open_image,
     orientation,
@@ -185,7 +186,9 @@ def photo_of(folder: Path, name: str, file: Path) -> Path:
     """
     photo = _photo_at(folder, name)
     if photo is None:
-        raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {folder}")
+        raise CaptureError(
+            file, name, f"no such photo ({alternatives(PHOTO_SUFFIXES)}) in {folder}"
+        )
     checked_path(folder, photo.relative_to(folder), folder)
     return photo
 
@@ -247,7 +250,9 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
                 if mask is not None and not mask.samefile(image):
                     return mask
         raise CaptureError(
-            masks / path, "", "no mask (PNG or JPEG): expected one for each photo, named like it"
+            masks / path,
+            "",
+            f"no mask ({alternatives(PHOTO_SUFFIXES)}): expected one for each photo, named like it",
         )
 
     return find

@@ -71,7 +71,7 @@ from humangs_jax.data.datasets.subject import (
     open_arrays,
 )
 from humangs_jax.data.photos import read_checked
-from humangs_jax.io.images import image_in, read_grey, read_image
+from humangs_jax.io.images import PHOTO_SUFFIXES, image_in, read_grey, read_image
 from humangs_jax.io.reading import (
     Refused,
     check_limit,
@@ -85,7 +85,6 @@ from humangs_jax.io.reading import (
 PARAMETERS, MISSING = "smpl_params.npz", "missing_img_files.txt"
 ON_PERSON = 128.5 / 255
 """Least value of a mask on the person: above 128."""
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 PHOTO = re.compile(r"(?:[\w-]+_(?:rgb|mask))?(\d+)\.\w+")
 """Names of photos, those of ActorsHQ included."""
 T = TypeVar("T")

@@ -25,6 +25,7 @@ from humangs_jax.data.keypoints.keypoints import (
     Source,
 )
 from humangs_jax.data.keypoints.orders import in_order
+from humangs_jax.io.images import PHOTO_SUFFIXES
 from humangs_jax.io.reading import check_limit, reading, walk
 
 NORMALIZED = 2.0
@@ -51,18 +52,8 @@ LARGEST_PIXEL = 1e6
 """Coordinates beyond it mean nothing, and are not to become inf in float32."""
 UNSORTED = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
 """Sets whose files may be of another one with as many points, and their points of the body."""
-IMAGE_SUFFIXES = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".bmp",
-    ".tif",
-    ".tiff",
-    ".webp",
-    ".avif",
-    ".heic",
-    ".heif",
-)
+IMAGE_SUFFIXES = (*PHOTO_SUFFIXES, ".bmp", ".tif", ".tiff")
+"""Suffixes of images that detectors read, and that names in their files may have."""
 
 
 def read_detections(path: Path) -> Detections:

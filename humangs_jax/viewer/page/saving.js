@@ -5,6 +5,30 @@ const VIDEO_FPS = 30;
 const VIDEO_BITS = 12e6;     // a second; the browsers' own choice is blurred
 const KEEP_LINK_MS = 10000;  // until the browser has begun to save
 
+const PICTURE_MARK = "Software\0humangs_jax";  // as io/images.py marks pictures that are no photos
+const PNG_HEAD = 33;         // bytes of a PNG up to the end of its first chunk, the sizes
+
+// The checksum of a chunk of a PNG (CRC-32, ISO 3309).
+function crc32(bytes) {
+  let crc = 0xffffffff;
+  for (const byte of bytes) {
+    crc ^= byte;
+    for (let i = 0; i < 8; i++) crc = (crc >>> 1) ^ (crc & 1 ? 0xedb88320 : 0);
+  }
+  return (crc ^ 0xffffffff) >>> 0;
+}
+
+// The PNG with the text that tells humangs that it is a drawing, lest it be taken for a photo.
+async function marked(blob) {
+  const png = new Uint8Array(await blob.arrayBuffer());
+  const text = new TextEncoder().encode(`tEXt${PICTURE_MARK}`), chunk = new Uint8Array(text.length + 8);
+  const numbers = new DataView(chunk.buffer);
+  numbers.setUint32(0, text.length - 4);
+  chunk.set(text, 4);
+  numbers.setUint32(text.length + 4, crc32(text));
+  return new Blob([png.subarray(0, PNG_HEAD), chunk, png.subarray(PNG_HEAD)], { type: "image/png" });
+}
+
 function saveFile(blob, name) {
   const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
   link.click();
@@ -21,7 +45,7 @@ function makeSaving(app, canvas) {
       say(`a picture of ${width} × ${height} pixels is more than this browser makes: choose a smaller one`, true);
       return;
     }
-    saveFile(blob, `${name}.png`);
+    saveFile(await marked(blob), `${name}.png`);
     say(`${name}.png: ${width} × ${height} pixels`);
   }
 
