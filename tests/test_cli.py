@@ -80,7 +80,7 @@ def test_the_usage_of_an_import_can_be_typed_as_it_stands(humangs):
 
 
 def test_the_options_of_each_way_to_fit_exist():
-    parts = (fit.Detections, fit.Scan, fit.Refinement, fit.Fit)
+    parts = (fit.Detections, fit.Refinement, fit.Fit)
     options = {field.name for part in parts for field in dataclasses.fields(part)}
     for way, others in fit.WAYS.items():
         assert others | {way.removeprefix("--")} <= options

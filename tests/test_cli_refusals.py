@@ -107,8 +107,6 @@ BAD_DATA = {
     "convert nobody.pt": "nobody.pt: no such file",
     "start cloud.ply --out new": "cloud.ply: is a file: expected a folder of photos",
     f"{FIT} --out new": "k.json",
-    "fit --scan scan.obj --out new": "scan.obj",
-    "fit --scan scan.obj --scan-views v": "scan.obj",
     "import cameras none --images someone/images --out new": "none",
 }
 BAD_USAGE = {
@@ -226,30 +224,19 @@ BAD_USAGE = {
                 "demo",
                 "import cameras c --images i",
                 "fit capture --keypoints k",
-                "fit --scan s.obj",
                 "start photos",
             ),
         )
     },
-    "fit --scan broken/me.obj --out broken --overwrite": (
-        "broken/me.obj lies in it and would be deleted"
-    ),
-    "fit --scan me.obj --out someone --overwrite": "the folder holds no scan_fit.json",
     f"{FIT} --out some --overwrite": "the folder holds no capture.json",
     "fit someone --keypoints k --body broken/b.npz --out broken --overwrite": (
         "broken/b.npz lies in it and would be deleted"
     ),
-    "fit": "give either a CAPTURE folder or --scan MESH",
-    "fit someone --scan scan.obj": "give either a CAPTURE folder or --scan MESH",
     "fit someone": "body.npz exists: --overwrite replaces it",
     FIT: "body.npz exists: --overwrite replaces it",
-    "fit someone --bare": "--bare is for --scan or --refine, not for --keypoints",
+    "fit someone --bare": "--bare is for --refine, not for --keypoints",
     "fit someone --refine --smoothness 0.1": "--smoothness is for --keypoints, not for --refine",
     f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
-    "fit --scan scan.obj --refine": "--refine is for captures, not for --scan",
-    "fit --scan scan.obj": "--out FOLDER is missing",
-    "fit --scan scan.obj --keypoints k.json --out new": "needs --scan-views FOLDER",
-    "fit --scan scan.obj --joints j.json --scan-views v": "--joints and --scan-views: give one",
 }
 REFUSED = [(line, cli.BAD_DATA, said) for line, said in BAD_DATA.items()]
 REFUSED += [(line, cli.BAD_USAGE, said) for line, said in BAD_USAGE.items()]

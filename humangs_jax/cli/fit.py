@@ -1,5 +1,4 @@
-"""`humangs fit` and `humangs check`: find the body of one's own photos or scans, and look at the
-result.
+"""`humangs fit` and `humangs check`: find the body in one's own photos, and look at the result.
 
 Everything is checked before the work begins, and written after it.
 """
@@ -56,31 +55,6 @@ class Detections:
 
 
 @dataclasses.dataclass(frozen=True)
-class Scan:
-    """A person in a scan."""
-
-    scan: Path | None = None
-    """A mesh with a person in it, of any scale and orientation."""
-    joints: Path | None = None
-    """3D landmarks of the scan by name (.json or .npz).
-
-    Without these and --scan-views, the pose is searched.
-    """
-    scan_views: Path | None = None
-    """Folder of images of the scan.
-
-    They are rendered there; then, with --keypoints, those that the keypoints are of.
-    """
-    height: float | None = None
-    """Height of the person in the scan without shoes, metres. It sets the scale of the scan."""
-    bare: bool = False
-    """Fill the scan, or with --refine the masks: to measure a body in no or tight clothes.
-
-    Avatars are better without.
-    """
-
-
-@dataclasses.dataclass(frozen=True)
 class Refinement:
     """Refinement of a capture that has a body."""
 
@@ -94,34 +68,36 @@ class Refinement:
 
     Else a fit to keypoints turns back those that they show to be turned, and --refine moves all.
     """
+    bare: bool = False
+    """With --refine, fill the masks: to measure a body in no or tight clothes.
+
+    Avatars are better without.
+    """
 
 
-Way = Literal["--scan", "--refine", "--keypoints"]
+Way = Literal["--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
-    "--scan": {"keypoints", "person", "body", "joints", "scan_views", "height", "bare"},
     "--refine": {"keypoints", "person", "fixed_cameras", "bare"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
-"""The three ways to fit, by the option that chooses each, and their other options."""
+"""The two ways to fit, by the option that chooses each, and their other options."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Find the body in photos with cameras, or in a scan.
+    """Find the body in photos with cameras.
 
-    With CAPTURE: shape and poses from 2D keypoints of --keypoints, or of the shipped detector. With
-    CAPTURE --refine: better cameras and poses from masks. With --scan: the body in a mesh. docs:
-    fitting.
+    Shape and poses come from 2D keypoints: those of --keypoints, or of the shipped detector. With
+    --refine: better cameras and poses from masks. docs: fitting.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
         "humangs fit me --keypoints keypoints.json",
-        "humangs fit --scan scan.obj --height 1.78 --out fitted",
+        "humangs fit me --refine",
     )
     detections: OmitArgPrefixes[Detections]
-    scan: OmitArgPrefixes[Scan]
     refinement: OmitArgPrefixes[Refinement]
-    capture: Positional[Path | None] = None
+    capture: Positional[Path]
     """Folder with capture.json; its body.npz need not exist."""
     body: Path | None = None
     """Model file (SMPL-X .npz or .pkl). Default: the shipped body."""
@@ -136,27 +112,24 @@ class Fit:
 
     def run(self) -> None:
         """Fit in the way that was asked for."""
-        if (self.capture is None) == (self.scan.scan is None):
-            raise UsageError("give either a CAPTURE folder or --scan MESH")
-        way: Way = (
-            "--scan" if self.scan.scan else "--refine" if self.refinement.refine else "--keypoints"
-        )
+        way: Way = "--refine" if self.refinement.refine else "--keypoints"
         for option in self._given():
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
                 raise UsageError(
                     f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}"
                 )
-        self._check_places(way)
-        {"--scan": self._fit_scan, "--refine": self._refine, "--keypoints": self._fit_keypoints}[
-            way
-        ]()
+        self._check_places()
+        if way == "--refine":
+            self._refine()
+        else:
+            self._fit_keypoints()
 
     def _given(self) -> Iterator[str]:
         """Options of the ways of fitting whose value is not the default, in the order of the
         help.
         """
-        for part in (self.refinement, self.scan, self.detections, self):
+        for part in (self.refinement, self.detections, self):
             for field in dataclasses.fields(part):
                 chosen = (
                     not dataclasses.is_dataclass(value := getattr(part, field.name))
@@ -165,23 +138,15 @@ class Fit:
                 if chosen and field.name not in ("capture", "out", "overwrite"):
                     yield field.name
 
-    def _check_places(self, way: Way) -> None:
+    def _check_places(self) -> None:
         """Whether the result can be written; the whole of it is checked again where the capture is
         known.
         """
-        scan, keypoints = self.scan, self.detections.keypoints
-        inputs = (self.capture, scan.scan, scan.joints, keypoints, self.body)
-        in_place = self.capture is not None and (
-            self.out is None or self.out.resolve() == self.capture.resolve()
-        )
-        if scan.scan_views is not None:
-            require_folder(scan.scan_views, "--scan-views")
+        inputs = (self.capture, self.detections.keypoints, self.body)
+        in_place = self.out is None or self.out.resolve() == self.capture.resolve()
         if self.out is not None and not in_place:
-            mark, views = (
-                ("scan_fit.json", scan.scan_views) if way == "--scan" else ("capture.json", None)
-            )
-            require_replaceable(self.out, self.overwrite, mark, (*inputs, views))
-        elif self.capture is not None and self.capture.is_dir():
+            require_replaceable(self.out, self.overwrite, "capture.json", inputs)
+        elif self.capture.is_dir():
             require_folder(self.capture, "CAPTURE")
             if (body := self.capture / "body.npz").exists() and not self.overwrite:
                 raise UsageError(
@@ -189,7 +154,6 @@ class Fit:
                 )
 
     def _fit_keypoints(self) -> None:
-        assert self.capture is not None  # `run` has checked it
         with stage("starting"):
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import DEFAULT_BODY
@@ -236,7 +200,6 @@ class Fit:
         suggest("humangs check", target)
 
     def _refine(self) -> None:
-        assert self.capture is not None  # `run` has checked it
         with stage("starting"):
             from humangs_jax.data.capture import load_capture
             from humangs_jax.fitting.files import check_place, write_fitted
@@ -247,9 +210,12 @@ class Fit:
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
-        fixed, bare = self.refinement.fixed_cameras or cameras_are_unseen(start), self.scan.bare
+        fixed = self.refinement.fixed_cameras or cameras_are_unseen(start)
         config = usual_config(
-            record is not None, fixed_cameras=fixed, bare=bare, calibrated=start.calibrated
+            record is not None,
+            fixed_cameras=fixed,
+            bare=self.refinement.bare,
+            calibrated=start.calibrated,
         )
         with stage("refining cameras and body"):
             refinement = refine_capture(start, keypoints=keypoints, config=config)
@@ -261,79 +227,6 @@ class Fit:
             write_fitted(self.capture, target, refinement.capture, refinement.report, record)
         wrote(target, "refined cameras and body")
         suggest("humangs check", target)
-
-    def _fit_scan(self) -> None:
-        scan, keypoints = self.scan, self.detections.keypoints
-        if scan.joints is not None and scan.scan_views is not None:
-            raise UsageError(
-                "--joints and --scan-views: give one of them, both say where the joints are"
-            )
-        if keypoints is not None and scan.scan_views is None:
-            raise UsageError(
-                "--keypoints of a scan needs --scan-views FOLDER, the images that they are of"
-            )
-        only_views = scan.scan_views is not None and keypoints is None
-        if self.out is None and not only_views:
-            raise UsageError("--out FOLDER is missing: where the body of the scan goes")
-        with stage("starting"):
-            from humangs_jax.apps.detect import KEYPOINTS_FILE
-            from humangs_jax.body.library import load_body
-            from humangs_jax.data.capture import DEFAULT_BODY
-            from humangs_jax.data.photos import load_photos
-            from humangs_jax.fitting.files import check_scan_folder, save_scan_fit
-            from humangs_jax.fitting.scan_files import (
-                joints_from_views,
-                read_joints,
-                render_scan_views,
-            )
-            from humangs_jax.fitting.scan_fit import fit_scan
-
-        assert scan.scan is not None  # `run` has checked it
-        if only_views:
-            assert scan.scan_views is not None
-            with stage("rendering the scan"):
-                render_scan_views(scan.scan, scan.scan_views)
-            images, found = scan.scan_views / "images", scan.scan_views / "found"
-            wrote(
-                scan.scan_views,
-                f"images of the scan; find keypoints in {images}, as the first of these commands"
-                " does",
-            )
-            suggest("humangs detect", images, "--out", found)
-            keypoints = found / KEYPOINTS_FILE
-            suggest(
-                "humangs fit --scan",
-                scan.scan,
-                "--scan-views",
-                scan.scan_views,
-                "--keypoints",
-                keypoints,
-                "--out FOLDER",
-            )
-            return
-        assert self.out is not None
-        check_scan_folder(
-            self.out,
-            self.overwrite,
-            (scan.scan, scan.joints, scan.scan_views, keypoints, self.body),
-        )
-        tell_deleted(self.out)
-        with stage("reading joints and body"):
-            joints = None if scan.joints is None else read_joints(scan.joints)
-            if scan.scan_views is not None:
-                joints = joints_from_views(
-                    scan.scan_views, self.detections.read(load_photos(scan.scan_views))
-                )
-            body = load_body(self.body)
-        with stage("fitting"):
-            fitted = fit_scan(
-                scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height
-            )
-        body_file = DEFAULT_BODY if self.body is None else str(self.body)
-        with stage("writing"):
-            save_scan_fit(self.out, fitted, body_file, overwrite=self.overwrite)
-        tell(fitted.report)
-        wrote(self.out, "body.npz, scan_fit.json and body_in_scan.ply")
 
 
 DEFAULT_SHEET = Path("check.png")

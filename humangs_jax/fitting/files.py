@@ -1,5 +1,4 @@
-"""What fits write: fit.npz and fit.json beside the body.npz of a capture, and the folder of a fit
-to a scan.
+"""What fits write: fit.npz and fit.json beside the body.npz of a capture.
 
 fit.npz, the input of a fit to keypoints and how well its result is known:
 
@@ -12,8 +11,7 @@ fit.npz, the input of a fit to keypoints and how well its result is known:
     shape_covariance (s, s)
     places (k, 3), certainty (k,)    of the set, as the fit found them, metres and weights
 
-fit.json is the report (`FitReport.to_json`). The folder of a scan holds body.npz, scan_fit.json
-(the report and where the scan is) and body_in_scan.ply.
+fit.json is the report (`FitReport.to_json`).
 """
 
 import dataclasses
@@ -27,18 +25,16 @@ import numpy as np
 from humangs_jax.body.landmarks import usual_certainty
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.data.capture import DEFAULT_BODY, Capture, capture_parameters, parameter_arrays
+from humangs_jax.data.capture import Capture, capture_parameters
 from humangs_jax.data.capture_checks import CaptureError, few, numbers
 from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS, Keypoints
 from humangs_jax.data.photos import capture_folder, read_description
 from humangs_jax.fitting.report import FitReport
-from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
 from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
 from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
-SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
 FOUND = ("noise", "joint_std", "determined", "shape_covariance")
 KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
 
@@ -222,47 +218,3 @@ def _copy(source: Path, folder: Path, file: str) -> None:
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source / file, target)
-
-
-# Scans
-# --------------------------------------------------------------------------------------------------
-
-
-def save_scan_fit(
-    folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BODY, *, overwrite: bool = False
-) -> None:
-    """Write body.npz (as in captures), scan_fit.json and body_in_scan.ply; all or nothing.
-
-    Arguments: body_file: where the model comes from, see `Capture`. Raises: see
-    `check_scan_folder`.
-    """
-    check_scan_folder(Path(folder), overwrite)
-    pose, align = fit.pose, fit.world_from_scan
-    poses = np.asarray(pose.rotations)[None], np.asarray(pose.translation)[None]
-    arrays = parameter_arrays(Path(folder), fit.body, body_file, fit.betas, *poses)
-    place = {
-        "world_from_scan": align.matrix().tolist(),
-        "scale": align.scale,
-        "rotation": align.rotation.tolist(),
-    }
-    place |= {"translation": align.translation.tolist(), "up": fit.up}
-
-    def write(temporary: Path):
-        import trimesh
-
-        temporary.mkdir()
-        write_npz(temporary / SCAN_BODY_FILE, arrays, compressed=False)
-        mesh = trimesh.Trimesh(body_in_scan(fit), np.asarray(fit.body.faces), process=False)
-        mesh.export(temporary / SCAN_MESH_FILE)
-        write_json(temporary / SCAN_REPORT_FILE, place | fit.report.to_json(), indent=2)
-
-    replace_folder(folder, write, mark=SCAN_REPORT_FILE)
-
-
-def check_scan_folder(
-    folder: Path, overwrite: bool, inputs: Iterable[str | Path | None] = ()
-) -> None:
-    """Raises: ValueError unless the folder is empty, or with `overwrite` a fit to a scan; see also
-    `check_replaceable`.
-    """
-    check_replaceable(folder, overwrite, SCAN_REPORT_FILE, inputs)

@@ -1,11 +1,10 @@
-"""Meshes: GLB, the binary form of glTF 2.0, parsed within limits and written; OBJ, PLY, STL and OFF
-of other programs by trimesh.
+"""Meshes: GLB, the binary form of glTF 2.0, parsed within limits and written; textured OBJ files of
+scans by trimesh.
 
 GLB is JSON that describes arrays, and one block of their bytes
 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification). What
-trimesh would trust is checked before. A file's textures are read if they are asked for, lie in its
-folder or in the file itself, and are PNG or JPEG; a texture that cannot be read is left out, with a
-warning.
+trimesh would trust is checked before. Textures of an OBJ file are read if they lie in its folder
+and are PNG or JPEG; one that cannot be read is left out, with a warning.
 """
 
 import io
@@ -46,7 +45,7 @@ VERTICES, INDICES = 34962, 34963
 def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, Any], bytes]:
     """The JSON of a GLB file and the bytes that it describes.
 
-    Arguments: limit: of the JSON. That of scans is low, because trimesh, which loads them, is slow.
+    Arguments: limit: of the JSON. By default that of files that nobody needs to be long.
     Raises: Refused, KeyError, TypeError, ... for sizes that do not fit the file or are more than
     the limits allow.
     """
@@ -186,72 +185,45 @@ class GlbWriter:
         write_bytes(path, struct.pack("<III", GLB_START, 2, 12 + len(chunks)) + chunks)
 
 
-TYPES = ("obj", "ply", "glb", "stl", "off")
-"""Suffixes of the formats; trimesh has more, of which some start programs or read XML."""
+def read_obj(path: str | Path) -> list[Any]:
+    """The triangle meshes of an OBJ file with materials and textures, as
+    trimesh.Trimesh; at least one.
 
-
-def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = False) -> list[Any]:
-    """The triangle meshes of a file in its common coordinates, as trimesh.Trimesh; empty if it has
-    none.
-
-    Arguments: textures: with materials and textures. colors: with colors of the vertices instead,
-    painted or from a texture; grey where they are not known. Materials and textures that the file
-    names but that cannot be read are left out, which is logged.
-    Raises: FileNotFoundError; FileError if it is damaged, of another format, or asks for more than
-    the limits allow.
+    Materials and textures that the file names but that cannot be read are left out, which is
+    logged.
+    Raises: FileNotFoundError; FileError if it has no triangles, is damaged, or asks for
+    more than the limits allow.
     """
     import trimesh
 
     path = Path(path)
     with reading(path, "mesh"):
-        kind = path.suffix.lower().removeprefix(".")
-        if kind not in TYPES:
-            raise Refused(
-                f"not a mesh that can be read: expected {', '.join(TYPES)}, got"
-                f" {path.suffix or 'no suffix'}"
-            )
-        data, painted = read_bytes(path, "mesh_bytes"), textures or colors
-        stream: Any = io.BytesIO(data)
-        if kind == "glb":
-            _check_glb(data, painted)
-        elif kind == "stl":
-            check_limit("parts", data.lower().count(b"endsolid"), "solids")
-        elif kind == "obj":  # text of other encodings would be guessed at for a long time
-            stream = io.StringIO(_grouped(data.decode("utf-8", "replace"), painted))
-        materials: dict[str, Any] = (
-            {} if kind in ("stl", "off") else {"skip_materials": not painted}
-        )
-        resolver: Any = _Folder(path.parent) if painted else None
+        if path.suffix.lower() != ".obj":
+            raise Refused(f"not a mesh that can be read: expected .obj, got {path.suffix!r}")
+        data, resolver = read_bytes(path, "mesh_bytes"), _Folder(path.parent)
+        # text of other encodings would be guessed at for a long time
+        stream = io.StringIO(_grouped(data.decode("utf-8", "replace")))
         # processing would silently drop what is not finite
         scene = trimesh.load_scene(
-            stream, file_type=kind, resolver=resolver, process=False, **materials
+            stream,
+            file_type="obj",
+            resolver=resolver,  # ty: ignore[invalid-argument-type]
+            process=False,
+            skip_materials=False,
         )
-        if resolver is not None:
-            resolver.report(path)
+        resolver.report(path)
         drawn = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
-        check_limit(
-            "corners",
-            sum(3 * len(getattr(part, "faces", ())) for part in drawn),
-            "corners of triangles",
-        )
-        materials_of = [getattr(part.visual, "material", None) for part in drawn]
-        images = [
-            getattr(each, "baseColorTexture", None) or getattr(each, "image", None)
-            for each in materials_of
-        ]
-        check_limit(
-            "capture_pixels",
-            sum(image.width * image.height for image in images if image),
-            "pixels of textures",
-        )
-        if colors:
-            for part in {
-                id(part): part for part in drawn if isinstance(part, trimesh.Trimesh)
-            }.values():
-                _paint(part)
+        corners = sum(3 * len(getattr(part, "faces", ())) for part in drawn)
+        check_limit("corners", corners, "corners of triangles")
+        materials = [getattr(part.visual, "material", None) for part in drawn]
+        images = [getattr(each, "image", None) for each in materials]
+        texels = sum(image.width * image.height for image in images if image)
+        check_limit("capture_pixels", texels, "pixels of textures")
         parts = [
             part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)
         ]
+        if not parts:
+            raise Refused("no triangles: expected the surface of a scan")
         for part in parts:
             if part.vertices.shape[1:] != (3,) or part.faces.shape[1:] != (3,):
                 raise Refused(
@@ -271,16 +243,16 @@ CHEAPER = 50
 """To look at a vertex, than a corner of a triangle."""
 _MATERIAL = re.compile(r"^usemtl\b(.*)$", re.MULTILINE)
 _FACES = re.compile(r"^f[ \t].*\n?", re.MULTILINE)
-_GROUPS = re.compile(r"^(?:usemtl|o|g|s)\b.*\n?", re.MULTILINE)
+_GROUPS = re.compile(r"^(?:o|g|s)\b.*\n?", re.MULTILINE)
 
 
-def _grouped(text: str, materials: bool) -> str:
+def _grouped(text: str) -> str:
     """An OBJ file with the faces of each material together, at its end. Without materials, and for
     objects and groups, all faces are one: trimesh takes longer than linear for each change, even
     for one that it finds in a comment.
     """
     text = text.replace("\r\n", "\n").replace("\\\n", "")
-    begin, *changes = _MATERIAL.split(text) if materials else (_GROUPS.sub("", text),)
+    begin, *changes = _MATERIAL.split(text)
     of_material: dict[str, list[str]] = {}
     for name, chunk in zip(changes[::2], changes[1::2], strict=True):
         of_material.setdefault(name.strip(), []).extend(_FACES.findall(chunk))
@@ -362,67 +334,3 @@ def _names_in(text: str) -> list[str]:
     first = re.match(r"\S+\.mtl\b", plain, re.IGNORECASE)
     names = [text, plain, plain.replace("\\", "/"), *([first[0]] if first else [])]
     return list(dict.fromkeys(names))
-
-
-GREY = 153
-"""Of 255: vertices whose color is not known."""
-
-
-def _paint(mesh: Any) -> None:
-    """Give a mesh colors of its vertices in place of a texture."""
-    from trimesh.visual import ColorVisuals
-
-    count, visual = len(mesh.vertices), mesh.visual
-    colors = (
-        visual.material.to_color(visual.uv) if visual.kind == "texture" else visual.vertex_colors
-    )
-    if colors is None or np.shape(colors) not in ((count, 4), (count, 3), (4,)):
-        colors = [GREY, GREY, GREY, 255]
-    mesh.visual = ColorVisuals(
-        mesh, vertex_colors=np.broadcast_to(colors, (count, np.shape(colors)[-1]))
-    )
-
-
-HARMLESS_EXTENSIONS = (
-    "KHR_materials_",
-    "KHR_lights_",
-    "KHR_mesh_quantization",
-    "KHR_texture_transform",
-    "KHR_xmp",
-)
-"""Beginnings of names of glTF extensions that leave positions and faces where the file has them."""
-
-
-def _check_extensions(content: dict[str, Any]) -> None:
-    """glTF 2.0 asks readers to refuse a file that requires an extension which they do not know."""
-    for name in content.get("extensionsRequired", []):
-        if "draco" in name or "meshopt" in name:
-            raise Refused(f"compressed by {shown(name)}: expected a GLB without compression")
-        if not name.startswith(HARMLESS_EXTENSIONS):
-            raise Refused(f"requires the extension {shown(name)}: expected a plain glTF 2.0 mesh")
-
-
-def _check_glb(data: bytes, textures: bool) -> None:
-    """Raises: Refused, KeyError, TypeError, ... for sizes and places that do not fit the file."""
-    content, binary = parse_glb(data)
-    _check_extensions(content)
-    views = [view_of(view, binary) for view in content.get("bufferViews", [])]
-    counts = [count_of(accessor) for accessor in content.get("accessors", [])]
-    corners = lambda part: (
-        counts[part["attributes"]["POSITION"]]
-        + (3 * counts[part["indices"]] if "indices" in part else 0)
-    )
-    of_mesh = [sum(map(corners, mesh["primitives"])) for mesh in content.get("meshes", [])]
-    drawn = [node["mesh"] for node in content.get("nodes", []) if "mesh" in node]
-    check_limit(
-        "corners", max(sum(of_mesh), sum(of_mesh[mesh] for mesh in drawn)), "corners of triangles"
-    )
-    parts = [len(mesh["primitives"]) for mesh in content.get("meshes", [])]
-    check_limit("parts", max(sum(parts), sum(parts[mesh] for mesh in drawn)), "parts of meshes")
-    if textures:
-        for image in content.get("images", []):
-            if "bufferView" in image:
-                with image_in(views[image["bufferView"]]):
-                    pass
-            elif str(image.get("uri", "")).startswith("data:"):
-                raise Refused("a texture within the text: expected it as a part of the numbers")

@@ -11,7 +11,6 @@ PEOPLE = "--subjects 1 --held-out 1 --poses 1 --pose-views 1 --size 64"
 CASES = {
     "extremes": "--cases black",
     "fit_keypoints": "--people 1 --frames 1 --no-curves",
-    "fit_scans": "--subjects 1 --kinds bare",
     "fit_sequences": "--people 2 --smoothness 0.02 --cases",
     "paper_claims": "",
     "people_faults": "--subjects 1 --size 64",

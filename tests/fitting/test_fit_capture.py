@@ -14,9 +14,8 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133, Keypoints
 from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting import files, fit_capture
-from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_record, write_fitted
+from humangs_jax.fitting.files import check_place, read_fit_record, write_fitted
 from humangs_jax.fitting.fit_capture import fit_photos
-from humangs_jax.fitting.scan_files import render_scan_views
 from humangs_jax.io import reading
 
 SIZE = 16
@@ -174,10 +173,6 @@ def test_folders_that_cannot_be_replaced_are_refused_before_the_fit(folder, tmp_
     for place, message in ((Path(), "is the working folder"), (link, "is a symbolic link")):
         with pytest.raises(ValueError, match=message):
             check_place(folder[0], place, overwrite=True)
-        with pytest.raises(ValueError, match=message):
-            check_scan_folder(place, overwrite=True)
-        with pytest.raises(ValueError, match=message):
-            render_scan_views(tmp_path / "scan.ply", place)
     here = copied(folder[0], tmp_path / "copy")
     monkeypatch.chdir(here)
     assert check_place(here, None, overwrite=True) == here  # files are replaced one by one

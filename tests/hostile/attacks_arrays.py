@@ -155,13 +155,6 @@ MOTION = {
 }
 for kind, change in MOTION.items():
     arrays_case(kind, "amass", AMASS.copy, change, 6)
-arrays_case(
-    "names that are no list",
-    "joints npz",
-    lambda: {"points": np.zeros((2, 3))},
-    to(names=np.asarray("x")),
-    6,
-)
 FITS = {
     "another set": to(set=np.asarray("mine")),
     "NaN": put("points", np.nan),

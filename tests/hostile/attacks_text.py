@@ -6,7 +6,6 @@ import json
 import re
 
 import honest_files as honest
-import numpy as np
 from hostile_cases import case, changed, edited, json_case, setting, written
 from readers import FORMATS
 
@@ -21,7 +20,6 @@ JSON_READERS = (
     "coco",
     "mmpose",
     "lhm",
-    "joints json",
     "configuration",
     "manifest",
 )
@@ -113,7 +111,6 @@ NUMBERS = {
     "mmpose": {"instance_info.0.instances.0.keypoint_scores": 17},
     "coco annotations": {"images.0.width": 0},
     "lhm": {"root_pose": 3},
-    "joints json": {"left_hip": 3},
 }
 """By reader: places of numbers, and how many are expected there; 0: one number."""
 for reader, paths in NUMBERS.items():
@@ -260,7 +257,6 @@ for kind, word in WORDS.items():
         0,
     )
     json_case(f"{kind} in a name", "coco", {"0.file_name": word, "0.keypoints": [1]}, 0)
-    json_case(f"{kind} in a key", "joints json", {word: [0, 0]}, 0)
     json_case(f"{kind} in a field", "configuration", {word: 1}, 0)
     json_case(f"{kind} in a preset", "settings", {"settings.splat": word}, 0)
     case(
@@ -274,19 +270,6 @@ for kind, word in WORDS.items():
 # Amounts, of which each file has few bytes
 # -------------------------------------------------------------------------------------
 
-PLACEMENTS = {
-    "zeros": np.zeros((4, 4)),
-    "NaN": np.full((4, 4), np.nan),
-    "a mirror": np.diag([-1.0, 1, 1, 1]),
-    "a scale for each axis": np.diag([1.0, 2, 3, 1]),
-    "1e200": np.eye(4) * 1e200,
-    "1e-200": np.diag([1e-200, 1e-200, 1e-200, 1]),
-    "another last row": np.eye(4)[::-1],
-    "too few numbers": np.eye(3),
-}
-for kind, matrix in PLACEMENTS.items():
-    json_case(f"a placement of {kind}", "scan views", {"world_from_scan": matrix.tolist()})
-json_case("a placement of words", "scan views", {"world_from_scan": "x"})
 for key, values in {
     "settings": ([], "x", None, 3),
     "split": ([], {}, 10**400),

@@ -3,7 +3,6 @@
 import functools
 import io
 import json
-import struct
 
 import bvh_files
 import calibration_files
@@ -387,42 +386,10 @@ def sphere():
     return trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 
 
-def mesh(suffix):
-    return written(f"scan.{suffix}", lambda: sphere().export(file_type=suffix))
-
-
 def photo_bytes():
     stream = io.BytesIO()
     Image.fromarray(pixels(64, 64, 3)).save(stream, format="PNG")
     return stream.getvalue()
-
-
-def textured_glb(image=None, images=None, change=lambda content: None):
-    """A GLB of a sphere with one texture in it, or with the JSON changed."""
-    import trimesh
-
-    mesh = sphere()
-    picture = Image.fromarray(pixels(4, 4, 3)) if image is None else image
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
-    mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2] + 0.5, material=material)
-    data = mesh.export(file_type="glb")
-    length = struct.unpack_from("<I", data, 12)[0]
-    content, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
-    if images is not None:  # other bytes in place of the texture
-        view = content["bufferViews"][content["images"][0]["bufferView"]]
-        view["byteOffset"], view["byteLength"] = len(binary), len(images)
-        binary += images + bytes(-len(images) % 4)
-        content["buffers"][0]["byteLength"] = len(binary)
-    change(content)
-    header = json.dumps(content).encode()
-    header += b" " * (-len(header) % 4)
-    total = 28 + len(header) + len(binary)
-    chunk = lambda kind, body: struct.pack("<II", len(body), kind) + body
-    return (
-        struct.pack("<III", 0x46546C67, 2, total)
-        + chunk(0x4E4F534A, header)
-        + chunk(0x004E4942, binary)
-    )
 
 
 def textured_obj(folder, texture="texture.png", material="scan.mtl"):

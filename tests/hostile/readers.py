@@ -44,7 +44,6 @@ from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
 from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.fitting.files import read_fit_record
-from humangs_jax.fitting.scan_files import read_joints, read_mesh, read_placement
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.images import (
     check_image,
@@ -55,6 +54,7 @@ from humangs_jax.io.images import (
     read_grey,
     read_image,
 )
+from humangs_jax.io.mesh import read_obj
 from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors
@@ -179,7 +179,6 @@ def pickled(content):
     return lambda: pickle.dumps(content(), protocol=2)
 
 
-colored_mesh = functools.partial(read_mesh, colors=True)
 avatarrex = data_set(dataset_files.write_avatarrex, frames=2)
 scenes = data_set(dataset_files.write_scenes, honest.MODEL, views=2)
 scans = data_set(dataset_files.write_thuman, honest.MODEL, kinds="C")
@@ -188,12 +187,10 @@ AIST = {"smpl_poses": np.zeros((3, 72)), "smpl_trans": np.zeros((3, 3)), "smpl_s
 AMASS = zeros(poses=(3, 156), trans=(3, 3)) | {"mocap_framerate": 120.0}
 PARTS = zeros(global_orient=(3, 3), body_pose=(3, 63), transl=(3, 3))
 WHAM = zeros(pose_world=(3, 72), trans_world=(3, 3), frame_ids=(3,)) | {"frame_ids": np.arange(3)}
-JOINTS = {"left_hip": [0, 1, 0], "right_hip": [0.2, 1, 0], "neck": [0.1, 1.5, 0]}
 RIG = {
     n: {"K": honest.K, "R": np.diag([1, -1, -1]).tolist(), "T": [0, 1, 3], "imgSize": [9, 9]}
     for n in "ab"
 }
-WORLD_FROM_SCAN = np.diag([2.0, 2, 2, 1]).tolist()
 STATE, BVH = (
     honest.STATE,
     functools.partial(bvh_files.write_bvh, shipped_joints(), np.zeros((2, 55, 3)), bvh_files.CMU),
@@ -319,16 +316,7 @@ ROWS = {
         load_gaussians,
         saved("a.glb", lambda path: save_gaussians(path, random_gaussians(harmonics=8))),
     ),
-    "obj": (colored_mesh, honest.write_obj),
-    "ply": (colored_mesh, honest.mesh("ply")),
-    "glb": (colored_mesh, written("scan.glb", honest.textured_glb)),
-    "stl": (read_mesh, honest.mesh("stl")),
-    "off": (read_mesh, honest.mesh("off")),
-    "joints json": (read_joints, written("j.json", as_json(JOINTS))),
-    "joints npz": (
-        read_joints,
-        npz("j.npz", lambda: {"names": np.asarray(["left_hip", "neck"])} | zeros(points=(2, 3))),
-    ),
+    "obj": (read_obj, honest.write_obj),
     "fit record": (read_fit_record, npz("fit.npz", honest.fit_arrays)),
     "bank": (load_bank, npz("bank.npz", honest.bank_arrays)),
     "manifest": (continue_synthetic_set, written("manifest.json", as_json(honest.MANIFEST))),
@@ -337,10 +325,6 @@ ROWS = {
         written("log.jsonl", '{"step": 1, "loss": 2.0}\n{"step": 2, "event": "skipped"}\n'),
     ),
     "filmed": (film, npz("m.npz", honest.motion_arrays)),
-    "scan views": (
-        read_placement,
-        written("scan.json", as_json({"world_from_scan": WORLD_FROM_SCAN})),
-    ),
     "start": (look, honest.write_import_folder, "photos/000.png"),
     "avatarrex": (read_data_set, avatarrex, "calibration_full.json"),
     "video poses": (read_data_set, avatarrex, "smpl_params.npz"),

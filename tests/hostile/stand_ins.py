@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from dataset_files import write_avatarrex, write_model
-from honest_files import sphere, write_import
+from honest_files import write_import
 
 from humangs_jax.apps.quick_check import Faults
 from humangs_jax.avatar.avatar import Avatar
@@ -39,8 +39,6 @@ from humangs_jax.evaluation.scores import Scores, score_names
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.refine import RefinedCapture
 from humangs_jax.fitting.report import FitReport
-from humangs_jax.fitting.scan_fit import ScanFit
-from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.network.presets import tiny
@@ -60,7 +58,7 @@ HEAVY = (
         "training.diagnose",
         "viewer.page",
     ),
-    *("fitting.fit_capture", "fitting.refine", "fitting.scan_files", "network.conversion"),
+    *("fitting.fit_capture", "fitting.refine", "network.conversion"),
 )
 LATE = (
     "orbax.checkpoint",
@@ -83,7 +81,7 @@ WORK = {
         "fit_photos",
         "refine_capture",
     ),
-    *("fit_scan", "load_checkpoint", "make_subject", "train_step"),
+    *("load_checkpoint", "make_subject", "train_step"),
 }
 """Stand-ins for what takes long: nothing that is wrong with the place may be found only after
 these.
@@ -212,13 +210,6 @@ def stand_ins(variant):
         image = random_of(variant, 3).random((camera.height, camera.width))
         return SimpleNamespace(shaded=np.repeat(image[..., None], 3, -1), covered=image > 0.5)
 
-    def in_scan(*_, **__):
-        model = load_body()
-        pose = BodyPose(jnp.full((len(model.parents), 3), variant / 100), jnp.zeros(3))
-        align = Similarity(1.0, np.eye(3), np.zeros(3))
-        betas = np.zeros(model.shape_directions.shape[-1], np.float32)
-        return ScanFit(model, betas, pose, align, "+y", np.zeros(4), FitReport("scan"))
-
     def fitted(photos, *_, **__):
         record = some_record(variant, photos.names)
         capture = moved(some_capture(0, len(photos.names), 32))
@@ -235,7 +226,6 @@ def stand_ins(variant):
     def scored(images, _truth, rules, *_):
         return [dict.fromkeys(score_names(rules), variant / 8) for _ in images]
 
-    mesh_views = lambda *_: iter([(np.full((32, 32, 3), variant / 4), np.ones((32, 32)))] * 8)
     avatar = lambda *_, **__: Avatar.load(Path(os.environ["KILLS_INPUTS"]) / f"avatar{variant}.npz")
     return {
         "avatar.reconstruct.reconstruct": avatar,
@@ -272,8 +262,6 @@ def stand_ins(variant):
         "evaluation.run.score_views": scored,
         "fitting.fit_capture.fit_photos": fitted,
         "fitting.refine.refine_capture": refined,
-        "fitting.scan_fit.fit_scan": in_scan,
-        "fitting.scan_files._draw": mesh_views,
         "network.conversion.load_checkpoint": converted,
         "network.conversion.describe": lambda _: "a network",
         "losses.loss_networks.collect_loss_networks": lambda _: ({"x": np.ones(999)}, ["VGG-19"]),
@@ -311,7 +299,6 @@ def make_inputs(inputs: Path) -> None:
         "points": record.keypoints.points,
     }
     write_npz(inputs / "keypoints.npz", arrays | {"confidences": record.keypoints.confidences})
-    (inputs / "scan.obj").write_text(sphere().export(file_type="obj"))
     (inputs / "any.pt").write_bytes(b"")
     (inputs / "train.json").write_text(
         config_to_json(dataclasses.replace(config.tiny(), steps=6, checkpoint_every=2), indent=1)

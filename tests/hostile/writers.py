@@ -80,13 +80,6 @@ COMMANDS = (
     ),
     Command("fit in place", f"fit capture {CAPTURE}", copies=("capture",)),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
-    Command("fit --scan", "fit --scan {inputs}/scan.obj --out body --overwrite"),
-    Command(
-        "fit --scan --scan-views",
-        "fit --scan {inputs}/scan.obj --scan-views views",
-        first=None,
-        once=True,
-    ),
     Command("check", "check {inputs}/capture --out check.png"),
     Command("demo", "demo --out demo --refine 0 --size 16", varies=("demo/report.json",)),
     Command("reconstruct", "reconstruct {inputs}/capture --out me.npz --no-check"),

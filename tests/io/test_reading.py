@@ -3,7 +3,6 @@
 import ast
 import dataclasses
 import errno
-import json
 import re
 import struct
 import threading
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 from humangs_jax.avatar.avatar import Avatar
@@ -25,7 +23,7 @@ from humangs_jax.data.motion import load_motion
 from humangs_jax.io import reading as module
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.images import read_image
-from humangs_jax.io.mesh import GREY, read_meshes
+from humangs_jax.io.mesh import read_obj
 from humangs_jax.io.reading import (
     FileError,
     Limits,
@@ -294,13 +292,11 @@ def test_textures_outside_of_the_folder_of_a_mesh_are_left_out(tmp_path, caplog)
         Image.new("RGB", (4, 4), "red").save(place / "red.png")
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     (folder / "scan.obj").write_text(f"mtllib scan.mtl\nusemtl skin\n{corners}")
-    for texture, color in {
-        "red.png": [255, 0, 0, 255],
-        "../red.png": [GREY, GREY, GREY, 255],
-    }.items():
+    for texture, found in {"red.png": True, "../red.png": False}.items():
         (folder / "scan.mtl").write_text(f"newmtl skin\nmap_Kd {texture}\n")
-        (mesh,) = read_meshes(folder / "scan.obj", colors=True)
-        assert (mesh.visual.vertex_colors == color).all()
+        (mesh,) = read_obj(folder / "scan.obj")
+        image = mesh.visual.material.image
+        assert found == (image is not None and image.size == (4, 4))
     assert "'../red.png' lies outside of" in caplog.text
 
 
@@ -324,44 +320,8 @@ def test_materials_and_textures_are_found_by_names_with_spaces_quotes_and_option
     (tmp_path / "scan.obj").write_text(f"mtllib {material}\nusemtl skin\n{corners}")
     for name in ("my scan.mtl", "plain.mtl"):
         (tmp_path / name).write_text(f"newmtl skin\nmap_Kd {texture}\n")
-    (mesh,) = read_meshes(tmp_path / "scan.obj", colors=True)
-    assert (mesh.visual.vertex_colors == [255, 0, 0, 255]).all()
-
-
-def glb_that_requires(path, *extensions):
-    """A box as GLB whose header requires glTF extensions."""
-    data = trimesh.creation.box().export(file_type="glb")
-    size = struct.unpack("<I", data[12:16])[0]
-    content = json.loads(data[20 : 20 + size]) | {"extensionsRequired": list(extensions)}
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    body = struct.pack("<I4s", len(text), b"JSON") + text + data[20 + size :]
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
-    return path
-
-
-@pytest.mark.parametrize(
-    "extension, words",
-    [
-        (
-            "KHR_draco_mesh_compression",
-            "compressed by 'KHR_draco_mesh_compression': expected a GLB without compression",
-        ),
-        ("EXT_meshopt_compression", "compressed by 'EXT_meshopt_compression'"),
-        ("ACME_voxels", "requires the extension 'ACME_voxels': expected a plain glTF"),
-    ],
-)
-def test_a_glb_that_requires_an_unknown_extension_is_refused_by_its_name(
-    tmp_path, extension, words
-):
-    path = glb_that_requires(tmp_path / "box.glb", "KHR_materials_unlit", extension)
-    with pytest.raises(FileError, match=words):
-        read_meshes(path)
-
-
-def test_a_glb_whose_extensions_leave_the_shape_alone_is_read(tmp_path):
-    (mesh,) = read_meshes(glb_that_requires(tmp_path / "box.glb", "KHR_materials_unlit"))
-    assert len(mesh.faces) == 12
+    (mesh,) = read_obj(tmp_path / "scan.obj")
+    assert mesh.visual.material.image.size == (4, 4)
 
 
 def test_a_file_without_permission_says_that_and_not_what_is_in_it(tmp_path, monkeypatch):

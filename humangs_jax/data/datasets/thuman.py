@@ -36,7 +36,7 @@ from humangs_jax.data.datasets.subject import (
     open_arrays,
 )
 from humangs_jax.io.arrays import check_array, check_indices
-from humangs_jax.io.mesh import read_meshes
+from humangs_jax.io.mesh import read_obj
 from humangs_jax.io.reading import Refused, read_text, reading
 
 Kind = Literal["A", "B", "C"]
@@ -227,7 +227,7 @@ def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
 def read_scan(file: str | Path) -> Scan:
     """The mesh of a scan with its texture. Raises: CaptureError naming the file."""
     with reading(file, "scan", CaptureError):
-        meshes = read_meshes(file, textures=True)
+        meshes = read_obj(file)
         if len(meshes) != 1:
             raise Refused(f"{len(meshes)} meshes: expected one mesh with one texture")
         mesh = meshes[0]
