@@ -13,8 +13,8 @@ import numpy as np
 
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import Up
-from humangs_jax.avatar.export.gaussians import up_matrix
+from humangs_jax.avatar.export import ExportFormat
+from humangs_jax.avatar.export.gaussians import world_matrix
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float
@@ -448,10 +448,13 @@ PAIRS = 4_000_000
 """(splat, tile) pairs that are drawn at once: some hundred megabytes."""
 
 
-def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict[str, Camera]:
-    """Cameras around the middle of the Gaussians, by name. up: of their world.
+def circle_cameras(
+    gaussians: Gaussians, form: ExportFormat, views: int, shot: Shot
+) -> dict[str, Camera]:
+    """Cameras around the middle of the Gaussians, by name.
 
-    Without a distance all of them fit.
+    form: of the file that the Gaussians are from. Without an azimuth the first camera sees the
+    front of a person that `export` wrote. Without a distance all of them fit.
     """
     means = np.asarray(gaussians.means)[
         np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
@@ -464,7 +467,7 @@ def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict
         if whole < COMPACT * radius:
             middle, radius = (low + high) / 2, max(radius, whole)
     distance = ROOM * max(float(radius), 1e-3) / np.sin(np.arctan(min(shot.tangents)))
-    turn = up_matrix(up)  # the file's world from one with y up
+    turn = world_matrix(form)
     cameras = orbit(
         jnp.asarray(middle @ turn, jnp.float32),
         distance if shot.distance is None else shot.distance,

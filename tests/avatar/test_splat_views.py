@@ -6,10 +6,13 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import small_avatar
 
 import humangs_jax as hg
 from humangs_jax import cli
 from humangs_jax.avatar.camera_paths import file_cameras
+from humangs_jax.avatar.export import EXPORTS
+from humangs_jax.avatar.export.gaussians import export, world_matrix
 from humangs_jax.avatar.frames import circle_cameras
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.geometry.camera import project
@@ -61,7 +64,7 @@ def test_a_circle_shows_the_whole_scene_upright(tmp_path, monkeypatch, capsys):
         "view_002.png",
     ]
     loaded = hg.load_gaussians(tmp_path / "a.ply")
-    cameras = circle_cameras(loaded, "-y", 3, Shot(size=64))
+    cameras = circle_cameras(loaded, EXPORTS["ply"], 3, Shot(size=64))
     for name, camera in cameras.items():
         drawn = hg.render(loaded, camera, background="black")
         np.testing.assert_allclose(
@@ -96,18 +99,57 @@ def person_like(far=0):
     return hg.Gaussians(*(jnp.asarray(x, jnp.float32) for x in arrays))
 
 
+AXES = {"ply": "RDF", "splat": "RDF", "spz": "RUB", "glb": "LUF"}
+"""What x, y and z are in these files, by Niantic's converters: right or left, up or down, front or
+back (https://github.com/nianticlabs/spz#coordinate-system)."""
+
+
+def looking(camera):
+    """The direction in which a camera looks."""
+    return np.asarray(camera.cam_from_world)[2, :3]
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_the_first_view_of_every_format_shows_a_person_upright_and_from_the_front(name, tmp_path):
+    """As converters and viewers of these formats take their axes."""
+    person = small_avatar()
+    export(tmp_path / f"me.{name}", person)
+    loaded = hg.load_gaussians(tmp_path / f"me.{name}")
+    # our world has y up and a person who faces +z, so that x is to the left of the person
+    signs = {"R": -1, "L": 1, "U": 1, "D": -1, "F": 1, "B": -1}
+    np.testing.assert_array_equal(
+        world_matrix(EXPORTS[name]), np.diag([signs[letter] for letter in AXES[name]])
+    )
+    (camera,) = circle_cameras(loaded, EXPORTS[name], 1, Shot(size=64, elevation=0.0)).values()
+    up, front = (world_matrix(EXPORTS[name])[:, axis] for axis in (1, 2))
+    np.testing.assert_allclose(looking(camera), -front, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(camera.cam_from_world)[1, :3], -up, atol=1e-5)
+
+
+@pytest.mark.parametrize("up", ["-y", "y", "z"])
+def test_another_axis_may_be_up_in_every_format(up, tmp_path):
+    """Feet on 0, and the head where up is."""
+    axis = {"-y": [0, -1, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[up]
+    for name in AXES:
+        export(tmp_path / f"me.{name}", small_avatar(), up=up)
+        heights = np.asarray(hg.load_gaussians(tmp_path / f"me.{name}").means) @ axis
+        assert heights.max() > 0.1 and heights.min() == pytest.approx(0, abs=1e-3)
+
+
 @pytest.mark.parametrize("size", [(64, 64), (40, 64), (64, 40)])
 def test_a_person_of_a_file_is_shown_with_a_margin(size):
     gaussians = person_like()
-    for camera in circle_cameras(gaussians, "y", 4, Shot(width=size[0], height=size[1])).values():
+    for camera in circle_cameras(
+        gaussians, EXPORTS["glb"], 4, Shot(width=size[0], height=size[1])
+    ).values():
         uv, depth = project(camera, gaussians.means)
         assert (depth > 0).all()
         assert (uv > 0.02 * np.asarray(size)).all() and (uv < 0.98 * np.asarray(size)).all()
 
 
 def test_what_is_far_away_of_a_scene_does_not_make_it_small():
-    near = circle_cameras(person_like(), "y", 1, Shot(size=64))["view_000"]
-    far = circle_cameras(person_like(40), "y", 1, Shot(size=64))["view_000"]
+    near = circle_cameras(person_like(), EXPORTS["glb"], 1, Shot(size=64))["view_000"]
+    far = circle_cameras(person_like(40), EXPORTS["glb"], 1, Shot(size=64))["view_000"]
     assert np.linalg.norm(far.center) < 1.5 * np.linalg.norm(near.center)
 
 

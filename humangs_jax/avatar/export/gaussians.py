@@ -77,6 +77,12 @@ def up_matrix(up: Up) -> Float[np.ndarray, "3 3"]:
     return _matrix(up_turn(up))
 
 
+def world_matrix(form: ExportFormat) -> Float[np.ndarray, "3 3"]:
+    """The rotation to the world of a format from ours, which has y up and people who face +z."""
+    matrix = up_matrix(form.up)
+    return matrix @ _matrix(BACKWARDS) if form.backwards else matrix
+
+
 def turned(gaussians: Gaussians, up: Up) -> Gaussians:
     """Gaussians of a world with y up in one where `up` is. Raises: ValueError for another axis.
 
@@ -253,8 +259,8 @@ def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
     """From a world with y up to the one that viewers of a format expect, or back: half turns are
     their own inverse.
     """
-    turned = rotated(gaussians, up_turn(form.up))
-    return rotated(turned, BACKWARDS) if form.backwards else turned
+    gaussians = rotated(gaussians, BACKWARDS) if form.backwards else gaussians
+    return turned(gaussians, form.up)
 
 
 def _suffixes() -> str:
@@ -424,10 +430,11 @@ def export(
         return files
     for i, file in enumerate(files):
         gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(i))
-        gaussians = turned(
-            grounded_gaussians(gaussians) if numbers is None else gaussians, up or form.up
-        )
-        gaussians = rotated(gaussians, BACKWARDS) if form.backwards else gaussians
+        if numbers is None:
+            gaussians = grounded_gaussians(gaussians)
+        if form.backwards:  # before up is elsewhere: the half turn is about the vertical axis
+            gaussians = rotated(gaussians, BACKWARDS)
+        gaussians = turned(gaussians, up or form.up)
         form(
             file, gaussians, **({"rest_fields": True} if rest_fields else {}), **_versioned(version)
         )
