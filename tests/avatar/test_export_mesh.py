@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import mesh as mesh_export
+from humangs_jax.avatar.export.gaussians import up_matrix
 from humangs_jax.avatar.export.mesh import (
     BodyMesh,
     body_mesh,
@@ -209,6 +210,20 @@ def test_the_skin_moves_the_mesh_as_we_do(tmp_path, up):
     np.testing.assert_allclose(
         still, shape.vertices - [0, shape.vertices[:, 1].min(), 0], atol=2e-5
     )
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "z"])
+def test_readers_that_know_no_skins_see_the_same_person_with_the_feet_on_0(tmp_path, up):
+    write_mesh_glb(tmp_path / "a.glb", avatar(), mesh(), up=up)
+    content, binary = parse_glb((tmp_path / "a.glb").read_bytes())
+    attributes = content["meshes"][0]["primitives"][0]["attributes"]
+    points = read_accessor(content, binary, attributes["POSITION"])
+    np.testing.assert_allclose(skinned(tmp_path / "a.glb", 0), points, atol=2e-5)
+    heights = points @ {"y": [0, 1, 0], "-y": [0, -1, 0], "z": [0, 0, 1]}[up]
+    assert heights.min() == pytest.approx(0, abs=1e-6)
+    normals = read_accessor(content, binary, attributes["NORMAL"])
+    turned = mesh().normals @ np.asarray(up_matrix(up)).T
+    np.testing.assert_allclose(normals, turned, atol=1e-6)
 
 
 def test_a_motion_that_was_exported_is_read_again(tmp_path):

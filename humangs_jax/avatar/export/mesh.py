@@ -203,8 +203,8 @@ def write_mesh_glb(
             _armature(avatar, up),
             {"name": "body", "mesh": 0, "skin": 0},
         ],
-        "meshes": [{"name": "body", "primitives": [_primitive(writer, mesh)]}],
-        "skins": [_skin(writer, avatar)],
+        "meshes": [{"name": "body", "primitives": [_primitive(writer, _standing(mesh, up))]}],
+        "skins": [_skin(writer, avatar, mesh, up)],
         "materials": [
             {
                 "name": "skin",
@@ -244,14 +244,24 @@ def strongest(
     return np.where(kept > 0, joints, 0), kept
 
 
+def _standing(mesh: BodyMesh, up: Up) -> BodyMesh:
+    """The mesh as its skin shows it in T-pose: readers that know no skins show it so, too."""
+    turn = up_matrix(up)
+    vertices = (mesh.vertices - _floor(mesh)) @ turn.T
+    return dataclasses.replace(mesh, vertices=vertices, normals=mesh.normals @ turn.T)
+
+
+def _floor(mesh: BodyMesh) -> Float[np.ndarray, "3"]:
+    """What lies on 0 in T-pose: the height of the lowest vertex."""
+    return np.asarray([0, mesh.vertices[:, 1].min(), 0], np.float32)
+
+
 def _joint_nodes(avatar: Avatar, mesh: BodyMesh) -> list[dict[str, Any]]:
     """Every joint at its place relative to its parent's; the root so that T-pose stands on 0."""
     joints = np.asarray(avatar.rest_joints, np.float64)
     nodes = []
     for j, (name, parent) in enumerate(zip(avatar.joint_names, avatar.parents, strict=True)):
-        place = joints[j] - (
-            joints[parent] if parent >= 0 else [0, float(mesh.vertices[:, 1].min()), 0]
-        )
+        place = joints[j] - (joints[parent] if parent >= 0 else _floor(mesh))
         node = {"name": name, "translation": place.tolist()}
         children = [i for i, p in enumerate(avatar.parents) if p == j]
         nodes.append(node | ({"children": children} if children else {}))
@@ -279,9 +289,11 @@ def _primitive(writer: GlbWriter, mesh: BodyMesh) -> dict[str, Any]:
     return {"attributes": attributes, "indices": indices, "material": 0}
 
 
-def _skin(writer: GlbWriter, avatar: Avatar) -> dict[str, Any]:
+def _skin(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str, Any]:
+    """From the mesh as it stands, where `up` is, to each joint's own place in our world."""
     matrices = np.tile(np.eye(4), (len(avatar.parents), 1, 1))
-    matrices[:, 3, :3] = -np.asarray(avatar.rest_joints)  # column by column, as glTF has them
+    matrices[:, :3, :3] = up_matrix(up)  # column by column, as glTF has them: the turn back
+    matrices[:, 3, :3] = _floor(mesh) - np.asarray(avatar.rest_joints)
     inverse = writer.array("MAT4", matrices.reshape(-1, 16))
     return {
         "joints": list(range(len(avatar.parents))),
@@ -366,7 +378,7 @@ def write_poses(
     check_beside(path)
     mesh = body_mesh(avatar)
     material = write_material(path, mesh)
-    floor = np.asarray([0, mesh.vertices[:, 1].min(), 0], np.float32)
+    floor = _floor(mesh)
     for i, file in enumerate(files):
         still = dataclasses.replace(mesh, vertices=mesh.vertices - floor)
         write_obj(
