@@ -26,10 +26,10 @@ from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.data.calibration.calibration import distort
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import camera_gains, multiplied
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.photos import on_white_background, write_description
-from humangs_jax.data.views import camera_gains, multiplied
 from humangs_jax.detection.people import (
     LANDMARK_SIZE,
     DetectedPerson,

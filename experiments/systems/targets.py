@@ -20,9 +20,9 @@ from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_b
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import (
     SubjectViews,
-    equal_exposure,
     gaussian_body,
     prepare_inputs,
     standardize,

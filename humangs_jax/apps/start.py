@@ -27,6 +27,7 @@ from humangs_jax.data.calibration.videos import (
 )
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.folders import (
     ELSEWHERE,
     VIDEO_SUFFIXES,
@@ -37,7 +38,7 @@ from humangs_jax.data.folders import (
     unused_line,
 )
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
-from humangs_jax.data.views import cropped, equal_exposure
+from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.geometry import quaternion

@@ -73,7 +73,7 @@ def draw(
     exposures: Float[np.ndarray, "v 3"] | None = None,
 ) -> Iterator[Rendering]:
     """One rendering per pose and camera. how: None for what the avatar's weights were trained with.
-    exposures: of the cameras, see `data.views`.
+    exposures: of the cameras, see `data.exposure`.
     """
     how = SPLAT_PRESETS[avatar.rendering] if how is None else how
     gaussians = (posed(avatar, pose) for pose in poses)

@@ -108,7 +108,7 @@ def write_views(
     """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and
     views.exr if asked.
 
-    exposures: of the cameras, see `data.views`. names: of the images, instead of view_000 and so
+    exposures: of the cameras, see `data.exposure`. names: of the images, instead of view_000 and so
     on.
 
     The files appear together when all are drawn; other views of an earlier call are removed.

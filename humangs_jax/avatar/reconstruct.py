@@ -37,10 +37,10 @@ from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.skirt import find_hem, with_skirt
 from humangs_jax.data.views import (
     SubjectViews,
-    equal_exposure,
     fits,
     gaussian_body,
     on_gaussian_body,

@@ -193,7 +193,7 @@ class Render:
             from humangs_jax.avatar.layers import ExrLayers, write_views
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.data.views import exposures
+            from humangs_jax.data.exposure import exposures
 
             check_video(
                 self.out,

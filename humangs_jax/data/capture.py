@@ -89,6 +89,9 @@ class Capture:
     None: `reconstruct` finds one by the masks."""
     calibrated: bool = True
     """False: the cameras were found from the person, and are centimetres off."""
+    gains: Float[np.ndarray, "v 3"] | None = None
+    """By what `data.exposure.equal_exposure` has multiplied red, green and blue of each view; None:
+    the colors are as they were photographed."""
 
     __repr__ = short_repr
 
@@ -121,6 +124,7 @@ class Capture:
             cameras=jax.tree.map(lambda leaf: leaf[views], self.cameras),
             frames=self.frames[views],
             names=tuple(self.names[i] for i in views),
+            gains=None if self.gains is None else self.gains[views],
         )
 
     def resized(self, longest: int) -> "Capture":

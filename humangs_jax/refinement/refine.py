@@ -18,7 +18,7 @@ from humangs_jax.core.array_types import Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.body_and_masks import unusable_views
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import equal_exposure
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.head import Crops, head_crops, sharpened, shows_heads
 from humangs_jax.refinement.objective import avatar_of

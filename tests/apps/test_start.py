@@ -22,9 +22,11 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.resolution import decimate
 from humangs_jax.cli.start import Start
+from humangs_jax.data import exposure
 from humangs_jax.data.calibration.importing import import_calibration
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.exposure import equal_exposure, multiplied
 from humangs_jax.data.keypoints.formats import SeenPerson
 from humangs_jax.data.keypoints.keypoints import COCO_17, MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
@@ -710,6 +712,20 @@ def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, toy
     assert held_out_psnr({}, tiny(), toy, None).psnr < found.psnr - 3
     for few in (toy.select([0, 1, 2]), dataclasses.replace(toy, masks=None)):
         assert held_out_psnr({}, tiny(), few, None) is None
+
+
+def test_photos_are_made_equal_once_before_one_is_held_out(body, toy, monkeypatch):
+    """What remains is not made equal again, by other gains."""
+    gains, given = np.linspace(0.8, 1.2, 12).reshape(4, 3), []
+    monkeypatch.setattr(exposure, "camera_gains", lambda capture: gains)
+    reconstructed(monkeypatch, body, lambda others: given.append(others) or 0.0)
+    held_out_psnr({}, tiny(), toy, None)
+    others = given[0]
+    assert equal_exposure(others) is others
+    own = [toy.names.index(name) for name in others.names]
+    np.testing.assert_array_equal(others.gains, gains[own])
+    once = multiplied(toy.images, toy.masks, gains)[own]
+    np.testing.assert_array_equal(others.images, once)
 
 
 def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):

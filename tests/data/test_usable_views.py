@@ -9,7 +9,7 @@ import logging
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -19,17 +19,15 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data import views as module
 from humangs_jax.data.body_and_masks import _sampling, unusable_views, usable_views
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.views import (
+from humangs_jax.data.exposure import (
     EXPECTED,
     camera_gains,
     equal_exposure,
     exposures,
     gains_of,
-    greedy_cover,
     multiplied,
-    select_views,
-    standardize,
 )
+from humangs_jax.data.views import greedy_cover, select_views, standardize
 from humangs_jax.refinement.photos import crop_to_person
 
 
@@ -301,26 +299,50 @@ def test_outliers_do_not_count():
 
 
 def test_a_synthetic_capture_stays_as_it_is(demo):
-    assert equal_exposure(demo) is demo
+    equal = equal_exposure(demo)
+    assert equal.images is demo.images
+    np.testing.assert_array_equal(equal.gains, 1)
 
 
-def test_a_capture_in_different_exposures_is_made_equal_once(demo):
+def exposed(capture, logs):
+    """The capture as if each camera had metered for itself."""
+    return dataclasses.replace(
+        capture, images=multiplied(capture.images, capture.masks, np.exp(-logs))
+    )
+
+
+def test_a_capture_in_different_exposures_is_made_equal(demo):
     logs = centred(
         np.asarray([[0.15, 0.1, 0.1], [-0.15, -0.1, -0.2], [0.1, 0.2, 0.15], [-0.1, -0.2, -0.15]])
     )
-    changed = dataclasses.replace(demo, images=multiplied(demo.images, demo.masks, np.exp(-logs)))
+    changed = exposed(demo, logs)
     gains = camera_gains(changed)
     left, before = (np.sqrt(np.mean(np.square(x))) for x in (np.log(gains) - logs, logs))
     assert left < 0.6 * before
     np.testing.assert_allclose(exposures(changed) * gains, 1, rtol=1e-12)
     equal = equal_exposure(changed)
-    assert equal_exposure(equal) is equal
     outside = demo.masks == 0
     np.testing.assert_array_equal(equal.images[outside], 1)
     # what a camera would have shown: the gains undone
     back = multiplied(equal.images, equal.masks, 1 / gains)
     unclipped = (equal.images < 1).all(-1) & (demo.masks > 0)
     np.testing.assert_allclose(back[unclipped], changed.images[unclipped], atol=1e-5)
+
+
+@given(
+    logs=arrays(float, (4, 3), elements=st.floats(-0.7, 0.7)),
+    views=st.lists(st.integers(0, 3), min_size=1, max_size=4, unique=True),
+)
+@settings(max_examples=4)
+def test_gains_are_found_once_for_a_capture_whatever_its_exposures(demo, logs, views):
+    """Equal photos, some of them, and smaller ones are never given gains again."""
+    equal = equal_exposure(exposed(demo, logs))
+    assert equal_exposure(equal) is equal
+    some = equal.select(views)
+    assert equal_exposure(some) is some
+    assert equal_exposure(some.resized(64)).gains is some.gains
+    np.testing.assert_array_equal(camera_gains(some), 1)
+    np.testing.assert_array_equal(exposures(some), 1 / equal.gains[views])
 
 
 def test_without_masks_nothing_is_changed(demo):
