@@ -1,15 +1,11 @@
 """Whether a calibration is right: a camera that is turned sees all landmarks beside where the other
-cameras see them, and one that is late sees where they were.
+cameras see them.
 
 The rotations that would mend it come from linearised bundle adjustment, in which every landmark of
 every moment is a free point (Triggs et al. 2000, "Bundle Adjustment"). Landmarks of a detector err,
 too, but each its own way: a camera is only named where its rotation exceeds several times the
 standard error that the scatter over landmarks gives (a sandwich estimate, clustered by landmark).
 As few cameras are turned as explain the residuals, because turning all of them explains no more.
-
-A camera is late by as many frames as bring its landmarks to those of the others, with all cameras
-free to turn: a turn explains what a shift of a person who moves evenly does, but not limbs that
-swing. Turns are looked for after that.
 """
 
 import dataclasses
@@ -48,15 +44,6 @@ ITERATIONS, FRAMES, CAMERAS = 8, 24, 64
 """
 ROBUST_SCALE = 3.0
 """Of residuals, standard deviations."""
-MOST_LATE, TIMED = 3, 12
-"""Frames that a camera may be late or early; frames and cameras with more and fewer than which
-nothing is said of time.
-"""
-EITHER_WAY = tuple(range(-MOST_LATE, MOST_LATE + 1))
-LATE_SHARE, LATE_CLEAR = 0.15, 4.0
-"""Share of the cost, and standard errors over landmarks, by which a shift in time has to explain
-more than none.
-"""
 PARTS = (
     "nose",
     "eye",
@@ -74,24 +61,16 @@ PARTS = (
 """Landmarks that err independently: those of a face or a hand err together."""
 
 
-Bundle = tuple[
-    Float[np.ndarray, "n 3"], Float[np.ndarray, "m k 3"], Float[np.ndarray, "m c k"], float
-]
-"""Rotations of the cameras, points, weights of what is no outlier, noise in pixels."""
-
-
 @dataclasses.dataclass(frozen=True)
 class CameraError:
-    """A camera that is turned or late. views: indices of its views. names: of its first view, and
-    of other cameras that would explain as much. rotation: (3,) axis-angle in the camera's axes that
-    mends it, radians. late: frames by which its photos show what the others have shown; below 0 it
-    is early.
-    """
+    """A camera that is turned."""
 
     views: tuple[int, ...]
+    """Indices of its views."""
     names: tuple[str, ...]
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    late: int = 0
+    """Names of its first view, and of those of other cameras that would explain as much."""
+    rotation: tuple[float, float, float]
+    """Axis-angle in the camera's axes, radians, that turns it back."""
 
     @property
     def degrees(self) -> float:
@@ -100,32 +79,19 @@ class CameraError:
 
     def __str__(self) -> str:
         """One line."""
-        if self.late:
-            frames = "1 frame" if abs(self.late) == 1 else f"{abs(self.late)} frames"
-            return (
-                f"camera {' or '.join(self.names)} is {frames}"
-                f" {'late' if self.late > 0 else 'early'}"
-            )
         return f"camera {' or '.join(self.names)} is off by {self.degrees:.1f} degrees"
 
 
 def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
-    """The cameras that keypoints show to be late, and those that they show to be turned, those that
-    explain most first; none with fewer than three of them.
+    """The cameras that keypoints show to be turned, those that explain most first; none with fewer
+    than three cameras.
     """
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     if not 3 <= camera_of.max() + 1 <= CAMERAS:
         return ()
-    late, keypoints = _late_cameras(photos, keypoints, camera_of)
-    return (*late, *_turned_cameras(photos, keypoints, camera_of))
-
-
-def _turned_cameras(
-    photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"]
-) -> list[CameraError]:
     seen = _Seen.of(photos, keypoints, camera_of)
     if seen is None:
-        return []
+        return ()
     gradients, matrices = seen.equations()
     solved = lambda cameras: _solved(gradients, matrices, cameras)
     chosen: list[int] = []
@@ -137,11 +103,11 @@ def _turned_cameras(
             break
         chosen, gain = [*chosen, best], found[best].gain
     if not chosen:
-        return []
+        return ()
     rotations = solved(chosen).rotations
     sizes = np.degrees(np.linalg.norm(rotations, axis=-1))
     if sizes.max() > MOST_DEGREES:
-        return []
+        return ()
     errors = []
     for camera, rotation, size in zip(chosen, rotations, sizes, strict=True):
         if size <= LEAST_DEGREES:
@@ -153,13 +119,11 @@ def _turned_cameras(
         views = [np.flatnonzero(camera_of == c).tolist() for c in (camera, *alike)]
         names = tuple(photos.names[own[0]] for own in views)
         errors.append(CameraError(tuple(views[0]), names, tuple(rotation.tolist())))
-    return errors
+    return tuple(errors)
 
 
 def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
-    """The same photos with cameras turned about their centres as the errors say; late ones stay
-    late.
-    """
+    """The same photos with cameras turned about their centres as the errors say."""
     rotations = np.zeros((len(photos.names), 3), np.float32)
     for error in errors:
         rotations[list(error.views)] = error.rotation
@@ -168,69 +132,6 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
     )
     matrices = jnp.matmul(turns, photos.cameras.cam_from_world, precision=transform.EXACT)
     return dataclasses.replace(photos, cameras=replace(photos.cameras, cam_from_world=matrices))
-
-
-# Time
-# --------------------------------------------------------------------------------------------------
-
-
-def _late_cameras(
-    photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"]
-) -> tuple[list[CameraError], Keypoints]:
-    """The cameras that are late, and the keypoints as if they were not; what then has no photo has
-    no certainty.
-    """
-    count, frames, found = int(camera_of.max()) + 1, photos.frame_count, {}
-    if count > TIMED or frames < TIMED:
-        return [], keypoints
-    view_at = np.full((count, frames + 2 * MOST_LATE), -1)
-    view_at[camera_of, np.asarray(photos.frames) + MOST_LATE] = np.arange(len(camera_of))
-    if (view_at >= 0).sum(1).min() < TIMED:
-        return [], keypoints
-
-    def shifted(late):
-        """The keypoints of late cameras, {camera: frames by which it is late}, when the others saw
-        the same.
-        """
-        by = np.zeros(count, int)
-        by[list(late)] = list(late.values())
-        views = view_at[camera_of, np.asarray(photos.frames) + MOST_LATE + by[camera_of]]
-        confidences = np.where(views[:, None] < 0, 0.0, keypoints.confidences[views])
-        return dataclasses.replace(
-            keypoints, points=keypoints.points[views], confidences=confidences, world=None
-        )
-
-    def look(late):
-        return _Seen.of(photos, shifted(late), camera_of, edge=MOST_LATE)
-
-    if (seen := look({})) is None:
-        return [], keypoints
-    state = seen.bundle()
-    while len(found) < (count - 1) // 2:
-        costs, guesses = seen.costs(state), []
-        for c in set(range(count)) - set(found):
-            others = seen.without(c, state)
-            nearest = sorted(EITHER_WAY, key=lambda by: look(found | {c: by}).misses(c, others))
-            guesses += [
-                (c, by) for by in nearest[:2] if nearest[0] and by
-            ]  # else it is where it should be
-        if not guesses:
-            break
-        tried = {guess: look(found | dict([guess])) for guess in guesses}
-        states = {guess: each.bundle() for guess, each in tried.items()}
-        gains = {guess: costs - each.costs(states[guess], state) for guess, each in tried.items()}
-        best = max(gains, key=lambda guess: gains[guess].sum())
-        gain, landmarks = gains[best], np.count_nonzero(costs)
-        scatter = float(np.std(gain[costs > 0], ddof=1)) * landmarks**0.5
-        if gain.sum() < LATE_SHARE * costs.sum() or gain.sum() < LATE_CLEAR * scatter:
-            break
-        found[best[0]] = best[1]
-        seen, state = tried[best], states[best]
-    views = {c: np.flatnonzero(camera_of == c).tolist() for c in found}
-    errors = [
-        CameraError(tuple(own), (photos.names[own[0]],), late=found[c]) for c, own in views.items()
-    ]
-    return errors, shifted(found)
 
 
 # Equations
@@ -254,17 +155,14 @@ class _Seen:
         photos: Photos | Capture,
         keypoints: Keypoints,
         camera_of: Int[np.ndarray, " v"],
-        edge: int = 0,
     ) -> "_Seen | None":
-        """None if there is too little to say anything. edge: moments at either end that are left
-        out.
-        """
+        """None if there is too little to say anything."""
         kinds = [
             name.removeprefix("left_").removeprefix("right_") in PARTS
             for name in keypoints.set.names
         ]
         observations, views = group_by_frame(photos, keypoints)
-        some = np.unique(np.linspace(edge, len(views) - 1 - edge, FRAMES).round().astype(int))
+        some = np.unique(np.linspace(0, len(views) - 1, FRAMES).round().astype(int))
         as_double = lambda name: np.asarray(getattr(observations, name), np.float64)[some]
         weights = as_double("confidences")[..., kinds]
         weights = weights * ((weights > 0).sum(1, keepdims=True) >= 2)
@@ -283,23 +181,10 @@ class _Seen:
     def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
         """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and
         Hessians (k, 3 n, 3 n), in standard deviations, landmark by landmark; the points are
-        eliminated. Outliers are found with all cameras free.
+        eliminated.
         """
-        turned, points, weights, _ = self.bundle()
-        for _ in range(ITERATIONS):
-            gradients, matrices, _, points = self._linear(np.zeros_like(turned), points, weights)
-        return gradients, matrices
-
-    def bundle(self) -> Bundle:
-        """Rotations (n, 3) and points (m, k, 3) that fit best, weights (m, c, k) of what is no
-        outlier, noise in pixels.
-        """
-        turned, points, weights, noise = (
-            np.zeros((self.count, 3)),
-            self._middle(),
-            self.weights,
-            1.0,
-        )
+        turned, points, weights = np.zeros((self.count, 3)), self._middle(), self.weights
+        # Outliers are found with all cameras free to turn: else a turned camera's landmarks are.
         for _ in range(ITERATIONS):
             gradients, matrices, errors, points = self._linear(turned, points, weights)
             turned = turned - _solve(gradients.sum(0), matrices.sum(0)).reshape(-1, 3)
@@ -307,30 +192,10 @@ class _Seen:
             noise = max(float(np.median(lengths[weights > 0])) / RAYLEIGH_MEDIAN, LEAST_NOISE)
             scale = (ROBUST_SCALE * noise) ** 2
             weights = self.weights * np.square(scale / (scale + lengths**2)) / noise**2
-        return turned, points, weights, noise
-
-    def costs(self, state: Bundle, units: Bundle | None = None) -> Float[np.ndarray, " k"]:
-        """(k,) means of the robust costs of the landmarks of a bundle, in units of its noise, or of
-        another one's.
-        """
-        noise = (units or state)[3]
-        lengths = np.linalg.norm(self._project(*state[:2])[-1], axis=-1) / noise
-        total = self.weights.sum((0, 1))
-        costs = (self.weights * lengths**2 / (1 + (lengths / ROBUST_SCALE) ** 2)).sum((0, 1))
-        return costs / np.where(total > 0, total, np.inf)
-
-    def without(self, camera: int, state: Bundle) -> Bundle:
-        """The bundle with the points that all cameras but one see."""
-        turned, points, weights, noise = state
-        weights = np.where((self.camera == camera)[..., None], 0.0, weights)
-        for _ in range(3):
-            points = self._linear(turned, points, weights)[-1]
-        return turned, points, weights, noise
-
-    def misses(self, camera: int, state: Bundle) -> float:
-        """Median distance of a camera's landmarks from the points of a bundle, pixels."""
-        lengths = np.linalg.norm(self._project(*state[:2])[-1], axis=-1)
-        return float(np.median(lengths[(self.weights > 0) & (self.camera == camera)[..., None]]))
+        # With these weights, the equations at the cameras as they are given.
+        for _ in range(ITERATIONS):
+            gradients, matrices, _, points = self._linear(np.zeros_like(turned), points, weights)
+        return gradients, matrices
 
     def _middle(self) -> Float[np.ndarray, "m k 3"]:
         """(m, k, 3) the point nearest to the axes of all cameras, to begin with."""

@@ -155,10 +155,6 @@ last stage of a fit.
 """
 
 
-REMEDIES = "`humangs fit` turns it back", "give its photos to other frames"
-"""Of cameras that are turned, and late."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Examination:
     """The report on a body and keypoints, and the arrays behind it, of v views and k keypoints.
@@ -242,7 +238,7 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         notes=_worst_frame(frames),
         warnings=(
             *(
-                f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}"
+                f"{error}, as the keypoints show: `humangs fit` turns it back"
                 for error in find_camera_errors(capture, keypoints)
             ),
             *keypoint_warnings(rows, expected, violations, swaps),
@@ -339,11 +335,7 @@ def fit_photos(
     fixed_cameras = (
         fixed_cameras or not photos.calibrated
     )  # found from such keypoints, which tell nothing new about them
-    errors = (
-        ()
-        if fixed_cameras
-        else tuple(e for e in find_camera_errors(photos, keypoints) if not e.late)
-    )
+    errors = () if fixed_cameras else find_camera_errors(photos, keypoints)
     photos = mended(photos, errors) if errors else photos
     kind = keypoints.set
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)

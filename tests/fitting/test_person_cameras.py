@@ -352,51 +352,6 @@ def test_all_moments_of_a_camera_that_stands_still_count_and_two_cameras_may_be_
     assert off(mended(wrong, errors), truth).max() < TURN
 
 
-def late(keypoints, cameras, frames):
-    """The keypoints of a moving person, of whom some cameras show what the others have shown so
-    many frames before.
-    """
-    views = np.arange(len(keypoints.points)).reshape(-1, VIEWS)
-    for camera, by in zip(cameras, frames, strict=True):
-        views[:, camera] = views[np.clip(np.arange(len(views)) - by, 0, len(views) - 1), camera]
-    points, confidences = keypoints.points[views.ravel()], keypoints.confidences[views.ravel()]
-    return dataclasses.replace(keypoints, points=points, confidences=confidences)
-
-
-@pytest.mark.parametrize(("seed", "by"), [(0, 0), (0, 3), (1, -2)])
-def test_a_camera_that_is_late_is_named_and_no_camera_that_is_right(seed, by):
-    truth, keypoints = person(seed, 24, VIEWS, still=True, moving=True, outliers=0.05)
-    found = find_camera_errors(truth, late(keypoints, [1], [by]))
-    assert [(error.names, error.late, error.degrees) for error in found] == (
-        [(("m0v1",), by, 0.0)] if by else []
-    )
-    when = {3: "3 frames late", -2: "2 frames early"}
-    assert by == 0 or str(found[0]) == f"camera m0v1 is {when[by]}"
-
-
-def test_a_turned_camera_is_not_taken_for_a_late_one_and_both_are_found():
-    truth, keypoints = person(2, 24, VIEWS, still=True, moving=True)
-    wrong = turned(truth, range(2, 24 * VIEWS, VIEWS), (1.0, 0.0, 0.3))
-    (error,) = find_camera_errors(wrong, keypoints)
-    assert error.late == 0 and error.names == ("m0v2",)
-    both = find_camera_errors(wrong, late(keypoints, [0], [2]))
-    assert [(error.names, error.late) for error in both] == [(("m0v0",), 2), (("m0v2",), 0)]
-
-
-def test_of_a_person_who_stands_nobody_is_late():
-    truth, keypoints = person(3, 1, VIEWS)
-    keypoints = dataclasses.replace(
-        keypoints,
-        points=np.tile(keypoints.points, (24, 1, 1)),
-        confidences=np.tile(keypoints.confidences, (24, 1)),
-    )
-    repeated = truth.select(np.tile(np.arange(VIEWS), 24))
-    repeated = dataclasses.replace(
-        repeated, frames=np.repeat(np.arange(24), VIEWS).astype(np.int32)
-    )
-    assert find_camera_errors(repeated, keypoints) == ()
-
-
 @pytest.mark.parametrize("views", [1, 2])
 def test_nothing_is_said_of_one_or_two_cameras(views):
     truth, keypoints = person(0, 1, views)
