@@ -184,7 +184,6 @@ BAD_USAGE = {
         "--lpips-alex: expected a backbone"
     ),
     "view me.npz --port 99999": "--port 99999",
-    "view me.npz --capture demo_capture": "--capture: only with --live",
     "export me.npz --out x.ply --frame 1": "--frame 1: expected --motion and --out",
     "export me.npz --html x.html --motion jump.npz --frames :": (
         "--frames :: expected --motion and --out"

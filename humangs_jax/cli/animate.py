@@ -307,20 +307,15 @@ class Render:
 class View:
     """Show an avatar moving in the browser.
 
-    Or, with --live, what a running training or refinement makes. Serves the HTML viewer on this
-    machine until Ctrl-C.
-    docs: viewer.
+    Serves the HTML viewer on this machine until Ctrl-C. docs: viewer.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
         "humangs view avatar.npz --motion dance.bvh",
-        "humangs view runs/train --live",
+        "humangs view avatar.npz --port 8000 --no-browser",
     )
     avatar: Positional[Path]
-    """File written by `humangs reconstruct`.
-
-    With --live: of `humangs refine --live`, or the folder of a training run.
-    """
+    """File written by `humangs reconstruct`."""
     motion: Path | None = None
     """The motion it plays. Default: the shipped walk."""
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
@@ -328,20 +323,8 @@ class View:
     """Port on 127.0.0.1; 0 for any free one."""
     browser: Annotated[bool, off("open a browser; the address is printed")] = True
     """Open a browser."""
-    live: bool = False
-    """Follow a training run or an avatar file that is being refined."""
-    capture: Path | None = None
-    """Whom a training run reconstructs with --live. Default: the shipped capture."""
 
     def run(self) -> None:
-        if self.capture is not None and not self.live:
-            raise UsageError("--capture: only with --live")
-        if self.live:
-            from humangs_jax.viewer.page import follow
-
-            motion = None if self.motion is None else self.part.load(self.motion)
-            follow(self.avatar, self.capture, motion, self.port, self.browser)
-            return
         with stage("making the page"):
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.viewer.page import page_html, serve

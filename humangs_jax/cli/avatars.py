@@ -276,7 +276,7 @@ class Refine:
 
     examples: ClassVar[tuple[str, ...]] = (
         "humangs refine avatar.npz me --limit 15s --out sharp.npz",
-        "humangs refine avatar.npz me --limit 60s --live",
+        "humangs refine avatar.npz me --limit 60s",
     )
     avatar: Positional[Path]
     """File written by `humangs reconstruct` from these photos."""
@@ -290,8 +290,6 @@ class Refine:
     """Learned-optimizer iterations before the steps."""
     image_size: Side | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
-    live: bool = False
-    """Write the avatar so far to --out now and then, for `humangs view --live`."""
     fit_masks: Annotated[
         bool, off("move masks that are too large or too small to the edges in the photos")
     ] = True
@@ -312,7 +310,7 @@ class Refine:
             avatar = Avatar.load(self.avatar)
         photos = _read_capture(self.capture, self.check, self.fit_masks)
         how = RefineConfig(iterations=self.iterations, image_size=self.image_size, **limits)
-        _refine_and_save(avatar, photos, self.out, how, self.live)
+        _refine_and_save(avatar, photos, self.out, how)
         suggest("humangs view", self.out)
 
 
@@ -387,11 +385,10 @@ def _refine_and_save(
     photos: "Capture",
     out: Path,
     how: "RefineConfig | None",
-    live: bool = False,
     unfinished: bool = True,
     made_from: str | None = None,
 ) -> None:
-    """Refine with a progress bar if asked, write the result (now and then, if live), say what it
+    """Refine with a progress bar if asked, write the result, say what it
     took.
 
     unfinished: whether an avatar is written whose refinement was interrupted. made_from: a checksum
@@ -404,8 +401,7 @@ def _refine_and_save(
     with stage("refining"):
         from humangs_jax.refinement.refine import refine_with_report
 
-        watch = (lambda so_far: so_far.save(out)) if live else None
-        refinement = refine_with_report(avatar, photos, how, progress=True, watch=watch)
+        refinement = refine_with_report(avatar, photos, how, progress=True)
     if refinement.interrupted and not unfinished:
         tell(f"{out}: not written, its refinement was interrupted: the same command makes it again")
         raise KeyboardInterrupt

@@ -14,20 +14,16 @@ import html
 import json
 import os
 import re
-import threading
-import time
 import webbrowser
 from collections.abc import Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar, light_values
 from humangs_jax.avatar.export.gaussians import unit_quats
-from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, RestBody
@@ -35,15 +31,13 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.configuration import ArgumentError, config_from_json
 from humangs_jax.core.progress import printable, say
-from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.motion import Motion, grounded, load_motion
 from humangs_jax.data.motion.rules import page_rules
-from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
 from humangs_jax.io.tensors import read_safetensors
 from humangs_jax.network.config import Conventions, HumanGSConfig
-from humangs_jax.network.weights import SHIPPED, load_weights
+from humangs_jax.network.weights import SHIPPED
 from humangs_jax.rendering.gaussians import added_variance, gaussian_values
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 
@@ -485,122 +479,3 @@ def _template() -> str:
         "scripts": page_script(*SCRIPTS),
     }
     return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), read_part("index.html"))
-
-
-# Live: an avatar while it is being made, by a training run (the newest weights reconstruct someone)
-# or a refinement (its file). The browser asks for the state of the view every second, and loads the
-# page again where it shows another avatar.
-
-
-RUN_WEIGHTS = "weights.safetensors"
-"""What a training run writes with every checkpoint."""
-LOOK_AGAIN = 1.0
-"""Seconds between two looks at the file that is followed."""
-
-
-class LiveView:
-    """The page of one avatar after the other on 127.0.0.1; a context manager.
-
-    Arguments: motion: played by the page; None: the shipped walk. port: 0 for any free one. Raises:
-    OSError if the port is taken.
-    """
-
-    def __init__(self, motion: Motion | None = None, port: int = 0):
-        self.motion, self.shown = motion, 0
-        self.pages = {"/": read_part("live.html")}
-        self.say("Waiting for the first avatar ...")
-        self.server = page_server(self.pages, port)
-        self.url = f"http://127.0.0.1:{self.server.server_address[1]}/"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
-
-    def __enter__(self) -> "LiveView":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.server.shutdown()
-        self.server.server_close()
-
-    def show(self, avatar: Avatar, status: str | None = None) -> None:
-        """Show an avatar in place of the last one, and a line above it.
-
-        May be called from any thread.
-        """
-        self.pages["/avatar"] = page_html(avatar, self.motion)
-        self.shown += 1
-        self.say(
-            f"{len(avatar.gaussians.means):,} Gaussians, {time.strftime('%H:%M:%S')}"
-            if status is None
-            else status
-        )
-
-    def say(self, status: str) -> None:
-        """Show a line above the avatar."""
-        self.pages["/state"] = json.dumps({"shown": self.shown, "status": status})
-
-
-def follow(
-    path: str | Path,
-    capture: str | Path | None = None,
-    motion: Motion | None = None,
-    port: int = 0,
-    open_browser: bool = True,
-) -> None:
-    """Show what a training run or a refinement makes, until Ctrl-C.
-
-    Arguments: path: the folder of a run of `humangs train`, or an avatar file, which need not exist
-    yet. capture: of the person that a run's network reconstructs; None for the shipped one.
-
-    Raises: ValueError or OSError, one line, for what cannot be followed.
-    """
-    path, photos = Path(path), None
-    if path.is_dir():
-        if not (path / "config.json").is_file():
-            raise ValueError(
-                f"{path}: no config.json: expected the folder of a training run, or an avatar file"
-            )
-        photos = load_capture(DEMO_CAPTURE if capture is None else capture)
-    elif path.suffix != ".npz" or not path.parent.is_dir():
-        raise FileNotFoundError(
-            f"{path}: no such run: expected the folder of a training run, or an avatar file (.npz)"
-        )
-    elif capture is not None:
-        raise ArgumentError(
-            "capture", f"{capture}: only for the folder of a training run; {path} is an avatar file"
-        )
-    with LiveView(motion, port) as view, contextlib.suppress(KeyboardInterrupt):
-        say(f"{view.url} shows {path} as it changes; Ctrl-C ends.")
-        if open_browser:
-            webbrowser.open(view.url)
-        shown = None
-        while True:
-            shown = show_newest(view, path, photos, shown)
-            time.sleep(LOOK_AGAIN)
-
-
-def show_newest(
-    view: LiveView, path: Path, photos: Capture | None, shown: tuple | None
-) -> tuple | None:
-    """Show the file at `path` unless it is shown already. Returns its time and size, which is
-    `shown` in the next call.
-
-    photos: of the person that the weights of the run in `path` reconstruct; None: `path` is an
-    avatar file. A file that cannot be read is reported in the page, once.
-    """
-    file = path if photos is None else path / RUN_WEIGHTS
-    try:
-        found = file.stat()
-    except FileNotFoundError:
-        view.say(f"Waiting for {file} ...")
-        return shown
-    stamp = found.st_mtime_ns, found.st_size
-    if stamp == shown:
-        return shown
-    try:
-        view.say(f"Reading {file.name} ...")
-        avatar = Avatar.load(file) if photos is None else reconstruct(*load_weights(file), photos)
-        view.show(
-            avatar, f"{file.name} of {time.strftime('%H:%M:%S', time.localtime(found.st_mtime))}"
-        )
-    except (ValueError, OSError) as error:
-        view.say(str(error))
-    return stamp

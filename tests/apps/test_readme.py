@@ -20,7 +20,6 @@ import humangs_jax as hg
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import shape_body
 from humangs_jax.data.capture import save_capture
-from humangs_jax.viewer.page import LiveView
 
 ROOT = Path(__file__).parents[2]
 LEAST_PSNR = 25.7
@@ -33,7 +32,6 @@ MODULES = {
     "jnp": jnp,
     "np": np,
     "dataclasses": dataclasses,
-    "LiveView": LiveView,
 }
 
 WHOLE = ("docs/how_it_works.md", "docs/splatting.md", "docs/ablations.md")

@@ -225,7 +225,7 @@ async function start() {
   controls.update();
   invalidate();
 
-  // ---- for tests and for live.html ----
+  // ---- for tests ----
   const nested = (flat, width) => Array.from({ length: flat.length / width }, (_, i) => flat.slice(width * i, width * i + width));
   function exactPose({ rotations, translation, frame }) {
     if (frame !== undefined) return motionPose(scene.motion, frame);
@@ -233,7 +233,6 @@ async function start() {
     return { quats: rotations.map((r) => quatFromAxisAngle(...r)), translation: translation || [0, 0, 0] };
   }
   return {
-    // What people have set: a page of the next avatar takes it over (live.html).
     state: () => ({ orbit: { ...orbit }, mode: app.mode, frame: app.frame, playing: app.playing }),
     restore(kept) {
       Object.assign(orbit, kept.orbit);
