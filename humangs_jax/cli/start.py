@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from humangs_jax.apps.start import HeldOut, Material
     from humangs_jax.data.calibration.importing import ImportReport
     from humangs_jax.data.capture import Capture
+    from humangs_jax.fitting.files import FitRecord
+    from humangs_jax.fitting.refine import RefinedCapture
 
 MARK = START_MARK
 """In a capture folder that `humangs start` imported: a later run may replace it until it has a
@@ -264,7 +266,7 @@ class Start:
 
     def _photos(self) -> Path:
         """The folder of photos; that of a video is beside --out."""
-        from humangs_jax.apps.start import photos_of_video, video_of
+        from humangs_jax.apps.video_photos import photos_of_video, video_of
 
         if (video := video_of(self.photos)) is None:
             return self.photos
@@ -352,17 +354,17 @@ class Start:
             report = fitted.report
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
         tell(f"\n{report}")
-        capture, estimate = fitted.capture, None
+        capture, record, estimate = fitted.capture, fitted.record, None
         if capture.masks is not None and (capture.masks > 0.5).any():
             with stage("refining the body by the masks"):
                 # calibrated ones move where the keypoints have shown that they are off
                 fixed = (
                     not fitted.camera_errors if capture.calibrated else cameras_are_unseen(capture)
                 )
-                loose, tight = (
+                bodies = [
                     refine_capture(
                         capture,
-                        keypoints=fitted.record.keypoints,
+                        keypoints=record.keypoints,
                         config=usual_config(
                             fitted=True,
                             fixed_cameras=fixed,
@@ -371,9 +373,11 @@ class Start:
                         ),
                     )
                     for tight in (False, True)
-                )
+                ]
+            bodies, record = self._with_own_poses(material.folder, bodies, record)
             with stage("comparing bodies by a held-out photo"):
                 weights, iterations = load_weights(), RefineConfig(**ITERATIONS_ALONE)
+                loose, tight = bodies
                 capture, estimate = better_body(*weights, loose.capture, tight.capture, iterations)
             report = (tight if capture is tight.capture else loose).report
             tell(f"\n{report}")
@@ -381,8 +385,34 @@ class Start:
             from humangs_jax.fitting.person_cameras import scaled_to_height
 
             capture = scaled_to_height(capture, self.height)
-        write_fitted(self.out, self.out, capture, report, fitted.record)
+        write_fitted(self.out, self.out, capture, report, record)
         return capture, estimate
+
+    def _with_own_poses(
+        self, photos: Path, bodies: "list[RefinedCapture]", record: "FitRecord"
+    ) -> "tuple[list[RefinedCapture], FitRecord]":
+        """Bodies with a pose for each photo, and the record of the fit to match, if photos that
+        share a pose show that the person moved between them; else what was given.
+        """
+        first = bodies[0].capture
+        if first.frame_count > 1 or first.view_count < 2:
+            return bodies, record
+        with stage("looking for movement between the photos"):
+            from humangs_jax.apps.video_photos import seconds_of_photos
+            from humangs_jax.fitting.own_poses import (
+                find_movement,
+                fit_own_poses,
+                movement_line,
+                record_of_photos,
+            )
+
+            seconds = seconds_of_photos(photos, first.names)
+            if not find_movement(first, record.keypoints, seconds).shown:
+                return bodies, record
+        with stage("fitting a pose for each photo"):
+            moved = [fit_own_poses(each.capture, record.keypoints, seconds) for each in bodies]
+        tell(movement_line(moved[0].capture))
+        return moved, record_of_photos(record, first.frames)
 
     def _check(self, capture: "Capture") -> None:
         with stage("checking"):
@@ -396,6 +426,7 @@ class Start:
         self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None
     ) -> None:
         with stage("reconstructing"):
+            from humangs_jax.apps.start import photos_to_read
             from humangs_jax.avatar.reconstruct import reconstruct
             from humangs_jax.data.body_and_masks import usable_views
             from humangs_jax.network.weights import load_weights
@@ -403,7 +434,7 @@ class Start:
 
             capture = usable_views(capture)
             weights = load_weights()
-            avatar = reconstruct(*weights, capture)
+            avatar = reconstruct(*weights, photos_to_read(capture))
         if limits is not None and capture.masks is not None:
             with stage("refining"):
                 from humangs_jax.refinement.config import RefineConfig

@@ -195,7 +195,7 @@ def write_fitted(
 
 
 def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, Any]:
-    """capture.json with the cameras of the capture where they have changed."""
+    """capture.json with the cameras and the frames of the capture where they have changed."""
     views = []
     for i, view in enumerate(description["views"]):
         new = {
@@ -206,7 +206,11 @@ def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, An
             name: np.array_equal(np.asarray(view[name], np.float32), value)
             for name, value in new.items()
         }
-        views.append(view | {name: value.tolist() for name, value in new.items() if not same[name]})
+        changed = {name: value.tolist() for name, value in new.items() if not same[name]}
+        frame = int(capture.frames[i])
+        if view.get("frame", 0) != frame:
+            changed["frame"] = frame
+        views.append(view | changed)
     return description | {"views": views}
 
 

@@ -88,6 +88,7 @@ class CaptureRefineConfig:
     robust_scales: multiples of the reach, outwards and inwards of the mask. keypoints_worse: a
     result whose keypoints' error is more than this multiple of the start's is not kept; a fit to
     them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
+    by_joint: (word, factor) of joints whose names hold the word: multiples of `std.body_pose`.
     """
 
     std: StateStd = dataclasses.field(default_factory=StateStd)
@@ -98,6 +99,7 @@ class CaptureRefineConfig:
     independent: float = 30.0
     robust_scales: tuple[float, float] = (1.0, 0.5)
     keypoints_worse: float = 1.3
+    by_joint: tuple[tuple[str, float], ...] = ()
 
 
 FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
@@ -164,12 +166,21 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
     return Origin(
         betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
         pose=capture.poses,
-        body_pose_std=jnp.full((len(joints), 3), np.radians(config.std.body_pose), jnp.float32),
+        body_pose_std=_body_pose_std([body.joint_names[j] for j in joints], config),
         cameras=camera_origin(cameras, capture.frames),
         segment=jnp.asarray(segments(body.parents, joints)),
         joints=joints,
         std=config.std,
     )
+
+
+def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[Array, "a 3"]:
+    """Standard deviations of the free joints' rotations, radians."""
+    factors = [
+        next((factor for word, factor in config.by_joint if word in name), 1.0) for name in names
+    ]
+    std = np.radians(config.std.body_pose) * np.asarray(factors)
+    return jnp.asarray(np.repeat(std[:, None], 3, axis=1), jnp.float32)
 
 
 def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
@@ -263,14 +274,33 @@ def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
     return jnp.where(clothing < 0, BARE * clothing, clothing)
 
 
+def _as_motion(values: Float[Array, "m ..."], memory: Float[Array, " n"]) -> Float[Array, "m ..."]:
+    """Numbers of m frames, independent and of unit variance where each of the frames has the
+    correlation `memory` (m - 1,) with the one before.
+    """
+    r = memory.reshape(-1, *[1] * (values.ndim - 1))
+    return jnp.concatenate([values[:1], (values[1:] - r * values[:-1]) / jnp.sqrt(1 - r * r)])
+
+
 @functools.partial(jax.jit, static_argnames="independent")
 def solve_round(
-    model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float
+    model: LandmarkModel,
+    origin: Origin,
+    evidence: Evidence,
+    state: FitState,
+    independent: float,
+    memory: Float[Array, " n"] | None = None,
 ) -> FitState:
-    """The state after some steps with fixed matches."""
+    """The state after some steps with fixed matches. memory: (m - 1,) correlations of m poses, see
+    `refine_capture`.
+    """
 
     def residuals(y):
         counted = replace(y, clothing=_counted(y.clothing))
+        if memory is not None:
+            names = ("global_orient", "transl", "body_pose")
+            motion = {name: _as_motion(getattr(y, name), memory) for name in names}
+            counted = replace(counted, **motion)
         return evidence_residuals(model, origin, y, evidence, independent), counted
 
     many = sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS
@@ -302,9 +332,14 @@ class Scene:
     """
 
     def __init__(
-        self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig
+        self,
+        capture: Capture,
+        keypoints: Keypoints | None,
+        config: CaptureRefineConfig,
+        memory: Float[np.ndarray, " n"] | None = None,
     ) -> None:
         self.capture, self.config = capture, config
+        self.memory = None if memory is None else jnp.asarray(memory, jnp.float32)
         small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
         looked_at = capture if small else capture.resized(LONGEST_SIDE)
         empty = np.zeros(looked_at.images.shape[:3], np.float32)
@@ -338,7 +373,9 @@ class Scene:
                 self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)),
             )
             before = state
-            state = solve_round(self.model, self.origin, evidence, state, config.independent)
+            state = solve_round(
+                self.model, self.origin, evidence, state, config.independent, self.memory
+            )
             moves = jax.tree.map(
                 lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before
             )
@@ -496,11 +533,13 @@ def refine_capture(
     *,
     keypoints: Keypoints | None = None,
     config: CaptureRefineConfig = DEFAULT_CONFIG,
+    memory: Float[np.ndarray, " n"] | None = None,
 ) -> RefinedCapture:
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 
     Arguments: keypoints: of the capture's views. config: after a fit to these keypoints, see
-    `usual_config`. Views whose mask is empty take no part.
+    `usual_config`. memory: (m - 1,) correlations in [0, 1) of each of the m poses with the one
+    before, as in a video; None: each stands for itself. Views whose mask is empty take no part.
     Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if
     the keypoints are of another number of views.
     """
@@ -515,7 +554,7 @@ def refine_capture(
             "masks",
             "none shows anybody, and there are no keypoints: refinement needs one or the other",
         )
-    scene = Scene(capture, keypoints, config)
+    scene = Scene(capture, keypoints, config, memory)
     state, move = scene.run()
     tried = moved_capture(capture, scene.origin, state)
     before, found = scene.score(capture), scene.score(tried)

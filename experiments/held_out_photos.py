@@ -1,0 +1,92 @@
+"""Photos of real people, each held out of an avatar in turn, for `real_people.py`.
+
+Whoever moves between photos has a pose of their own in each, which a photo that is held out has to
+give, too. So there are two
+numbers: "own pose", the avatar of the other photos in the pose that was found with the held-out
+photo, and "shared pose", in the mean of the poses of the others, which knows nothing of it.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.subjects import Scores, score_tasks
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.core.array_types import Float
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.views import camera_gains, multiplied
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.scores import mean_scores
+from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
+from humangs_jax.losses.perceptual import Lpips
+
+
+def held_out_scores(
+    capture: Capture,
+    make: Callable[[Capture], Avatar],
+    views: Sequence[int],
+    truth: Float[np.ndarray, "v h w 3"] | None = None,
+    masks: Float[np.ndarray, "v h w"] | None = None,
+) -> dict[str, Scores]:
+    """PSNRs (dB) and LPIPS of photos by the avatars of the others: means over the views, by pose,
+    "own" and "shared".
+
+    A rendering has the exposure of the photo's camera, which is found from all photos.
+
+    Arguments: capture: what the package makes of the photos. make: an avatar from a part of it.
+    views: that are held out in turn.
+    truth, masks: of the person alone on white; those of the capture if not given.
+    """
+    rows: dict[str, list[Scores]] = {"own": [], "shared": []}
+    gains = camera_gains(capture)
+    for view in views:
+        others = [other for other in range(capture.view_count) if other != view]
+        rest, shown = capture.select(others), capture.select([view])
+        avatar = make(rest)
+        # of the others alone the gains are the same but for one factor
+        factor = np.exp(np.mean(np.log(gains[others] / camera_gains(rest)), axis=0))
+        told = dataclasses.replace(
+            shown,
+            images=shown.images if truth is None else truth[[view]],
+            masks=shown.masks if masks is None else masks[[view]],
+        )
+        for pose, drawn in (("own", shown), ("shared", in_shared_pose(rest, shown))):
+            found = draw_views(avatar, drawn)
+            images = multiplied(found.images, np.asarray(found.alpha), (factor / gains[view])[None])
+            rows[pose].append(photo_scores(images, told))
+    return {
+        pose: mean_scores(scores) | {"each": [row["psnr_fg"] for row in scores]}
+        for pose, scores in rows.items()
+    }
+
+
+def in_shared_pose(rest: Capture, shown: Capture) -> Capture:
+    """A view in the mean of the poses of other views."""
+    frames = np.asarray(rest.frames)
+    rotations = rest.poses.rotations[frames].mean(axis=0)
+    translation = rest.poses.translation[frames].mean(axis=0)
+    count = shown.frame_count
+    poses = replace(
+        shown.poses,
+        rotations=jnp.broadcast_to(rotations, (count, *rotations.shape)),
+        translation=jnp.broadcast_to(translation, (count, 3)),
+    )
+    return dataclasses.replace(shown, poses=poses)
+
+
+def photo_scores(images: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
+    """psnr and psnr_fg (dB), and LPIPS, of drawn views against the photos of a capture, means
+    over them.
+    """
+    still = dataclasses.replace(truth, frames=np.zeros(truth.view_count, np.int32))
+    scores = score_tasks(images, still, _alex())["novel"]
+    return {"psnr": scores["psnr"], "psnr_fg": scores["psnr_fg"], "alex": scores["lpips"]}
+
+
+@functools.cache
+def _alex() -> Lpips | None:
+    return load_lpips("alex") if "alex" in installed_lpips() else None
