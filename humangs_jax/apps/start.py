@@ -1,12 +1,11 @@
 """From a folder of photos to an avatar: what is there, what is missing, and which well-known tool
 makes it.
 
-Nothing is asked: the folder is looked at. docs/your_photos.md shows the way. Also the best frames
-of a video, and how like a person an avatar is where no photo was.
+Nothing is asked: the folder is looked at. docs/your_photos.md shows the way. Also how like a person
+an avatar is where no photo was. The best frames of a video: `apps.video_photos`.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,15 +15,6 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.array_types import Float, PyTree
 from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.calibration.photos import MASK_FOLDERS, is_transparent
-from humangs_jax.data.calibration.videos import (
-    LONGER_SIDE,
-    PHOTOS,
-    choose_frames,
-    find_videos,
-    grey_frames,
-    looked_at,
-    write_frames,
-)
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import equal_exposure
@@ -33,18 +23,16 @@ from humangs_jax.data.folders import (
     VIDEO_SUFFIXES,
     FolderScan,
     Unused,
-    is_video,
     scan_folder,
     unused_line,
 )
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
-from humangs_jax.data.views import cropped
+from humangs_jax.data.views import cropped, select_views
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.geometry import quaternion
-from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import PHOTO_SUFFIXES, image_size
-from humangs_jax.io.reading import read_json, reading, visible, write_json
+from humangs_jax.io.reading import visible
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine
@@ -279,76 +267,13 @@ def _scan(folder: Path) -> FolderScan:
     return scan_folder(folder, lambda place: place.name in others)
 
 
-# Photos of a video
-# --------------------------------------------------------------------------------------------------
-
-
-MARK = "video.json"
-"""In the folder of photos: the video that they are of."""
-
-
-def video_of(place: Path) -> Path | None:
-    """The video that `place` is, or that is in a folder without photos; None if there is none.
-
-    Raises: CaptureError for several videos.
-    """
-    if not place.is_dir():
-        return place if place.is_file() and is_video(place) else None
-    if has_photos(place):
-        return None
-    videos = find_videos(place)
-    if not videos:
-        return None
-    if len(videos) > 1:
-        problem = (
-            "expected photos or one video (videos of several cameras: `humangs import cameras`)"
-        )
-        raise CaptureError(place, "", f"{len(videos)} videos and no photo: {problem}")
-    return next(iter(videos.values()))
-
-
-def photos_of_video(video: Path, folder: Path) -> str:
-    """Write the chosen frames into `folder / "images"`, and say so; a folder that an earlier run
-    wrote of this video stays.
-
-    Raises: CaptureError naming the video, or the folder if something else is there.
-    """
-    with reading(video, "video", CaptureError):
-        status = video.stat()
-    of_video = {"video": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns}
-    if folder.exists() or folder.is_symlink():
-        known = read_json(folder / MARK) if (folder / MARK).is_file() else None
-        if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
-            problem = (
-                f"exists, and is not of {video.name} as it is now: expected another folder, or"
-                " remove it"
-            )
-            raise CaptureError(folder, "", problem)
-        return _said(video, folder, known["chosen"], known["frames"])
-    sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
-    with reading(video, "video", CaptureError):
-        chosen = choose_frames(sharpness, thumbnails, PHOTOS)
-
-    def write(place: Path) -> None:
-        write_frames(video, place / "images", chosen)
-        write_json(place / MARK, {**of_video, "frames": len(sharpness), "chosen": chosen})
-
-    replace_folder(folder, write, mark=MARK)
-    return _said(video, folder, chosen, len(sharpness))
-
-
-def _said(video: Path, folder: Path, chosen: Sequence[int], count: int) -> str:
-    return (
-        f"{video}: {len(chosen)} of {count:,} frames, sharp ones that show different things"
-        f" ({', '.join(map(str, chosen))}), are the photos in {folder / 'images'}; what is to be"
-        f" added goes into {folder}"
-    )
-
-
 # A held-out photo
 # --------------------------------------------------------------------------------------------------
 
 
+READ = 8
+"""Photos that the network reads where cameras were found from the person: more are no sharper, and
+take their time. All serve poses and refinement."""
 LEAST_PHOTOS, SIZE = 4, 512
 LONGEST = 1024
 """Pixels: larger photos are reduced, whose crops around the person would be all the same."""
@@ -378,7 +303,7 @@ def held_out_psnr(
     Body and cameras are those of all photos. In its place is a second copy of the nearest photo:
     the programs for that number of photos are compiled already.
     """
-    capture = usable_views(capture)
+    capture = photos_to_read(usable_views(capture))
     if max(capture.images.shape[1:3]) > LONGEST:
         capture = capture.resized(LONGEST)
     capture = equal_exposure(capture)
@@ -397,6 +322,15 @@ def held_out_psnr(
     return HeldOut(
         capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_fg)
     )
+
+
+def photos_to_read(capture: Capture) -> Capture:
+    """The photos of a capture that the network reads: `READ` of them that show the body best, where
+    cameras were found from the person; else all.
+    """
+    if capture.calibrated or capture.view_count <= READ:
+        return capture
+    return capture.select(select_views(capture, READ))
 
 
 def better_body(

@@ -7,15 +7,14 @@ import pytest
 
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.calibration import videos
-from humangs_jax.data.calibration.importing import import_cameras
-from humangs_jax.data.calibration.videos import (
+from humangs_jax.data.calibration.frame_choice import (
     NOTHING_NEW,
     PHOTOS,
     choose_frames,
-    grey_frames,
     looked_at,
-    write_frames,
 )
+from humangs_jax.data.calibration.importing import import_cameras
+from humangs_jax.data.calibration.videos import grey_frames, write_frames
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import load_photos
 from humangs_jax.io.images import read_image

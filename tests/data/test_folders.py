@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 import humangs_jax as hg
-from humangs_jax.apps.start import look, photo_files, video_of
+from humangs_jax.apps.start import look, photo_files
+from humangs_jax.apps.video_photos import video_of
 from humangs_jax.avatar.video import contact_sheet, write_video
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError

@@ -12,9 +12,7 @@ What a video says about itself is obeyed: pixels that are not square are scaled 
 colors of high dynamic range or of wide primaries are converted to those of sRGB. Other videos keep
 their values.
 
-Of one video, of a phone that goes around a person or of a person who turns, frames are taken that
-are sharp and differ: each of equal windows of time offers its sharpest one, and that is taken which
-differs most from all that were taken, until none does.
+Which frames of one video become photos: `frame_choice`.
 """
 
 import contextlib
@@ -22,7 +20,7 @@ import re
 import subprocess
 import tempfile
 import threading
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -431,6 +429,24 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
 
     Raises: CaptureError naming the video.
     """
+    return (frame[..., 0] for frame in _small_frames(path, longer_side, "gray", None))
+
+
+def color_frames(
+    path: Path, longer_side: int, chosen: Sequence[int]
+) -> Iterator[UInt[np.ndarray, "h w 3"]]:
+    """These frames of a video, counted from 0 and in order, in colors as stored, no larger than
+    that.
+
+    Raises: CaptureError naming the video.
+    """
+    return _small_frames(path, longer_side, "rgb24", chosen)
+
+
+def _small_frames(
+    path: Path, longer_side: int, pixels: str, chosen: Sequence[int] | None
+) -> Iterator[UInt[np.ndarray, "h w c"]]:
+    """Frames as ffmpeg's format `pixels` has them, see `grey_frames` and `color_frames`."""
     with reading(path, "video", CaptureError):
         width, height = _frame_size(path, _shown(path))
         room, scale = (
@@ -438,8 +454,10 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
             min(1.0, longer_side / max(width, height)),
         )
         w, h = (max(1, round(side * scale)) for side in (width, height))
-        command = [*_ffmpeg(path, f"scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
-        command += ["-f", "rawvideo", "-pix_fmt", "gray", "pipe:1"]
+        select = "" if chosen is None else f"select={_expression(chosen)},"
+        command = [*_ffmpeg(path, f"{select}scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
+        command += ["-f", "rawvideo", "-pix_fmt", pixels, "pipe:1"]
+        size = w * h * (1 if pixels == "gray" else 3)
         with (
             tempfile.TemporaryFile() as said,
             subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said) as process,
@@ -448,16 +466,25 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
             clock, count = threading.Timer(LONGEST_SECONDS, process.kill), 0
             clock.start()
             try:
-                while len(data := process.stdout.read(w * h)) == w * h:
+                while len(data := process.stdout.read(size)) == size:
                     count += 1
                     _check_pixels(count * width * height, count, width, height)
-                    yield np.frombuffer(data, np.uint8).reshape(h, w)
+                    yield np.frombuffer(data, np.uint8).reshape(h, w, -1)
                 if process.wait():
                     said.seek(0)
                     raise _said(path, said.read())
             finally:
                 clock.cancel()
                 process.kill()
+
+
+def frame_rate(path: Path) -> float | None:
+    """Frames a second of a video in the mean; None where it does not say.
+
+    Raises: CaptureError naming the video.
+    """
+    with reading(path, "video", CaptureError):
+        return _shown(path).rate
 
 
 def _opened(path: Path, verbosity: str = "error") -> list[str]:
@@ -528,74 +555,3 @@ def _finished(path: Path, command: Sequence[str], folder: Path | None = None) ->
 def _said(path: Path, text: bytes) -> ValueError:
     said = " ".join(text.decode(errors="replace").split()) or "no frame"
     return ValueError(said.replace(f"file:{path.resolve()}", path.name))
-
-
-# Which frames become photos
-# -------------------------------------------------------------------------------------------
-
-PHOTOS = 8
-"""A person from all sides."""
-WINDOWS = 64
-LONGER_SIDE = 480
-"""Pixels of the frames that are looked at: blur that does not show there does not hurt."""
-CELLS = 24
-"""Rows and columns of the thumbnails that are compared."""
-NOTHING_SHOWN = 3.0
-"""Levels of 255: the standard deviation of a frame that is all of one color, but for noise."""
-NOTHING_NEW = 0.05
-"""Root mean square of the difference of two thumbnails, in standard deviations of one."""
-
-
-def looked_at(
-    frames: Iterable[UInt[np.ndarray, "h w"]],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
-    """Sharpness and thumbnail of each grey frame; the thumbnails have mean 0 and variance 1, or are
-    0 where nothing is shown.
-
-    Sharpness is the mean square of the Laplacian over the variance of the frame: exposure does not
-    change it.
-    """
-    sharpness, thumbnails = [], []
-    for frame in frames:
-        x = frame.astype(np.float32)
-        rows, columns = (np.linspace(0, side, CELLS + 1).astype(int)[:-1] for side in x.shape)
-        cells = np.add.reduceat(np.add.reduceat(x, rows, axis=0), columns, axis=1)
-        cells /= np.add.reduceat(np.add.reduceat(np.ones_like(x), rows, axis=0), columns, axis=1)
-        spread = float(x.std())
-        if spread < NOTHING_SHOWN or min(x.shape) < 3:
-            sharpness.append(0.0)
-            thumbnails.append(np.zeros(CELLS * CELLS, np.float32))
-            continue
-        edges = 4 * x[1:-1, 1:-1] - x[:-2, 1:-1] - x[2:, 1:-1] - x[1:-1, :-2] - x[1:-1, 2:]
-        sharpness.append(float((edges**2).mean()) / spread**2)
-        thumbnails.append(((cells - cells.mean()) / max(float(cells.std()), NOTHING_SHOWN)).ravel())
-    shape = len(sharpness), CELLS * CELLS
-    return np.asarray(sharpness, np.float32), np.asarray(thumbnails, np.float32).reshape(shape)
-
-
-def choose_frames(
-    sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarray, "n p"], most: int
-) -> list[int]:
-    """Numbers of at most `most` frames, in order.
-
-    Raises: Refused if no frame shows anything.
-    """
-    shown = np.flatnonzero(sharpness > 0)
-    if not len(shown):
-        raise Refused(
-            f"none of its {len(sharpness):,} frames shows anything: expected a video of a person"
-        )
-    windows = np.array_split(shown, min(len(shown), WINDOWS))
-    offered = np.asarray([window[np.argmax(sharpness[window])] for window in windows])
-    worth = np.minimum(
-        1, sharpness[offered] / np.median(sharpness[offered])
-    )  # of a window that is blurred as a whole: less
-    chosen, new = [int(np.argmax(worth))], np.full(len(offered), np.inf)
-    while len(chosen) < min(most, len(offered)):
-        apart = thumbnails[offered] - thumbnails[offered[chosen[-1]]]
-        new = np.minimum(new, np.sqrt((apart**2).mean(axis=-1)))
-        best = int(np.argmax(worth * new))
-        if worth[best] * new[best] < NOTHING_NEW:
-            break
-        chosen.append(best)
-    return sorted(offered[chosen].tolist())

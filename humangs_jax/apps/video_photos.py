@@ -1,0 +1,168 @@
+"""The photos of a video: its sharp frames, from all sides of the person.
+
+The person is followed through the frames that are offered (`data.calibration.frame_choice`),
+reduced to `FOLLOWED` pixels: where one frame has found the person, the landmark network alone looks
+at the next. That tells which way the person faces in each, and which pose is the usual one.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from humangs_jax.apps.start import has_photos
+from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.core.progress import bar
+from humangs_jax.data.calibration.frame_choice import (
+    FRAMES,
+    LONGER_SIDE,
+    PHOTOS,
+    USUAL,
+    WORTHLESS,
+    choose_by_direction,
+    choose_frames,
+    directions_of,
+    looked_at,
+    offered_frames,
+    unusual,
+)
+from humangs_jax.data.calibration.videos import (
+    color_frames,
+    find_videos,
+    frame_rate,
+    grey_frames,
+    write_frames,
+)
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.folders import is_video
+from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.detection.people import (
+    LEAST_PRESENCE,
+    Landmarks,
+    Networks,
+    available,
+    find_people,
+)
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.reading import read_json, reading, write_json
+
+MARK = "video.json"
+"""In the folder of photos: the video that they are of, and which frames."""
+FOLLOWED = 640
+"""Pixels of the longer side of frames in which the person is followed: twice what the landmark
+network looks at.
+"""
+LEAST_FOUND = 0.5
+"""Share of the offered frames in which the person has to be found for directions to choose."""
+
+
+def video_of(place: Path) -> Path | None:
+    """The video that `place` is, or that is in a folder without photos; None if there is none.
+
+    Raises: CaptureError for several videos.
+    """
+    if not place.is_dir():
+        return place if place.is_file() and is_video(place) else None
+    if has_photos(place):
+        return None
+    videos = find_videos(place)
+    if not videos:
+        return None
+    if len(videos) > 1:
+        problem = (
+            "expected photos or one video (videos of several cameras: `humangs import cameras`)"
+        )
+        raise CaptureError(place, "", f"{len(videos)} videos and no photo: {problem}")
+    return next(iter(videos.values()))
+
+
+def photos_of_video(video: Path, folder: Path) -> str:
+    """Write the chosen frames into `folder / "images"`, and say so; a folder that an earlier run
+    wrote of this video stays.
+
+    Raises: CaptureError naming the video, or the folder if something else is there.
+    """
+    with reading(video, "video", CaptureError):
+        status = video.stat()
+    of_video = {"video": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns}
+    if folder.exists() or folder.is_symlink():
+        known = read_json(folder / MARK) if (folder / MARK).is_file() else None
+        if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
+            problem = (
+                f"exists, and is not of {video.name} as it is now: expected another folder, or"
+                " remove it"
+            )
+            raise CaptureError(folder, "", problem)
+        return _told(video, folder, known["chosen"], known["frames"], known.get("by_direction"))
+    sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
+    with reading(video, "video", CaptureError):
+        chosen = _by_direction(video, sharpness) if available() else []
+        by_direction = bool(chosen)
+        chosen = chosen or choose_frames(sharpness, thumbnails, PHOTOS)
+    count = len(sharpness)
+    about = {"frames": count, "chosen": chosen, "by_direction": by_direction}
+
+    def write(place: Path) -> None:
+        write_frames(video, place / "images", chosen)
+        write_json(place / MARK, {**of_video, **about, "rate": frame_rate(video)})
+
+    replace_folder(folder, write, mark=MARK)
+    return _told(video, folder, chosen, count, by_direction)
+
+
+def _told(
+    video: Path, folder: Path, chosen: Sequence[int], count: int, by_direction: bool | None
+) -> str:
+    which = "from all sides of the person" if by_direction else "that show different things"
+    return (
+        f"{video}: {len(chosen)} of {count:,} frames, sharp ones {which}"
+        f" ({', '.join(map(str, chosen))}), are the photos in {folder / 'images'}; what is to be"
+        f" added goes into {folder}"
+    )
+
+
+def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, " v"] | None:
+    """Seconds at which views were taken, by the names of their photos, if the folder of photos is
+    of one video.
+
+    None for other folders, and where the video does not say its rate.
+    """
+    known = read_json(folder / MARK) if (folder / MARK).is_file() else None
+    rate = known.get("rate") if isinstance(known, dict) else None
+    numbers = [name.rpartition("_")[2] for name in names]
+    if not isinstance(rate, int | float) or not rate > 0 or not all(n.isdigit() for n in numbers):
+        return None
+    seconds = np.asarray([int(number) / rate for number in numbers])
+    return seconds if np.all(np.diff(seconds) > 0) else None
+
+
+def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
+    """Numbers of sharp frames that are spread over the directions from which they see the
+    person; none if it does not turn.
+    """
+    offered, worth = offered_frames(sharpness)
+    people = list(followed(color_frames(video, FOLLOWED, offered.tolist()), len(offered)))
+    found = np.asarray([person is not None for person in people])
+    if len(people) != len(offered) or found.mean() < LEAST_FOUND:
+        return []
+    seen = [person for person in people if person is not None]
+    world = np.stack([person.world for person in seen])
+    directions = directions_of(world, MEDIAPIPE_33.names)
+    odd = unusual(world, directions, np.stack([person.visibility for person in seen]))
+    worth = worth[found] * np.maximum(1 / (1 + (odd / USUAL) ** 2), WORTHLESS)
+    chosen = choose_by_direction(directions, worth, FRAMES)
+    return offered[found][chosen].tolist()
+
+
+def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterable[Landmarks | None]:
+    """The largest person of the first frame that shows one, in all frames; None where the person
+    is not found.
+    """
+    networks, last = Networks(), None
+    for frame in bar(frames, total=count, desc="following the person", unit="frame"):
+        photo = frame.astype(np.float32) / 255
+        found = None if last is None else networks.landmarks(photo, last.again.crop())
+        if found is None or found.presence < LEAST_PRESENCE:
+            found = next(iter(find_people(networks, photo)), None)
+        last = found
+        yield found
