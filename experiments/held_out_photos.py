@@ -9,6 +9,7 @@ photo, and "shared pose", in the mean of the poses of the others, which knows no
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +32,7 @@ def held_out_scores(
     views: Sequence[int],
     truth: Float[np.ndarray, "v h w 3"] | None = None,
     masks: Float[np.ndarray, "v h w"] | None = None,
-) -> dict[str, Scores]:
+) -> dict[str, dict[str, Any]]:
     """PSNRs (dB) and LPIPS of photos by the avatars of the others: means over the views, by pose,
     "own" and "shared".
 
