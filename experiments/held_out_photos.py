@@ -19,7 +19,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import camera_gains, multiplied
+from humangs_jax.data.exposure import camera_gains, multiplied
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import mean_scores
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
