@@ -12,7 +12,7 @@ from pathlib import Path
 
 from humangs_jax.core.jax_faults import avoid_wrong_sums
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _PUBLIC = {
     name.name: node.module
