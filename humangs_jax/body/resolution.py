@@ -22,6 +22,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from scipy import sparse
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
@@ -58,6 +59,15 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
 
     Raises: ValueError if `longest` is not positive, or less than 1/64 of the longest edge.
     """
+    return split_with_weights(body, longest)[0]
+
+
+def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, sparse.csr_array]:
+    """What `split_long_edges` returns, and the matrix (finer, n) whose product with a linear
+    quantity of the original vertices is that of the result's: a midpoint has the mean of its ends.
+
+    Raises: ValueError, as it.
+    """
     if not longest > 0:
         raise ValueError(f"longest edge: expected a positive length in metres, got {longest}")
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
@@ -66,6 +76,7 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     }
     faces = np.asarray(body.faces)
     linear["area"] = vertex_areas(linear["template"], faces)
+    weights = sparse.eye_array(len(linear["template"]), format="csr")
     while True:
         edges, edge_of_side = mesh_edges(faces)
         lengths = np.linalg.norm(
@@ -85,6 +96,8 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         linear = {
             name: np.concatenate([x, middle[name].astype(x.dtype)]) for name, x in linear.items()
         }
+        means = 0.5 * (weights[edges[long, 0]] + weights[edges[long, 1]])
+        weights = sparse.vstack([weights, means], format="csr")
         faces = _cut(faces, midpoint[edge_of_side])
     spacing = np.sqrt(
         vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA)
@@ -93,7 +106,7 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     regressor = jnp.pad(
         body.joint_regressor, ((0, 0), (0, added))
     )  # joints follow the original vertices
-    return replace(
+    finer = replace(
         body,
         **{name: jnp.asarray(x) for name, x in linear.items()},
         faces=jnp.asarray(faces, body.faces.dtype),
@@ -105,6 +118,7 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         collapse_into=None,
         made_for=None,
     )
+    return finer, weights
 
 
 def _cut(
@@ -449,8 +463,19 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     """A body on `vertex_count` of the body's own vertices, with the same joints for every shape.
 
     Host-side numpy: about 0.1 s if the body carries its collapses (the shipped one does), seconds
-    to find them otherwise; the result carries its own. Raises: ValueError if vertex_count is larger
-    than the body or too small for its topology.
+    to find them otherwise; the result carries its own.
+
+    Raises: ValueError if vertex_count is larger than the body or too small for its topology.
+    """
+    return decimate_with_kept(body, vertex_count)[0]
+
+
+def decimate_with_kept(
+    body: BodyModel, vertex_count: int
+) -> tuple[BodyModel, Int[np.ndarray, " kept"]]:
+    """What `decimate` returns, and the numbers of the vertices that it keeps, in their order.
+
+    Raises: ValueError, as it.
     """
     total = body.template.shape[0]
     if not 0 < vertex_count <= total:
@@ -481,7 +506,7 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     rows = lambda array: jnp.asarray(
         np.asarray(array)[kept]
     )  # by numpy: no compilation for each size
-    return replace(
+    coarse = replace(
         body,
         template=rows(body.template),
         shape_directions=rows(body.shape_directions),
@@ -495,3 +520,4 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
         collapse_order=jnp.asarray(order[kept], jnp.int32),
         collapse_into=jnp.asarray(renumber[into[kept]], jnp.int32),
     )
+    return coarse, kept

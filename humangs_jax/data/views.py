@@ -11,9 +11,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import sparse
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
-from humangs_jax.body.resolution import decimate, split_long_edges, vertex_areas
+from humangs_jax.body.resolution import (
+    decimate,
+    decimate_with_kept,
+    split_with_weights,
+    vertex_areas,
+)
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -116,7 +122,7 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
             "runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of"
             " them"
         )
-    return body if fits(body, config) else _remeshed(_ByContent(body), *_wanted(config))
+    return body if fits(body, config) else _remeshed(_ByContent(body), *_wanted(config))[0]
 
 
 def fits(body: BodyModel, config: HumanGSConfig) -> bool:
@@ -158,23 +164,34 @@ def _remeshed(
     fewer: int | None,
     longest: float | int | None,
     wanted: Any,
-) -> BodyModel:
+) -> tuple[BodyModel, sparse.csr_array]:
+    """The body that carries the Gaussians, and the matrix (m, n) that makes a linear quantity of
+    the given body's vertices one of its vertices.
+    """
     body = key.body
+    weights = sparse.eye_array(len(body.template), format="csr")
     if vertices is not None and vertices < len(body.template):
-        body = decimate(body, vertices)
-    whole = body
+        body, kept = decimate_with_kept(body, vertices)
+        weights = weights[kept]
+    whole, of_whole = body, weights
     if edge is not None:
-        body = replace(split_long_edges(body, edge), spacing=None)
+        body, split = split_with_weights(body, edge)
+        body, weights = replace(body, spacing=None), split @ weights
     if fewer is not None and fewer < len(whole.template):
-        coarse = decimate(whole, fewer)
+        coarse, kept = decimate_with_kept(whole, fewer)
+        of_coarse = of_whole[kept]
         if edge is not None:  # edges as much longer as the body has fewer vertices on the same area
-            coarse = split_long_edges(coarse, edge * np.sqrt(len(whole.template) / fewer))
+            longer = edge * np.sqrt(len(whole.template) / fewer)
+            coarse, split = split_with_weights(coarse, longer)
+            of_coarse = split @ of_coarse
         wider = np.sqrt(len(body.template) / len(coarse.template))
-        body = replace(coarse, spacing=jnp.full(len(coarse.template), wider, body.template.dtype))
+        spacing = jnp.full(len(coarse.template), wider, body.template.dtype)
+        body, weights = replace(coarse, spacing=spacing), of_coarse
     if longest is not None:
-        body = split_long_edges(body, longest)
+        body, split = split_with_weights(body, longest)
+        weights = split @ weights
     body = body if wanted is None else replace(body, texels=wanted.texels(body))
-    return replace(body, made_for=(vertices, edge, fewer, longest, wanted))
+    return replace(body, made_for=(vertices, edge, fewer, longest, wanted)), weights
 
 
 def on_gaussian_body(
@@ -183,12 +200,10 @@ def on_gaussian_body(
     """A displacement of a body's vertices, of those of its `gaussian_body`: midpoints of edges move
     by the mean of the ends.
     """
-    carrier = replace(
-        body, pose_directions=jnp.asarray(displacement)[..., None]
-    )  # linear, and no joint depends on them
-    carried = gaussian_body(carrier, config).pose_directions
-    assert carried is not None
-    return carried[..., 0]
+    if fits(body, config):
+        return jnp.asarray(displacement)
+    weights = _remeshed(_ByContent(body), *_wanted(config))[1]
+    return jnp.asarray(weights @ np.asarray(displacement, np.float64), body.template.dtype)
 
 
 def subject_rest(

@@ -14,6 +14,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
+from humangs_jax.data import views
 from humangs_jax.data.body_and_masks import HELD_JOINTS, WRAP, Reach, displacement
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.views import gaussian_body, on_gaussian_body, subject_rest
@@ -131,18 +132,43 @@ def test_only_a_body_that_sticks_out_of_the_masks_needs_it(body, dressed):
     assert np.percentile(inwards, 10) < -COAT / 2
 
 
-def test_a_displacement_is_carried_to_the_vertices_of_another_mesh(body, filled):
-    config, small = (
-        tiny().with_conventions(body_vertices=200, longest_edge=0.1),
-        decimate(body, 300),
-    )
-    gaussians = gaussian_body(small, config)
-    assert len(gaussians.template) != len(small.template)
-    # the template itself is carried to the template
-    np.testing.assert_array_equal(
-        on_gaussian_body(np.asarray(small.template), small, config), gaussians.template
-    )
-    np.testing.assert_array_equal(on_gaussian_body(filled, body, tiny()), filled)  # the body itself
+REMESHED = {
+    "decimated and split": dict(body_vertices=200, longest_edge=0.1),
+    "decimated": dict(body_vertices=200),
+    "split": dict(longest_edge=0.03),
+    "coarser than its weights": dict(longest_edge=0.1, runtime=dict(body_vertices=200)),
+    "finer than its weights": dict(body_vertices=250, runtime=dict(longest_edge=0.05)),
+}
+
+
+@pytest.mark.parametrize("wish", REMESHED)
+def test_a_displacement_is_carried_to_the_vertices_of_another_mesh(body, wish):
+    """As the mesh itself is: what the remeshing does to any quantity of the vertices."""
+    conventions = dict(REMESHED[wish])
+    config = tiny().with_runtime(**conventions.pop("runtime", {})).with_conventions(**conventions)
+    small = decimate(body, 300)
+    moved = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    # carried as columns of the pose directions: they are linear, and no joint depends on them
+    carrier = replace(small, pose_directions=jnp.asarray(moved)[..., None])
+    carried = gaussian_body(carrier, config).pose_directions[..., 0]
+    assert len(carried) != len(small.template)
+    found = on_gaussian_body(moved, small, config)
+    assert found.dtype == carried.dtype
+    # one rounding here, one for each halving of an edge there
+    np.testing.assert_allclose(found, carried, rtol=0, atol=4 * np.finfo(np.float32).eps)
+
+
+def test_a_displacement_of_the_body_itself_stays_as_it_is(body, filled):
+    np.testing.assert_array_equal(on_gaussian_body(filled, body, tiny()), filled)
+
+
+def test_another_displacement_of_a_body_costs_no_decimation(body, monkeypatch):
+    config, small = tiny().with_conventions(body_vertices=190), decimate(body, 300)
+    gaussian_body(small, config)
+    for name in ("decimate_with_kept", "split_with_weights"):
+        monkeypatch.setattr(views, name, lambda *_: pytest.fail("made again"))
+    for seed in range(2):
+        on_gaussian_body(np.random.default_rng(seed).normal(size=(300, 3)), small, config)
 
 
 def test_joints_stay(body, dressed):
