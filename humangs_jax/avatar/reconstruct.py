@@ -23,6 +23,7 @@ from humangs_jax.avatar.avatar import (
     log_brightness,
     turned_normals,
 )
+from humangs_jax.avatar.unseen import with_guesses
 from humangs_jax.body.model import (
     BodyModel,
     BodyPose,
@@ -84,8 +85,9 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     Worlds that are not y-up are turned for the network; the avatar then has no light, whose
     directions would be those of another world. The body is displaced first
     (`Runtime.displacement`): by the capture's displacement; without one, to the masks where it
-    sticks out of them. Where masks show a skirt, the avatar's body has one (`data.skirt`). For a
-    network with a driver this is the avatar before any correction of a frame.
+    sticks out of them. Where masks show a skirt, the avatar's body has one (`data.skirt`). What no
+    photo shows is guessed from what they show (`avatar.unseen`). For a network with a driver this
+    is the avatar before any correction of a frame.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -405,6 +407,7 @@ def _reconstruct(
 ) -> tuple[Avatar, Int[Array, ""]]:
     inputs = prepare_inputs(body, views, config) if inputs is None else inputs
     outputs, _ = apply_humangs(variables, inputs, config)
+    outputs = with_guesses(outputs, inputs, body, config)
     return completed_avatar(outputs, body, views, config), outputs.dropped_tokens
 
 

@@ -163,6 +163,7 @@ class Reconstruct:
         require_place(out, "--out", Place() if several else AVATAR)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct_many
+            from humangs_jax.avatar.unseen import guess_line
             from humangs_jax.data.capture import capture_checksum
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
@@ -225,6 +226,9 @@ class Reconstruct:
                     unfinished=not several,
                     made_from=sources.get(name),
                 )
+                guess = guess_line(photos)
+                if guess is not None:
+                    tell(f"{name}: {guess}" if several else guess)
         if not several:
             suggest("humangs view", out)
         if failed:

@@ -428,6 +428,7 @@ class Start:
         with stage("reconstructing"):
             from humangs_jax.apps.start import photos_to_read
             from humangs_jax.avatar.reconstruct import reconstruct
+            from humangs_jax.avatar.unseen import guess_line
             from humangs_jax.data.body_and_masks import usable_views
             from humangs_jax.network.weights import load_weights
             from humangs_jax.viewer.page import write_page
@@ -457,6 +458,9 @@ class Start:
                 )
         if estimate is not None:
             tell(estimate)
+        guess = guess_line(capture)
+        if guess is not None:
+            tell(guess)
         with stage("writing the page"):
             avatar.save(self.out / "avatar.npz")
             page = self.out / "avatar.html"

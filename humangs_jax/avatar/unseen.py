@@ -1,0 +1,325 @@
+"""What no photo shows of a person is guessed from what the photos show.
+
+The network knows that a back wears something, but not what: without a photo it paints cloth in
+grey. Here each vertex that no photo shows takes colors, opacities and heights above the skin of its
+Gaussians from vertices that photos show: those that are near it on the surface, in front of it or
+behind it, or on the other side of the body. It is an attention over the vertices v that are shown,
+and over their mirror images:
+
+    guess(u) = sum_v softmax_v(log sure(v) - |f(u) - f(v)|^2 / (2 SPREAD^2)) value(v)
+
+The features f are the position in the T-pose, in metres, where depths from front to back count
+little, and the skinning
+weights: a sleeve is not like the trunk behind it. On the head the plain position is the feature,
+and the face is no source: the back of a head gets hair, not a second face. Faces and hands stay as
+the network made them.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD, shaped, skinned
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.mesh import unit, vertex_areas, vertex_crosses
+from humangs_jax.geometry.transform import EXACT
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs, subject_unit
+from humangs_jax.network.reader import project_and_test
+from humangs_jax.rendering.gaussians import Gaussians
+
+UNSEEN, SEEN = 0.15, 0.45
+"""Cosine between a vertex's normal and the line of sight of the photo that shows it best. Below the
+first nothing is known of it, above the second nothing is guessed; between them both are mixed."""
+SPREAD = 0.015
+"""Metres in the space of the features, over which sources are averaged."""
+DEPTH = 0.5
+"""What a metre from front to back counts: the back of a trunk is like its front more than like
+its sides.
+"""
+PART = 0.6
+"""Metres that a change of the square roots of the skinning weights by 1 counts."""
+MIRRORED = 0.05
+"""Metres that a source on the other side of the body is farther away than one on the same side."""
+FARTHEST = 0.5
+"""Metres in the space of the features: beyond them a source says nothing."""
+APART = 10.0
+"""Metres between the head and the rest in the space of the features."""
+CROWN, FACE = 0.93, 0.5
+"""Shares of the head's height and depth: what is in front of the second and below the first is
+the face, which stays.
+"""
+NAPE = (0.35, 0.55)
+"""Shares of the head's depth and height: what is behind the first and above the second is hair,
+as the crown is.
+"""
+GLANCE = (0.03, 0.25)
+"""Instead of `UNSEEN` and `SEEN`, for hair as a source: photos of a face show the crown at a
+glancing angle.
+"""
+HEAD_JOINTS = ("head", "jaw", "eye")
+HAND_JOINTS = ("wrist", "index", "middle", "pinky", "ring", "thumb")
+BLOCK = 256
+"""Vertices whose sources are weighed at a time: bounds the memory."""
+TINY = 1e-6
+"""Of distances and weights, so that quotients and logarithms are finite."""
+
+
+def with_guesses(
+    outputs: HumanGSOutputs, inputs: HumanGSInputs, body: BodyModel, config: HumanGSConfig
+) -> HumanGSOutputs:
+    """The outputs with guesses for what no photo shows; the outputs as they are where all is shown.
+
+    So are those of networks that read whole photos, not the person alone, and of those whose
+    Gaussians are not on vertices. Gradients do not pass through the choice of sources.
+    """
+    on_vertices = not outputs.is_empty and outputs.skinning_weights is None
+    rest, normals = inputs.canonical_vertices, inputs.canonical_normals
+    if config.conventions.pixels != "person" or not on_vertices or normals is None:
+        return outputs
+    shown = jnp.max(shown_by_view(inputs, config), axis=0)
+    chosen = lax.stop_gradient((shown, body_regions(body, rest)))
+    new = guessed(outputs.gaussians, rest, normals, *chosen)
+    return replace(outputs, gaussians=new)
+
+
+def shown_by_view(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array, "v n"]:
+    """How well each photo shows each vertex: the cosine between its normal and the line of sight, 0
+    where it is hidden, beyond the frame or beyond the mask, and in padding.
+    """
+    assert inputs.posed_normals is not None  # `prepare_inputs` computes them
+    unit_length = subject_unit(inputs.canonical_vertices)
+    cameras, vertices = inputs.cameras.in_units(unit_length), inputs.posed_vertices / unit_length
+    grid = config.conventions.pixel_grid
+    _, visible = project_and_test(cameras, vertices, inputs.depth_maps, inputs.present, grid)
+    sight = cameras.center[:, None] - vertices
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(sight**2, axis=-1), TINY))
+    facing = jnp.sum(sight * inputs.posed_normals, axis=-1) / distance
+    return jnp.where(visible, jnp.maximum(facing, 0), 0)
+
+
+class Regions(NamedTuple):
+    """Which vertices of a body may take guesses and give them, and where each lies for the
+    distances between them.
+    """
+
+    head: Bool[Array, " n"]
+    """Those of the head."""
+    free: Bool[Array, " n"]
+    """Those that take guesses: all but the face."""
+    sources: Bool[Array, " n"]
+    """Those that give guesses: of the head the hair alone."""
+    features: Float[Array, "n f"]
+    """Where they lie, metres."""
+    mirrored: Float[Array, "n f"]
+    """Where their mirror images lie, metres."""
+
+
+def body_regions(body: BodyModel, rest: Float[Array, "n 3"]) -> Regions:
+    """The regions of a body whose vertices in the T-pose are `rest`, metres."""
+    weights = body.skinning_weights
+    head = _share_of(body, HEAD_JOINTS) > 0.5
+    hands = _share_of(body, HAND_JOINTS) > 0.5
+
+    # Shares of the head's box: 0 at the chin and at the back of the head, 1 at the crown and at the
+    # nose.
+    low = jnp.min(jnp.where(head[:, None], rest, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(head[:, None], rest, -jnp.inf), axis=0)
+    _, height, front = jnp.moveaxis((rest - low) / jnp.maximum(high - low, TINY), 1, 0)
+    crown = head & (height > CROWN)
+    face = head & (front > FACE) & ~crown
+    hair = crown | (head & (front < NAPE[0]) & (height > NAPE[1]))
+
+    # Where a vertex and its mirror image lie. Heads and hands are far from all else.
+    names = body.joint_names
+    twins = [_mirrored(name) if _mirrored(name) in names else name for name in names]
+    others = np.asarray([names.index(twin) for twin in twins])
+    flip = jnp.asarray([-1.0, 1.0, 1.0])
+    group = jnp.where(head, APART, jnp.where(hands, -APART, 0.0))
+    features = _features(rest, weights, group)
+    mirrored = _features(rest * flip, weights[:, others], group)
+    return Regions(head, ~face, hair | ~head, features, mirrored)
+
+
+def _features(
+    positions: Float[Array, "n 3"], weights: Float[Array, "n j"], group: Float[Array, " n"]
+) -> Float[Array, "n f"]:
+    plain = group != 0
+    depths = jnp.where(plain, 1.0, DEPTH) * positions[:, 2]
+    parts = PART * jnp.sqrt(jnp.maximum(weights, 0)) * ~plain[:, None]
+    return jnp.concatenate([positions[:, :2], depths[:, None], parts, group[:, None]], axis=1)
+
+
+def _share_of(body: BodyModel, joints: tuple[str, ...]) -> Float[Array, " n"]:
+    """Sum of the skinning weights of all joints whose names contain one of these words."""
+    chosen = [any(word in name for word in joints) for name in body.joint_names]
+    return jnp.sum(body.skinning_weights * jnp.asarray(chosen, float), axis=1)
+
+
+def _mirrored(name: str) -> str:
+    """The name of the joint on the other side."""
+    side, _, part = name.partition("_")
+    other = {"left": "right", "right": "left"}
+    return f"{other[side]}_{part}" if side in other else name
+
+
+def guessed(
+    gaussians: Gaussians,
+    rest: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    shown: Float[Array, " n"],
+    regions: Regions,
+) -> Gaussians:
+    """The Gaussians of the n vertices with guesses where they are not shown.
+
+    rest, normals: of the body in the T-pose, metres and unit. shown: cosines of the best photos,
+    see `shown_by_view`.
+    """
+    count = len(rest)
+    sure = jnp.clip((shown - UNSEEN) / (SEEN - UNSEEN), 0, 1)
+    need = jnp.where(regions.free, 1 - sure, 0)
+    glance = jnp.clip((shown - GLANCE[0]) / (GLANCE[1] - GLANCE[0]), 0, 1)
+    given = jnp.where(regions.sources, jnp.where(regions.head, glance, sure), 0)
+
+    # What is guessed, a row for each vertex: colors, opacities, and heights above the skin.
+    offsets = gaussians.means.reshape(count, -1, 3) - rest[:, None]
+    heights = jnp.einsum("nka,na->nk", offsets, normals, precision=EXACT)
+    colors, opacities = gaussians.colors.reshape(count, -1), gaussians.opacities.reshape(count, -1)
+    columns = (colors.shape[1], colors.shape[1] + opacities.shape[1])
+    values = jnp.concatenate([colors, opacities, heights], axis=1)
+    new = attended(values, need, given, regions)
+    new_colors, new_opacities, new_heights = jnp.split(new, columns, axis=1)
+
+    means = rest[:, None] + offsets + (new_heights - heights)[..., None] * normals[:, None]
+    changed = jnp.repeat(jnp.any(new != values, axis=1), gaussians.means.shape[0] // count)
+    return replace(
+        gaussians,
+        means=jnp.where(changed[:, None], means.reshape(-1, 3), gaussians.means),
+        colors=new_colors.reshape(-1, 3),
+        opacities=new_opacities.reshape(-1),
+    )
+
+
+def attended(
+    values: Float[Array, "n c"],
+    need: Float[Array, " n"],
+    sure: Float[Array, " n"],
+    regions: Regions,
+) -> Float[Array, "n c"]:
+    """The values, each mixed with its guess by the share `need`, which is 0 where nothing changes.
+
+    sure: how much a vertex counts as a source; 0: it is none. Vertices far from all sources keep
+    their values. The time grows with the number of vertices in need.
+    """
+    count = len(need)
+    order = jnp.argsort(-need)  # so that blocks without need are skipped
+    order = jnp.pad(order, (0, -count % BLOCK), constant_values=count)  # beyond the end: dropped
+    keys = jnp.concatenate([regions.features, regions.mirrored])
+    farther = jnp.concatenate([jnp.zeros(count), jnp.full(count, MIRRORED**2)])
+    weight = jnp.where(sure > 0, jnp.log(jnp.maximum(sure, TINY)), -jnp.inf)
+    weight = jnp.concatenate([weight, weight])
+    lengths = jnp.sum(keys**2, axis=1)
+
+    @jax.checkpoint  # the shares are computed again for gradients: they are larger than all else
+    def guess(rows: Int[Array, " r"]) -> Float[Array, "r c"]:
+        query, own = regions.features[rows], values[rows]
+        products = jnp.matmul(query, keys.T, precision=EXACT)
+        squares = jnp.sum(query**2, axis=1)[:, None] + lengths - 2 * products + farther
+        near = jnp.any((squares < FARTHEST**2) & (weight > -jnp.inf), axis=1)
+        scores = weight - squares / (2 * SPREAD**2)
+        shares = jax.nn.softmax(jnp.where(near[:, None], scores, 0.0), axis=1)
+        shares = shares[:, :count] + shares[:, count:]
+        mixed = jnp.where(near, need[rows], 0)[:, None]
+        found = own + mixed * (jnp.matmul(shares, values, precision=EXACT) - own)
+        return jnp.where(mixed > 0, found, own)
+
+    def block(rows: Int[Array, " r"]) -> Float[Array, "r c"]:
+        return lax.cond(jnp.any(need[rows] > 0), guess, lambda rows: values[rows], rows)
+
+    found = lax.map(block, order.reshape(-1, BLOCK)).reshape(-1, values.shape[1])
+    return jnp.zeros_like(values).at[order].set(found, mode="drop")
+
+
+# What is said about it
+# ------------------------------------------------------------------------------------------------
+
+CLEARLY = 0.5
+"""Cosine between normal and line of sight, from which on a photo shows what a surface looks
+like.
+"""
+LEAST_SHOWN = 0.5
+"""Share of the area of a side that photos have to show clearly, or of a part of the body to
+contain; else it is a guess.
+"""
+SIDES = {
+    "front": (0.0, 0.0, 1.0),
+    "back": (0.0, 0.0, -1.0),
+    "left side": (1.0, 0.0, 0.0),
+    "right side": (-1.0, 0.0, 0.0),
+}
+"""Directions of the normals in the T-pose; those within 60 degrees belong to a side."""
+PARTS = {"head": HEAD_JOINTS, "lower legs": ("knee",), "feet": ("ankle", "foot")}
+"""Words of the names of the joints whose vertices these are."""
+
+
+def guess_line(capture: Capture) -> str | None:
+    """One line that names the sides and parts of the person that no photo of a capture shows;
+    None where all are shown.
+    """
+    names = [f"the {name}" for name in unseen_sides(capture)]
+    if not names:
+        return None
+    several = len(names) > 1 or names[0].endswith("s")
+    listed = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    if several:
+        return f"{listed} are guesses: no photo shows them"
+    return f"{listed} is a guess: no photo shows it"
+
+
+def unseen_sides(capture: Capture) -> list[str]:
+    """Names of `SIDES` and `PARTS` that hardly any photo shows.
+
+    On the host, without occlusion by other limbs.
+    """
+    body, rest = capture.body, shaped(capture.body, capture.betas)
+    faces, weights = np.asarray(body.faces), np.asarray(body.skinning_weights)
+    normals, areas = unit(vertex_crosses(rest, faces)), vertex_areas(rest, faces)
+    joints = np.asarray(body.joint_regressor, float) @ rest
+
+    # A vertex is shown where it faces the camera and lies in the frame and in the mask.
+    framed, shown = np.zeros((2, len(rest)), bool)
+    cameras = jax.tree.map(np.asarray, capture.cameras)
+    for i, frame in enumerate(np.asarray(capture.frames).tolist()):
+        linear, offset = skinned(body, joints, capture.poses, frame, weights)
+        vertices = np.einsum("nab,nb->na", linear, rest) + offset
+        rotation, translation = cameras.cam_from_world[i, :3, :3], cameras.cam_from_world[i, :3, 3]
+        seen = vertices @ rotation.T + translation
+        facing = np.einsum("nab,nb->na", linear, normals) @ rotation.T
+        cosine = -np.sum(facing * seen, axis=1) / np.linalg.norm(seen, axis=1)
+        depth = np.maximum(seen[:, 2:], TINY)
+        pixels = np.floor((seen @ cameras.K[i].T)[:, :2] / depth).astype(int)
+        size = np.asarray([capture.images.shape[2], capture.images.shape[1]])
+        within = (seen[:, 2] > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)
+        column, row = np.where(within[:, None], pixels, 0).T
+        if capture.masks is not None:
+            within &= np.asarray(capture.masks[i])[row, column] > MASK_THRESHOLD
+        framed |= within
+        shown |= within & (cosine > CLEARLY)
+
+    def share(found: Bool[np.ndarray, " n"], chosen: Bool[np.ndarray, " n"]) -> float:
+        return float(np.sum(areas * chosen * found) / max(np.sum(areas * chosen), TINY))
+
+    dominant = np.asarray(body.joint_names)[np.argmax(weights, axis=1)]
+    sides = {name: normals @ along > 0.5 for name, along in SIDES.items()}
+    parts = {
+        name: np.asarray([any(word in joint for word in words) for joint in dominant])
+        for name, words in PARTS.items()
+    }
+    hidden = [name for name, chosen in sides.items() if share(shown, chosen) < LEAST_SHOWN]
+    return hidden + [name for name, chosen in parts.items() if share(framed, chosen) < LEAST_SHOWN]
