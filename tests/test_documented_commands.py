@@ -31,6 +31,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
     ROOT / "humangs_jax/assets/weights.md",
     *sorted((ROOT / "notebooks").glob("*.ipynb")),
+    ROOT / "colab/humangs_jax.ipynb",
 ]
 FENCE = re.compile(
     r"^(?P<fence>```+|~~~+)[ \t]*(?P<kind>[\w+-]*)[^\n]*\n(?P<text>.*?)^(?P=fence)[ \t]*$",

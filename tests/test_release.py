@@ -1,6 +1,9 @@
 """What a release consists of agrees: version, addresses, dependencies, tools, and what CI runs."""
 
+import ast
+import dataclasses
 import importlib.util
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -9,6 +12,7 @@ import pytest
 import yaml
 
 import humangs_jax
+from humangs_jax.cli.start import Start
 
 ROOT = Path(__file__).parents[1]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -96,3 +100,29 @@ def test_workflows_run_scripts_that_are_there():
             assert (ROOT / script).is_file(), f"{file.name}: {script}"
     release = (ROOT / ".github/workflows/release.yml").read_text()
     assert "id-token: write" in release and "password" not in release.replace("no password", "")
+
+
+def test_notebook_and_page_of_others_machines_use_what_is_there():
+    """Neither is part of the package, and both want a released one."""
+    cells = json.loads((ROOT / "colab" / "humangs_jax.ipynb").read_text())["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert not any(cell.get("outputs") for cell in cells)
+    plain = "\n".join(line for text in code for line in text.splitlines() if line[:1] not in "!%")
+    used = {
+        node.attr
+        for node in ast.walk(ast.parse(plain))
+        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "hg"
+    }
+    assert used and used <= set(humangs_jax.__all__)
+    page = ast.parse((ROOT / "space" / "app.py").read_text())
+    (command,) = [
+        [each.value for each in node.args[1].elts if isinstance(each, ast.Constant)]
+        for node in ast.walk(page)
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", "") == "made"
+        and isinstance(node.args[1], ast.Tuple)
+        and node.args[1].elts[0].value == "start"
+    ]
+    given = [word for word in command if word.startswith("--")]
+    assert given == ["--out", "--height", "--no-browser"]
+    assert {"out", "height", "browser"} <= {field.name for field in dataclasses.fields(Start)}
