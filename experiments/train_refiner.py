@@ -197,7 +197,10 @@ def read_sample(folder: Path) -> Sample:
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
     cameras = Camera(
-        jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), *images.shape[1:3]
+        jnp.asarray(arrays["K"]),
+        jnp.asarray(arrays["cam_from_world"]),
+        images.shape[1],
+        images.shape[2],
     )
     pose = jnp.asarray(arrays["rotations"]), jnp.asarray(arrays["translations"])
     views = list(jax.vmap(Photo)(images, masks, jnp.ones(masks.shape, bool), cameras, *pose))

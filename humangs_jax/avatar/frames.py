@@ -527,10 +527,12 @@ def render_in_bands(
     """The image of `render`, as arrays of numpy, drawn in as many bands as keep each below
     `most_pairs`; for calls outside of transformations.
 
-    Bands of one row of tiles may still need more: they get it. Configurations whose image depends
-    on its height (a `jacobian_margin`, `visibility`) are drawn whole. Raises: as `render`.
+    Bands of one row of tiles may still need more: they get it. Configurations whose image depends on its height (a
+    `jacobian_margin`, or what is asked for of each Gaussian) are drawn whole. Raises: as `render`.
     """
-    whole = config.jacobian_margin is not None or config.visibility
+    whole = (
+        config.jacobian_margin is not None or config.visibility or config.means2d or config.radii
+    )
     planned = plan_buffers(gaussians, camera, config, margin=1.0)
     rows, bands = -(-camera.height // config.tile_size), 1
     cameras = camera
@@ -545,7 +547,8 @@ def render_in_bands(
     ]
     joined = {
         name: np.concatenate([getattr(each, name) for each in drawn])[: camera.height]
-        for name in ("rgb", "alpha", "depth")
+        for name in ("rgb", "alpha", "depth", "depth_sum", "depth_median", "distortion")
+        if getattr(drawn[0], name) is not None
     }
     return replace(drawn[0], **joined)
 
@@ -558,5 +561,5 @@ def banded(camera: Camera, height: int) -> Camera:
     shift = (
         jnp.zeros((len(tops), 3, 3), camera.K.dtype).at[:, 1, 2].set(tops.astype(camera.K.dtype))
     )
-    poses = jnp.broadcast_to(camera.cam_from_world, (len(tops), 4, 4))
-    return replace(camera, K=camera.K - shift, cam_from_world=poses, height=height)
+    each = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(tops), *leaf.shape)), camera)
+    return replace(each, K=camera.K - shift, height=height)

@@ -36,7 +36,7 @@ from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import COMPILING, bar
-from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.camera import Camera, require_pinhole
 from humangs_jax.io.atomic import add_files, check_ours, replace_file
 from humangs_jax.io.images import DRAWN, is_own_output, write_png
 from humangs_jax.io.reading import limits
@@ -205,6 +205,7 @@ def write_renderings_exr(
 
 
 def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
+    require_pinhole("an .exr with its camera", camera)
     alpha = np.asarray(rendering.alpha)
     return ExrView(
         rgba=np.concatenate([np.asarray(rendering.rgb), alpha[..., None]], axis=-1),
@@ -216,9 +217,8 @@ def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
 
 
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along
-    the camera's axis, metres.
-    """
+    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along the camera's axis, metres."""
+    require_pinhole("unprojection", camera)
     K, world_from_cam = (
         np.asarray(camera.K, np.float64),
         np.linalg.inv(np.asarray(camera.cam_from_world, np.float64)),

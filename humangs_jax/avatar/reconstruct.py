@@ -51,7 +51,7 @@ from humangs_jax.data.views import (
     subject_rest,
 )
 from humangs_jax.geometry import transform
-from humangs_jax.geometry.camera import camera_values
+from humangs_jax.geometry.camera import camera_values, require_pinhole
 from humangs_jax.io.reading import check_limit
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import needed_tokens
@@ -527,6 +527,7 @@ def _check(capture: Capture, name: str) -> None:
     if capture.view_count == 0:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
     check_limit("network_views", capture.view_count, f"photos in {name}")
+    require_pinhole(f"reconstruct: {name}", capture.cameras)
     views, height, width = (*np.shape(capture.images), 0, 0, 0)[:3]
     shapes = {
         "images": (views, height, width, 3),

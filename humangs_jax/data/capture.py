@@ -47,7 +47,7 @@ from humangs_jax.data.photos import (
     read_photos,
     write_description,
 )
-from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.geometry.camera import Camera, require_pinhole, stack_cameras
 from humangs_jax.io.arrays import checksum, file_checksum, read_npz, write_npz
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import image_row, png_bytes, resized, write_png
@@ -407,6 +407,7 @@ def _check_before_writing(capture: Capture) -> None:
     """Everything that reading would check, of a `Capture` made by hand."""
     v, (height, width) = len(capture.images), capture.images.shape[1:3]
     cameras, poses = capture.cameras, capture.poses
+    require_pinhole("a capture", cameras)
     if len(cameras.K) != v:
         raise CaptureError(
             "capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}"

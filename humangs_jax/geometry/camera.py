@@ -1,7 +1,8 @@
-"""Pinhole cameras in the OpenCV convention: x right, y down, z forward; pixel centres at +0.5.
+"""Cameras in the OpenCV convention: x right, y down, z forward; pixel centres at +0.5.
 
-A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. No
-lens distortion.
+A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. What `lens` and `distortion` do
+between [R | t] p and K is in `geometry.lens`. Gaussians are drawn through every lens; what works with bodies and photos of
+people is for pinholes without distortion (`require_pinhole`).
 """
 
 import math
@@ -16,6 +17,7 @@ from humangs_jax.core.checks import FINITE, POSITIVE, Values, checked_arguments
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
+from humangs_jax.geometry.lens import check_lens, distorted
 
 RIGID_TOLERANCE = 1e-3
 """Calibrations are stored with few digits: R R^T may be this far from the identity before a camera
@@ -33,8 +35,7 @@ RIGHT_ANGLE = np.pi / 2 + 1e-6
 
 @pytree_dataclass
 class Camera(Batchable):
-    """A pinhole camera, or a batch of cameras of one image size (leading axes on K and
-    cam_from_world).
+    """A camera, or a batch of cameras of one image size and lens (leading axes on the arrays).
 
     A batch can be indexed and iterated over: `for camera in cameras`.
 
@@ -50,20 +51,32 @@ class Camera(Batchable):
     """Pixels."""
     height: int = static_field()
     """Pixels."""
+    distortion: Float[Array, " coefficients"] | None = None
+    """OpenCV's: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], of a fisheye k1 k2 k3 k4; None for no distortion."""
+    lens: str = static_field(default="pinhole")
+    """ "fisheye": equidistant, fields of view below 180 degrees. "orthographic": K is in pixels a metre, rays are parallel."""
 
     @classmethod
-    def from_opencv(cls, K: object, cam_from_world: object, width: int, height: int) -> "Camera":
-        """A camera from array-likes (3, 3) and (4, 4), checked. Under `jit`, `vmap` and `grad` only
-        shapes are.
+    def from_opencv(
+        cls,
+        K: object,
+        cam_from_world: object,
+        width: int,
+        height: int,
+        distortion: object = None,
+        lens: str = "pinhole",
+    ) -> "Camera":
+        """A camera from array-likes (3, 3), (4, 4) and perhaps (n,), checked. Under `jit`, `vmap` and `grad` only shapes are.
 
         Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have
         it.
 
-        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive,
-        the rotation not orthonormal and right-handed (to 1e-3), the image empty, or its sides no
-        whole numbers.
+        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive, the rotation not
+        orthonormal and right-handed (to 1e-3), the image empty, its sides no whole numbers, or the coefficients not those of
+        the lens.
         """
-        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((K, cam_from_world)))
+        given = K, cam_from_world, distortion
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given))
         array = jnp.asarray if traced else np.asarray
         K, cam_from_world = array(K), array(cam_from_world)
         kept = jnp.promote_types(
@@ -74,8 +87,15 @@ class Camera(Batchable):
         if cam_from_world.shape != (4, 4):
             raise ValueError(f"cam_from_world: expected shape (4, 4), got {cam_from_world.shape}")
         width, height = _pixels(width, height)
+        coefficients = None if distortion is None else jnp.asarray(distortion, kept)
+        check_lens(lens, None if coefficients is None else coefficients.size)
+        if coefficients is not None and coefficients.ndim != 1:
+            raise ValueError(f"distortion: expected shape (n,), got {coefficients.shape}")
         if traced:
-            return cls(jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept), width, height)
+            arrays = jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept)
+            return cls(*arrays, width, height, coefficients, lens)
+        if coefficients is not None and not np.isfinite(coefficients).all():
+            raise ValueError("distortion must be finite numbers")
         K, cam_from_world = K.astype(np.float64), cam_from_world.astype(np.float64)
         for name, values in (("K", K), ("cam_from_world", cam_from_world)):
             if not np.abs(values).max() <= LARGEST_NUMBER:  # nor NaN
@@ -103,7 +123,13 @@ class Camera(Batchable):
             raise ValueError(
                 f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}"
             )
-        return cls(jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept), width, height)
+        arrays = jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept)
+        return cls(*arrays, width, height, coefficients, lens)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is a pinhole without distortion."""
+        return self.lens == "pinhole" and self.distortion is None
 
     @property
     def world_from_cam(self) -> Float[Array, "*b 4 4"]:
@@ -127,7 +153,32 @@ class Camera(Batchable):
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
         """The same camera for a world whose lengths are divided by `unit`."""
         translation = self.cam_from_world[..., :3, 3] / unit
-        return replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
+        moved = replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
+        if self.lens != "orthographic":
+            return moved
+        scale = jnp.stack([jnp.asarray(unit, self.K.dtype)] * 2 + [jnp.ones((), self.K.dtype)])
+        return replace(moved, K=self.K * scale)
+
+    def moved(self, twist: Float[Array, "*b 6"]) -> "Camera":
+        """The camera after a rigid motion in its own frame, exp(twist) `cam_from_world`.
+
+        twist: a rotation vector, radians, then a velocity, metres, in the camera's axes; for optimizers: zeros are no motion, and
+        the result stays a rotation (`transform.from_twist`).
+
+        Examples:
+            >>> loss = lambda twist: jnp.mean((hg.render(gaussians, camera.moved(twist), config).rgb - photo) ** 2)
+            >>> gradient = jax.grad(loss)(jnp.zeros(6))
+        """
+        motion = transform.from_twist(twist)
+        pose = jnp.matmul(motion, self.cam_from_world, precision=transform.EXACT)
+        return replace(self, cam_from_world=pose)
+
+
+def require_pinhole(what: str, camera: Camera) -> None:
+    """Raises: ValueError for a camera with another lens than a pinhole, or with distortion, where `what` knows only those."""
+    if not camera.is_plain:
+        kind = "distortion" if camera.lens == "pinhole" else f"a lens that is {camera.lens}"
+        raise ValueError(f"{what} is for pinhole cameras without distortion, got one with {kind}")
 
 
 def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
@@ -149,26 +200,28 @@ def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values
     read on the host.
     """
     K, cam_from_world = cameras.K, cameras.cam_from_world
+    lens: dict[str, tuple[Array | np.ndarray, Values]] = {}
+    if cameras.distortion is not None:
+        lens = {"camera.distortion": (cameras.distortion, FINITE)}
     if isinstance(K, Tracer) or isinstance(cam_from_world, Tracer):
-        return {"camera.K": (K, FINITE), "camera.cam_from_world": (cam_from_world, FINITE)}
+        return {"camera.K": (K, FINITE), "camera.cam_from_world": (cam_from_world, FINITE)} | lens
     K = np.asarray(K)
     return {
         "camera.K": (K, FINITE),
         "camera.K focal lengths": (K[..., [0, 1], [0, 1]], POSITIVE),
         "camera.cam_from_world": (np.asarray(cam_from_world), FINITE),
-    }
+    } | lens
 
 
 @checked_arguments
 def stack_cameras(cameras: list[Camera]) -> Camera:
-    """A batch from cameras of one image size.
-
-    Raises ValueError if sizes differ or the list is empty.
-    """
+    """A batch from cameras of one image size and lens. Raises ValueError if they differ or the list is empty."""
     if not cameras:
         raise ValueError("no cameras to stack")
     if len({(c.width, c.height) for c in cameras}) > 1:
         raise ValueError(f"image sizes differ: {sorted({(c.width, c.height) for c in cameras})}")
+    if len({(c.lens, None if c.distortion is None else c.distortion.shape) for c in cameras}) > 1:
+        raise ValueError("lenses differ: expected one lens with one number of coefficients")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
 
 
@@ -181,6 +234,13 @@ def project(
     """
     p = transform.apply(camera.cam_from_world, points)
     depth = p[..., 2]
+    if not camera.is_plain:
+        slopes = p[..., :2] if camera.lens == "orthographic" else p[..., :2] / depth[..., None]
+        if camera.lens != "orthographic":
+            x, y = distorted(camera.lens, camera.distortion, slopes[..., 0], slopes[..., 1])
+            slopes = jnp.stack([x, y], axis=-1)
+        focal = jnp.stack([camera.K[0, 0], camera.K[1, 1]])
+        return slopes * focal + camera.K[:2, 2], depth
     uv = (
         p[..., :2] / depth[..., None] * jnp.stack([camera.K[0, 0], camera.K[1, 1]])
         + camera.K[:2, 2]
@@ -292,9 +352,11 @@ def orbit(
 
 
 def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]]:
-    """Camera centre and unit directions through the pixel centres (x + 0.5, y + 0.5) of one
-    camera.
+    """Camera centre and unit directions through the pixel centres (x + 0.5, y + 0.5) of one pinhole camera.
+
+    Raises: ValueError for another lens.
     """
+    require_pinhole("pixel_rays", camera)
     x = (jnp.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     y = (jnp.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     x, y = jnp.meshgrid(x, y)

@@ -113,7 +113,7 @@ def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     return jnp.take_along_axis(candidates, best, axis=-2)[..., 0, :]
 
 
-def _sine_and_cosine_ratios(
+def sine_and_cosine_ratios(
     angle_squared: Float[Array, "*b"],
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """sin(t)/t and (1 - cos t)/t^2 from t^2, smooth through 0."""
@@ -131,7 +131,7 @@ def _sine_and_cosine_ratios(
 def matrix_from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     """Rodrigues' formula, with exact derivatives at the zero rotation."""
     x, y, z = jnp.moveaxis(axis_angle, -1, 0)
-    sine, cosine = _sine_and_cosine_ratios(x * x + y * y + z * z)
+    sine, cosine = sine_and_cosine_ratios(x * x + y * y + z * z)
     rows = [
         [1 - cosine * (y * y + z * z), cosine * x * y - sine * z, cosine * x * z + sine * y],
         [cosine * x * y + sine * z, 1 - cosine * (x * x + z * z), cosine * y * z - sine * x],
@@ -144,7 +144,7 @@ def from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion of a rotation vector, with exact derivatives at the zero rotation."""
     half = 0.5 * axis_angle
     squared = jnp.sum(jnp.square(half), axis=-1)
-    sine, cosine = _sine_and_cosine_ratios(squared)
+    sine, cosine = sine_and_cosine_ratios(squared)
     return jnp.concatenate([(1 - squared * cosine)[..., None], half * sine[..., None]], axis=-1)
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.geometry import quaternion
 
 EXACT = jax.lax.Precision.HIGHEST
 
@@ -41,6 +42,28 @@ def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
     return make(
         rotation, -jnp.einsum("...ij,...j->...i", rotation, transform[..., :3, 3], precision=EXACT)
     )
+
+
+SERIES_BELOW = 0.25
+"""Squared angles below which (t - sin t) / t^3 is its Taylor series: the difference would cancel."""
+
+
+def from_twist(twist: Float[Array, "*b 6"]) -> Float[Array, "*b 4 4"]:
+    """The rigid motion exp(twist) of SE(3), with exact derivatives at the zero twist.
+
+    twist: a rotation vector w in radians, then a velocity v in metres: rotation exp([w]), translation V v with
+    V = 1 + (1 - cos t) / t^2 [w] + (t - sin t) / t^3 [w]^2 and t = |w|.
+    """
+    w, v = twist[..., :3], twist[..., 3:]
+    squared = jnp.sum(w * w, axis=-1, keepdims=True)
+    sine, cosine = quaternion.sine_and_cosine_ratios(squared)
+    small = squared < SERIES_BELOW
+    a = jnp.where(small, squared, 0.0)
+    series = 1 / 6 - a * (1 / 120 - a * (1 / 5040 - a * (1 / 362880 - a / 39916800)))
+    third = jnp.where(small, series, (1 - sine) / jnp.where(small, 1.0, squared))
+    across = jnp.cross(w, v)
+    translation = v + cosine * across + third * jnp.cross(w, across)
+    return make(quaternion.matrix_from_axis_angle(w), translation)
 
 
 BITS = 10

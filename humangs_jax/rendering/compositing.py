@@ -49,6 +49,10 @@ from humangs_jax.rendering.tiling import TileGrid, TileLists, blocks_by_length, 
 X, Y, R00, R01, R11, LOG_OPACITY = range(6)
 FEATURES = slice(6, None)
 """Red, green, blue, z, and any others: their number is static, XLA unrolls them."""
+Z = 9
+"""The column of z."""
+HALF = 0.5
+"""The transmittance at the median depth."""
 Schedule = Callable[[TileGrid, SplatConfig], Callable[..., PyTree]]
 EXACT = lax.Precision.HIGHEST
 """GPUs and TPUs would otherwise round the factors of a product to 10 or 8 bits."""
@@ -72,12 +76,14 @@ def pack_splats(
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def composite(
     splats: Float[Array, "g width"], lists: TileLists, grid: TileGrid, config: SplatConfig
-) -> tuple[Float[Array, "t n p"], Float[Array, "t p"], Float[Array, " g"]]:
+) -> tuple[
+    Float[Array, "t n p"], Float[Array, "t p"], Float[Array, " g"], Float[Array, "t p"] | None
+]:
     """Draws lists of splats, which must be in depth order, into tiles.
 
-    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; and
-    the largest w of each splat if `config.visibility`, else 0. The first two are differentiable
-    with respect to `splats`, in reverse mode only.
+    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; the largest w of each
+    splat if `config.visibility`, else 0; and if `config.depth_median`, the z of the splat at which T falls to one half,
+    infinite where it never does, else None. The first two are differentiable with respect to `splats`, in reverse mode only.
     """
     return _composite_fwd(splats, lists, grid, config)[0]
 
@@ -85,17 +91,18 @@ def composite(
 def _composite_fwd(
     splats: Array, lists: TileLists, grid: TileGrid, config: SplatConfig
 ) -> tuple[PyTree, PyTree]:
-    features, transmittance, lengths, peaks = _scheduled(
+    features, transmittance, lengths, peaks, medians = _scheduled(
         forward_by_blocks, forward_by_chunks, grid, config, splats, *lists
     )
-    return (features, transmittance, peaks), (splats, lists, features, transmittance, lengths)
+    outputs = features, transmittance, peaks, medians
+    return outputs, (splats, lists, features, transmittance, lengths)
 
 
 def _composite_bwd(
     grid: TileGrid, config: SplatConfig, saved: PyTree, cotangents: PyTree
 ) -> tuple[Array, None]:
     splats, lists, features, transmittance, lengths = saved
-    g, g_transmittance, _ = cotangents
+    g, g_transmittance, *_ = cotangents
     total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
     arrays = splats, lists.items, lists.starts, lengths, g, total
     sums = _scheduled(backward_by_blocks, backward_by_chunks, grid, config, *arrays)
@@ -255,10 +262,11 @@ the chain from the last stored link on; storing T after every splat costs more t
 
 @functools.lru_cache
 def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the
-    lists (t,), peaks (g,).
+    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the lists (t,), peaks (g,), medians.
 
-    peaks: largest w of each splat; 0 unless `config.visibility`.
+    peaks: largest w of each splat; 0 unless `config.visibility`. medians: (t, p) z of the splat at which T falls to one half,
+    infinite where it never does; None unless `config.depth_median`. Lists run front to back, so it is the smallest z behind
+    which T is one half or less.
     """
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
@@ -268,12 +276,12 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
         blocks = blocks_by_length(counts, block)
 
         def draw(b, carry):
-            *out, peaks = carry
+            *out, peaks, all_medians = carry
             tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
             start, count = _lists_of(tile, starts, counts)
 
             def body(carry):
-                i, transmittance, features, lengths, live, peaks = carry
+                i, transmittance, features, lengths, live, peaks, medians = carry
                 item, row, _, raw = take_chunk(
                     splats, items, start + i * k, count - i * k, tile, grid, k
                 )
@@ -288,6 +296,10 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                     features = features + weight * row[:, j, FEATURES, None]
                     weights.append(weight)
                     before = after
+                    if medians is not None:
+                        reached = (weight[:, 0] > 0) & (after[:, 0] <= HALF)
+                        nearer = jnp.minimum(medians, row[:, j, Z, None])
+                        medians = jnp.where(reached, nearer, medians)
                 if config.visibility:
                     highest = largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
                     peaks = peaks.at[item].max(highest, mode="drop")
@@ -298,12 +310,13 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                     )
                 lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
                 live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
-                return i + 1, transmittance, features, lengths, live, peaks
+                return i + 1, transmittance, features, lengths, live, peaks, medians
 
             ones = jnp.ones((block, grid.pixels), dtype)
             zeros = jnp.zeros((block, splats.shape[1] - FEATURES.start, grid.pixels), dtype)
-            carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks
-            _, transmittance, features, lengths, _, peaks = lax.while_loop(
+            medians = jnp.full_like(ones, jnp.inf) if config.depth_median else None
+            carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks, medians
+            _, transmittance, features, lengths, _, peaks, medians = lax.while_loop(
                 lambda carry: jnp.any(carry[4]), body, carry
             )
             results = features, jnp.abs(transmittance), lengths
@@ -311,13 +324,16 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                 o.at[tile].set(r, mode="drop", unique_indices=True)
                 for o, r in zip(out, results, strict=True)
             )
-            return *drawn, peaks
+            if medians is not None:
+                all_medians = all_medians.at[tile].set(medians, mode="drop", unique_indices=True)
+            return *drawn, peaks, all_medians
 
         out = (
             jnp.zeros((t, splats.shape[1] - FEATURES.start, grid.pixels), dtype),
             jnp.ones((t, grid.pixels), dtype),
             jnp.zeros(t, jnp.int32),
             jnp.zeros(splats.shape[0], dtype),
+            jnp.full((t, grid.pixels), jnp.inf, dtype) if config.depth_median else None,
         )
         return lax.fori_loop(0, blocks.used, draw, out)
 
@@ -468,7 +484,7 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
         chunks = cut(starts, counts, items.shape[0], step)
 
         def draw(i, carry):
-            sums, lengths, peaks, tail = carry
+            sums, lengths, peaks, medians, tail = carry
             c = _slice(chunks, i, step)
             item, row, _, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
             alpha, fading = _fading(raw, config)
@@ -485,15 +501,21 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             lengths = lengths.at[c.tiles].max(reached, mode="drop", indices_are_sorted=True)
             if config.visibility:
                 peaks = peaks.at[item].max(largest_weights(weights, c.tiles, grid), mode="drop")
-            return sums, lengths, peaks, _tail(c.tiles, before, since + fading)
+            if medians is not None:
+                reached = (weights > 0) & (before[:, None] + since + fading <= math.log(HALF))
+                nearest = jnp.min(jnp.where(reached, row[..., Z, None], jnp.inf), axis=1)
+                medians = medians.at[c.tiles].min(nearest, mode="drop", indices_are_sorted=True)
+            return sums, lengths, peaks, medians, _tail(c.tiles, before, since + fading)
 
         sums, lengths = (
             jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype),
             jnp.zeros(t, jnp.int32),
         )
-        carry = sums, lengths, jnp.zeros(splats.shape[0], dtype), _no_tail(t, p, dtype)
-        sums, lengths, peaks, _ = lax.fori_loop(0, chunks.steps, draw, carry)
-        return sums[:, :-1], jnp.exp(sums[:, -1]), lengths, peaks
+        peaks = jnp.zeros(splats.shape[0], dtype)
+        medians = jnp.full((t, p), jnp.inf, dtype) if config.depth_median else None
+        carry = sums, lengths, peaks, medians, _no_tail(t, p, dtype)
+        sums, lengths, peaks, medians, _ = lax.fori_loop(0, chunks.steps, draw, carry)
+        return sums[:, :-1], jnp.exp(sums[:, -1]), lengths, peaks, medians
 
     return forward
 

@@ -10,19 +10,16 @@ With p = (X, Y, Z) the mean in the camera's frame, fx, fy, cx, cy of K and W the
 where J is the projection's derivative at p, and A R diag(s) the factor of the covariance; M is
 (2, 3).
 
-Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the
-projection, and its gradient, into a few loops. Its determinant is not taken from the entries of
-cov2d, where float32 cancels for needles, but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 +
-|m1|^2) + eps2d^2 for the rows m0, m1 of M. What is drawn is the upper triangular r with r^T r =
-cov2d^-1 / 2, whose gradient is written by hand for the same reason.
+The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels of s metres
+(`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d), where e = eps2d (s fx/Z)^2 <= eps2d is what
+was added in images of such pixels: what they weigh together stays the same in smaller images (Mip-Splatting's 2D filter,
+https://arxiv.org/abs/2311.16493, equation 9, which has e = 0). `SplatConfig.antialiased` dims all others with e = 0.
 
-The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels
-of s metres (`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d),
-where e = eps2d (s fx/Z)^2 <= eps2d is what was added in images of such pixels: what they weigh
-together stays the same in smaller images (Mip-Splatting's 2D filter,
-https://arxiv.org/abs/2311.16493, equation 9, which has e = 0).
+Where the camera has a lens, mean2d is where the lens puts (X/Z, Y/Z), and J is that of the whole map (`geometry.lens`):
+K's focal lengths, times the lens's Jacobian, times that of the division by Z. Of an orthographic camera J = [[fx, 0, 0],
+[0, fy, 0]], and all directions of sight are its axis.
 
-Gaussians that are not drawn (centre nearer than `near` or behind, footprint beyond
+Gaussians that are not drawn (centre nearer than `near`, behind, or beyond the reach of the lens, footprint beyond
 `LARGEST_FOOTPRINT`) have finite values and pass zero gradients. K's skew is taken as 0.
 """
 
@@ -38,6 +35,7 @@ from humangs_jax.core.array_types import Array, Bool, Float, PyTree
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.lens import distorted_with_slopes, within_reach
 from humangs_jax.rendering.gaussians import Gaussians, added_colors, added_variance
 from humangs_jax.rendering.splat_config import (
     DEFAULT_CONFIG,
@@ -53,11 +51,9 @@ Planes = list[Array]
 class ProjectedGaussians(NamedTuple):
     """2D Gaussians on the image, planes of (g,). In gsplat's arrays: `means2d`, `depths`, `conics`.
 
-    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2,
-    eps2d included.
-    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic
-    / 2, 1 / pixels, finite where not drawn. visible: whether it is drawn. dimming: factor of the
-    opacity in (0, 1], None without low-pass.
+    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, eps2d included.
+    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic / 2, 1 / pixels,
+    finite where not drawn. visible: whether it is drawn. dimming: factor of the opacity in (0, 1], None where nothing is dimmed.
     added_colors: what harmonics add to the colors from here, None without.
     """
 
@@ -100,8 +96,8 @@ def project_gaussians(
 ) -> ProjectedGaussians:
     """Every Gaussian on the image that `config` draws: the first half of `splatting.render`.
 
-    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the
-    half field of view beyond the border.
+    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the half field of view beyond the
+    border, for cameras without lens.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d, jacobian_margin = (
@@ -116,6 +112,10 @@ def project_gaussians(
     X, Y = jnp.where(in_front, X, 0.0), jnp.where(in_front, Y, 0.0)
     inverse_depth = 1 / jnp.where(in_front, Z, 1.0)
     u, v = X * inverse_depth, Y * inverse_depth
+    if not camera.is_plain:
+        reached = within_reach(camera.lens, camera.distortion, u, v)
+        in_front &= reached
+        u, v = jnp.where(reached, u, 0.0), jnp.where(reached, v, 0.0)
 
     ju, jv = u, v
     if jacobian_margin is not None:
@@ -126,6 +126,18 @@ def project_gaussians(
         [zx * (rotation[0, j] - ju * rotation[2, j]) for j in range(3)],
         [zy * (rotation[1, j] - jv * rotation[2, j]) for j in range(3)],
     ]
+    x, y = u, v
+    if camera.lens == "orthographic":
+        x, y, zx = X, Y, fx
+        jw = [[focal * rotation[i, j] for j in range(3)] for i, focal in enumerate((fx, fy))]
+    elif not camera.is_plain:
+        x, y, slopes = distorted_with_slopes(camera.lens, camera.distortion, u, v)
+        toward_u = [inverse_depth * (rotation[0, j] - u * rotation[2, j]) for j in range(3)]
+        toward_v = [inverse_depth * (rotation[1, j] - v * rotation[2, j]) for j in range(3)]
+        jw = [
+            [focal * (du * toward_u[j] + dv * toward_v[j]) for j in range(3)]
+            for focal, (du, dv) in zip((fx, fy), slopes, strict=True)
+        ]
     m = _times_factors(jw, gaussians, config.normalize_quats)
 
     small = _all([jnp.abs(entry) < LARGEST_FOOTPRINT for row in m for entry in row])
@@ -134,16 +146,21 @@ def project_gaussians(
     dimming = None
     if gaussians.low_pass is not None and eps2d > 0:
         dimming = _dimming(m0, m1, determinant, eps2d, gaussians.low_pass * zx)
+    elif config.antialiased and eps2d > 0:
+        dimming = _dimming(m0, m1, determinant, eps2d, jnp.zeros_like(determinant))
     r00, r01, r11 = _conic_factor(m0, m1, eps2d)
     colors = None
     if gaussians.harmonics is not None:
-        sight = [rotation[0, j] * u + rotation[1, j] * v + rotation[2, j] for j in range(3)]
+        if camera.lens == "orthographic":
+            sight = [rotation[2, j] for j in range(3)]
+        else:
+            sight = [rotation[0, j] * u + rotation[1, j] * v + rotation[2, j] for j in range(3)]
         colors = added_colors(
             gaussians.harmonics, *(lax.rsqrt(_dot(sight, sight)) * s for s in sight)
         )
     return ProjectedGaussians(
-        x=fx * u + cx,
-        y=fy * v + cy,
+        x=fx * x + cx,
+        y=fy * y + cy,
         depths=Z,
         xx=xx,
         xy=xy,

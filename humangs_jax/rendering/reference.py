@@ -23,6 +23,7 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.lens import within_reach
 from humangs_jax.rendering.gaussians import Gaussians, added_variance, covariance_factors
 from humangs_jax.rendering.splat_config import (
     DEFAULT_CONFIG,
@@ -40,6 +41,7 @@ def render_reference(
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
     features: Float[Array, "g n"] | None = None,
+    shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
     """The image of `render` by its definition, without tiles or buffers, in the precision of its
     arguments.
@@ -51,16 +53,19 @@ def render_reference(
         camera: as `render`.
         config: as `render`.
         background: as `render`.
+        features: as `render`.
+        shifts: as `render`.
 
     Returns:
-        A `Rendering`.
+        A `Rendering` with all kinds of depth and the distortion; without visibility, means2d and radii.
 
     Examples:
         >>> with jax.enable_x64():
         ...     exact = hg.render_reference(gaussians, camera).rgb
     """
     drawn = with_background(gaussians, camera, background)
-    return _reference(*drawn, splat_config(config), features_of(features, len(gaussians.opacities)))
+    features = features_of(features, len(gaussians.opacities))
+    return _reference(*drawn, splat_config(config), features, shifts)
 
 
 @jax.jit
@@ -70,19 +75,24 @@ def _reference(
     background: Array,
     config: SplatConfig,
     features: Array | None,
+    shifts: Array | None,
 ) -> Rendering:
     centers, axes, depths, visible = _project(gaussians, camera, config)
+    centers = centers if shifts is None else centers + shifts
     eps2d = added_variance(gaussians.low_pass, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
     if gaussians.low_pass is not None and eps2d > 0:  # dimmed as `projection` says
-        contained = eps2d * jnp.minimum((gaussians.low_pass * camera.K[0, 0] / depths) ** 2, 1)
+        away = 1.0 if camera.lens == "orthographic" else depths
+        contained = eps2d * jnp.minimum((gaussians.low_pass * camera.K[0, 0] / away) ** 2, 1)
         opacities = opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
+    elif config.antialiased and eps2d > 0:
+        opacities = opacities * _root(_determinant(axes, 0.0) / determinants)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
 
     def draw(state, splat):
-        color, distance, transmittance, ended = state
+        color, (first, second), median, transmittance, ended = state
         center, axis, determinant, depth, is_visible, opacity, rgb = splat
         d = pixels - center
         squared = jnp.sum(_cross(axis, d[..., None]) ** 2, axis=-1) + eps2d * jnp.sum(d**2, axis=-1)
@@ -91,11 +101,12 @@ def _reference(
         alpha = jnp.where(is_visible & (raw >= config.alpha_min), alpha, 0.0)
         ended = ended | (transmittance * (1 - alpha) <= config.transmittance_stop)
         alpha = jnp.where(ended, 0.0, alpha)
-        weight = alpha * transmittance
+        weight, after = alpha * transmittance, transmittance * (1 - alpha)
         state = (
             color + weight[..., None] * rgb,
-            distance + weight * depth,
-            transmittance * (1 - alpha),
+            (first + weight * depth, second + weight * depth**2),
+            jnp.where((transmittance > 0.5) & (after <= 0.5), depth, median),
+            after,
             ended,
         )
         return state, None
@@ -106,6 +117,8 @@ def _reference(
         sight = jnp.where(
             visible[:, None], transform.apply(camera.cam_from_world, gaussians.means), 1.0
         )
+        if camera.lens == "orthographic":
+            sight = jnp.zeros_like(sight).at[:, 2].set(1.0)
         sight = jnp.matmul(sight, camera.cam_from_world[:3, :3], precision=transform.EXACT)
         sight = sight / jnp.linalg.norm(sight, axis=-1, keepdims=True)
         functions = _harmonics(sight, math.isqrt(gaussians.harmonics.shape[1]))
@@ -113,17 +126,25 @@ def _reference(
         colors = jnp.maximum(colors + added, 0)
     if features is not None:
         colors = jnp.concatenate([colors, features], axis=-1)
-    state = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype), blank, blank + 1, blank > 0
+    colored = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype)
+    state = colored, (blank, blank), blank, blank + 1, blank > 0
     splats = centers, axes, determinants, depths, visible, opacities, colors
-    (color, distance, transmittance, _), _ = lax.scan(
+    (color, (first, second), median, transmittance, _), _ = lax.scan(
         draw, state, jax.tree.map(lambda leaf: leaf[order], splats)
     )
     alpha = 1 - transmittance
     some = alpha > 0
-    depth = jnp.where(some, distance / jnp.where(some, alpha, 1.0), 0.0)
+    depth = jnp.where(some, first / jnp.where(some, alpha, 1.0), 0.0)
     rgb = color[..., :3] + transmittance[..., None] * background
     return Rendering(
-        rgb, alpha, depth, jnp.int32(0), features=None if features is None else color[..., 3:]
+        rgb,
+        alpha,
+        depth,
+        jnp.int32(0),
+        features=None if features is None else color[..., 3:],
+        depth_sum=first,
+        depth_median=lax.stop_gradient(median),
+        distortion=2 * (alpha * second - first**2),
     )
 
 
@@ -138,6 +159,8 @@ def _project(
     """
     p = transform.apply(camera.cam_from_world, gaussians.means)
     visible = p[:, 2] > config.near
+    if not camera.is_plain:
+        return _project_by_lens(gaussians, camera, config, p, visible)
     depths = jnp.where(visible, p[:, 2], 1.0)
     slopes = jnp.where(visible[:, None], p[:, :2], 0.0) / depths[:, None]
     focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
@@ -162,6 +185,49 @@ def _project(
         depths,
         visible & small,
     )
+
+
+def _project_by_lens(
+    gaussians: Gaussians, camera: Camera, config: SplatConfig, p: Array, visible: Array
+) -> tuple[Array, Array, Array, Array]:
+    """As `_project`, with the Jacobian of the whole camera by autodiff."""
+    slopes = p[:, :2] / jnp.where(visible, p[:, 2], 1.0)[:, None]
+    visible &= within_reach(camera.lens, camera.distortion, *slopes.T)
+    p = jnp.where(visible[:, None], p, jnp.asarray([0.0, 0.0, 1.0], p.dtype))
+    centers, jacobian = jax.vmap(lambda q: (_pixel(q, camera), jax.jacfwd(_pixel)(q, camera)))(p)
+    product = functools.partial(jnp.matmul, precision=transform.EXACT)
+    factors = covariance_factors(gaussians, config.normalize_quats)
+    axes = product(product(jacobian, camera.cam_from_world[:3, :3]), factors)
+    small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
+    return centers, jnp.where(small[:, None, None], axes, 0.0), p[:, 2], visible & small
+
+
+def _pixel(p: Float[Array, "3"], camera: Camera) -> Float[Array, "2"]:
+    """Where a camera sees a point of its own frame."""
+    focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
+    if camera.lens == "orthographic":
+        return focal * p[:2] + center
+    k = jnp.zeros(12, p.dtype)
+    if camera.distortion is not None:
+        k = k.at[: camera.distortion.shape[0]].set(camera.distortion)
+    if camera.lens == "fisheye":
+        radius = jnp.sqrt(p[0] ** 2 + p[1] ** 2 + 1e-30)  # smooth on the axis
+        angle = jnp.arctan2(radius, p[2])
+        bent = angle + sum(k[i] * angle ** (2 * i + 3) for i in range(4))
+        return focal * p[:2] * (bent / radius) + center
+    x, y = p[0] / p[2], p[1] / p[2]
+    square = x**2 + y**2
+    ratio = (1 + k[0] * square + k[1] * square**2 + k[4] * square**3) / (
+        1 + k[5] * square + k[6] * square**2 + k[7] * square**3
+    )
+    moved = jnp.stack(
+        [
+            x * ratio + 2 * k[2] * x * y + k[3] * (square + 2 * x**2),
+            y * ratio + k[2] * (square + 2 * y**2) + 2 * k[3] * x * y,
+        ]
+    )
+    prism = jnp.stack([k[8] * square + k[9] * square**2, k[10] * square + k[11] * square**2])
+    return focal * (moved + prism) + center
 
 
 def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
@@ -196,6 +262,12 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
             ]
         cosine, sine = x * cosine - y * sine, x * sine + y * cosine
     return jnp.stack([found[n, m] for n in range(1, degree + 1) for m in range(-n, n + 1)], axis=-1)
+
+
+def _root(x: Float[Array, " g"]) -> Float[Array, " g"]:
+    """Square roots, with zero gradient at 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:

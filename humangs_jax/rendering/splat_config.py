@@ -72,6 +72,9 @@ class SplatConfig:
     """Metres; nearer Gaussians are not drawn."""
     eps2d: Annotated[float, Range(0, 1e6)] = EPS2D
     """Pixels^2 added to the projected variances."""
+    antialiased: bool = False
+    """Opacities are dimmed by what these pixels^2 add to the footprint, so that what a Gaussian weighs stays the same (gsplat's
+    "antialiased"; Mip-Splatting's 2D filter). Gaussians with a `low_pass` are dimmed by theirs anyway."""
     alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
     """Alphas below are skipped."""
     alpha_max: Share = ALPHA_MAX
@@ -84,7 +87,7 @@ class SplatConfig:
     )
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
-    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat."""
+    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat; of cameras without lens."""
     normalize_quats: bool = True
     """False: quaternions are not normalised, as in INRIA's rasterizer."""
     radius_sigma: Annotated[float, Range(1e-6, 100)] | None = knob(
@@ -109,6 +112,16 @@ class SplatConfig:
         measured=MEASURED,
     )
     """Whether `Rendering.visibility` is computed."""
+    means2d: bool = False
+    """Whether `Rendering.means2d`, centres on the image, is returned."""
+    radii: bool = False
+    """Whether `Rendering.radii`, half the sides of the footprints, is computed."""
+    depth_sum: bool = False
+    """Whether `Rendering.depth_sum`, gsplat's "D", is computed."""
+    depth_median: bool = False
+    """Whether `Rendering.depth_median` is computed."""
+    distortion: bool = False
+    """Whether `Rendering.distortion`, the loss of 2DGS for each pixel, is computed."""
     max_pairs: Slots | None = knob(
         None,
         cost="pairs beyond it are not drawn, counted and reported",

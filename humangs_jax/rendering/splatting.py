@@ -27,7 +27,7 @@ from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.processes import compiler_options
-from humangs_jax.core.pytree import Batchable, pytree_dataclass
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.io.images import image_row, named_color, png_bytes
 from humangs_jax.rendering.buffers import (
@@ -46,6 +46,7 @@ from humangs_jax.rendering.tiling import (
     depth_order,
     emit_pairs,
     footprints_by,
+    radii_on_image,
     sort_into_tiles,
     take,
     tiles_to_image,
@@ -66,12 +67,15 @@ __all__ = [
 class Rendering(Batchable):
     """One image of a set of Gaussians; with leading axes, a batch of images.
 
-    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is
-    seen, weighted as the colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that
-    did not fit in the buffers and were not drawn. visibility: (g,) the largest weight alpha T of
-    each Gaussian on any pixel, 0 if it is hidden; not differentiable; None unless
-    `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
-    over 0; None without.
+    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
+    colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
+    drawn. visibility: (g,) the largest weight alpha T of each Gaussian on any pixel, 0 if it is hidden; not
+    differentiable; None unless `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
+    over 0; None without. The others are None unless the field of `SplatConfig` of their name asks for them:
+    means2d: (g, 2) centres on the image, pixels. radii: (g, 2) half the width and height of the footprints, pixels, 0 where
+    nothing is drawn; not differentiable. depth_sum: (h, w) z summed by weight, depth times alpha. depth_median: (h, w) z of
+    the Gaussian at which half of the light is left, 0 where more passes; not differentiable. distortion: (h, w) sum over
+    pairs of w_i w_j (z_i - z_j)^2, squared metres (2DGS, https://arxiv.org/abs/2403.17888, eq. 13, with squares).
     """
 
     rgb: Float[Array, "h w 3"]
@@ -80,6 +84,11 @@ class Rendering(Batchable):
     overflow: Int[Array, ""]
     visibility: Float[Array, " g"] | None = None
     features: Float[Array, "h w n"] | None = None
+    means2d: Float[Array, "g 2"] | None = None
+    radii: Float[Array, "g 2"] | None = None
+    depth_sum: Float[Array, "h w"] | None = None
+    depth_median: Float[Array, "h w"] | None = None
+    distortion: Float[Array, "h w"] | None = None
 
     def _repr_png_(self) -> bytes:
         """The image, or those of a batch side by side, for notebooks."""
@@ -98,6 +107,7 @@ def render(
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
     features: Float[Array, "g n"] | None = None,
+    shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
     """Draw Gaussians as one camera sees them. Gradients are of reverse mode, first derivatives: no
     `jvp`, no Hessian.
@@ -115,11 +125,13 @@ def render(
         camera: one camera; its size is the image's.
         config: what is drawn, and the buffers; or the name of one of `SPLAT_PRESETS`.
         background: (3,) RGB, three numbers, or a color's name. None: white.
-        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels,
-            what a network has learned.
+        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels, what a network has
+            learned.
+        shifts: (g, 2) pixels that are added to the centres on the image. The gradient by zeros is what gsplat's
+            `means2d.grad` holds.
 
     Returns:
-        A `Rendering`: rgb (h, w, 3), alpha, depth, features, overflow, visibility.
+        A `Rendering`: rgb (h, w, 3), alpha, depth, features, overflow, visibility, and what `config` asks for.
 
     Raises:
         TypeError: for arguments of other classes.
@@ -141,7 +153,7 @@ def render(
             " render_views(gaussians, cameras), or jax.vmap(render, in_axes=(None, 0))(gaussians,"
             " cameras) to draw all views at once"
         )
-    return _render(draw, gaussians, camera, config, background, features)
+    return _render(draw, gaussians, camera, config, background, features, shifts)
 
 
 @checked_arguments
@@ -209,6 +221,7 @@ def _render(
     config: SplatConfig | str,
     background: Background,
     features: Float[Array, "g n"] | None = None,
+    shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
     if gaussians.batch_shape:
         raise ValueError(
@@ -218,26 +231,24 @@ def _render(
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     features = features_of(features, len(gaussians.opacities))
+    more = (features,) if shifts is None else (features, _shifts_of(shifts, gaussians))
     if any(
-        isinstance(leaf, Tracer)
-        for leaf in jax.tree.leaves((gaussians, cameras, background, features))
+        isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background, more))
     ):
         config = with_default_buffers(gaussians, cameras, config)
-        rendering = draw(gaussians, cameras, background, config, features)
+        rendering = draw(gaussians, cameras, background, config, *more)
         warn_of_overflow(rendering.overflow, config)
         return rendering
     check_values(
         "render",
         gaussian_values(gaussians)
         | camera_values(cameras)
-        | {
-            "background": (background, FINITE),
-            "features": (features, FINITE),
-        },
+        | {"background": (background, FINITE), "features": (features, FINITE)}
+        | {"shifts": (shifts, FINITE)},
     )
     if config.max_pairs is None:
         config = plan_buffers(gaussians, cameras, config, margin=1.0)
-    rendering = _jitted(draw)(gaussians, cameras, background, config, features)
+    rendering = _jitted(draw)(gaussians, cameras, background, config, *more)
     raise_on_overflow(rendering.overflow, gaussians, cameras, config)
     return rendering
 
@@ -292,6 +303,14 @@ def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array
     if features is not None and features.shape[:1] != (count,):
         raise ValueError(f"features: expected shape ({count}, n), got {features.shape}")
     return at_least_float32(features)
+
+
+def _shifts_of(shifts: Float[Array, "g 2"], gaussians: Gaussians) -> Float[Array, "g 2"]:
+    """Raises: ValueError for those of another number of Gaussians."""
+    expected = (len(gaussians.opacities), 2)
+    if shifts.shape != expected:
+        raise ValueError(f"shifts: expected shape {expected}, got {shifts.shape}")
+    return shifts
 
 
 def _color(background: object, dtype: np.dtype) -> Array:
@@ -351,13 +370,17 @@ def draw(
     background: Float[Array, "3"],
     config: SplatConfig,
     features: Float[Array, "g n"] | None = None,
+    shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
     """`render` with buffers that are decided, `config.max_pairs`: pure, and without checks."""
     gaussians, features = jax.tree.map(
         lambda leaf: _once_per_image(leaf, camera), (gaussians, features)
     )
+    projected = project_gaussians(gaussians, camera, config)
+    if shifts is not None:
+        projected = projected._replace(x=projected.x + shifts[:, 0], y=projected.y + shifts[:, 1])
     return _draw(
-        project_gaussians(gaussians, camera, config),
+        projected,
         gaussians,
         camera,
         background,
@@ -391,18 +414,13 @@ def _draw(
 ) -> Rendering:
     grid = TileGrid(camera.width, camera.height, config.tile_size)
     if gaussians.means.shape[0] == 0:
-        blank = jnp.zeros(
-            (grid.tiles, 4 + (0 if others is None else others.shape[1]), grid.pixels),
-            projected.x.dtype,
-        )
-        visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
-        return _blended(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), visibility)
+        return _blank(projected, grid, background, config, others)
 
     depths = jnp.where(projected.visible, lax.stop_gradient(projected.depths), jnp.inf)
     order = depth_order(depths)
     opacities = projected.dimmed(gaussians.opacities)
-    footprints = footprints_by(projected, opacities, config)
-    footprints = jax.tree.map(lambda plane: take(plane, order), footprints)
+    found = footprints_by(projected, opacities, config)
+    footprints = jax.tree.map(lambda plane: take(plane, order), found)
 
     # Depths are blended relative to the nearest: their gradient is a difference of depths, which
     # must not drown in the rounding of depths.
@@ -413,6 +431,7 @@ def _draw(
         projected.seen_from_here(gaussians.colors),
         behind[:, None],
         *([] if others is None else [others]),
+        *([_powers(behind, projected.visible)] if config.distortion else []),
     ]
     seen = jnp.concatenate(seen, axis=-1)
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
@@ -420,16 +439,56 @@ def _draw(
     assert config.max_pairs is not None  # callers have fitted the buffers
     pairs = emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs)
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
-    features, transmittance, peaks = composite(splats, lists, grid, config)
+    features, transmittance, peaks, medians = composite(splats, lists, grid, config)
     peaks = lax.stop_gradient(peaks)
     visibility = (
         jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True)
         if config.visibility
         else None
     )
-    return _blended(
-        features, transmittance[:, None], grid, background, nearest, pairs.overflow, visibility
+    rendering = _blended(
+        features, transmittance[:, None], grid, background, nearest, pairs.overflow, config
     )
+    depth_median, radii = None, None
+    if medians is not None:
+        medians = lax.stop_gradient(jnp.where(medians < jnp.inf, nearest + medians, 0.0))
+        depth_median = tiles_to_image(medians[:, None], grid)[..., 0]
+    if config.radii:
+        radii = radii_on_image(found, camera.width, camera.height)
+    return replace(
+        rendering,
+        visibility=visibility,
+        means2d=projected.means2d if config.means2d else None,
+        radii=radii,
+        depth_median=depth_median,
+    )
+
+
+def _blank(
+    projected: ProjectedGaussians,
+    grid: TileGrid,
+    background: Array,
+    config: SplatConfig,
+    others: Array | None,
+) -> Rendering:
+    """The image of no Gaussians."""
+    count = 4 + (0 if others is None else others.shape[1]) + 2 * config.distortion
+    blank = jnp.zeros((grid.tiles, count, grid.pixels), projected.x.dtype)
+    rendering = _blended(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), config)
+    return replace(
+        rendering,
+        visibility=jnp.zeros(0, blank.dtype) if config.visibility else None,
+        means2d=jnp.zeros((0, 2), blank.dtype) if config.means2d else None,
+        radii=jnp.zeros((0, 2), blank.dtype) if config.radii else None,
+        depth_median=jnp.zeros_like(rendering.depth) if config.depth_median else None,
+    )
+
+
+def _powers(behind: Float[Array, " g"], visible: Array) -> Float[Array, "g 2"]:
+    """z and its square, about the mean of what is drawn: small numbers have small squares."""
+    count = jnp.maximum(jnp.sum(visible), 1)
+    z = jnp.where(visible, behind - lax.stop_gradient(jnp.sum(behind) / count), 0.0)
+    return jnp.stack([z, z * z], axis=-1)
 
 
 def _blended(
@@ -439,7 +498,7 @@ def _blended(
     background: Array,
     nearest: Array | float,
     overflow: Array,
-    visibility: Array | None,
+    config: SplatConfig,
 ) -> Rendering:
     """features: (t, 4 + n, p) premultiplied rgb, z - nearest and others. transmittance: (t, 1, p)
     the final one.
@@ -450,6 +509,22 @@ def _blended(
     alpha = 1 - transmittance
     rgb = features[:, :3] + transmittance * background[:, None]
     depth = jnp.where(alpha > 0, nearest + safe_divide(features[:, 3:4], alpha), 0.0)
-    rgb, alpha, depth = (tiles_to_image(tiles, grid) for tiles in (rgb, alpha, depth))
+    rgb, alpha_image, depth = (tiles_to_image(tiles, grid) for tiles in (rgb, alpha, depth))
+    depth_sum, distortion = None, None
+    if config.depth_sum:
+        depth_sum = tiles_to_image(nearest * alpha + features[:, 3:4], grid)[..., 0]
+    if config.distortion:
+        first, second = features[:, -2:-1], features[:, -1:]
+        spread = 2 * jnp.maximum(alpha * second - first * first, 0.0)
+        distortion = tiles_to_image(spread, grid)[..., 0]
+        features = features[:, :-2]
     others = tiles_to_image(features[:, 4:], grid) if features.shape[1] > 4 else None
-    return Rendering(rgb, alpha[..., 0], depth[..., 0], overflow, visibility, others)
+    return Rendering(
+        rgb,
+        alpha_image[..., 0],
+        depth[..., 0],
+        overflow,
+        features=others,
+        depth_sum=depth_sum,
+        distortion=distortion,
+    )

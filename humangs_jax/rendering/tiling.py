@@ -305,6 +305,10 @@ class Footprints(NamedTuple):
         row1 = _last(self.y + half, grid.tile_size, grid.rows)
         return row0, jnp.where(self.reach > 0, jnp.maximum(row1 - row0 + 1, 0), 0)
 
+    def half_sides(self) -> Float[Array, "g 2"]:
+        """Half the width and height of each, pixels."""
+        return jnp.sqrt(self.reach[:, None] * jnp.stack([self.xx, self.yy], axis=-1))
+
     def bands(self) -> "_Bands":
         height, tip = jnp.sqrt(self.reach * self.yy), self.xy * jnp.sqrt(self.reach / self.xx)
         inverse = 1 / self.yy
@@ -365,6 +369,10 @@ class Squares(NamedTuple):
         """First row of tiles of each splat, and how many."""
         first, last = self._range(self.y, grid.tile_size, grid.rows)
         return first, jnp.where(self.radius > 0, jnp.maximum(last - first + 1, 0), 0)
+
+    def half_sides(self) -> Float[Array, "g 2"]:
+        """Half the sides of each, pixels."""
+        return jnp.stack([self.radius, self.radius], axis=-1)
 
     def bands(self) -> "Squares":
         return self
@@ -463,6 +471,17 @@ def footprints_by(
     if config.square:
         return square_footprints(projected, reach, config.radius_sigma)
     return footprints(projected, jnp.minimum(reach, config.radius_sigma**2))
+
+
+def radii_on_image(
+    footprints: Footprints | Squares, width: int, height: int
+) -> Float[Array, "g 2"]:
+    """Half the sides of the footprints in pixels, 0 for those that lie beside the image. No gradient."""
+    half = footprints.half_sides()
+    center = jnp.stack([footprints.x, footprints.y], axis=-1)
+    size = jnp.asarray([width, height], half.dtype)
+    met = jnp.all((center + half > 0) & (center - half < size), axis=-1, keepdims=True)
+    return jnp.where(met, half, 0.0)
 
 
 def count_pairs(

@@ -105,7 +105,7 @@ def test_equals_the_formula_with_its_gradient():
 
 def test_empty_lists_leave_their_tiles_blank():
     splats, lists = make(1)
-    features, transmittance, _ = jax.jit(lambda s, l: composite(s, l, GRID, CONFIG))(splats, lists)
+    features, transmittance, *_ = jax.jit(lambda s, l: composite(s, l, GRID, CONFIG))(splats, lists)
     for tile in (1, 4):
         assert not features[tile].any() and (transmittance[tile] == 1).all()
 

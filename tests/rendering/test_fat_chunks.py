@@ -85,7 +85,7 @@ def schedule(functions, splats, lists, grid=GRID, config=None, per_step=1024):
     config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, visibility=True)
     forward, backward = functions
     with mock.patch.object(compositing, "STEP_CHUNKS", per_step):
-        features, transmittance, lengths, peaks = forward(grid, config)(splats, *lists)
+        features, transmittance, lengths, peaks, _ = forward(grid, config)(splats, *lists)
         g, g_transmittance = cotangents(grid, splats.dtype)
         total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
         sums = backward(grid, config)(splats, lists.items, lists.starts, lengths, g, total)

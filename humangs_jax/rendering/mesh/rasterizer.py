@@ -36,7 +36,7 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import Range, Spread, configuration
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
-from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.camera import Camera, require_pinhole
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
 
 SPAN_SLACK = 16
@@ -146,10 +146,8 @@ def interpolate_attributes(
 
 
 def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
-    """(n, 3): pixel position x, y and depth z.
-
-    Written out: matrix products are of low precision on GPU and TPU.
-    """
+    """(n, 3): pixel position x, y and depth z. Written out: matrix products are of low precision on GPU and TPU."""
+    require_pinhole("the rasterizer of meshes", camera)
     R, t, K = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3], camera.K
     x, y, z = (
         R[i, 0] * vertices[:, 0] + R[i, 1] * vertices[:, 1] + R[i, 2] * vertices[:, 2] + t[i]

@@ -1,0 +1,106 @@
+"""Lenses: where a point of the plane z = 1 before a camera appears on it, and how far a lens reaches.
+
+"pinhole" with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]] (Brown and Conrady, calib3d): of a point
+(u, v) = (X / Z, Y / Z), with r^2 = u^2 + v^2 and R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+
+    x = u R + 2 p1 u v + p2 (r^2 + 2 u^2) + s1 r^2 + s2 r^4
+    y = v R + p1 (r^2 + 2 v^2) + 2 p2 u v + s3 r^2 + s4 r^4.
+
+"fisheye" (Kannala and Brandt 2006, OpenCV's fisheye module), with t = atan(r) and coefficients k1 k2 k3 k4, or none:
+
+    (x, y) = (u, v) t / r (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
+
+"orthographic" has neither: pixels are fx X + cx and fy Y + cy, K in pixels a metre. Arrays are planes of any shape.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Bool, Float
+
+COUNTS: dict[str, tuple[int, ...]] = {
+    "pinhole": (4, 5, 8, 12),
+    "fisheye": (4,),
+    "orthographic": (),
+}
+"""Numbers of coefficients, by lens."""
+SMALL_SQUARE = 1e-3
+"""Below this r^2, atan(r) / r is its Taylor series, cut after r^10: exact to the rounding of float64."""
+RINGS = 16
+"""Places along the way from the axis to a point, at each of which the image has to grow outwards."""
+
+
+def check_lens(lens: object, count: int | None) -> None:
+    """Raises: ValueError for a lens that is not known, and for another number of coefficients than it has."""
+    if lens not in COUNTS:
+        raise ValueError(f"lens: expected {', '.join(COUNTS)}, got {lens!r}")
+    allowed = COUNTS[str(lens)]
+    if count is not None and count not in allowed:
+        expected = f"{' or '.join(map(str, allowed))} coefficients" if allowed else "none"
+        raise ValueError(f"distortion of a {lens} lens: expected {expected}, got {count}")
+
+
+def distorted(
+    lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
+) -> tuple[Array, Array]:
+    """Where the lens puts points of the plane z = 1. Raises: as `check_lens`."""
+    check_lens(lens, None if coefficients is None else coefficients.shape[-1])
+    if lens == "fisheye":
+        scale = _fisheye_scale(coefficients, u * u + v * v)
+        return u * scale, v * scale
+    if coefficients is None:
+        return u, v
+    c = [coefficients[i] for i in range(coefficients.shape[-1])] + [0.0] * 12
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = c[:12]
+    rr = u * u + v * v
+    radial = (1 + rr * (k1 + rr * (k2 + rr * k3))) / (1 + rr * (k4 + rr * (k5 + rr * k6)))
+    x = u * radial + 2 * p1 * u * v + p2 * (rr + 2 * u * u) + rr * (s1 + rr * s2)
+    y = v * radial + p1 * (rr + 2 * v * v) + 2 * p2 * u * v + rr * (s3 + rr * s4)
+    return x, y
+
+
+def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
+    """t / r (1 + k1 t^2 + ...) from r^2, smooth on the axis."""
+    small = rr < SMALL_SQUARE
+    near = jnp.where(small, rr, 0.0)
+    series = 1 - near * (1 / 3 - near * (1 / 5 - near * (1 / 7 - near * (1 / 9 - near / 11))))
+    r = jnp.sqrt(jnp.where(small, 1.0, rr))
+    ratio = jnp.where(small, series, jnp.arctan(r) / r)
+    if coefficients is None:
+        return ratio
+    k1, k2, k3, k4 = (coefficients[i] for i in range(4))
+    tt = ratio * ratio * rr
+    return ratio * (1 + tt * (k1 + tt * (k2 + tt * (k3 + tt * k4))))
+
+
+def distorted_with_slopes(
+    lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
+) -> tuple[Array, Array, list[list[Array]]]:
+    """x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]], by forward mode: it has a gradient itself."""
+    lensed = lambda u, v: distorted(lens, coefficients, u, v)
+    one, zero = jnp.ones_like(u), jnp.zeros_like(u)
+    (x, y), (xu, yu) = jax.jvp(lensed, (u, v), (one, zero))
+    _, (xv, yv) = jax.jvp(lensed, (u, v), (zero, one))
+    return x, y, [[xu, xv], [yu, yv]]
+
+
+def within_reach(
+    lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
+) -> Bool[Array, "*b"]:
+    """Whether the image grows outwards all the way from the axis to a point: beyond that, a lens's polynomial folds the image
+    back over itself. Tangential terms are left out. No gradient.
+    """
+    u, v = jax.lax.stop_gradient((u, v))
+    if coefficients is None:
+        return jnp.isfinite(u) & jnp.isfinite(v)
+    coefficients = jax.lax.stop_gradient(coefficients)
+    if lens == "pinhole":
+        straight = [i for i in (2, 3, 8, 9, 10, 11) if i < coefficients.shape[-1]]
+        coefficients = coefficients.at[jnp.asarray(straight)].set(0.0)
+    r = jnp.sqrt(u * u + v * v)
+    image = lambda r: distorted(lens, coefficients, r, jnp.zeros_like(r))[0]
+    grows = jnp.isfinite(r)
+    for i in range(1, RINGS + 1):
+        _, slope = jax.jvp(image, (r * (i / RINGS),), (jnp.ones_like(r),))
+        grows &= slope > 0
+    return grows
