@@ -41,6 +41,7 @@ from .avatar.export.gaussians import (
     load_gaussians as load_gaussians,
     save_gaussians as save_gaussians,
 )
+from .data.calibration.loaded import load_cameras as load_cameras
 from .geometry.camera import Camera as Camera, look_at as look_at, orbit as orbit
 from .rendering.splatting import render as render, render_views as render_views
 from .rendering.reference import render_reference as render_reference

@@ -320,9 +320,14 @@ def colmap(tmp_path, cameras=None, images=None):
     ("cameras", "images", "problem"),
     [
         (
-            lambda t: t.replace("PINHOLE", "OPENCV_FISHEYE"),
+            lambda t: re.sub("PINHOLE (.*)", r"OPENCV_FISHEYE \1 0.1 0 0 0", t),
             None,
             "line 2: camera model OPENCV_FISHEYE: expected one of",
+        ),
+        (
+            lambda t: t.replace("PINHOLE", "FOV"),
+            None,
+            "line 2: camera model FOV: expected one of",
         ),
         (
             lambda t: t.replace("PINHOLE", "SIMPLE_PINHOLE"),

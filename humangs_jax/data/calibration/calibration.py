@@ -64,12 +64,11 @@ PixelCenters = Literal["integer", "half"]
 class CalibratedCamera:
     """One camera, or one image's camera where the format has one per image.
 
-    name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world:
-    (4, 4), OpenCV axes.
-    width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of
-    OpenCV, or None.
-    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera
-    for each image.
+    name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world: (4, 4), OpenCV axes.
+    width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of OpenCV, or None.
+    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera for each image.
+    lens: of `geometry.lens`. refusal: of lenses whose photos are not undistorted here (fisheyes, more coefficients), what is
+    raised where that is needed; their distortion has 8, 12 or, of fisheyes, 4 numbers.
     """
 
     name: str
@@ -77,9 +76,11 @@ class CalibratedCamera:
     cam_from_world: Float[np.ndarray, "4 4"]
     width: int | None = None
     height: int | None = None
-    distortion: Float[np.ndarray, "5"] | None = None
+    distortion: Float[np.ndarray, " coefficients"] | None = None
     frame: int = 0
     mask: str | None = None
+    lens: str = "pinhole"
+    refusal: CaptureError | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,13 +88,14 @@ class Observations:
     """Points that the calibration saw, one row for each time: the evidence that reprojection is
     checked against.
 
-    points: (n, 3) in the world. cameras: (n,) which camera saw it. pixels: (n, 2) where, distortion
-    included.
+    points: (n, 3) in the world. cameras: (n,) which camera saw it. pixels: (n, 2) where, distortion included.
+    colors: (n, 3) of the points, 0 to 255; None where the format has none.
     """
 
     points: Float[np.ndarray, "n 3"]
     cameras: Int[np.ndarray, " n"]
     pixels: Float[np.ndarray, "n 2"]
+    colors: Float[np.ndarray, "n 3"] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -136,7 +138,8 @@ class Calibration:
             new = np.full(len(self.cameras), -1)
             new[list(kept)] = np.arange(len(kept))
             own = new[seen.cameras] >= 0
-            seen = Observations(seen.points[own], new[seen.cameras[own]], seen.pixels[own])
+            colors = None if seen.colors is None else seen.colors[own]
+            seen = Observations(seen.points[own], new[seen.cameras[own]], seen.pixels[own], colors)
             seen = seen if own.any() else None
         stations = None if self.stations is None else min(self.stations, len(cameras))
         return dataclasses.replace(
@@ -182,13 +185,23 @@ class Source:
         return Calibration(*what, unit=format.unit, **more)
 
 
-def read_calibration(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibration:
+def read_calibration(
+    path: Path, photo_size: Callable[[str], tuple[int, int]], any_lens: bool = False
+) -> Calibration:
     """The calibration in a file or folder of one of the `CAMERAS`; its content decides which one.
 
-    photo_size: as in `Source`.
+    photo_size: as in `Source`. any_lens: also one whose photos are not undistorted here, else refused.
 
     Raises: CaptureError, one line that names the file and what was expected.
     """
+    calibration = _read(path, photo_size)
+    refusals = (camera.refusal for camera in calibration.cameras if camera.refusal is not None)
+    if not any_lens and (refusal := next(refusals, None)) is not None:
+        raise refusal
+    return calibration
+
+
+def _read(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibration:
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
     with reading(path, "calibration", CaptureError):
@@ -317,17 +330,37 @@ s1..s4, tx ty.
 def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5"] | None:
     """k1 k2 p1 p2 k3 of OpenCV's list of coefficients; None if all are 0.
 
-    Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or others than the first five are not
-    0.
+    Raises: as `pinhole_lens`, and CaptureError if others than the first five are not 0.
+    """
+    fields = pinhole_lens(values, file, field)
+    if "refusal" in fields:
+        raise fields["refusal"]
+    return fields["distortion"]
+
+
+def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
+    """Fields of a `CalibratedCamera` for OpenCV's list of coefficients.
+
+    Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or the last two of 14, a tilted sensor, are not 0.
     """
     values = file_numbers(values, file, field).ravel()
     if len(values) not in COUNTS:
         raise CaptureError(file, field, f"expected k1 k2 p1 p2 [k3], got {len(values)} numbers")
+    beyond = f"coefficients beyond k1 k2 p1 p2 k3 are not supported: {UNDISTORT_BEFORE}"
+    refusal = CaptureError(file, field, beyond)
+    if values[12:].any():
+        raise refusal
     if values[5:].any():
-        raise CaptureError(
-            file, field, f"coefficients beyond k1 k2 p1 p2 k3 are not supported: {UNDISTORT_BEFORE}"
-        )
-    return np.pad(values[:5], (0, max(0, 5 - len(values)))) if values.any() else None
+        return {"distortion": values[: 8 if not values[8:].any() else 12], "refusal": refusal}
+    five = np.pad(values[:5], (0, max(0, 5 - len(values))))
+    return {"distortion": five if values.any() else None}
+
+
+def fisheye_lens(values: Any, file: object, field: str, refusal: CaptureError) -> dict[str, Any]:
+    """Fields of a `CalibratedCamera` for k1 k2 k3 k4 of a fisheye, or fewer. refusal: where photos have to be undistorted."""
+    values = file_numbers(values, file, field).ravel()
+    coefficients = values if values[4:].any() else np.pad(values[:4], (0, max(0, 4 - len(values))))
+    return {"distortion": coefficients, "lens": "fisheye", "refusal": refusal}
 
 
 def distort(

@@ -162,7 +162,9 @@ def import_cameras(
             raise CaptureError(folder, "", "no such folder")
     check_place(out, overwrite, (source, images, masks))
     with photos_of_videos(images, masks, out, every, frames) as found:
-        calibration = read_calibration(source, functools.partial(_size_of, found.images, source))
+        calibration = read_calibration(
+            source, functools.partial(photo_size_of, found.images, source)
+        )
         calibration, left_out = with_photos(calibration, found.images)
         report = import_calibration(
             calibration,
@@ -183,11 +185,8 @@ def import_cameras(
     )
 
 
-def _size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
-    """Width and height of the photo of that name.
-
-    A name without photo gets those of another: its camera is left out later.
-    """
+def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
+    """Width and height of the photo of that name. A name without photo gets those of another: its camera is left out later."""
     try:
         return photo_size(photo_of(images, name, source))
     except CaptureError:

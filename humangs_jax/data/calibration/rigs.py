@@ -30,8 +30,10 @@ from humangs_jax.data.calibration.calibration import (
     Calibration,
     Source,
     brown_conrady,
+    fisheye_lens,
     image_size,
     intrinsics,
+    pinhole_lens,
     pose_matrix,
     rotation,
 )
@@ -145,16 +147,21 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
     pose = pose_matrix(
         rotation(values[turn_key], *where(turn_key)), floats(values["T"], *where("T"), (3,))
     )
-    K, lens = floats(values["K"], *where("K"), (3, 3)), None
+    K, lens, refusal = floats(values["K"], *where("K"), (3, 3)), (None, ""), None
     for key, value in values.items():
-        if (
-            value.lower() in FISHEYE
-            if isinstance(value, str)
-            else key.lower() in FISHEYE and bool(value)
-        ):
-            raise CaptureError(*where(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
+        named = isinstance(value, str) and value.lower() in FISHEYE
+        if named or (not isinstance(value, str) and key.lower() in FISHEYE and bool(value)):
+            refusal = CaptureError(
+                *where(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
+            )
         if (key.lower() == "d" or key.lower().startswith("dist")) and not isinstance(value, str):
-            lens = brown_conrady(value, *where(key))
+            lens = value, key
+    coefficients, key = lens
+    if refusal is not None:
+        at = where(key) if key else where("dist")
+        fields = fisheye_lens([] if coefficients is None else coefficients, *at, refusal)
+    else:
+        fields = {} if coefficients is None else pinhole_lens(coefficients, *where(key))
     sizes = {key: values[key] for key in ("imgSize", "image_size") if key in values}
     sizes |= {
         w: [values[w], values[h]]
@@ -162,7 +169,7 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
         if {w, h} <= values.keys()
     }
     size = next((image_size(value, *where(key)) for key, value in sizes.items()), (None, None))
-    return CalibratedCamera(name, K, pose, *size, lens)
+    return CalibratedCamera(name, K, pose, *size, **fields)
 
 
 def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:

@@ -24,9 +24,10 @@ from humangs_jax.data.calibration.calibration import (
     Calibration,
     Observations,
     Source,
-    brown_conrady,
+    fisheye_lens,
     image_size,
     intrinsics,
+    pinhole_lens,
     pose_matrix,
 )
 from humangs_jax.data.capture_checks import (
@@ -50,10 +51,16 @@ PARAMETERS = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
-"""Camera models and their parameters in cameras.txt; in cameras.bin they are numbered in this
-order.
-"""
+"""Camera models and their parameters in cameras.txt."""
+NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), PARAMETERS, strict=True))
+"""Camera models by their numbers in cameras.bin."""
+UNDISTORTED = tuple(PARAMETERS)[:5]
+"""Those whose photos `import_cameras` undistorts."""
 
 
 def read_colmap(source: Source, format: CameraFormat) -> Calibration:
@@ -91,7 +98,10 @@ def read_colmap(source: Source, format: CameraFormat) -> Calibration:
         if int(p) in places
     ]
     table = np.asarray(rows, np.float64)
-    found = Observations(table[:, 3:], table[:, 0].astype(int), table[:, 1:3]) if rows else None
+    found = None
+    if rows:
+        owners = table[:, 0].astype(int)
+        found = Observations(table[:, 3:6], owners, table[:, 1:3], table[:, 6:])
     return source.calibration(format, cameras, file=file, observations=found)
 
 
@@ -106,18 +116,25 @@ def _lens(
         )
     )
     K = intrinsics(p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0)), p["cx"], p["cy"])
-    distortion = brown_conrady([p.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")], file, where)
-    return CalibratedCamera("", K, np.eye(4), *image_size(size, file, where), distortion)
+    if model.endswith("FISHEYE"):
+        coefficients = [p.get(f"k{i}", 0.0) for i in (1, 2, 3, 4)]
+        lens = fisheye_lens(coefficients, file, where, _refusal(model, file, where))
+    else:
+        keys = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        lens = pinhole_lens([p.get(key, 0.0) for key in keys], file, where)
+    return CalibratedCamera("", K, np.eye(4), *image_size(size, file, where), **lens)
 
 
 def _check_camera_model(model: str, file: Path, where: str) -> None:
     if model not in PARAMETERS:
-        supported = ", ".join(PARAMETERS)
-        raise CaptureError(
-            file,
-            where,
-            f"camera model {model}: expected one of {supported}; else {UNDISTORT_BEFORE}",
-        )
+        raise _refusal(model, file, where)
+
+
+def _refusal(model: str, file: Path, where: str) -> CaptureError:
+    supported = ", ".join(UNDISTORTED)
+    return CaptureError(
+        file, where, f"camera model {model}: expected one of {supported}; else {UNDISTORT_BEFORE}"
+    )
 
 
 def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, "4 4"]:
@@ -131,6 +148,10 @@ def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, 
 
 # Text
 # --------------------------------------------------------------------------------------------------
+
+
+GREY = (128.0, 128.0, 128.0)
+"""Of points whose line has no color."""
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
@@ -181,10 +202,10 @@ def _text_images(file: Path) -> Iterator[Registered]:
 def _text_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
     for where, line in _lines(file):
         if line.strip():
-            yield (
-                int(line.split()[0]),
-                floats(_numbers(line.split()[1:4], file, where), file, where, (3,)).tolist(),
-            )
+            number, *words = line.split()[:7]
+            place = floats(_numbers(words[:3], file, where), file, where, (3,))
+            color = _numbers(words[3:], file, where) if len(words) == 6 else GREY
+            yield int(number), [*place.tolist(), *color]
 
 
 # Binary: read inside `reading`, which names the file
@@ -223,7 +244,7 @@ def _binary_cameras(file: Path) -> Iterator[tuple[str, CalibratedCamera]]:
         data = _Bytes(file)
         for i in range(*data.read("Q")):
             camera_id, number, width, height = data.read("iiQQ")
-            model = dict(enumerate(PARAMETERS)).get(number, str(number))
+            model = NUMBERS.get(number, str(number))
             _check_camera_model(model, file, f"camera {i}")
             values = data.read("d" * len(PARAMETERS[model]))
             yield str(camera_id), _lens(model, (width, height), values, file, f"camera {i}")
@@ -246,15 +267,17 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
     with reading(file, "COLMAP model", CaptureError):
         data = _Bytes(file)
         for i in range(*data.read("Q")):
-            point, *place, _, _, _, _, track = data.read("Q3d3BdQ")
+            point, x, y, z, red, green, blue, _, track = data.read("Q3d3BdQ")
             data.take(8 * track)
-            yield point, floats(place, file, f"point {i}", (3,)).tolist()
+            place = floats((x, y, z), file, f"point {i}", (3,))
+            yield point, [*place.tolist(), red, green, blue]
 
 
 # transforms.json
 # --------------------------------------------------------------------------------------------------
 
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+FISHEYE_MODEL = "OPENCV_FISHEYE"
 MASK_KEYS = ("fg_mask_path", "mask_path")
 """Of VHAP and of nerfstudio."""
 MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
@@ -298,13 +321,15 @@ def _frame_camera(
 ) -> CalibratedCamera:
     (name,) = members(values, file, prefix.rstrip("."), file_path=str)
     number = lambda key: float(floats(values[key], file, f"{prefix}{key}", ()))
-    model = values.get("camera_model", "OPENCV")
+    model, refusal = values.get("camera_model", "OPENCV"), None
     if model not in CAMERA_MODELS:
         expected = f"expected {', '.join(CAMERA_MODELS)}; else {UNDISTORT_BEFORE}"
-        raise CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
+        refusal = CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
+        if model != FISHEYE_MODEL:
+            raise refusal
     for key in ("is_fisheye", "k4"):  # five coefficients do not describe these lenses
-        if values.get(key):
-            raise CaptureError(
+        if values.get(key) and refusal is None:
+            refusal = CaptureError(
                 file, f"{prefix}{key}", f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
             )
     size = None
@@ -331,7 +356,14 @@ def _frame_camera(
         K = intrinsics(*(focal.get(axis, next(iter(focal.values()))) for axis in "xy"), *center)
     else:
         raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
-    lens = [number(key) if key in values else 0.0 for key in ("k1", "k2", "p1", "p2", "k3")]
+    of_fisheye = model == FISHEYE_MODEL or bool(values.get("is_fisheye"))
+    keys = ("k1", "k2", "k3", "k4") if of_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4")
+    coefficients = [number(key) if key in values else 0.0 for key in keys]
+    if refusal is not None and of_fisheye:
+        lens = fisheye_lens(coefficients, file, f"{prefix}k1", refusal)
+    else:
+        lens = pinhole_lens([*coefficients, 0.0, 0.0], file, f"{prefix}k1")
+        lens |= {} if refusal is None else {"refusal": refusal}
     pose = floats(
         required(values, "transform_matrix", file, prefix),
         file,
@@ -344,9 +376,7 @@ def _frame_camera(
         raise CaptureError(
             file, f"{prefix}transform_matrix", "expected a rigid transform, got a singular one"
         ) from None
-    return CalibratedCamera(
-        name, K, cam_from_world, width, height, brown_conrady(lens, file, f"{prefix}k1")
-    )
+    return CalibratedCamera(name, K, cam_from_world, width, height, **lens)
 
 
 # Moments
