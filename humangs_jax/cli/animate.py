@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.avatar.export import EXPORTS, OTHERS, VIDEOS
+from humangs_jax.avatar.export import EXPORTS, OTHERS, READ_ONLY, VIDEOS
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import (
     WHOLE,
@@ -36,7 +36,12 @@ RATE, FINITE = Range(0.01, 1000.0), at_least(-LARGEST)
 VIDEO = Place(VIDEOS.suffixes, folder=True)
 _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
 FROM_THE_SIDE = Shot(azimuth=20.0)
-SPLATS = {suffix: each for each in EXPORTS.values() if not each.mesh for suffix in each.suffixes}
+SPLATS = {
+    suffix: each
+    for each in (*EXPORTS.values(), *READ_ONLY.values())
+    if not each.mesh
+    for suffix in each.suffixes
+}
 """Files of Gaussians, and the axis that points up in them."""
 OF_A_FILE = (
     "Cameras of a file: of Gaussians in its world, of an avatar around a person who stands on the"

@@ -295,25 +295,34 @@ def read_torch_file(
             return _state_dict(_of_archive(archive, size, _NAMES), size, wanted)
 
 
-def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
+def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
+    """All tensors of a dict that lies under one of the keys, in the bytes of a file of `torch.save`. Raises: Refused."""
+    file, size = io.BytesIO(data), len(data)
+    if data.startswith(PICKLE_START):
+        return _state_dict(_of_stream(file, size, _NAMES), size, everything, keys)[0]
+    if not data.startswith(ZIP_START):
+        raise Refused("neither of the formats that torch.save writes")
+    with open_archive(file, size) as archive:
+        return _state_dict(_of_archive(archive, size, _NAMES), size, everything, keys)[0]
+
+
+def _state_dict(
+    content: Any, size: int, wanted: Wanted, keys: tuple[str, ...] = STATE_DICTS
+) -> tuple[Tensors, int]:
     """The wanted tensors of the state dict in what was unpickled, and how many others it has.
 
-    The state dict is what lies under one of `STATE_DICTS`, or else the content itself. What tensors
-    take together is bounded by the size of the file. Raises: Refused.
+    The state dict is what lies under one of the keys, or else the content itself. What tensors take together is bounded by
+    the size of the file. Raises: Refused.
     """
     label = next(
-        (
-            key
-            for key in STATE_DICTS
-            if isinstance(content, dict) and isinstance(content.get(key), dict)
-        ),
+        (key for key in keys if isinstance(content, dict) and isinstance(content.get(key), dict)),
         None,
     )
     model = content if label is None else content[label]
     if not isinstance(model, dict) or (
         label is None and not any(isinstance(x, _Tensor) for x in model.values())
     ):
-        names = " or ".join(map(repr, STATE_DICTS))
+        names = " or ".join(map(repr, keys))
         raise Refused(f"expected a state dict, or a dict with one under {names}")
     if not all(isinstance(key, str) for key in model):
         raise Refused("the state dict has a key that is no string")

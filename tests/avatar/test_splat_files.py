@@ -514,8 +514,8 @@ BAD = {
         "limit parts",
     ),
     "glb of a node in itself": (lambda: glb(scene(), {"children": [0]}), "lies below itself"),
-    "text": (lambda: b"hello", "expected a file ending in .ply, .splat, .spz or .glb"),
-}
+    "text": (lambda: b"hello", "expected a file ending in .ply, .splat, .spz, .glb, .sog, .pt, .pth or .ckpt"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -662,11 +662,12 @@ def test_kernels_and_attributes_of_a_glb_that_are_not_used_are_named(tmp_path, c
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("a.sog", "PlayCanvas' SOG: `npx @playcanvas/splat-transform scene.sog"),
+        ("a.sog", "not a zip archive, or cut off"),
+        ("meta.json", "an unbundled SOG, or no Gaussians: `zip -j scene.sog FOLDER/*`"),
         ("a.ksplat", "mkkellogg's viewer: `npx @playcanvas/splat-transform scene.ksplat"),
         (
             "ckpt_29999_rank0.pt",
-            "a checkpoint of torch: write a .ply with the program that trained it",
+            "not a zip archive, or cut off",
         ),
     ],
 )

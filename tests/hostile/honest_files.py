@@ -308,6 +308,19 @@ def write_easymocap_motion(folder):
     return folder
 
 
+def splats():
+    """What gsplat's trainer saves of four Gaussians."""
+    shapes = {
+        "means": (3,),
+        "quats": (4,),
+        "scales": (3,),
+        "opacities": (),
+        "sh0": (1, 3),
+        "shN": (3, 3),
+    }
+    return {name: np.full((4, *shape), 0.5, np.float32) for name, shape in shapes.items()}
+
+
 def text_ply():
     """Of Gaussians, in text."""
     names = [*"xyz", *(f"{kind}_{i}" for kind in ("f_dc", "scale") for i in range(3)), "opacity"]

@@ -21,6 +21,7 @@ from joblib_files import joblib
 from PIL import Image
 from safetensors.numpy import save_file
 from small import random_gaussians
+from sog_files import write_sog
 from torch_writer import tensors, write_checkpoint, write_stream
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
@@ -32,6 +33,7 @@ from humangs_jax.body.library import load_body, load_hands, load_smplx, save_bod
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
+from humangs_jax.data.calibration.loaded import load_cameras
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.subject import open_people
@@ -316,6 +318,19 @@ ROWS = {
         load_gaussians,
         saved("a.glb", lambda path: save_gaussians(path, random_gaussians(harmonics=8))),
     ),
+    "sog": (
+        load_gaussians,
+        saved("a.sog", lambda path: write_sog(path, random_gaussians(harmonics=3))),
+    ),
+    "gsplat": (
+        load_gaussians,
+        saved("a.pt", lambda path: write_checkpoint(path, {"splats": tensors(honest.splats())})),
+    ),
+    "gsplat stream": (
+        load_gaussians,
+        saved("a.pt", lambda path: write_stream(path, {"splats": tensors(honest.splats())})),
+    ),
+    "cameras with lenses": (load_cameras, honest.write_colmap, "images.txt"),
     "obj": (read_obj, honest.write_obj),
     "fit record": (read_fit_record, npz("fit.npz", honest.fit_arrays)),
     "bank": (load_bank, npz("bank.npz", honest.bank_arrays)),

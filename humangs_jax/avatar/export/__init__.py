@@ -90,17 +90,27 @@ EXPORTS = Formats(
 )
 """By name; a suffix has at most one format of Gaussians and one of meshes."""
 
+READ_ONLY = Formats(
+    sog=ExportFormat(
+        *("PlayCanvas' SOG, a bundle", "", (".sog",)),
+        **{"up": "-y", "reader": f"{HERE}.sog:read_sog"},
+    ),
+    checkpoint=ExportFormat(
+        *("gsplat's checkpoints", "", (".pt", ".pth", ".ckpt")),
+        **{"up": "-y", "reader": f"{HERE}.splats:read_checkpoint"},
+    ),
+)
+"""Formats of Gaussians that are read and not written."""
+
 _CONVERT = "`npx @playcanvas/splat-transform {} scene.ply` makes a .ply of it"
-_CHECKPOINT = (
-    "a checkpoint of torch: write a .ply with the program that trained it (gsplat:"
-    " `simple_trainer.py --save_ply`, or `gsplat.export_splats`; nerfstudio: `ns-export"
-    " gaussian-splat`)"
+CHECKPOINTS = (
+    "of other checkpoints write a .ply with the program that trained it "
+    "(gsplat: `simple_trainer.py --save_ply`; nerfstudio: `ns-export gaussian-splat`)"
 )
 OTHERS = {
-    ".sog": f"a bundle of PlayCanvas' SOG: {_CONVERT.format('scene.sog')}",
     ".ksplat": f"a compressed file of mkkellogg's viewer: {_CONVERT.format('scene.ksplat')}",
     ".lcc": f"XGRIDS' LCC: {_CONVERT.format('scene.lcc')}",
-    **dict.fromkeys((".pt", ".pth", ".ckpt"), _CHECKPOINT),
+    ".json": "an unbundled SOG, or no Gaussians: `zip -j scene.sog FOLDER/*` makes a bundle of its folder",
 }
 """What is said of files of Gaussians that are not read, by suffix."""
 

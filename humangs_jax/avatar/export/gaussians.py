@@ -21,7 +21,7 @@ import numpy as np
 
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import EXPORTS, OTHERS, ExportFormat, Up, chosen_format
+from humangs_jax.avatar.export import EXPORTS, OTHERS, READ_ONLY, ExportFormat, Up, chosen_format
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import (
@@ -33,7 +33,7 @@ from humangs_jax.core.checks import (
 )
 from humangs_jax.core.progress import printable
 from humangs_jax.core.pytree import replace
-from humangs_jax.core.registry import alternatives, imported
+from humangs_jax.core.registry import Formats, alternatives, imported
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
@@ -163,15 +163,13 @@ def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
 
 @checked_arguments
 def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gaussians:
-    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas),
-    `.splat`, `.spz`, `.glb`.
+    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas), `.splat`, `.spz`, `.glb`,
+    `.sog` (PlayCanvas) and `.pt` (checkpoints of gsplat).
 
     Args:
-        path: The file. How it begins decides the format; where that does not tell (`.splat`), its
-            suffix.
-        y_up: Turn them from the world that viewers of the format expect (y down in `.ply` and
-            `.splat`) to one with y up, as `orbit` has it. False: the numbers stay those of the
-            file, and its cameras fit.
+        path: The file. How it begins decides the format; where that does not tell (`.splat`), its suffix.
+        y_up: Turn them from the world that viewers of the format expect (y down in `.ply`, `.splat`, `.sog` and `.pt`) to one
+            with y up, as `orbit` has it. False: the numbers stay those of the file, and its cameras fit.
 
     Returns:
         Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1],
@@ -192,9 +190,11 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
         suffix = os.path.splitext(path)[1].lower()
         data = read_bytes(path, "array_bytes")
         begun = (each for each in EXPORTS.values() if data.startswith(each.magic))
-        form = next(begun, None) or chosen_format(suffix)
+        read_only = (each for each in READ_ONLY.values() if suffix in each.suffixes)
+        form = next(begun, None) or next(read_only, None) or chosen_format(suffix)
         if form is None or not form.reader:
-            raise Refused(OTHERS.get(suffix, f"not known: expected a file ending in {_suffixes()}"))
+            known = alternatives((*_written().suffixes, *READ_ONLY.suffixes))
+            raise Refused(OTHERS.get(suffix, f"not known: expected a file ending in {known}"))
         said: list[str] = []
         gaussians = imported(form.reader)(data, said)
         if said:
@@ -263,8 +263,12 @@ def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
     return turned(gaussians, form.up)
 
 
+def _written() -> Formats[ExportFormat]:
+    return EXPORTS.where(lambda each: not each.mesh)
+
+
 def _suffixes() -> str:
-    return alternatives(EXPORTS.where(lambda each: not each.mesh).suffixes)
+    return alternatives(_written().suffixes)
 
 
 def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) -> Gaussians:

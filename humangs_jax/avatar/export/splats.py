@@ -1,4 +1,4 @@
-"""Formats of Gaussians: `.ply`, `.splat` and `.glb`; `spz` has `.spz`.
+"""Formats of Gaussians: `.ply`, `.splat`, `.glb` and checkpoints of gsplat; `spz` and `sog` have the others.
 
 `.ply` is that of 3DGS, or the compressed one of PlayCanvas, which is read only.
 
@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import expit
 
+from humangs_jax.avatar.export import CHECKPOINTS
 from humangs_jax.avatar.export.gaussians import (
     colors_of,
     linear_of,
@@ -38,6 +39,7 @@ from humangs_jax.data.motion.clips import node_matrices
 from humangs_jax.io.atomic import replace_file, write_bytes
 from humangs_jax.io.mesh import VERTICES, GlbWriter, count_of, parse_glb, read_accessor
 from humangs_jax.io.reading import Refused, check_limit, shown
+from humangs_jax.io.tensors import tensors_in
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_gaussians
 
 OPACITY_MARGIN = 1e-6
@@ -352,6 +354,52 @@ def read_splat(data: bytes, said: list[str]) -> Gaussians:
         "opacity": rgba[:, 3],
         "color": rgba[:, :3],
     }
+    return loaded(arrays, said)
+
+
+# Checkpoints of gsplat's trainer (https://github.com/nerfstudio-project/gsplat, examples/simple_trainer.py): a dict `splats` of
+# means, quats wxyz, log scales, logit opacities, sh0 (g, 1, 3) and shN (g, k, 3), as in `.ply`.
+
+
+SPLATS = "splats"
+
+
+def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
+    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused; what damaged files raise."""
+    try:
+        tensors = tensors_in(data, (SPLATS,))
+    except Refused as error:
+        raise Refused(f"no checkpoint of gsplat with {SPLATS!r} ({error}): {CHECKPOINTS}") from None
+
+    def tensor(name: str, *shape: int) -> np.ndarray:
+        if name not in tensors:
+            network = "features" in tensors and name in ("sh0", "shN")
+            why = "trained with --app_opt, whose colors a network makes" if network else "missing"
+            raise Refused(f"{SPLATS}.{name}: {why}")
+        array = tensors[name]
+        expected = (len(tensors.get("means", ())), *shape)
+        if array.shape != expected or array.dtype.kind != "f":
+            got = f"{array.dtype} {array.shape}"
+            raise Refused(f"{SPLATS}.{name}: expected floats of shape {expected}, got {got}")
+        return array.astype(np.float64)
+
+    check_limit("gaussians", len(tensors.get("means", ())), "Gaussians")
+    arrays = {
+        f"{SPLATS}.means": tensor("means", 3),
+        f"{SPLATS}.quats": tensor("quats", 4),
+        f"{SPLATS}.scales": _exponential(tensor("scales", 3)),
+        f"{SPLATS}.opacities": expit(tensor("opacities")),
+        f"{SPLATS}.sh0": colors_of(tensor("sh0", 1, 3)[:, 0]),
+    }
+    rest = tensors.get("shN")
+    functions = 0 if rest is None or rest.ndim != 3 else rest.shape[1]
+    if functions not in COUNTS:
+        degree = " of degree 4" if 3 * functions == DEGREE_4 else ""
+        raise Refused(
+            f"{SPLATS}.shN: expected 0, 3, 8 or 15 functions, of degree 0 to 3, got {functions}{degree}"
+        )
+    if functions:
+        arrays[f"{SPLATS}.shN"] = tensor("shN", functions, 3)
     return loaded(arrays, said)
 
 
