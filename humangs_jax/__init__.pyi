@@ -49,6 +49,15 @@ from .rendering.splat_config import SplatConfig as SplatConfig, SPLAT_PRESETS as
 from .rendering.buffers import plan_buffers as plan_buffers
 from .rendering.gaussians import constrain as constrain, unconstrain as unconstrain
 
+# posed photos -> Gaussians
+from .scenes.fitting import fit_scene as fit_scene
+from .scenes.config import SceneConfig as SceneConfig
+from .scenes.mcmc import (
+    mcmc_relocate as mcmc_relocate,
+    mcmc_noise as mcmc_noise,
+    mcmc_penalty as mcmc_penalty,
+)
+
 # the network, training and scores
 from .network.config import HumanGSConfig as HumanGSConfig
 from .network.humangs import init_humangs as init_humangs

@@ -57,7 +57,7 @@ def render_reference(
         shifts: as `render`.
 
     Returns:
-        A `Rendering` with all kinds of depth and the distortion; without visibility, means2d and radii.
+        A `Rendering`, without visibility, means2d and radii.
 
     Examples:
         >>> with jax.enable_x64():
@@ -142,9 +142,9 @@ def _reference(
         depth,
         jnp.int32(0),
         features=None if features is None else color[..., 3:],
-        depth_sum=first,
-        depth_median=lax.stop_gradient(median),
-        distortion=2 * (alpha * second - first**2),
+        depth_sum=first if config.depth_sum else None,
+        depth_median=lax.stop_gradient(median) if config.depth_median else None,
+        distortion=2 * (alpha * second - first**2) if config.distortion else None,
     )
 
 

@@ -1,0 +1,67 @@
+"""Settings of `fit_scene`: how many Gaussians, how long, how fast each parameter moves."""
+
+from typing import Annotated
+
+from humangs_jax.core.configuration import Range, Seed, Share, Spread, Steps, Weight, configuration
+from humangs_jax.rendering.splat_config import SplatConfig
+
+SCENE_SPLAT = SplatConfig(jacobian_margin=0.3)
+"""As gsplat draws: in scenes around the cameras Gaussians beside them would otherwise cover whole images."""
+Capacity = Annotated[int, Range(1, 100_000_000)]
+"""Of Gaussians."""
+
+
+@configuration
+class SceneRates:
+    """Change of each parameter in a step of Adam; those of Kheradmand et al. but for colors, which are no harmonics here."""
+
+    means: Spread = 1.6e-4
+    """Times the extent of the cameras, metres."""
+    quats: Spread = 1e-3
+    """Of quaternions of any length."""
+    log_scales: Spread = 5e-3
+    """Of natural logarithms."""
+    opacity_logits: Spread = 5e-2
+    """Of logits."""
+    color_logits: Spread = 1e-2
+    """Of logits, whose slope is a quarter in the middle."""
+    harmonics: Spread = 1e-3
+    """Of coefficients, as colors."""
+
+
+@configuration
+class SceneConfig:
+    """How `fit_scene` fits Gaussians to photos."""
+
+    capacity: Capacity = 200_000
+    """Gaussians at most; the number of slots, which every step works on."""
+    steps: Steps = 7_000
+    """One photo each."""
+    start: Capacity = 5_000
+    """Gaussians to begin with where no points are given."""
+    degree: Annotated[int, Range(0, 3)] = 1
+    """Of the harmonics, by which colors depend on the direction of sight."""
+    rates: SceneRates = SceneRates()
+    """Learning rates."""
+    final_share: Share = 0.01
+    """Of the rate of the means that is left at the end; it falls exponentially."""
+    other_final_share: Share = 0.1
+    """Of the other rates, in the same way."""
+    structural: Share = 0.2
+    """Share of the structural dissimilarity in the loss; the rest is absolute error."""
+    opacity_penalty: Weight = 0.01
+    """Weight of the mean opacity (`mcmc_penalty`)."""
+    scale_penalty: Weight = 0.01
+    """Weight of the mean scale, in extents of the cameras."""
+    noise: Weight = 5e5
+    """Of the means (`mcmc_noise`), in their learning rate and per extent squared."""
+    relocate_every: Steps = 100
+    """Steps after which dead Gaussians move and more slots are used."""
+    growth: Annotated[float, Range(1, 10)] = 1.05
+    """Times as many slots are used then, up to the capacity."""
+    relocate_until: Share = 0.85
+    """Share of the steps after which nothing moves any more."""
+    splat: SplatConfig = SCENE_SPLAT
+    """How images are drawn; buffers are planned."""
+    seed: Seed = 0
+    """Of the order of photos, the noise, and what moves where."""

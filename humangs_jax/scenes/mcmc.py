@@ -1,0 +1,169 @@
+"""A fixed number of Gaussians that move to where they are needed: 3D Gaussian Splatting as Markov Chain Monte Carlo.
+
+After Kheradmand et al. 2024 (https://arxiv.org/abs/2404.09591). A scene has slots, as many as it may ever have Gaussians, and
+`used` says which of them are Gaussians. In place of cloning, splitting and pruning
+
+- `mcmc_relocate` moves Gaussians that have become transparent, and slots that are to be used from now on, onto opaque ones,
+  chosen by opacity. N Gaussians that then lie on one place look as the one did: with o its opacity and s its scales (equation 9)
+
+      o' = 1 - (1 - o)^(1/N),     s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1);
+
+- `mcmc_noise` shakes the means along their covariances, transparent Gaussians most, so that they explore (equation 8);
+- `mcmc_penalty` keeps opacities and scales small, so that what is not needed becomes transparent (section 3.4).
+
+All are pure functions of one scene, for any optimizer and loss. The double sum is an integral without cancellation: with
+1/sqrt(k+1) = 2/sqrt(pi) int_0^inf exp(-(k+1) t^2) dt it is 2/sqrt(pi) int_0^inf 1 - (1 - o' exp(-t^2))^N dt.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.pytree import replace
+from humangs_jax.rendering.gaussians import UnconstrainedGaussians, constrain, covariances
+
+DEAD = 0.005
+"""Opacity at and below which a Gaussian is moved; the paper's."""
+SHARPNESS = 100.0
+"""Of the sigmoid of the opacity by which noise fades around `DEAD`; the paper's."""
+STEP, REACH = 0.1, 5.0
+"""Of the integral: distance of its nodes, and where exp(-t^2) is below float32's rounding. The trapezoidal rule converges
+exponentially there: tests compare it with the double sum."""
+MOST = 1.0 - 1e-6
+"""Opacity from which on one Gaussian is split as if it had this one: (1 - o)^(1/N) of 0 is no number to take logarithms of."""
+
+
+class Relocated(NamedTuple):
+    """A scene after `mcmc_relocate`.
+
+    moved: of each slot, whether its Gaussian is another one than before; the optimizer forgets what it knew of it.
+    """
+
+    parameters: UnconstrainedGaussians
+    used: Bool[Array, " g"]
+    moved: Bool[Array, " g"]
+
+
+def divided(
+    opacity_logits: Float[Array, " g"], copies: Float[Array, " g"]
+) -> tuple[Float[Array, " g"], Float[Array, " g"]]:
+    """Logits of the opacities o' of N = `copies` Gaussians that look as one, and s' / s."""
+    logits = jnp.minimum(opacity_logits, math.log(MOST / (1 - MOST)))
+    depth = jax.nn.softplus(logits) / copies  # -log(1 - o')
+    opacity = -jnp.expm1(-depth)
+    t = jnp.asarray(np.arange(0.0, REACH + STEP, STEP), logits.dtype)
+    weights = jnp.full(t.shape, STEP, t.dtype).at[0].set(STEP / 2)
+    rays = jnp.log1p(-opacity[:, None] * jnp.exp(-t * t))
+    integral = 2 / math.sqrt(math.pi) * jnp.sum(-jnp.expm1(copies[:, None] * rays) * weights, -1)
+    return jnp.log(jnp.expm1(depth)), jax.nn.sigmoid(logits) / integral
+
+
+@checked_arguments
+def mcmc_relocate(
+    key: Key,
+    parameters: UnconstrainedGaussians,
+    used: Bool[Array, " g"],
+    count: Int[Array, ""] | int | None = None,
+) -> Relocated:
+    """Move dead Gaussians onto others that are seen, and use more slots, up to `count` of them; nothing changes its look.
+
+    Args:
+        key: of `jax.random`.
+        parameters: of all slots, by `unconstrain`.
+        used: (g,) which slots are Gaussians.
+        count: how many slots are used afterwards, no fewer than now. None: as many as now.
+
+    Returns:
+        Parameters and used slots, and which have been changed.
+
+    Examples:
+        >>> moved = jax.jit(hg.mcmc_relocate)(key, parameters, used, jnp.sum(used) * 21 // 20)
+        >>> parameters, used = moved.parameters, moved.used
+    """
+    opacities = jax.nn.sigmoid(parameters.opacity_logits)
+    alive = used & (opacities > DEAD)
+    room = 0 if count is None else jnp.asarray(count, jnp.int32) - jnp.sum(used, dtype=jnp.int32)
+    grown = ~used & (jnp.cumsum(~used, dtype=jnp.int32) <= room)
+    moving = ((used & ~alive) | grown) & jnp.any(alive)
+
+    # a source for every slot, by the inverse of the running sum of the opacities
+    sums = jnp.cumsum(jnp.where(alive, opacities, 0.0))
+    places = jax.random.uniform(key, sums.shape, sums.dtype) * sums[-1]
+    source = jnp.minimum(jnp.searchsorted(sums, places, side="right"), sums.shape[0] - 1)
+    copies = 1 + jnp.zeros(sums.shape, sums.dtype).at[source].add(moving.astype(sums.dtype))
+    split = copies > 1
+    logits, shrink = divided(parameters.opacity_logits, copies)
+    least = math.log(DEAD / (1 - DEAD))
+    parameters = replace(
+        parameters,
+        opacity_logits=jnp.where(split, jnp.maximum(logits, least), parameters.opacity_logits),
+        log_scales=parameters.log_scales + jnp.where(split, jnp.log(shrink), 0.0)[:, None],
+    )
+    take = lambda leaf: jnp.where(_like(moving, leaf), leaf[source], leaf)
+    return Relocated(jax.tree.map(take, parameters), used | (moving & grown), moving | split)
+
+
+def _like(mask: Bool[Array, " g"], leaf: Array) -> Array:
+    """The mask with the axes of another array."""
+    return mask.reshape(mask.shape + (1,) * (leaf.ndim - 1))
+
+
+@checked_arguments
+def mcmc_noise(
+    key: Key,
+    parameters: UnconstrainedGaussians,
+    used: Bool[Array, " g"],
+    rate: Float[Array, ""] | float,
+) -> UnconstrainedGaussians:
+    """Means moved at random: by `rate` times the covariance times normal numbers, fading out above an opacity of 0.005.
+
+    Args:
+        key: of `jax.random`.
+        parameters: of all slots.
+        used: (g,) which slots are Gaussians; others stay.
+        rate: 1 / metres; the paper's is 5e5 times the learning rate of the means.
+
+    Returns:
+        Parameters with other means.
+
+    Examples:
+        >>> parameters = hg.mcmc_noise(key, parameters, used, 5e5 * 1.6e-4)
+    """
+    gaussians = constrain(parameters)
+    normal = jax.random.normal(key, parameters.means.shape, parameters.means.dtype)
+    share = jnp.where(used, jax.nn.sigmoid(SHARPNESS * (DEAD - gaussians.opacities)), 0.0)
+    moves = jnp.sum(covariances(gaussians) * normal[:, None, :], axis=-1)
+    return replace(parameters, means=parameters.means + rate * share[:, None] * moves)
+
+
+@checked_arguments
+def mcmc_penalty(
+    parameters: UnconstrainedGaussians,
+    used: Bool[Array, " g"],
+    opacity: Float[Array, ""] | float = 0.01,
+    scale: Float[Array, ""] | float = 0.01,
+) -> Float[Array, ""]:
+    """What is added to the loss: the mean opacity and the mean scale (metres) of the used slots, each times its weight.
+
+    Args:
+        parameters: of all slots.
+        used: (g,) which slots are Gaussians.
+        opacity: weight of the mean opacity; the paper's is 0.01.
+        scale: weight of the mean scale; the paper's is 0.01.
+
+    Returns:
+        A number.
+
+    Examples:
+        >>> loss = lambda parameters: error(parameters) + hg.mcmc_penalty(parameters, used)
+    """
+    gaussians = constrain(parameters)
+    count = jnp.maximum(jnp.sum(used), 1)
+    opacities = jnp.sum(jnp.where(used, gaussians.opacities, 0.0)) / count
+    scales = jnp.sum(jnp.where(used[:, None], gaussians.scales, 0.0)) / (3 * count)
+    return opacity * opacities + scale * scales

@@ -1,0 +1,120 @@
+"""What `fit_scene` begins with: photos that fit their cameras, and Gaussians at points."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import replace
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.images import read_image
+from humangs_jax.losses.losses import GAUSSIAN
+from humangs_jax.rendering.gaussians import COUNTS, Gaussians
+from humangs_jax.scenes.config import SceneConfig
+
+START_OPACITY, START_SHARE = 0.5, 0.5
+"""Of Gaussians at points: opacity, and scale as a share of the mean distance to the three nearest points."""
+PARALLEL = 1e-3
+"""Squared sine of the angle between axes that meet nowhere."""
+SMALLEST = 1e-4
+"""Scale of a Gaussian at the start, in extents of the cameras: points may coincide."""
+Points = Gaussians | np.ndarray | Array | tuple[Any, Any] | None
+"""Where Gaussians begin: (n, 3) points, or with their colors (n, 3) in [0, 1], or Gaussians."""
+
+
+def read_photos(images: Any, views: Sequence[Camera], config: SceneConfig) -> list[np.ndarray]:
+    """Raises: ValueError for another number or size than the cameras have, or values beyond [0, 1]."""
+    if len(images) != len(views) or not views:
+        raise ValueError(
+            f"images: expected one for each of {len(views)} cameras, got {len(images)}"
+        )
+    photos = []
+    for i, (image, camera) in enumerate(zip(images, views, strict=True)):
+        if isinstance(image, str | os.PathLike):
+            image = np.rint(255 * read_image(Path(image))[0]).astype(np.uint8)
+        image = np.asarray(image)
+        expected = (camera.height, camera.width, 3)
+        if image.shape != expected:
+            raise ValueError(f"images[{i}]: expected shape {expected}, got {image.shape}")
+        if image.dtype != np.uint8:
+            image = image.astype(np.float32)
+            if not (image.min() >= 0 and image.max() <= 1):  # nor NaN
+                raise ValueError(f"images[{i}]: expected numbers in [0, 1], or bytes")
+        if config.structural and min(image.shape[:2]) < GAUSSIAN.size:
+            side = f"{camera.width} x {camera.height}"
+            raise ValueError(
+                f"images[{i}]: {side} is too small for SceneConfig.structural: set it to 0"
+            )
+        photos.append(image)
+    return photos
+
+
+def extent_of(views: Sequence[Camera]) -> Float[Array, ""]:
+    """Largest distance of a camera from their middle; 1 if all stand in one place."""
+    centers = np.stack([np.asarray(camera.center) for camera in views])
+    reach = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    return jnp.float32(reach if reach > 0 else 1.0)
+
+
+def first_gaussians(points: Points, views: Sequence[Camera], config: SceneConfig) -> Gaussians:
+    """Gaussians with harmonics of the degree that is wanted."""
+    gaussians = points
+    if not isinstance(gaussians, Gaussians):
+        gaussians = _at_points(*_points(points, views, config), float(extent_of(views)))
+    if gaussians.harmonics is None and config.degree:
+        shape = (len(gaussians.opacities), COUNTS[config.degree], 3)
+        gaussians = replace(gaussians, harmonics=jnp.zeros(shape, gaussians.means.dtype))
+    return gaussians
+
+
+def _points(
+    points: Any, views: Sequence[Camera], config: SceneConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and colors. Raises: ValueError for others than (n, 3)."""
+    rng = np.random.default_rng(config.seed)
+    if points is None or (isinstance(points, tuple) and len(points[0]) == 0):
+        middle, reach = _middle(views), float(extent_of(views))
+        shape = (config.start, 3)
+        return middle + rng.uniform(-reach, reach, shape), rng.uniform(0, 1, shape)
+    colors = None
+    if isinstance(points, tuple):
+        points, colors = points
+    points = np.asarray(points, np.float64)
+    colors = np.full(points.shape, 0.5) if colors is None else np.asarray(colors, np.float64)
+    for name, array in (("points", points), ("colors of points", colors)):
+        if array.shape != (len(points), 3) or not len(points) or not np.isfinite(array).all():
+            raise ValueError(f"{name}: expected finite numbers (n, 3), got shape {array.shape}")
+    return points, colors
+
+
+def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
+    """The point nearest to the axes of all cameras, or one before the first where they are parallel."""
+    poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in views])
+    centers, axes = np.stack([np.asarray(camera.center) for camera in views]), poses[:, 2, :3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.mean(axis=0)
+    if np.linalg.eigvalsh(normal)[0] < PARALLEL:
+        return centers[0] + float(extent_of(views)) * axes[0]
+    return np.linalg.solve(normal, np.einsum("vij,vj->i", across, centers) / len(views))
+
+
+def _at_points(points: np.ndarray, colors: np.ndarray, extent: float) -> Gaussians:
+    """Round ones, as large as the points are far apart."""
+    near = min(4, len(points))
+    distances = np.full((len(points), 1), extent)
+    if near > 1:
+        distances = KDTree(points).query(points, k=near)[0][:, 1:]
+    size = np.clip(START_SHARE * distances.mean(axis=1), SMALLEST * extent, extent)
+    count = len(points)
+    return Gaussians(
+        jnp.asarray(points, jnp.float32),
+        jnp.tile(jnp.asarray([1.0, 0.0, 0.0, 0.0]), (count, 1)),
+        jnp.asarray(np.tile(size[:, None], (1, 3)), jnp.float32),
+        jnp.full(count, START_OPACITY),
+        jnp.asarray(np.clip(colors, 0, 1), jnp.float32),
+    )
