@@ -38,6 +38,13 @@ def test_a_bundle_has_y_down(tmp_path):
     np.testing.assert_allclose(upright.means, plain.means * np.asarray([-1, -1, 1]), atol=1e-6)
 
 
+def test_the_model_of_a_bundle_is_mentioned(tmp_path, caplog):
+    change = lambda meta, pictures: meta.update(model="antialiased")
+    path = write_sog(tmp_path / "a.sog", random_gaussians(0, 70, 0), change=change)
+    hg.load_gaussians(path)
+    assert "model 'antialiased' is not applied" in caplog.text
+
+
 def emptied(meta, pictures):
     pictures.pop("scales.webp")
 

@@ -23,6 +23,8 @@ from humangs_jax.rendering.gaussians import COUNTS, Gaussians
 
 META = "meta.json"
 VERSION = 2
+USUAL = "default"
+"""Of `model`, which is also "antialiased" or "2dgs"."""
 LEVELS = 256
 """Numbers in a codebook, at most."""
 FIRST_PLACE = 252
@@ -40,6 +42,8 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
             found = shown(meta.get("version")) if isinstance(meta, dict) else "none"
             convert = "`npx @playcanvas/splat-transform scene.sog scene.ply` makes a .ply of it"
             raise Refused(f"{META}: version {found}, expected {VERSION}: {convert}")
+        if (model := meta.get("model", USUAL)) != USUAL:
+            said.append(f"model {shown(model)} is not applied (SplatConfig.antialiased draws such)")
         count = _whole(meta.get("count"), "count")
         check_limit("gaussians", count, "Gaussians")
         pictures = lambda part, number: [
