@@ -1,4 +1,6 @@
-"""Scenes of Gaussians fitted to photos: the strategy of fixed numbers beside Adam alone, on a garden made from a seed."""
+"""Scenes of Gaussians fitted to photos: the strategy of fixed numbers beside Adam alone, on a
+garden made from a seed.
+"""
 
 import dataclasses
 import resource
@@ -37,9 +39,11 @@ def scene_fits(
     checkpoints: Path | None = None,
     only: tuple[str, ...] = (),
 ) -> None:
-    """Photos of a garden of Gaussians, fitted from few points, from none, and from points of the true number.
+    """Photos of a garden of Gaussians, fitted from few points, from none, and from points of the
+    true number.
 
-    "True number" begins with a grey Gaussian at each Gaussian of the scene, 3 cm off, and is what Adam alone then reaches.
+    "True number" begins with a grey Gaussian at each Gaussian of the scene, 3 cm off, and is what
+    Adam alone then reaches.
 
     Options:
     gaussians: of the scene, and the capacity of the fits
@@ -110,7 +114,9 @@ def measured(
     hidden: np.ndarray,
     checkpoint: Path | None,
 ) -> list[str]:
-    """A row: Gaussians, dB of the photos and of those held out, seconds of all calls, peak memory of the process."""
+    """A row: Gaussians, dB of the photos and of those held out, seconds of all calls, peak
+    memory of the process.
+    """
     began = time.perf_counter()
     fit: SceneFit = fit_scene(
         truth[shown], cameras[shown], points, config, checkpoint=checkpoint, progress=True
@@ -137,7 +143,9 @@ def around(count: int, width: int, height: int) -> Camera:
 
 
 def garden(count: int, seed: int) -> Gaussians:
-    """A table with a vase on a lawn, a hedge around it: flat, round and thin Gaussians with textures, some of them glossy."""
+    """A table with a vase on a lawn, a hedge around it: flat, round and thin Gaussians with
+    textures, some of them glossy.
+    """
     rng = np.random.default_rng(seed)
     kinds = rng.choice(5, count, p=[0.3, 0.2, 0.1, 0.3, 0.1])
     angle, u, v = rng.uniform(0, 2 * np.pi, count), rng.random(count), rng.random(count)

@@ -527,8 +527,9 @@ def render_in_bands(
     """The image of `render`, as arrays of numpy, drawn in as many bands as keep each below
     `most_pairs`; for calls outside of transformations.
 
-    Bands of one row of tiles may still need more: they get it. Configurations whose image depends on its height (a
-    `jacobian_margin`, or what is asked for of each Gaussian) are drawn whole. Raises: as `render`.
+    Bands of one row of tiles may still need more: they get it. Configurations whose image depends
+    on its height (a `jacobian_margin`, or what is asked for of each Gaussian) are drawn whole.
+    Raises: as `render`.
     """
     whole = (
         config.jacobian_margin is not None or config.visibility or config.means2d or config.radii

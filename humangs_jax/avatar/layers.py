@@ -217,7 +217,9 @@ def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
 
 
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along the camera's axis, metres."""
+    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along
+    the camera's axis, metres.
+    """
     require_pinhole("unprojection", camera)
     K, world_from_cam = (
         np.asarray(camera.K, np.float64),

@@ -1,8 +1,9 @@
 """Cameras in the OpenCV convention: x right, y down, z forward; pixel centres at +0.5.
 
-A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. What `lens` and `distortion` do
-between [R | t] p and K is in `geometry.lens`. Gaussians are drawn through every lens; what works with bodies and photos of
-people is for pinholes without distortion (`require_pinhole`).
+A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. What
+`lens` and `distortion` do between [R | t] p and K is in `geometry.lens`. Gaussians are drawn
+through every lens; what works with bodies and photos of people is for pinholes without distortion
+(`require_pinhole`).
 """
 
 import math
@@ -52,9 +53,14 @@ class Camera(Batchable):
     height: int = static_field()
     """Pixels."""
     distortion: Float[Array, " coefficients"] | None = None
-    """OpenCV's: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], of a fisheye k1 k2 k3 k4; None for no distortion."""
+    """OpenCV's: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], of a fisheye k1 k2 k3 k4; None for no
+    distortion.
+    """
     lens: str = static_field(default="pinhole")
-    """ "fisheye": equidistant, fields of view below 180 degrees. "orthographic": K is in pixels a metre, rays are parallel."""
+    """ "fisheye": equidistant, fields of view below 180 degrees.
+
+    "orthographic": K is in pixels a metre, rays are parallel.
+    """
 
     @classmethod
     def from_opencv(
@@ -66,14 +72,15 @@ class Camera(Batchable):
         distortion: object = None,
         lens: str = "pinhole",
     ) -> "Camera":
-        """A camera from array-likes (3, 3), (4, 4) and perhaps (n,), checked. Under `jit`, `vmap` and `grad` only shapes are.
+        """A camera from array-likes (3, 3), (4, 4) and perhaps (n,), checked. Under `jit`, `vmap`
+        and `grad` only shapes are.
 
         Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have
         it.
 
-        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive, the rotation not
-        orthonormal and right-handed (to 1e-3), the image empty, its sides no whole numbers, or the coefficients not those of
-        the lens.
+        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive,
+        the rotation not orthonormal and right-handed (to 1e-3), the image empty, its sides no whole
+        numbers, or the coefficients not those of the lens.
         """
         given = K, cam_from_world, distortion
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given))
@@ -162,11 +169,12 @@ class Camera(Batchable):
     def moved(self, twist: Float[Array, "*b 6"]) -> "Camera":
         """The camera after a rigid motion in its own frame, exp(twist) `cam_from_world`.
 
-        twist: a rotation vector, radians, then a velocity, metres, in the camera's axes; for optimizers: zeros are no motion, and
-        the result stays a rotation (`transform.from_twist`).
+        twist: a rotation vector, radians, then a velocity, metres, in the camera's axes; for
+        optimizers: zeros are no motion, and the result stays a rotation (`transform.from_twist`).
 
         Examples:
-            >>> loss = lambda twist: jnp.mean((hg.render(gaussians, camera.moved(twist), config).rgb - photo) ** 2)
+            >>> drawn = lambda twist: hg.render(gaussians, camera.moved(twist), config).rgb
+            >>> loss = lambda twist: jnp.mean((drawn(twist) - photo) ** 2)
             >>> gradient = jax.grad(loss)(jnp.zeros(6))
         """
         motion = transform.from_twist(twist)
@@ -175,7 +183,9 @@ class Camera(Batchable):
 
 
 def require_pinhole(what: str, camera: Camera) -> None:
-    """Raises: ValueError for a camera with another lens than a pinhole, or with distortion, where `what` knows only those."""
+    """Raises: ValueError for a camera with another lens than a pinhole, or with distortion,
+    where `what` knows only those.
+    """
     if not camera.is_plain:
         kind = "distortion" if camera.lens == "pinhole" else f"a lens that is {camera.lens}"
         raise ValueError(f"{what} is for pinhole cameras without distortion, got one with {kind}")
@@ -215,7 +225,10 @@ def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values
 
 @checked_arguments
 def stack_cameras(cameras: list[Camera]) -> Camera:
-    """A batch from cameras of one image size and lens. Raises ValueError if they differ or the list is empty."""
+    """A batch from cameras of one image size and lens.
+
+    Raises ValueError if they differ or the list is empty.
+    """
     if not cameras:
         raise ValueError("no cameras to stack")
     if len({(c.width, c.height) for c in cameras}) > 1:
@@ -352,7 +365,8 @@ def orbit(
 
 
 def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]]:
-    """Camera centre and unit directions through the pixel centres (x + 0.5, y + 0.5) of one pinhole camera.
+    """Camera centre and unit directions through the pixel centres (x + 0.5, y + 0.5) of one pinhole
+    camera.
 
     Raises: ValueError for another lens.
     """

@@ -1,16 +1,20 @@
-"""Lenses: where a point of the plane z = 1 before a camera appears on it, and how far a lens reaches.
+"""Lenses: where a point of the plane z = 1 before a camera appears on it, and how far a lens
+reaches.
 
-"pinhole" with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]] (Brown and Conrady, calib3d): of a point
-(u, v) = (X / Z, Y / Z), with r^2 = u^2 + v^2 and R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+"pinhole" with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]] (Brown and Conrady,
+calib3d): of a point (u, v) = (X / Z, Y / Z), with r^2 = u^2 + v^2 and R = (1 + k1 r^2 + k2 r^4 + k3
+r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
 
     x = u R + 2 p1 u v + p2 (r^2 + 2 u^2) + s1 r^2 + s2 r^4
     y = v R + p1 (r^2 + 2 v^2) + 2 p2 u v + s3 r^2 + s4 r^4.
 
-"fisheye" (Kannala and Brandt 2006, OpenCV's fisheye module), with t = atan(r) and coefficients k1 k2 k3 k4, or none:
+"fisheye" (Kannala and Brandt 2006, OpenCV's fisheye module), with t = atan(r) and coefficients k1
+k2 k3 k4, or none:
 
     (x, y) = (u, v) t / r (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
 
-"orthographic" has neither: pixels are fx X + cx and fy Y + cy, K in pixels a metre. Arrays are planes of any shape.
+"orthographic" has neither: pixels are fx X + cx and fy Y + cy, K in pixels a metre. Arrays are
+planes of any shape.
 """
 
 import jax
@@ -25,13 +29,19 @@ COUNTS: dict[str, tuple[int, ...]] = {
 }
 """Numbers of coefficients, by lens."""
 SMALL_SQUARE = 1e-3
-"""Below this r^2, atan(r) / r is its Taylor series, cut after r^10: exact to the rounding of float64."""
+"""Below this r^2, atan(r) / r is its Taylor series, cut after r^10: exact to the rounding of
+float64.
+"""
 RINGS = 16
-"""Places along the way from the axis to a point, at each of which the image has to grow outwards."""
+"""Places along the way from the axis to a point, at each of which the image has to grow
+outwards.
+"""
 
 
 def check_lens(lens: object, count: int | None) -> None:
-    """Raises: ValueError for a lens that is not known, and for another number of coefficients than it has."""
+    """Raises: ValueError for a lens that is not known, and for another number of coefficients
+    than it has.
+    """
     if lens not in COUNTS:
         raise ValueError(f"lens: expected {', '.join(COUNTS)}, got {lens!r}")
     allowed = COUNTS[str(lens)]
@@ -76,7 +86,9 @@ def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
 def distorted_with_slopes(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> tuple[Array, Array, list[list[Array]]]:
-    """x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]], by forward mode: it has a gradient itself."""
+    """x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]], by forward mode: it has a
+    gradient itself.
+    """
     lensed = lambda u, v: distorted(lens, coefficients, u, v)
     one, zero = jnp.ones_like(u), jnp.zeros_like(u)
     (x, y), (xu, yu) = jax.jvp(lensed, (u, v), (one, zero))
@@ -87,8 +99,8 @@ def distorted_with_slopes(
 def within_reach(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> Bool[Array, "*b"]:
-    """Whether the image grows outwards all the way from the axis to a point: beyond that, a lens's polynomial folds the image
-    back over itself. Tangential terms are left out. No gradient.
+    """Whether the image grows outwards all the way from the axis to a point: beyond that, a lens's
+    polynomial folds the image back over itself. Tangential terms are left out. No gradient.
     """
     u, v = jax.lax.stop_gradient((u, v))
     if coefficients is None:

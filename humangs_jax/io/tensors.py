@@ -296,7 +296,9 @@ def read_torch_file(
 
 
 def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
-    """All tensors of a dict that lies under one of the keys, in the bytes of a file of `torch.save`. Raises: Refused."""
+    """All tensors of a dict that lies under one of the keys, in the bytes of a file of
+    `torch.save`. Raises: Refused.
+    """
     file, size = io.BytesIO(data), len(data)
     if data.startswith(PICKLE_START):
         return _state_dict(_of_stream(file, size, _NAMES), size, everything, keys)[0]
@@ -311,8 +313,8 @@ def _state_dict(
 ) -> tuple[Tensors, int]:
     """The wanted tensors of the state dict in what was unpickled, and how many others it has.
 
-    The state dict is what lies under one of the keys, or else the content itself. What tensors take together is bounded by
-    the size of the file. Raises: Refused.
+    The state dict is what lies under one of the keys, or else the content itself. What tensors take
+    together is bounded by the size of the file. Raises: Refused.
     """
     label = next(
         (key for key in keys if isinstance(content, dict) and isinstance(content.get(key), dict)),

@@ -81,9 +81,10 @@ def composite(
 ]:
     """Draws lists of splats, which must be in depth order, into tiles.
 
-    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; the largest w of each
-    splat if `config.visibility`, else 0; and if `config.depth_median`, the z of the splat at which T falls to one half,
-    infinite where it never does, else None. The first two are differentiable with respect to `splats`, in reverse mode only.
+    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; the
+    largest w of each splat if `config.visibility`, else 0; and if `config.depth_median`, the z of
+    the splat at which T falls to one half, infinite where it never does, else None. The first two
+    are differentiable with respect to `splats`, in reverse mode only.
     """
     return _composite_fwd(splats, lists, grid, config)[0]
 
@@ -262,11 +263,12 @@ the chain from the last stored link on; storing T after every splat costs more t
 
 @functools.lru_cache
 def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the lists (t,), peaks (g,), medians.
+    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the
+    lists (t,), peaks (g,), medians.
 
-    peaks: largest w of each splat; 0 unless `config.visibility`. medians: (t, p) z of the splat at which T falls to one half,
-    infinite where it never does; None unless `config.depth_median`. Lists run front to back, so it is the smallest z behind
-    which T is one half or less.
+    peaks: largest w of each splat; 0 unless `config.visibility`. medians: (t, p) z of the splat at
+    which T falls to one half, infinite where it never does; None unless `config.depth_median`.
+    Lists run front to back, so it is the smallest z behind which T is one half or less.
     """
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 

@@ -10,17 +10,26 @@ With p = (X, Y, Z) the mean in the camera's frame, fx, fy, cx, cy of K and W the
 where J is the projection's derivative at p, and A R diag(s) the factor of the covariance; M is
 (2, 3).
 
-The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels of s metres
-(`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d), where e = eps2d (s fx/Z)^2 <= eps2d is what
-was added in images of such pixels: what they weigh together stays the same in smaller images (Mip-Splatting's 2D filter,
-https://arxiv.org/abs/2311.16493, equation 9, which has e = 0). `SplatConfig.antialiased` dims all others with e = 0.
+Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the
+projection, and its gradient, into a few loops. Its determinant is not taken from the entries of
+cov2d, where float32 cancels for needles, but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 +
+|m1|^2) + eps2d^2 for the rows m0, m1 of M. What is drawn is the upper triangular r with r^T r =
+cov2d^-1 / 2, whose gradient is written by hand for the same reason.
 
-Where the camera has a lens, mean2d is where the lens puts (X/Z, Y/Z), and J is that of the whole map (`geometry.lens`):
-K's focal lengths, times the lens's Jacobian, times that of the division by Z. Of an orthographic camera J = [[fx, 0, 0],
-[0, fy, 0]], and all directions of sight are its axis.
+The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels
+of s metres (`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d),
+where e = eps2d (s fx/Z)^2 <= eps2d is what was added in images of such pixels: what they weigh
+together stays the same in smaller images (Mip-Splatting's 2D filter,
+https://arxiv.org/abs/2311.16493, equation 9, which has e = 0). `SplatConfig.antialiased` dims all
+others with e = 0.
 
-Gaussians that are not drawn (centre nearer than `near`, behind, or beyond the reach of the lens, footprint beyond
-`LARGEST_FOOTPRINT`) have finite values and pass zero gradients. K's skew is taken as 0.
+Where the camera has a lens, mean2d is where the lens puts (X/Z, Y/Z), and J is that of the whole
+map (`geometry.lens`): K's focal lengths, times the lens's Jacobian, times that of the division by
+Z. Of an orthographic camera J = [[fx, 0, 0], [0, fy, 0]], and all directions of sight are its axis.
+
+Gaussians that are not drawn (centre nearer than `near`, behind, or beyond the reach of the lens,
+footprint beyond `LARGEST_FOOTPRINT`) have finite values and pass zero gradients. K's skew is taken
+as 0.
 """
 
 import functools
@@ -51,9 +60,11 @@ Planes = list[Array]
 class ProjectedGaussians(NamedTuple):
     """2D Gaussians on the image, planes of (g,). In gsplat's arrays: `means2d`, `depths`, `conics`.
 
-    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, eps2d included.
-    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic / 2, 1 / pixels,
-    finite where not drawn. visible: whether it is drawn. dimming: factor of the opacity in (0, 1], None where nothing is dimmed.
+    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2,
+    eps2d included.
+    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic
+    / 2, 1 / pixels, finite where not drawn. visible: whether it is drawn. dimming: factor of the
+    opacity in (0, 1], None where nothing is dimmed.
     added_colors: what harmonics add to the colors from here, None without.
     """
 
@@ -96,8 +107,8 @@ def project_gaussians(
 ) -> ProjectedGaussians:
     """Every Gaussian on the image that `config` draws: the first half of `splatting.render`.
 
-    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the half field of view beyond the
-    border, for cameras without lens.
+    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the
+    half field of view beyond the border, for cameras without lens.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d, jacobian_margin = (

@@ -73,8 +73,9 @@ class SplatConfig:
     eps2d: Annotated[float, Range(0, 1e6)] = EPS2D
     """Pixels^2 added to the projected variances."""
     antialiased: bool = False
-    """Opacities are dimmed by what these pixels^2 add to the footprint, so that what a Gaussian weighs stays the same (gsplat's
-    "antialiased"; Mip-Splatting's 2D filter). Gaussians with a `low_pass` are dimmed by theirs anyway."""
+    """Opacities are dimmed by what these pixels^2 add to the footprint, so that what a Gaussian
+    weighs stays the same (gsplat's "antialiased"; Mip-Splatting's 2D filter). Gaussians with a
+    `low_pass` are dimmed by theirs anyway."""
     alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
     """Alphas below are skipped."""
     alpha_max: Share = ALPHA_MAX
@@ -87,7 +88,9 @@ class SplatConfig:
     )
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
-    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat; of cameras without lens."""
+    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat; of cameras
+    without lens.
+    """
     normalize_quats: bool = True
     """False: quaternions are not normalised, as in INRIA's rasterizer."""
     radius_sigma: Annotated[float, Range(1e-6, 100)] | None = knob(

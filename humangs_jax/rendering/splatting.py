@@ -67,15 +67,18 @@ __all__ = [
 class Rendering(Batchable):
     """One image of a set of Gaussians; with leading axes, a batch of images.
 
-    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
-    colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
-    drawn. visibility: (g,) the largest weight alpha T of each Gaussian on any pixel, 0 if it is hidden; not
-    differentiable; None unless `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
-    over 0; None without. The others are None unless the field of `SplatConfig` of their name asks for them:
-    means2d: (g, 2) centres on the image, pixels. radii: (g, 2) half the width and height of the footprints, pixels, 0 where
-    nothing is drawn; not differentiable. depth_sum: (h, w) z summed by weight, depth times alpha. depth_median: (h, w) z of
-    the Gaussian at which half of the light is left, 0 where more passes; not differentiable. distortion: (h, w) sum over
-    pairs of w_i w_j (z_i - z_j)^2, squared metres (2DGS, https://arxiv.org/abs/2403.17888, eq. 13, with squares).
+    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is
+    seen, weighted as the colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that
+    did not fit in the buffers and were not drawn. visibility: (g,) the largest weight alpha T of
+    each Gaussian on any pixel, 0 if it is hidden; not differentiable; None unless
+    `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
+    over 0; None without. The others are None unless the field of `SplatConfig` of their name asks
+    for them:
+    means2d: (g, 2) centres on the image, pixels. radii: (g, 2) half the width and height of the
+    footprints, pixels, 0 where nothing is drawn; not differentiable. depth_sum: (h, w) z summed by
+    weight, depth times alpha. depth_median: (h, w) z of the Gaussian at which half of the light is
+    left, 0 where more passes; not differentiable. distortion: (h, w) sum over pairs of w_i w_j (z_i
+    - z_j)^2, squared metres (2DGS, https://arxiv.org/abs/2403.17888, eq. 13, with squares).
     """
 
     rgb: Float[Array, "h w 3"]
@@ -125,13 +128,14 @@ def render(
         camera: one camera; its size is the image's.
         config: what is drawn, and the buffers; or the name of one of `SPLAT_PRESETS`.
         background: (3,) RGB, three numbers, or a color's name. None: white.
-        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels, what a network has
-            learned.
-        shifts: (g, 2) pixels that are added to the centres on the image. The gradient by zeros is what gsplat's
-            `means2d.grad` holds.
+        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels,
+            what a network has learned.
+        shifts: (g, 2) pixels that are added to the centres on the image. The gradient by zeros is
+            what gsplat's `means2d.grad` holds.
 
     Returns:
-        A `Rendering`: rgb (h, w, 3), alpha, depth, features, overflow, visibility, and what `config` asks for.
+        A `Rendering`: rgb (h, w, 3), alpha, depth, features, overflow, visibility, and what
+        `config` asks for.
 
     Raises:
         TypeError: for arguments of other classes.

@@ -476,7 +476,10 @@ def footprints_by(
 def radii_on_image(
     footprints: Footprints | Squares, width: int, height: int
 ) -> Float[Array, "g 2"]:
-    """Half the sides of the footprints in pixels, 0 for those that lie beside the image. No gradient."""
+    """Half the sides of the footprints in pixels, 0 for those that lie beside the image.
+
+    No gradient.
+    """
     half = footprints.half_sides()
     center = jnp.stack([footprints.x, footprints.y], axis=-1)
     size = jnp.asarray([width, height], half.dtype)

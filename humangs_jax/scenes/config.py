@@ -6,14 +6,18 @@ from humangs_jax.core.configuration import Range, Seed, Share, Spread, Steps, We
 from humangs_jax.rendering.splat_config import SplatConfig
 
 SCENE_SPLAT = SplatConfig(jacobian_margin=0.3)
-"""As gsplat draws: in scenes around the cameras Gaussians beside them would otherwise cover whole images."""
+"""As gsplat draws: in scenes around the cameras Gaussians beside them would otherwise cover
+whole images.
+"""
 Capacity = Annotated[int, Range(1, 100_000_000)]
 """Of Gaussians."""
 
 
 @configuration
 class SceneRates:
-    """Change of each parameter in a step of Adam; those of Kheradmand et al. but for colors, which are no harmonics here."""
+    """Change of each parameter in a step of Adam; those of Kheradmand et al. but for colors,
+    which are no harmonics here.
+    """
 
     means: Spread = 1.6e-4
     """Times the extent of the cameras, metres."""

@@ -1,6 +1,7 @@
 """`fit_scene`: Gaussians of a scene from posed photos, with Adam and the strategy of `scenes.mcmc`.
 
-A scene is an explicit state; a step and a relocation are pure functions of it, compiled once for each size of photos.
+A scene is an explicit state; a step and a relocation are pure functions of it, compiled once for
+each size of photos.
 """
 
 import functools
@@ -94,16 +95,20 @@ def fit_scene(
     progress: bool = False,
     watch: Callable[[int, Gaussians], None] | None = None,
 ) -> SceneFit:
-    """Fit Gaussians to posed photos of a scene that stands still (Kheradmand et al. 2024, https://arxiv.org/abs/2404.09591).
+    """Fit Gaussians to posed photos of a scene that stands still (Kheradmand et al. 2024,
+    https://arxiv.org/abs/2404.09591).
 
     Args:
-        images: (h, w, 3) of each camera, RGB in [0, 1] or bytes, or paths of files; sizes may differ.
+        images: (h, w, 3) of each camera, RGB in [0, 1] or bytes, or paths of files; sizes may
+            differ.
         cameras: one for each image, in the same order, with or without lenses.
-        points: (n, 3) where Gaussians begin, as structure from motion finds them, perhaps as (points, colors); or Gaussians.
+        points: (n, 3) where Gaussians begin, as structure from motion finds them, perhaps as
+            (points, colors); or Gaussians.
             None: `SceneConfig.start` random points where the cameras look.
         config: None: `SceneConfig()`.
         background: behind the scene, as `render` takes it.
-        checkpoint: a file that takes the state each minute, at the end and at Ctrl-C, and from which the same call continues.
+        checkpoint: a file that takes the state each minute, at the end and at Ctrl-C, and from
+            which the same call continues.
         progress: Show a bar.
         watch: is called with the number of steps and the Gaussians, whenever some have moved.
 
@@ -112,12 +117,14 @@ def fit_scene(
 
     Raises:
         ValueError: images that do not fit their cameras, or more points than the capacity.
-        FileError: a checkpoint that cannot be read, or is of other photos, cameras, points or settings.
+        FileError: a checkpoint that cannot be read, or is of other photos, cameras, points or
+            settings.
 
     Examples:
         >>> cameras = hg.load_cameras("garden/sparse/0")
         >>> photos = [f"garden/images/{name}" for name in cameras]
-        >>> fit = hg.fit_scene(photos, cameras, (cameras.points, cameras.colors), checkpoint="garden.npz", progress=True)
+        >>> points = cameras.points, cameras.colors
+        >>> fit = hg.fit_scene(photos, cameras, points, checkpoint="garden.npz", progress=True)
         >>> hg.save_gaussians("garden.ply", fit.gaussians)
     """
     require_concrete("fit_scene", "reads photos and measures buffers", cameras, points)
@@ -160,13 +167,16 @@ def fit_scene(
     return SceneFit(gaussians, int(state.step), seconds, psnr, interrupted)
 
 
-# The state, and what makes the next one ---------------------------------------------------------------------------------
+# The state, and what makes the next one
 
 ADAM = optax.scale_by_adam(eps=1e-15)
 
 
 def begin_scene(gaussians: Gaussians, capacity: int) -> SceneState:
-    """A state whose first slots are these Gaussians. Raises: ValueError for more than the capacity."""
+    """A state whose first slots are these Gaussians.
+
+    Raises: ValueError for more than the capacity.
+    """
     count = len(gaussians.opacities)
     if count > capacity:
         raise ValueError(f"points: {count:,} are more than SceneConfig.capacity {capacity:,}")
@@ -189,7 +199,10 @@ def _drawn(parameters: UnconstrainedGaussians, used: Bool[Array, " g"]) -> Gauss
 
 @functools.cache
 def _programs() -> tuple[Callable[..., SceneState], Callable[..., SceneState]]:
-    """The step and the relocation, compiled. A state is not donated: Ctrl-C may come before there is the next one."""
+    """The step and the relocation, compiled.
+
+    A state is not donated: Ctrl-C may come before there is the next one.
+    """
     step = jax.jit(scene_step, static_argnums=(6, 7), compiler_options=compiler_options())
     return step, jax.jit(relocate_scene)
 
@@ -253,11 +266,13 @@ def relocate_scene(state: SceneState, key: Key, growth: Float[Array, ""] | float
     return replace(state, parameters=found.parameters, used=found.used, moments=moments)
 
 
-# Of the loop ------------------------------------------------------------------------------------------------------------
+# Of the loop
 
 
 def _photo_of_step(step: int, count: int, seed: int) -> int:
-    """Each photo once in every `count` steps, in an order that only the step and the seed decide."""
+    """Each photo once in every `count` steps, in an order that only the step and the seed
+    decide.
+    """
     epoch, place = divmod(step, count)
     return int(np.random.default_rng([seed, epoch]).permutation(count)[place])
 
@@ -296,7 +311,7 @@ def _mean_psnr(
     return float(np.mean(found))
 
 
-# Checkpoints ------------------------------------------------------------------------------------------------------------
+# Checkpoints
 
 
 def _about(
@@ -315,7 +330,10 @@ def _save(path: str | os.PathLike[str], state: SceneState, about: str) -> None:
 
 
 def _resumed(path: str | os.PathLike[str] | None, state: SceneState, about: str) -> SceneState:
-    """The state of a checkpoint, if there is one. Raises: FileError for one of another run, or another file."""
+    """The state of a checkpoint, if there is one.
+
+    Raises: FileError for one of another run, or another file.
+    """
     if path is None or not os.path.exists(path):
         return state
     with reading(path, "checkpoint of a scene"):

@@ -1,18 +1,25 @@
-"""A fixed number of Gaussians that move to where they are needed: 3D Gaussian Splatting as Markov Chain Monte Carlo.
+"""A fixed number of Gaussians that move to where they are needed: 3D Gaussian Splatting as Markov
+Chain Monte Carlo.
 
-After Kheradmand et al. 2024 (https://arxiv.org/abs/2404.09591). A scene has slots, as many as it may ever have Gaussians, and
-`used` says which of them are Gaussians. In place of cloning, splitting and pruning
+After Kheradmand et al. 2024 (https://arxiv.org/abs/2404.09591). A scene has slots, as many as it
+may ever have Gaussians, and `used` says which of them are Gaussians. In place of cloning, splitting
+and pruning
 
-- `mcmc_relocate` moves Gaussians that have become transparent, and slots that are to be used from now on, onto opaque ones,
-  chosen by opacity. N Gaussians that then lie on one place look as the one did: with o its opacity and s its scales (equation 9)
+- `mcmc_relocate` moves Gaussians that have become transparent, and slots that are to be used from
+  now on, onto opaque ones, chosen by opacity. N Gaussians that then lie on one place look as the
+  one did: with o its opacity and s its scales (equation 9)
 
-      o' = 1 - (1 - o)^(1/N),     s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1);
+      o' = 1 - (1 - o)^(1/N),
+      s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1);
 
-- `mcmc_noise` shakes the means along their covariances, transparent Gaussians most, so that they explore (equation 8);
-- `mcmc_penalty` keeps opacities and scales small, so that what is not needed becomes transparent (section 3.4).
+- `mcmc_noise` shakes the means along their covariances, transparent Gaussians most, so that they
+  explore (equation 8);
+- `mcmc_penalty` keeps opacities and scales small, so that what is not needed becomes transparent
+  (section 3.4).
 
-All are pure functions of one scene, for any optimizer and loss. The double sum is an integral without cancellation: with
-1/sqrt(k+1) = 2/sqrt(pi) int_0^inf exp(-(k+1) t^2) dt it is 2/sqrt(pi) int_0^inf 1 - (1 - o' exp(-t^2))^N dt.
+All are pure functions of one scene, for any optimizer and loss. The double sum is an integral
+without cancellation: with 1/sqrt(k+1) = 2/sqrt(pi) int_0^inf exp(-(k+1) t^2) dt it is 2/sqrt(pi)
+int_0^inf 1 - (1 - o' exp(-t^2))^N dt.
 """
 
 import math
@@ -32,16 +39,19 @@ DEAD = 0.005
 SHARPNESS = 100.0
 """Of the sigmoid of the opacity by which noise fades around `DEAD`; the paper's."""
 STEP, REACH = 0.1, 5.0
-"""Of the integral: distance of its nodes, and where exp(-t^2) is below float32's rounding. The trapezoidal rule converges
-exponentially there: tests compare it with the double sum."""
+"""Of the integral: distance of its nodes, and where exp(-t^2) is below float32's rounding. The
+trapezoidal rule converges exponentially there: tests compare it with the double sum."""
 MOST = 1.0 - 1e-6
-"""Opacity from which on one Gaussian is split as if it had this one: (1 - o)^(1/N) of 0 is no number to take logarithms of."""
+"""Opacity from which on one Gaussian is split as if it had this one: (1 - o)^(1/N) of 0 is no
+number to take logarithms of.
+"""
 
 
 class Relocated(NamedTuple):
     """A scene after `mcmc_relocate`.
 
-    moved: of each slot, whether its Gaussian is another one than before; the optimizer forgets what it knew of it.
+    moved: of each slot, whether its Gaussian is another one than before; the optimizer forgets what
+    it knew of it.
     """
 
     parameters: UnconstrainedGaussians
@@ -70,7 +80,8 @@ def mcmc_relocate(
     used: Bool[Array, " g"],
     count: Int[Array, ""] | int | None = None,
 ) -> Relocated:
-    """Move dead Gaussians onto others that are seen, and use more slots, up to `count` of them; nothing changes its look.
+    """Move dead Gaussians onto others that are seen, and use more slots, up to `count` of them;
+    nothing changes its look.
 
     Args:
         key: of `jax.random`.
@@ -120,7 +131,8 @@ def mcmc_noise(
     used: Bool[Array, " g"],
     rate: Float[Array, ""] | float,
 ) -> UnconstrainedGaussians:
-    """Means moved at random: by `rate` times the covariance times normal numbers, fading out above an opacity of 0.005.
+    """Means moved at random: by `rate` times the covariance times normal numbers, fading out above
+    an opacity of 0.005.
 
     Args:
         key: of `jax.random`.
@@ -148,7 +160,8 @@ def mcmc_penalty(
     opacity: Float[Array, ""] | float = 0.01,
     scale: Float[Array, ""] | float = 0.01,
 ) -> Float[Array, ""]:
-    """What is added to the loss: the mean opacity and the mean scale (metres) of the used slots, each times its weight.
+    """What is added to the loss: the mean opacity and the mean scale (metres) of the used slots,
+    each times its weight.
 
     Args:
         parameters: of all slots.

@@ -18,7 +18,9 @@ from humangs_jax.rendering.gaussians import COUNTS, Gaussians
 from humangs_jax.scenes.config import SceneConfig
 
 START_OPACITY, START_SHARE = 0.5, 0.5
-"""Of Gaussians at points: opacity, and scale as a share of the mean distance to the three nearest points."""
+"""Of Gaussians at points: opacity, and scale as a share of the mean distance to the three
+nearest points.
+"""
 PARALLEL = 1e-3
 """Squared sine of the angle between axes that meet nowhere."""
 SMALLEST = 1e-4
@@ -28,7 +30,9 @@ Points = Gaussians | np.ndarray | Array | tuple[Any, Any] | None
 
 
 def read_photos(images: Any, views: Sequence[Camera], config: SceneConfig) -> list[np.ndarray]:
-    """Raises: ValueError for another number or size than the cameras have, or values beyond [0, 1]."""
+    """Raises: ValueError for another number or size than the cameras have, or values beyond [0,
+    1].
+    """
     if len(images) != len(views) or not views:
         raise ValueError(
             f"images: expected one for each of {len(views)} cameras, got {len(images)}"
@@ -93,7 +97,9 @@ def _points(
 
 
 def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
-    """The point nearest to the axes of all cameras, or one before the first where they are parallel."""
+    """The point nearest to the axes of all cameras, or one before the first where they are
+    parallel.
+    """
     poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in views])
     centers, axes = np.stack([np.asarray(camera.center) for camera in views]), poses[:, 2, :3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

@@ -1,4 +1,6 @@
-"""Formats of Gaussians that are read only: PlayCanvas' SOG and gsplat's checkpoints, from files by hand."""
+"""Formats of Gaussians that are read only: PlayCanvas' SOG and gsplat's checkpoints, from files
+by hand.
+"""
 
 import numpy as np
 import pytest

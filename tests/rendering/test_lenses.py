@@ -1,4 +1,6 @@
-"""Lenses of cameras: OpenCV's formulas, how far they reach, what is drawn through them, and the motion of cameras by twists."""
+"""Lenses of cameras: OpenCV's formulas, how far they reach, what is drawn through them, and the
+motion of cameras by twists.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +60,9 @@ def opencv(points, name, c):
 
 @pytest.mark.parametrize("kind", LENSES)
 def test_points_fall_where_opencv_puts_them_and_footprints_turn_with_them(kind):
-    """The covariance of a tiny Gaussian is that of its points, projected one by one: finite differences of the whole camera."""
+    """The covariance of a tiny Gaussian is that of its points, projected one by one: finite
+    differences of the whole camera.
+    """
     with jax.enable_x64(True):
         view = lensed(kind, camera())
         gaussians = random_gaussians(0)
@@ -102,7 +106,9 @@ def test_no_distortion_is_the_pinhole_and_the_axis_of_a_fisheye_is_smooth():
 
 
 def test_what_a_lens_would_fold_back_is_not_drawn():
-    """r (1 - 0.1 r^2) grows up to r^2 = 10 / 3; a fisheye without coefficients reaches everything in front."""
+    """r (1 - 0.1 r^2) grows up to r^2 = 10 / 3; a fisheye without coefficients reaches
+    everything in front.
+    """
     u = jnp.asarray([0.0, 1.0, 1.82, 1.84, 10.0, 1e30, jnp.nan])
     reached = lens.within_reach("pinhole", jnp.asarray([-0.1, 0.0, 0.0, 0.0]), u, 0 * u)
     assert reached.tolist() == [True, True, True, False, False, False, False]
@@ -144,7 +150,9 @@ def test_images_and_all_gradients_are_those_of_the_reference(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rational and prism", "fisheye", "orthographic"])
 def test_gradients_through_a_lens_are_derivatives(kind):
-    """Along a random direction of means, K, the pose and the coefficients, with nothing near a decision."""
+    """Along a random direction of means, K, the pose and the coefficients, with nothing near a
+    decision.
+    """
     with jax.enable_x64(True):
         smooth = SplatConfig(
             block=4, chunk=4, max_pairs=2000, alpha_min=1e-9, transmittance_stop=0.0

@@ -1,4 +1,6 @@
-"""What a rendering holds only if asked: radii, centres, sums and medians of depth, distortion; opacities without aliasing."""
+"""What a rendering holds only if asked: radii, centres, sums and medians of depth, distortion;
+opacities without aliasing.
+"""
 
 import dataclasses
 from unittest import mock
@@ -161,7 +163,9 @@ def test_shifts_move_the_image_and_their_shape_is_checked():
 
 @pytest.mark.slow
 def test_antialiased_opacities_keep_what_a_small_gaussian_weighs():
-    """A blob far below a pixel: its weight is opacity times its area, whatever eps2d makes of its width."""
+    """A blob far below a pixel: its weight is opacity times its area, whatever eps2d makes of
+    its width.
+    """
     with jax.enable_x64(True):
         point = replace(wall([2.0], [1.0]), scales=jnp.full((1, 3), 0.004))
         view = replace(camera(), K=camera().K.at[0, 0].set(22.0).at[1, 1].set(22.0))

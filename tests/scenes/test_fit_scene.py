@@ -1,4 +1,6 @@
-"""`fit_scene`: what it takes and refuses, that it learns, grows, stops and continues bit for bit."""
+"""`fit_scene`: what it takes and refuses, that it learns, grows, stops and continues bit for
+bit.
+"""
 
 import dataclasses
 

@@ -1,4 +1,6 @@
-"""The strategy of fixed numbers of Gaussians: what it moves where, that nothing changes its look, and unused slots."""
+"""The strategy of fixed numbers of Gaussians: what it moves where, that nothing changes its
+look, and unused slots.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -113,7 +115,9 @@ def test_sources_are_chosen_by_their_opacity():
 
 
 def test_a_scene_looks_the_same_after_relocation():
-    """A Gaussian and its copies on one place: the ray through the middle is the same, those beside it nearly."""
+    """A Gaussian and its copies on one place: the ray through the middle is the same, those
+    beside it nearly.
+    """
     parameters, used = slots([0.8, 0.001, 0.001, 0.001])
     K = jnp.asarray([[300.0, 0, 16], [0, 300.0, 16], [0, 0, 1]])
     view = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, K, 32, 32)[0]

@@ -110,7 +110,10 @@ CHECKPOINTS = (
 OTHERS = {
     ".ksplat": f"a compressed file of mkkellogg's viewer: {_CONVERT.format('scene.ksplat')}",
     ".lcc": f"XGRIDS' LCC: {_CONVERT.format('scene.lcc')}",
-    ".json": "an unbundled SOG, or no Gaussians: `zip -j scene.sog FOLDER/*` makes a bundle of its folder",
+    ".json": (
+        "an unbundled SOG, or no Gaussians: `zip -j scene.sog FOLDER/*` makes a bundle of its"
+        " folder"
+    ),
 }
 """What is said of files of Gaussians that are not read, by suffix."""
 

@@ -163,13 +163,15 @@ def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
 
 @checked_arguments
 def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gaussians:
-    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas), `.splat`, `.spz`, `.glb`,
-    `.sog` (PlayCanvas) and `.pt` (checkpoints of gsplat).
+    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas),
+    `.splat`, `.spz`, `.glb`, `.sog` (PlayCanvas) and `.pt` (checkpoints of gsplat).
 
     Args:
-        path: The file. How it begins decides the format; where that does not tell (`.splat`), its suffix.
-        y_up: Turn them from the world that viewers of the format expect (y down in `.ply`, `.splat`, `.sog` and `.pt`) to one
-            with y up, as `orbit` has it. False: the numbers stay those of the file, and its cameras fit.
+        path: The file. How it begins decides the format; where that does not tell (`.splat`), its
+            suffix.
+        y_up: Turn them from the world that viewers of the format expect (y down in `.ply`,
+            `.splat`, `.sog` and `.pt`) to one with y up, as `orbit` has it. False: the numbers stay
+            those of the file, and its cameras fit.
 
     Returns:
         Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1],

@@ -1,9 +1,11 @@
-"""`.sog` of PlayCanvas, read only: a zip of meta.json and of pictures (WebP without loss, or PNG), a pixel for each Gaussian.
+"""`.sog` of PlayCanvas, read only: a zip of meta.json and of pictures (WebP without loss, or PNG),
+a pixel for each Gaussian.
 
-Version 2 (https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog) has positions in 16 bits, of two
-pictures, between bounds of sign(x) log(1 + |x|); log scales and colors as bytes that stand for numbers of a codebook; opacities
-in a byte; quaternions as the three components beside the largest, whose place is the alpha less 252; and harmonics as one of
-up to 65,536 rows of a picture, by the two bytes of their label. Y points down, as in `.ply`.
+Version 2 (https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog) has
+positions in 16 bits, of two pictures, between bounds of sign(x) log(1 + |x|); log scales and colors
+as bytes that stand for numbers of a codebook; opacities in a byte; quaternions as the three
+components beside the largest, whose place is the alpha less 252; and harmonics as one of up to
+65,536 rows of a picture, by the two bytes of their label. Y points down, as in `.ply`.
 """
 
 import io
@@ -34,7 +36,10 @@ COLUMNS = 64
 
 
 def read_sog(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a bundle. said: takes lines. Raises: Refused; what damaged files raise."""
+    """Gaussians of the bytes of a bundle. said: takes lines.
+
+    Raises: Refused; what damaged files raise.
+    """
     with open_archive(io.BytesIO(data), len(data)) as archive:
         root = _root(archive)
         meta = parse_json(_member(archive, root + META, "text_bytes").decode("utf-8"))
@@ -112,7 +117,9 @@ def _numbers(values: Any, name: str, least: int, most: int) -> Float[np.ndarray,
 
 
 def _codebook(meta: dict[str, Any], part: str) -> Float[np.ndarray, "256"]:
-    """The numbers that bytes stand for; those beyond a short one are NaN, which `loaded` leaves out."""
+    """The numbers that bytes stand for; those beyond a short one are NaN, which `loaded` leaves
+    out.
+    """
     found = _numbers(_part(meta, part).get("codebook"), f"{part}.codebook", 1, LEVELS)
     return np.pad(found, (0, LEVELS - len(found)), constant_values=np.nan)
 

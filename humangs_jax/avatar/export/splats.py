@@ -1,4 +1,5 @@
-"""Formats of Gaussians: `.ply`, `.splat`, `.glb` and checkpoints of gsplat; `spz` and `sog` have the others.
+"""Formats of Gaussians: `.ply`, `.splat`, `.glb` and checkpoints of gsplat; `spz` and `sog` have
+the others.
 
 `.ply` is that of 3DGS, or the compressed one of PlayCanvas, which is read only.
 
@@ -357,15 +358,19 @@ def read_splat(data: bytes, said: list[str]) -> Gaussians:
     return loaded(arrays, said)
 
 
-# Checkpoints of gsplat's trainer (https://github.com/nerfstudio-project/gsplat, examples/simple_trainer.py): a dict `splats` of
-# means, quats wxyz, log scales, logit opacities, sh0 (g, 1, 3) and shN (g, k, 3), as in `.ply`.
+# Checkpoints of gsplat's trainer (https://github.com/nerfstudio-project/gsplat,
+# examples/simple_trainer.py): a dict `splats` of means, quats wxyz, log scales, logit opacities,
+# sh0 (g, 1, 3) and shN (g, k, 3), as in `.ply`.
 
 
 SPLATS = "splats"
 
 
 def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused; what damaged files raise."""
+    """Gaussians of the bytes of a file. said: takes lines.
+
+    Raises: Refused; what damaged files raise.
+    """
     try:
         tensors = tensors_in(data, (SPLATS,))
     except Refused as error:
@@ -396,7 +401,8 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
     if functions not in COUNTS:
         degree = " of degree 4" if 3 * functions == DEGREE_4 else ""
         raise Refused(
-            f"{SPLATS}.shN: expected 0, 3, 8 or 15 functions, of degree 0 to 3, got {functions}{degree}"
+            f"{SPLATS}.shN: expected 0, 3, 8 or 15 functions, of degree 0 to 3, got"
+            f" {functions}{degree}"
         )
     if functions:
         arrays[f"{SPLATS}.shN"] = tensor("shN", functions, 3)

@@ -64,11 +64,15 @@ PixelCenters = Literal["integer", "half"]
 class CalibratedCamera:
     """One camera, or one image's camera where the format has one per image.
 
-    name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world: (4, 4), OpenCV axes.
-    width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of OpenCV, or None.
-    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera for each image.
-    lens: of `geometry.lens`. refusal: of lenses whose photos are not undistorted here (fisheyes, more coefficients), what is
-    raised where that is needed; their distortion has 8, 12 or, of fisheyes, 4 numbers.
+    name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world:
+    (4, 4), OpenCV axes.
+    width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of
+    OpenCV, or None.
+    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera
+    for each image.
+    lens: of `geometry.lens`. refusal: of lenses whose photos are not undistorted here (fisheyes,
+    more coefficients), what is raised where that is needed; their distortion has 8, 12 or, of
+    fisheyes, 4 numbers.
     """
 
     name: str
@@ -88,7 +92,8 @@ class Observations:
     """Points that the calibration saw, one row for each time: the evidence that reprojection is
     checked against.
 
-    points: (n, 3) in the world. cameras: (n,) which camera saw it. pixels: (n, 2) where, distortion included.
+    points: (n, 3) in the world. cameras: (n,) which camera saw it. pixels: (n, 2) where, distortion
+    included.
     colors: (n, 3) of the points, 0 to 255; None where the format has none.
     """
 
@@ -190,7 +195,8 @@ def read_calibration(
 ) -> Calibration:
     """The calibration in a file or folder of one of the `CAMERAS`; its content decides which one.
 
-    photo_size: as in `Source`. any_lens: also one whose photos are not undistorted here, else refused.
+    photo_size: as in `Source`. any_lens: also one whose photos are not undistorted here, else
+    refused.
 
     Raises: CaptureError, one line that names the file and what was expected.
     """
@@ -341,7 +347,8 @@ def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5
 def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
     """Fields of a `CalibratedCamera` for OpenCV's list of coefficients.
 
-    Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or the last two of 14, a tilted sensor, are not 0.
+    Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or the last two of 14, a tilted sensor,
+    are not 0.
     """
     values = file_numbers(values, file, field).ravel()
     if len(values) not in COUNTS:
@@ -357,7 +364,9 @@ def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
 
 
 def fisheye_lens(values: Any, file: object, field: str, refusal: CaptureError) -> dict[str, Any]:
-    """Fields of a `CalibratedCamera` for k1 k2 k3 k4 of a fisheye, or fewer. refusal: where photos have to be undistorted."""
+    """Fields of a `CalibratedCamera` for k1 k2 k3 k4 of a fisheye, or fewer. refusal: where
+    photos have to be undistorted.
+    """
     values = file_numbers(values, file, field).ravel()
     coefficients = values if values[4:].any() else np.pad(values[:4], (0, max(0, 4 - len(values))))
     return {"distortion": coefficients, "lens": "fisheye", "refusal": refusal}

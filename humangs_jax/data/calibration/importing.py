@@ -186,7 +186,10 @@ def import_cameras(
 
 
 def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
-    """Width and height of the photo of that name. A name without photo gets those of another: its camera is left out later."""
+    """Width and height of the photo of that name.
+
+    A name without photo gets those of another: its camera is left out later.
+    """
     try:
         return photo_size(photo_of(images, name, source))
     except CaptureError:

@@ -1,4 +1,6 @@
-"""Cameras of other tools as they stand in their world, with their lenses, for scenes of Gaussians (`load_cameras`)."""
+"""Cameras of other tools as they stand in their world, with their lenses, for scenes of
+Gaussians (`load_cameras`).
+"""
 
 import dataclasses
 import functools
@@ -24,7 +26,9 @@ from humangs_jax.io.reading import check_limit, reading
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SceneCameras(Mapping[str, Camera]):
-    """The cameras of a calibration by name, in the order of its file, and the points that it found; a mapping."""
+    """The cameras of a calibration by name, in the order of its file, and the points that it
+    found; a mapping.
+    """
 
     cameras: dict[str, Camera]
     """By the name of the camera, or the path of its image where the format has one for each."""
@@ -59,19 +63,21 @@ def load_cameras(
     y_up: bool = False,
     scale: float = 1.0,
 ) -> SceneCameras:
-    """The cameras of a calibration of COLMAP, nerfstudio, OpenCV and the others of docs/cameras.md, with their lenses.
+    """The cameras of a calibration of COLMAP, nerfstudio, OpenCV and the others of docs/cameras.md,
+    with their lenses.
 
     Args:
         path: A file or folder; its content decides which format it is.
         images: The folder of the photos, for formats that do not say how large they are.
-        lenses: With the distortion that the file has, fisheyes included, as photos show it. False: as pinholes, for photos
-            that are undistorted; a fisheye is refused.
-        y_up: Turn the world from the axis that the format has up to y. False: it stays that of the file, in which Gaussians of
-            other programs stand, too.
+        lenses: With the distortion that the file has, fisheyes included, as photos show it. False:
+            as pinholes, for photos that are undistorted; a fisheye is refused.
+        y_up: Turn the world from the axis that the format has up to y. False: it stays that of the
+            file, in which Gaussians of other programs stand, too.
         scale: Metres per unit of the file.
 
     Returns:
-        A mapping from names to cameras, pixel centres at +0.5, with the points that the calibration found.
+        A mapping from names to cameras, pixel centres at +0.5, with the points that the calibration
+        found.
 
     Raises:
         CaptureError: One line that names the file, the field and what was expected.

@@ -146,7 +146,10 @@ def interpolate_attributes(
 
 
 def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
-    """(n, 3): pixel position x, y and depth z. Written out: matrix products are of low precision on GPU and TPU."""
+    """(n, 3): pixel position x, y and depth z.
+
+    Written out: matrix products are of low precision on GPU and TPU.
+    """
     require_pinhole("the rasterizer of meshes", camera)
     R, t, K = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3], camera.K
     x, y, z = (
