@@ -16,6 +16,7 @@ from humangs_jax.body.model import BodyModel, without_expression
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
+from humangs_jax.data.capture_checks import few
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.camera_errors import CameraError, find_camera_errors, mended
@@ -388,12 +389,17 @@ def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str
     motion is.
     """
     taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
+    single = []
     for frame, views in enumerate(seen):
         points, cameras = int(views.any(0).sum()), int(views.any(1).sum())
         if points < FEW:
             yield f"frame {frame}: {points} keypoints are seen: its pose is {taken}"
         elif cameras == 1:
-            yield f"frame {frame}: seen by one view: distance and height are hardly determined"
+            single.append(str(frame))
+    if single:
+        frames, each = ("frame", "") if len(single) == 1 else ("frames", "each ")
+        told = f"{each}seen by one view: distance and height are hardly determined"
+        yield f"{frames} {few(single)}: {told}"
 
 
 def _motion_warnings(

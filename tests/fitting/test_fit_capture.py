@@ -15,7 +15,7 @@ from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133, Keypoints
 from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting import files, fit_capture
 from humangs_jax.fitting.files import check_place, read_fit_record, write_fitted
-from humangs_jax.fitting.fit_capture import fit_photos
+from humangs_jax.fitting.fit_capture import _blind_frames, fit_photos
 from humangs_jax.io import reading
 
 SIZE = 16
@@ -176,6 +176,16 @@ def test_folders_that_cannot_be_replaced_are_refused_before_the_fit(folder, tmp_
     here = copied(folder[0], tmp_path / "copy")
     monkeypatch.chdir(here)
     assert check_place(here, None, overwrite=True) == here  # files are replaced one by one
+
+
+def test_frames_of_one_view_each_are_one_line():
+    seen = np.ones((8, 2, 17), bool)
+    assert list(_blind_frames(seen, smooth=False)) == []
+    seen[1:, 1] = False
+    (line,) = _blind_frames(seen, smooth=False)
+    assert line.startswith("frames 1, 2, 3, 4 and 3 more: each seen by one view")
+    seen[0, :, 3:] = False
+    assert next(_blind_frames(seen, smooth=False)).startswith("frame 0: 3 keypoints are seen")
 
 
 @pytest.mark.slow
