@@ -66,7 +66,6 @@ def tradeoff(
     subjects: int = 2,
     only: tuple[str, ...] = (),
     image: Path | None = None,
-    front: bool = False,
 ) -> None:
     """Speed against accuracy of the whole path: some 60 settings, their front, and presets. Half an
     hour on one core.
@@ -78,7 +77,6 @@ def tradeoff(
     subjects: how many people
     only: knobs to measure, beside the default point
     image: draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png
-    front: write humangs_jax/assets/front.json, where `humangs tune` finds it
     """
     if unknown := set(only) - (knobs := {each.knob: None for each in points()}).keys():
         raise ValueError(f"--only {unknown.pop()}: expected some of {', '.join(knobs)}")
@@ -104,7 +102,7 @@ def tradeoff(
                 bench.default_make_ms()  # compiles
             bench.measure(each, i, rows[each.name])
             write_json(out, result)
-    tradeoff_report.show(run, result, image, front)
+    tradeoff_report.show(run, result, image)
 
 
 def settings_of() -> dict[str, Any]:

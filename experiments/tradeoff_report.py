@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.harness import Run, figure, means, staircase
-from experiments.results import REPOSITORY, cells, markdown_table, significant, write_json
+from experiments.results import cells, markdown_table, significant
 from humangs_jax.apps.settings import PRESETS, Settings
 from humangs_jax.network.runtime import Runtime
 
@@ -140,7 +140,6 @@ def combined(**fields: Any) -> Point:
     )
 
 
-FRONT = REPOSITORY / "humangs_jax" / "assets" / "front.json"
 EQUAL = 1.05
 """Times of points that differ by less are taken for equal: they are measured beside other programs.
 """
@@ -156,7 +155,7 @@ KINDS = {"feed-forward": "#1f6f8b", "refined": "#c0392b", "no network": "#7f8c8d
 Row = dict[str, Any]
 
 
-def show(run: Run, result: dict[str, Any], image: Path | None, front: bool) -> None:
+def show(run: Run, result: dict[str, Any], image: Path | None) -> None:
     """All tables, and what is asked for."""
     result = result | {
         "points": {
@@ -164,8 +163,6 @@ def show(run: Run, result: dict[str, Any], image: Path | None, front: bool) -> N
         }
     }
     rows = rows_of(result)
-    if front:
-        write_json(FRONT, front_file(rows, result))
     run.show(point_table(rows, result), kept(result), "tradeoff")
     run.show(preset_table(rows, result), table="tradeoff_presets")
     if image:
@@ -231,26 +228,6 @@ def front_of(rows: list[Row]) -> list[Row]:
         quality(other) > quality(row) and no_longer(other, row) for other in ours
     )
     return sorted((row for row in ours if not beaten(row)), key=lambda row: row["reconstruct"])
-
-
-def front_file(rows: list[Row], result: dict[str, Any]) -> dict[str, Any]:
-    """What `humangs tune` chooses from: the front, and the presets."""
-    chosen = front_of(rows)
-    chosen += [row for row in rows if row["knob"] == "preset" and row not in chosen]
-    points = [
-        {
-            "name": row["name"],
-            "settings": row["settings"],
-            "make": row["reconstruct"] - row["refine_share"],
-            "refine": row["refine_share"],
-            "frame": row["frame"],
-            "memory_mb": row["memory_mb"],
-            "psnr": row["novel"]["psnr"],
-            "psnr_poses": row["animation"]["psnr"],
-        }
-        for row in chosen
-    ]
-    return {"weights": result["settings"]["weights"], "points": points}
 
 
 # Tables

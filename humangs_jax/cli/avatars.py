@@ -586,11 +586,11 @@ class Export:
 
 @dataclasses.dataclass(frozen=True)
 class Tune:
-    """Find the best settings within a budget of time or memory.
+    """Find the best preset within a budget of time or memory.
 
-    They are measured on this machine. The result is for --config of `reconstruct`, `animate`,
-    `render`. Times are without compilation. The exit code is 1, and nothing is written, if no
-    setting is within the budget. docs: tradeoff.
+    The presets are timed on this machine with this person, without compilation. The result is for
+    --config of `reconstruct`, `animate`, `render`. The exit code is 1, and nothing is written, if
+    no preset is within the budget. docs: tradeoff.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -636,12 +636,12 @@ class Tune:
             tuned = tune(variables, config, photos, **budgets, size=self.size, progress=True)
         costs = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
         about = {
-            "name": tuned.point.name,
+            "name": tuned.name,
             "budget": budgets,
             "frame_size": self.size,
             "measured": costs,
         }
-        save_settings(self.out, tuned.point.settings, **about)
+        save_settings(self.out, tuned.settings, **about)
         tell(tuned)
         wrote(self.out, "settings")
         weights = () if self.weights is None else ("--weights", self.weights)

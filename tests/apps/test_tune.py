@@ -3,25 +3,18 @@
 import dataclasses
 import json
 import typing
+from pathlib import Path
 
 import jax
 import pytest
 from command_line import run
-from hypothesis import assume, given
-from hypothesis import strategies as st
 
 from humangs_jax.apps import settings as tuning
 from humangs_jax.apps.settings import (
-    MARGIN,
     PRESETS,
-    Budget,
     Cost,
-    FrontPoint,
     Settings,
-    choose,
-    load_front,
     load_settings,
-    predict,
     save_settings,
     tune,
 )
@@ -33,6 +26,8 @@ from humangs_jax.network import presets
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.weights import save_weights
+
+TRADEOFF = Path(__file__).parents[2] / "docs" / "results" / "tradeoff.json"
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -84,138 +79,65 @@ def test_what_a_shot_says_wins_over_the_settings():
     assert settings.shot(Shot(splat="exact")).splat == "exact"
 
 
-def test_every_preset_is_a_point_of_the_front_that_ships():
-    """With the settings that the sweep has measured; the best one is called so."""
-    front = {point.name: point for point in load_front()}
-    assert {name: front[name].settings for name in PRESETS} == PRESETS
-    qualities = [front[name].quality for name in PRESETS]
+def test_presets_are_in_the_order_of_their_quality_on_the_page():
+    """`tune` takes the last one that is fast enough."""
+    points = json.loads(TRADEOFF.read_text())["numbers"]["points"]
+    quality = lambda row: row["novel"]["psnr"] + row["animation"]["psnr"]
+    qualities = [quality(points[f"preset {name}"]) for name in PRESETS]
     assert qualities == sorted(qualities), qualities
 
 
 # The choice
 # --------------------------------------------------------------------------------------------------
 
-shares = st.floats(0.05, 20)
+BY_PRESET = {
+    "realtime": Cost(100.0, 10.0, 90.0),
+    "balanced": Cost(400.0, 20.0, 110.0),
+    "quality": Cost(800.0, 25.0, 200.0),
+    "best": Cost(3000.0, 30.0, 320.0),
+}
 
 
-@st.composite
-def fronts(draw):
-    count = draw(st.integers(1, 8))
-    rows = [
-        (
-            draw(shares),
-            draw(st.just(0.0) | shares),
-            draw(shares),
-            draw(st.floats(10, 2000)),
-            draw(st.floats(15, 30)),
-        )
-        for _ in range(count)
-    ]
-    return [
-        FrontPoint(str(i), Settings(), m, r, f, mib, q, q - 1)
-        for i, (m, r, f, mib, q) in enumerate(rows)
-    ]
-
-
-def searched(front, machine, budget):
-    """(answer, names measured) of the search with a machine that says what a point costs."""
-    measured = {}
-    while (point := choose(front, measured, budget)) is not None and point.name not in measured:
-        measured[point.name] = machine(point)
-    return point, measured
-
-
-@given(
-    fronts(), shares, shares, shares, st.floats(1, 3000), st.floats(1, 3000), st.floats(10, 2000)
-)
-def test_the_choice_is_the_best_within_the_budget_where_ratios_carry_over(
-    front, make, refine, frame, most, each, memory
-):
-    machine = lambda p: Cost(
-        100 * make * p.make, 100 * refine * p.refine, 10 * frame * p.frame, p.memory_mb
-    )
-    budget = Budget(most, each, memory)
-    for point in front:  # where a point is at the edge of the budget, rounding decides
-        cost = machine(point)
-        assume(
-            all(
-                abs(a / b - 1) > 1e-6
-                for a, b in ((MARGIN * cost.reconstruct_ms, most), (MARGIN * cost.frame_ms, each))
-            )
-        )
-        assume(abs(cost.memory_mb / memory - 1) > 1e-6)
-    allowed = [point for point in front if budget.allows(machine(point))]
-    found, measured = searched(front, machine, budget)
-    if not allowed:
-        assert found is None
-    else:
-        assert found.quality == max(point.quality for point in allowed) and budget.allows(
-            measured[found.name]
-        )
-
-
-@given(fronts(), st.randoms(use_true_random=False), st.floats(1, 3000))
-def test_what_is_chosen_has_been_measured_within_the_budget_on_any_machine(front, random, most):
-    machine = lambda p: Cost(
-        random.uniform(1, 3000), random.uniform(0, 3000) if p.refine else 0.0, 1.0
-    )
-    budget = Budget(reconstruct_ms=most)
-    found, measured = searched(front, machine, budget)
-    assert len(measured) <= len(front)
-    assert found is None or MARGIN * measured[found.name].reconstruct_ms <= most
-
-
-def test_a_choice_that_is_slower_the_second_time_is_not_taken(monkeypatch):
-    fast, good = (
-        FrontPoint(n, Settings(views=v), float(v), 0.0, 1.0, 100.0, q, q)
-        for n, v, q in (("a", 1, 20.0), ("b", 2, 25.0))
-    )
-    times = {1: [30.0, 31.0], 2: [70.0, 90.0]}
-    measure = lambda settings, *_: Cost(times[settings.views].pop(0), 0.0, 10.0, None)
-    monkeypatch.setattr(tuning, "measure", measure)
+def tuned(monkeypatch, masks=(), **budget):
+    """`tune` on a machine on which the presets cost what `BY_PRESET` says."""
+    names = {id(settings): name for name, settings in PRESETS.items()}
+    monkeypatch.setattr(tuning, "measure", lambda settings, *_: BY_PRESET[names[id(settings)]])
     capture = object.__new__(Capture)  # nothing of it is measured
-    object.__setattr__(capture, "masks", ())
-    tuned = tune({}, presets.tiny(), capture, reconstruct_ms=100.0, size=32, front=[fast, good])
-    assert tuned.point is fast and tuned.cost == Cost(31.0, 0.0, 10.0) and not any(times.values())
-    assert tuned.measured["b"].reconstruct_ms == 90
+    object.__setattr__(capture, "masks", masks)
+    return tune({}, presets.tiny(), capture, **budget)
 
 
-def test_costs_are_extrapolated_from_the_nearest_measured_point():
-    front = [
-        FrontPoint(name, Settings(), make, 0.0, frame, 100.0, 20.0, 19.0)
-        for name, make, frame in (("a", 1.0, 1.0), ("b", 4.0, 1.0), ("c", 8.0, 2.0))
-    ]
-    measured = {"a": Cost(100.0, 0.0, 10.0, 50.0), "b": Cost(300.0, 0.0, 10.0, 60.0)}
-    assert predict(front[2], front, measured) == Cost(600.0, 0.0, 20.0, 50.0)
-    assert choose(front, {}, Budget(frame_ms=1.0)).name == "a"  # the cheapest first
+@pytest.mark.parametrize(
+    ("budget", "name"),
+    [
+        ({"reconstruct_ms": 1e9}, "best"),
+        ({"reconstruct_ms": 1001.0}, "quality"),  # 25 % of room
+        ({"reconstruct_ms": 999.0}, "balanced"),
+        ({"frame_ms": 20.0}, "realtime"),
+        ({"reconstruct_ms": 1e9, "memory_mb": 200.0}, "quality"),
+    ],
+)
+def test_the_best_preset_within_the_budget_is_chosen(monkeypatch, budget, name):
+    found = tuned(monkeypatch, **budget)
+    assert found.name == name and found.settings == PRESETS[name]
+    later = list(PRESETS)[list(PRESETS).index(name) + 2 :]
+    assert not set(later) & set(found.measured), "what is slower still is not timed"
 
 
-def test_what_is_given_up_is_said():
-    low, best = (
-        FrontPoint(n, Settings(views=2), 1.0, 0.0, 1.0, 100.0, q, q - 2)
-        for n, q in (("low", 20.0), ("best", 26.5))
-    )
-    text = str(tuning.Tuned(low, Cost(210.0, 0.0, 12.5, 300.0), best, {}))
-    assert (
-        text.startswith("low") and "takes 210 ms a reconstruction, 12.5 ms a frame, 300 MiB" in text
-    )
-    assert (
-        "gives up 6.5 dB in the pose of the photos and 6.5 dB in novel poses against 'best'" in text
-    )
-    assert "is the best of all settings" in str(tuning.Tuned(best, Cost(1.0, 0.0, 1.0), best, {}))
+def test_where_nothing_is_within_the_budget_the_fastest_is_named(monkeypatch):
+    with pytest.raises(ValueError, match="'realtime', the fastest, takes 100 ms a reconstruction"):
+        tuned(monkeypatch, frame_ms=1.0)
 
 
-def test_without_masks_nothing_that_refines_is_tried(monkeypatch):
-    tried = []
-    monkeypatch.setattr(
-        tuning, "measure", lambda settings, *_: tried.append(settings) or Cost(1.0, 0.0, 1.0)
-    )
-    capture = object.__new__(Capture)
-    object.__setattr__(capture, "masks", None)
-    tuned = tune({}, presets.tiny(), capture, frame_ms=1e9)
-    assert tuned.point.settings.refinement is tuned.best.settings.refinement is None and not any(
-        each.refinement for each in tried
-    )
+def test_memory_that_cannot_be_measured_cannot_be_limited(monkeypatch):
+    monkeypatch.setitem(BY_PRESET, "realtime", Cost(1.0, 1.0))
+    with pytest.raises(ValueError, match=r"^memory_mb"):
+        tuned(monkeypatch, memory_mb=100.0)
+
+
+def test_without_masks_no_preset_that_refines_is_tried(monkeypatch):
+    found = tuned(monkeypatch, masks=None, frame_ms=1e9)
+    assert found.name == "realtime" and list(found.measured) == ["realtime"]
 
 
 # The command
@@ -224,7 +146,7 @@ def test_without_masks_nothing_that_refines_is_tried(monkeypatch):
 
 @pytest.mark.slow
 def test_tuning_for_real(tmp_path, monkeypatch, capsys):
-    """The smallest network finds the better of two settings in a large budget, none in a tiny one;
+    """The smallest network finds the better of two presets in a large budget, none in a tiny one;
     `reconstruct`, `animate` and `render` take the file.
     """
     monkeypatch.chdir(tmp_path)
@@ -234,35 +156,14 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     variables = init_humangs(jax.random.key(0), config)
     save_weights(tmp_path / "tiny.safetensors", variables, config)
     small = Runtime(image_size=32)
-    front = [
-        FrontPoint(
-            "one photo",
-            Settings(views=1, runtime=small, splat="fast"),
-            0.5,
-            0.0,
-            0.8,
-            100.0,
-            20.0,
-            19.0,
-        ),
-        FrontPoint(
-            "refined",
-            Settings(runtime=small, refine_iterations=1, refine_steps=3),
-            1.0,
-            2.0,
-            1.0,
-            150.0,
-            24.0,
-            21.0,
-        ),
-    ]
-    assert (
-        tune(
-            variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32, front=front
-        ).point.name
-        == "refined"
-    )
-    monkeypatch.setattr(tuning, "load_front", lambda: front)
+    fast = Settings(views=1, runtime=small, splat="fast")
+    refined = Settings(runtime=small, refine_iterations=1, refine_steps=3)
+    monkeypatch.setitem(PRESETS, "realtime", fast)
+    monkeypatch.setitem(PRESETS, "balanced", refined)
+    for name in ("quality", "best"):
+        monkeypatch.delitem(PRESETS, name)
+    found = tune(variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32)
+    assert found.name == "balanced" and set(found.measured) == {"realtime", "balanced"}
     command = (
         "tune",
         "someone",
@@ -275,15 +176,15 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     )
 
     code, _, err = run(monkeypatch, capsys, *command, "--reconstruct-ms", "0.001")
-    assert code == 1 and "no setting is within the budget" in err.splitlines()[-1]
+    assert code == 1 and "no preset is within the budget" in err.splitlines()[-1]
     assert not (tmp_path / "tuned.json").exists()
 
     code, out, err = run(
         monkeypatch, capsys, *command, "--reconstruct-ms", "1e7", "--frame-ms", "1e6"
     )
     assert code == 0, err
-    assert "refined\n" in out and "is the best of all settings" in out
-    assert load_settings(tmp_path / "tuned.json") == front[1].settings
+    assert "balanced: " in out and " ms a reconstruction, " in out
+    assert load_settings(tmp_path / "tuned.json") == refined
 
     run_with = lambda *words: run(monkeypatch, capsys, *words, "--config", "tuned.json")
     code, _, err = run_with("reconstruct", "someone", "--weights", "tiny.safetensors", "--no-check")
@@ -298,7 +199,7 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
         "--out",
         "plain.npz",
     )
-    code, out, err = run(monkeypatch, capsys, *words, "--preset", "quality")
+    code, out, err = run(monkeypatch, capsys, *words, "--preset", "balanced")
     assert code == 0 and "no masks: the avatar is not refined" in out + err, err
     code, _, err = run_with("render", "avatar.npz", "--size", "32", "--views", "2")
     assert code == 0 and len(list((tmp_path / "views").glob("*.png"))) == 2, err

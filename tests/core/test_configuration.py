@@ -39,7 +39,6 @@ def reachable(cls, found):
 ALL = set()
 CONFIGURATIONS = (
     settings.Settings,
-    settings.FrontPoint,
     config.TrainConfig,
     settings.RefineConfig,
     OnTheFlyConfig,

@@ -1,9 +1,6 @@
 """The sweep of speed against accuracy: its points, its front, and the files made of it."""
 
-import json
-
 from experiments import tradeoff_report as report
-from experiments.results import REPOSITORY
 from experiments.tradeoff_report import points
 
 
@@ -62,9 +59,3 @@ def test_the_points_are_many_and_change_one_knob_each():
             (each.settings.splat, default.settings.splat),
         ]
         assert sum(a != b for a, b in changed) == 1, each
-
-
-def test_the_front_that_ships_is_that_of_the_page():
-    result = json.loads((REPOSITORY / "docs/results/tradeoff.json").read_text())["numbers"]
-    rows = report.rows_of(result)
-    assert json.loads(report.FRONT.read_text()) == report.front_file(rows, result)
