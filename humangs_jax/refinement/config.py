@@ -75,9 +75,10 @@ class RefineConfig:
         gain="detail of faces",
         measured="benchmarks/quality.md",
     )
-    """Steps on the head alone afterwards, where photos have 512 pixels or more and calibrated
-    cameras, and `seconds` is None or `steps` 0; 0: none. They move the Gaussians of the head by
-    crops of the photos around it, and hold back what grows beyond the masks (see `head.py`)."""
+    """Steps on the head alone afterwards, where photos have 512 pixels or more, and calibrated
+    cameras or a pose each, and `seconds` is None or `steps` 0; 0: none. They move the Gaussians of
+    the head by crops of the photos around it, and hold back what grows beyond the masks (see
+    `head.py`)."""
     region: tuple[str, ...] = HEAD
     """The region of interest of `head_steps`: parts of the names of its joints; `("left_wrist",
     "left_index")` is a hand.

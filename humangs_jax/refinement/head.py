@@ -75,12 +75,13 @@ class Crops(NamedTuple):
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
-    """Whether photos are large enough for steps on the head, and cameras exact enough: those that
-    were found from the person are centimetres off. That blurs a face, and the steps would fit the
-    blur.
+    """Whether photos are large enough for steps on the head, and heads where they are to be: with
+    cameras that were found from the person and one pose for all photos they are centimetres off.
+    That blurs a face, and the steps would fit the blur. A pose for each photo takes it away.
     """
     longest = max(capture.images.shape[1:3])
-    return capture.calibrated and min(longest, config.image_size or longest) >= LEAST_SIDE
+    in_place = capture.calibrated or capture.frame_count >= capture.view_count > 1
+    return in_place and min(longest, config.image_size or longest) >= LEAST_SIDE
 
 
 def sharpened(

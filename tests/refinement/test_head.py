@@ -12,6 +12,7 @@ from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
+from humangs_jax.fitting.own_poses import with_own_poses
 from humangs_jax.refinement import head as heads
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.config import HEAD, RefineConfig
@@ -157,7 +158,9 @@ def test_colors_count_in_the_mask_and_excess_alpha_costs_more(four):
     assert grown / change[0].mean() > 5 * shrunk / change[1].mean()
 
 
-def test_cameras_from_the_person_blur_a_face_and_get_no_steps_on_the_head():
+def test_cameras_from_the_person_blur_a_face_unless_each_photo_has_a_pose():
     capture = load_capture("demo_capture").resized(heads.LEAST_SIDE)
     assert shows_heads(capture, ALONE)
-    assert not shows_heads(dataclasses.replace(capture, calibrated=False), ALONE)
+    uncalibrated = dataclasses.replace(capture, calibrated=False)
+    assert not shows_heads(uncalibrated, ALONE)
+    assert shows_heads(with_own_poses(uncalibrated), ALONE)
