@@ -19,7 +19,8 @@ from experiments.results import REPOSITORY
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.body.motion import Motion
+from humangs_jax.data.motion import save_motion
 from humangs_jax.people.subject import split_of
 from humangs_jax.people.writer import Layout, write_person
 

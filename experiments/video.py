@@ -22,8 +22,9 @@ from humangs_jax.avatar.frames import (
 from humangs_jax.avatar.layers import LAYERS, exr_view
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile
+from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import Motion, load_motion
+from humangs_jax.data.motion import load_motion
 from humangs_jax.io.images import to_uint8
 
 WALKED = 2.5

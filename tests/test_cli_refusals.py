@@ -17,10 +17,11 @@ from small import random_gaussians, small_avatar
 from humangs_jax import cli
 from humangs_jax.avatar import reconstruct as many
 from humangs_jax.avatar.export.gaussians import save_gaussians
+from humangs_jax.body.motion import Motion
 from humangs_jax.cli import options
 from humangs_jax.core.configuration import marks_in
 from humangs_jax.data.capture import load_capture, save_capture
-from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.data.motion import save_motion
 from humangs_jax.io.images import write_png
 
 

@@ -38,7 +38,7 @@ SUFFIXES = {
 }
 VARIABLES = {"self", "cls", "hg", "state", "x", "model", "views", "lin0"}
 """Words that stand for objects of any class, parts of configurations and of files."""
-FILES_OF_OTHERS = {"three.js", "compute_metrics.py"}
+FILES_OF_OTHERS = {"three.js", "compute_metrics.py", "simple_trainer.py"}
 FILE = re.compile(r"(?<![\w*{}/.-])([\w/]+\.(?:py|js|frag))\b")
 
 

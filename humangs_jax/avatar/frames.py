@@ -17,13 +17,13 @@ from humangs_jax.avatar.export import ExportFormat
 from humangs_jax.avatar.export.gaussians import world_matrix
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody, blend_transforms, joint_transforms
+from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import COMPILING, bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.data.views import upright_world
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit

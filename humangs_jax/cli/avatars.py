@@ -33,8 +33,8 @@ from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.body.motion import Motion
     from humangs_jax.data.capture import Capture
-    from humangs_jax.data.motion import Motion
 
 
 DEMO_REFINE = "15s"

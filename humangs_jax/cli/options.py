@@ -34,8 +34,8 @@ from humangs_jax.core.registry import alternatives
 
 if TYPE_CHECKING:
     from humangs_jax.apps.settings import Settings
+    from humangs_jax.body.motion import Motion
     from humangs_jax.core.array_types import Array
-    from humangs_jax.data.motion import Motion
 
 LARGEST_IMAGE = 8192
 """Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn.

@@ -10,6 +10,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from humangs_jax.body.motion import DEFAULT_FPS
 from humangs_jax.core.registry import FOLDER, Format, Formats, imported
 from humangs_jax.io.reading import visible
 
@@ -227,7 +228,6 @@ KEYPOINTS = SourceFormats(
 # Motions
 # --------------------------------------------------------------------------------------------------
 
-DEFAULT_FPS = 30.0
 ARRAYS = "humangs_jax.data.motion.arrays:read_arrays"
 ARRAY_SUFFIXES = (".npz", ".pkl", ".pickle", ".pt", ".pth", ".npy", ".smpl", ".json", FOLDER)
 PLACES = {

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
+from humangs_jax.body.motion import turned_upright
 from humangs_jax.body.resolution import (
     decimate,
     decimate_with_kept,
@@ -26,12 +27,7 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD, usable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.motion.rules import (
-    nearest_axis,
-    standing_axis,
-    turned_upright,
-    upright_matrix,
-)
+from humangs_jax.geometry.axes import nearest_axis, standing_axis, upright_matrix
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized

@@ -23,12 +23,13 @@ import numpy as np
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.body.motion import Motion
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.progress import say
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.capture_checks import checked_json
 from humangs_jax.data.loading.captures import find_captures
-from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.data.motion import save_motion
 from humangs_jax.data.sets import (
     DATA_SET,
     MANIFEST,

@@ -27,11 +27,12 @@ from humangs_jax.avatar.export.gaussians import unit_quats
 from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, RestBody
+from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.configuration import ArgumentError, config_from_json
 from humangs_jax.core.progress import printable, say
-from humangs_jax.data.motion import Motion, grounded, load_motion
+from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.rules import page_rules
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text

@@ -12,8 +12,9 @@ from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.camera_paths import camera_path, file_cameras, one_size, repeated, standing
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
+from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.data.motion import save_motion
 from humangs_jax.geometry.camera import intrinsics_from_fov, look_at, orbit, stack_cameras
 from humangs_jax.io.images import read_image
 

@@ -30,8 +30,9 @@ from humangs_jax.avatar.export.mesh import (
 from humangs_jax.avatar.export.splats import write_glb
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import RestBody
+from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
+from humangs_jax.data.motion import load_motion, save_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.rendering.gaussians import Gaussians

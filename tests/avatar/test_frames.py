@@ -11,7 +11,7 @@ from avatar_cases import CENTRES, RADIUS, two_balls
 from humangs_jax.avatar import frames
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
-from humangs_jax.data.motion import Motion
+from humangs_jax.body.motion import Motion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS

@@ -12,18 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import RestBody, joint_transforms
+from humangs_jax.body.motion import PELVIS, Motion, grounded
 from humangs_jax.cli import animate
 from humangs_jax.cli.options import PartOfMotion
 from humangs_jax.data.formats import MOTIONS, MotionFormat
-from humangs_jax.data.motion import (
-    PELVIS,
-    Motion,
-    MotionError,
-    Poses,
-    grounded,
-    load_motion,
-    save_motion,
-)
+from humangs_jax.data.motion import MotionError, Poses, load_motion, save_motion
 from humangs_jax.geometry import quaternion
 
 FLOAT32 = 1e-5

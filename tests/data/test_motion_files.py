@@ -14,10 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.data.motion import PELVIS, UPRIGHT, MotionError, load_motion
+from humangs_jax.body.motion import PELVIS
+from humangs_jax.data.motion import MotionError, load_motion
 from humangs_jax.data.motion.arrays import RIG, RIG_JOINTS
 from humangs_jax.data.motion.rules import joint_places
 from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.geometry.axes import UPRIGHT
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "network"))
 from joblib_files import joblib

@@ -12,8 +12,8 @@ from small import small_avatar, small_body
 
 from humangs_jax.avatar.avatar import Avatar, Light
 from humangs_jax.body.model import shape_body
+from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import Motion
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import EPS2D, MIP_EPS2D
 from humangs_jax.viewer import page as packing

@@ -13,8 +13,8 @@ from PIL import Image
 from small import small_avatar
 
 from experiments import chromium
+from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import Motion
 from humangs_jax.io.images import DRAWN, MARK_KEY
 from humangs_jax.viewer import page
 

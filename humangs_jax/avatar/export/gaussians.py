@@ -23,6 +23,7 @@ from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, OTHERS, READ_ONLY, ExportFormat, Up, chosen_format
 from humangs_jax.body.model import RestBody
+from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import (
     BOUNDED,
@@ -34,7 +35,6 @@ from humangs_jax.core.checks import (
 from humangs_jax.core.progress import printable
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import Formats, alternatives, imported
-from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.io.arrays import check_array

@@ -27,10 +27,10 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, Up, files_beside
 from humangs_jax.avatar.export.gaussians import up_matrix, up_turn
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
+from humangs_jax.body.motion import Motion
 from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.core.progress import bar, followed
-from humangs_jax.data.motion import Motion
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.atomic import check_ours, write_text
 from humangs_jax.io.images import DRAWN, is_own_picture, png_bytes, write_png

@@ -1,36 +1,32 @@
 """Motions: one body pose per frame, read from the files that people have. `load_motion` is the one
 door.
 
-In memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up. Readers (`data.formats.MOTIONS`
-is their table): `arrays`, by key; `clips`, skeletons of other programs, which `skeleton` brings to
-our joints. `rules`: what all of them and the page know, as tables.
+In memory (`body.motion.Motion`): SMPL-X's 55 joints, axis-angle in radians, metres, y up. Readers
+(`data.formats.MOTIONS` is their table): `arrays`, by key; `clips`, skeletons of other programs,
+which `skeleton` brings to our joints. `rules`: what all of them and the page know, as tables.
 """
 
-import functools
 import logging
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
+from humangs_jax.body.motion import Motion, turned_upright
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
-from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.core.registry import alternatives
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
-from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS, MotionFormat
+from humangs_jax.data.formats import MOTIONS, MotionFormat
 from humangs_jax.data.motion import rules, skeleton
-from humangs_jax.data.motion.rules import PELVIS, UPRIGHT
-from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.axes import UPRIGHT, standing_axis
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.reading import FileError, check_limit, open_file, reading
 
-__all__ = ["PELVIS", "UPRIGHT", "Motion", "MotionError", "grounded", "load_motion", "save_motion"]
+__all__ = ["Motion", "MotionError", "load_motion", "save_motion"]
 
 
 logger = logging.getLogger(__name__)
@@ -57,60 +53,6 @@ class MotionError(FileError):
     """Something is wrong with a motion file; the message is one line: file, key, and what was
     expected.
     """
-
-
-@pytree_dataclass
-class Motion:
-    """Poses over time. rotations: (m, j, 3) axis-angle. translations: (m, 3) metres, applied last.
-
-    fps: static.
-    """
-
-    rotations: Float[Array, "m j 3"]
-    translations: Float[Array, "m 3"]
-    fps: float = static_field(default=DEFAULT_FPS)
-
-    def pose(self, frame: int) -> BodyPose:
-        """One frame."""
-        return BodyPose(self.rotations[frame], self.translations[frame])
-
-    def at_rate(self, fps: float | int) -> "Motion":
-        """The motion at another frame rate, between two frames interpolated: rotations on the
-        shortest way, positions linearly.
-
-        Raises: ValueError for a rate that is not positive, or more frames than the limit.
-        """
-        if not (np.isfinite(fps) and fps > 0):
-            raise ValueError(f"fps: expected a positive number of frames per second, got {fps}")
-        last = len(self.translations) - 1
-        count = max(1, round(min((last + 1) * fps / self.fps, 1e18)))
-        check_limit("frames", count, "frames")
-        return replace(
-            self._at(np.minimum(np.arange(count) * self.fps / fps, last)), fps=float(fps)
-        )
-
-    def _at(self, times: Float[np.ndarray, " n"]) -> "Motion":
-        low = np.floor(times).astype(int)
-        frames = self.rotations[low], self.translations[low]
-        if (times > low).any():
-            high = np.minimum(low + 1, len(self.translations) - 1)
-            share = jnp.asarray(times - low, jnp.float32)
-            frames = _between(*frames, self.rotations[high], self.translations[high], share)
-        return replace(self, rotations=frames[0], translations=frames[1])
-
-
-@jax.jit
-def _between(
-    rotations: Float[Array, "m j 3"],
-    translations: Float[Array, "m 3"],
-    next_rotations: Float[Array, "m j 3"],
-    next_translations: Float[Array, "m 3"],
-    share: Float[Array, " m"],
-) -> tuple[Float[Array, "m j 3"], Float[Array, "m 3"]]:
-    """Frames between frames; those with share 0 as they are."""
-    turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
-    moved = translations + share[:, None] * (next_translations - translations)
-    return jnp.where(share[:, None, None] > 0, turned, rotations), moved
 
 
 class Reading(NamedTuple):
@@ -174,8 +116,8 @@ def load_motion(
     Examples:
         >>> motion = hg.load_motion("dance.bvh", rest_joints=avatar.rest_joints)
     """
-    if up not in ("auto", *rules.UPRIGHT):
-        raise ValueError(f"up: expected auto, {', '.join(rules.UPRIGHT)}, got {up!r}")
+    if up not in ("auto", *UPRIGHT):
+        raise ValueError(f"up: expected auto, {', '.join(UPRIGHT)}, got {up!r}")
     if path is None:
         with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
             return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)
@@ -203,9 +145,7 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
         else:
             rate = found.fps
             axis, said = _up_of(found, body) if up == "auto" else (up, "")
-            rotations, translations = rules.turned_upright(
-                found.rotations, found.translations, axis
-            )
+            rotations, translations = turned_upright(found.rotations, found.translations, axis)
     if rest_joints is not None and rotations.shape[1] != len(rest_joints):
         raise MotionError(
             path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}"
@@ -278,7 +218,7 @@ def _reader(path: Path) -> MotionFormat:
 
 def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
     rotations, translations, usual = poses.rotations, poses.translations, poses.up
-    stands = None if poses.fixed else rules.standing_axis(rotations[:, 0])
+    stands = None if poses.fixed else standing_axis(rotations[:, 0])
     if (
         stands in (None, usual) or len(joints := body()) != rotations.shape[1]
     ):  # another number is refused later
@@ -294,29 +234,3 @@ def save_motion(path: str | Path, motion: Motion) -> None:
         path,
         {"rotations": motion.rotations, "translations": motion.translations, "fps": motion.fps},
     )
-
-
-def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
-    """The motion moved by a constant so that the person starts at x = z = 0 and, at its lowest,
-    stands on y = 0.
-
-    Arguments:
-        rest, parents: of the body that will move. Its lowest joint is asked, and as far below it as
-        in T-pose is the sole.
-    """
-    joints = _joint_paths(rest.joints, parents, motion.rotations, motion.translations)
-    sole = rest.joints[:, 1].min() - rest.vertices[:, 1].min()
-    shift = jnp.stack([joints[0, 0, 0], joints[..., 1].min() - sole, joints[0, 0, 2]])
-    return replace(motion, translations=motion.translations - shift)
-
-
-@functools.partial(jax.jit, static_argnames="parents")
-def _joint_paths(
-    rest_joints: Float[Array, "j 3"],
-    parents: tuple[int, ...],
-    rotations: Float[Array, "m j 3"],
-    translations: Float[Array, "m 3"],
-) -> Float[Array, "m j 3"]:
-    transforms = jax.vmap(joint_transforms, in_axes=(None, None, 0, 0))
-    transforms = transforms(rest_joints, parents, rotations, translations)
-    return transform.apply(transforms, rest_joints)

@@ -9,15 +9,15 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import BODY_NAMES, FINGERS, JOINT_NAMES, PARENTS
+from humangs_jax.body.motion import DEFAULT_FPS, PELVIS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE
-from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS, PLACES
-from humangs_jax.geometry import quaternion
+from humangs_jax.data.formats import MOTIONS, PLACES
+from humangs_jax.geometry.axes import CLEARLY_UP, UPRIGHT, upright_matrix
 
 # Files of arrays
 # --------------------------------------------------------------------------------------------------
@@ -177,22 +177,6 @@ not that of a pelvis.
 RATE_ROUNDING = 1e-4
 """Relative error of a frame rate: BVH files have as few as four digits of the time of a frame."""
 
-PELVIS = np.array([0.0, -0.35, 0.0])
-"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about
-it. Other bodies are off by a constant, which `grounded` removes."""
-UPRIGHT = {
-    "y": (1.0, 0.0, 0.0, 0.0),
-    "-y": (0.0, 1.0, 0.0, 0.0),
-    "z": (np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0),
-    "-z": (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
-    "x": (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)),
-    "-x": (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)),
-}
-"""The rotation (quaternion, wxyz) that turns the named axis to +y."""
-CLEARLY_UP = 0.5
-"""Mean cosine between a person's own up and an axis from which on the person stands along that
-axis.
-"""
 FLOOR_BAND = 0.05
 """Metres from the usual height of the lowest joint within which that joint is on the floor."""
 STILL = (0.1, 0.3)
@@ -216,28 +200,6 @@ HANDS = tuple(
 
 # Which way is up
 # --------------------------------------------------------------------------------------------------
-
-
-def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
-    """The rotation that turns the named axis to +y: a matrix of 0 and +-1."""
-    return np.asarray(quaternion.to_matrix(jnp.asarray(UPRIGHT[up])), np.float64).round()
-
-
-def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
-    """The name of the axis that a vector points along most, and how far it does."""
-    axis = int(np.argmax(np.abs(direction)))
-    return ("-" if direction[axis] < 0 else "") + "xyz"[axis], float(np.abs(direction[axis]))
-
-
-def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
-    """The axis of the world that the pelvis's own y axis points along on average; None if none is
-    clear.
-
-    Arguments: root: axis-angle of the pelvis in each frame.
-    """
-    mean = Rotation.from_rotvec(np.asarray(root, np.float64)).as_matrix()[..., 1].mean(axis=0)
-    axis, cosine = nearest_axis(mean)
-    return None if cosine < CLEARLY_UP else axis
 
 
 def sampled_frames(count: int) -> np.ndarray:
@@ -342,36 +304,14 @@ def joint_places(
     return np.stack(places, axis=1)
 
 
-def turned_upright(
-    rotations: Float[np.ndarray, "m j 3"],
-    translations: Float[np.ndarray, "m 3"],
-    up: str,
-    pelvis: Float[np.ndarray, "3"] = PELVIS,
-) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """Poses and positions in a world turned so that the axis `up` becomes +y. pelvis: the root
-    joint in T-pose, metres.
-    """
-    if up == "y":
-        return rotations, translations
-    turn = upright_matrix(up)
-    root = quaternion.from_axis_angle(jnp.asarray(rotations[:, 0], jnp.float32))
-    root = np.asarray(quaternion.multiply(jnp.asarray(UPRIGHT[up], jnp.float32), root), np.float64)
-    root *= np.where(root[:, :1] < 0, -1, 1)  # the shorter way round
-    sine = np.linalg.norm(root[:, 1:], axis=1, keepdims=True)
-    angle = 2 * np.arctan2(sine, root[:, :1])
-    axis_angle = root[:, 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2)
-    rotations = np.concatenate([axis_angle[:, None], rotations[:, 1:]], axis=1)
-    return rotations, (translations + pelvis) @ turn.T - pelvis
-
-
 def page_rules() -> dict[str, Any]:
     """All of it as JSON has it, for the page."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT
-    NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT
-    CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE
-    NO_PLACES"""
+    NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING
+    FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}
+    rules |= {"UPRIGHT": UPRIGHT, "CLEARLY_UP": CLEARLY_UP}
     formats = [
         dataclasses.asdict(each.arrays)
         for each in MOTIONS.values()

@@ -35,7 +35,8 @@ from humangs_jax.body.library import read_body
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.motion import rules
 from humangs_jax.data.motion.matching import matched
-from humangs_jax.data.motion.rules import nearest_axis, sampled_frames, up_axis, upright_matrix
+from humangs_jax.data.motion.rules import sampled_frames, up_axis
+from humangs_jax.geometry.axes import CLEARLY_UP, nearest_axis, upright_matrix
 from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.reading import Refused
 
@@ -131,7 +132,7 @@ def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[st
     axis, cosine = nearest_axis(unit(trunk).mean(axis=0))
     chosen = sampled_frames(len(clip.places))
     points = scale * clip.places[chosen][:, sorted(source.values())]
-    return up_axis(points, axis if cosine >= rules.CLEARLY_UP else None, usual, clip.fps)
+    return up_axis(points, axis if cosine >= CLEARLY_UP else None, usual, clip.fps)
 
 
 _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}

@@ -1,0 +1,122 @@
+"""Motions: one body pose per frame, of SMPL-X's joints or those of another body."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.axes import UPRIGHT, upright_matrix
+from humangs_jax.io.reading import check_limit
+
+DEFAULT_FPS = 30.0
+"""Frames per second of a motion that says none."""
+PELVIS = np.array([0.0, -0.35, 0.0])
+"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about
+it. Other bodies are off by a constant, which `grounded` removes."""
+
+
+@pytree_dataclass
+class Motion:
+    """Poses over time. rotations: (m, j, 3) axis-angle. translations: (m, 3) metres, applied last.
+
+    fps: static.
+    """
+
+    rotations: Float[Array, "m j 3"]
+    translations: Float[Array, "m 3"]
+    fps: float = static_field(default=DEFAULT_FPS)
+
+    def pose(self, frame: int) -> BodyPose:
+        """One frame."""
+        return BodyPose(self.rotations[frame], self.translations[frame])
+
+    def at_rate(self, fps: float | int) -> "Motion":
+        """The motion at another frame rate, between two frames interpolated: rotations on the
+        shortest way, positions linearly.
+
+        Raises: ValueError for a rate that is not positive, or more frames than the limit.
+        """
+        if not (np.isfinite(fps) and fps > 0):
+            raise ValueError(f"fps: expected a positive number of frames per second, got {fps}")
+        last = len(self.translations) - 1
+        count = max(1, round(min((last + 1) * fps / self.fps, 1e18)))
+        check_limit("frames", count, "frames")
+        return replace(
+            self._at(np.minimum(np.arange(count) * self.fps / fps, last)), fps=float(fps)
+        )
+
+    def _at(self, times: Float[np.ndarray, " n"]) -> "Motion":
+        low = np.floor(times).astype(int)
+        frames = self.rotations[low], self.translations[low]
+        if (times > low).any():
+            high = np.minimum(low + 1, len(self.translations) - 1)
+            share = jnp.asarray(times - low, jnp.float32)
+            frames = _between(*frames, self.rotations[high], self.translations[high], share)
+        return replace(self, rotations=frames[0], translations=frames[1])
+
+
+@jax.jit
+def _between(
+    rotations: Float[Array, "m j 3"],
+    translations: Float[Array, "m 3"],
+    next_rotations: Float[Array, "m j 3"],
+    next_translations: Float[Array, "m 3"],
+    share: Float[Array, " m"],
+) -> tuple[Float[Array, "m j 3"], Float[Array, "m 3"]]:
+    """Frames between frames; those with share 0 as they are."""
+    turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
+    moved = translations + share[:, None] * (next_translations - translations)
+    return jnp.where(share[:, None, None] > 0, turned, rotations), moved
+
+
+def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
+    """The motion moved by a constant so that the person starts at x = z = 0 and, at its lowest,
+    stands on y = 0.
+
+    Arguments:
+        rest, parents: of the body that will move. Its lowest joint is asked, and as far below it as
+        in T-pose is the sole.
+    """
+    joints = _joint_paths(rest.joints, parents, motion.rotations, motion.translations)
+    sole = rest.joints[:, 1].min() - rest.vertices[:, 1].min()
+    shift = jnp.stack([joints[0, 0, 0], joints[..., 1].min() - sole, joints[0, 0, 2]])
+    return replace(motion, translations=motion.translations - shift)
+
+
+@functools.partial(jax.jit, static_argnames="parents")
+def _joint_paths(
+    rest_joints: Float[Array, "j 3"],
+    parents: tuple[int, ...],
+    rotations: Float[Array, "m j 3"],
+    translations: Float[Array, "m 3"],
+) -> Float[Array, "m j 3"]:
+    transforms = jax.vmap(joint_transforms, in_axes=(None, None, 0, 0))
+    transforms = transforms(rest_joints, parents, rotations, translations)
+    return transform.apply(transforms, rest_joints)
+
+
+def turned_upright(
+    rotations: Float[np.ndarray, "m j 3"],
+    translations: Float[np.ndarray, "m 3"],
+    up: str,
+    pelvis: Float[np.ndarray, "3"] = PELVIS,
+) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
+    """Poses and positions in a world turned so that the axis `up` becomes +y. pelvis: the root
+    joint in T-pose, metres.
+    """
+    if up == "y":
+        return rotations, translations
+    turn = upright_matrix(up)
+    root = quaternion.from_axis_angle(jnp.asarray(rotations[:, 0], jnp.float32))
+    root = np.asarray(quaternion.multiply(jnp.asarray(UPRIGHT[up], jnp.float32), root), np.float64)
+    root *= np.where(root[:, :1] < 0, -1, 1)  # the shorter way round
+    sine = np.linalg.norm(root[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, root[:, :1])
+    axis_angle = root[:, 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2)
+    rotations = np.concatenate([axis_angle[:, None], rotations[:, 1:]], axis=1)
+    return rotations, (translations + pelvis) @ turn.T - pelvis

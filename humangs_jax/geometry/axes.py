@@ -1,0 +1,44 @@
+"""Axes of a world by name: which one is up, and the rotation that makes it +y."""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.geometry import quaternion
+
+UPRIGHT = {
+    "y": (1.0, 0.0, 0.0, 0.0),
+    "-y": (0.0, 1.0, 0.0, 0.0),
+    "z": (np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0),
+    "-z": (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
+    "x": (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)),
+    "-x": (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)),
+}
+"""The rotation (quaternion, wxyz) that turns the named axis to +y."""
+CLEARLY_UP = 0.5
+"""Mean cosine between a person's own up and an axis from which on the person stands along that
+axis.
+"""
+
+
+def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
+    """The rotation that turns the named axis to +y: a matrix of 0 and +-1."""
+    return np.asarray(quaternion.to_matrix(jnp.asarray(UPRIGHT[up])), np.float64).round()
+
+
+def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
+    """The name of the axis that a vector points along most, and how far it does."""
+    axis = int(np.argmax(np.abs(direction)))
+    return ("-" if direction[axis] < 0 else "") + "xyz"[axis], float(np.abs(direction[axis]))
+
+
+def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
+    """The axis of the world that the pelvis's own y axis points along on average; None if none is
+    clear.
+
+    Arguments: root: axis-angle of the pelvis in each frame.
+    """
+    mean = Rotation.from_rotvec(np.asarray(root, np.float64)).as_matrix()[..., 1].mean(axis=0)
+    axis, cosine = nearest_axis(mean)
+    return None if cosine < CLEARLY_UP else axis
