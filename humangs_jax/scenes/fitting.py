@@ -104,7 +104,7 @@ def fit_scene(
         cameras: one for each image, in the same order, with or without lenses.
         points: (n, 3) where Gaussians begin, as structure from motion finds them, perhaps as
             (points, colors); or Gaussians.
-            None: `SceneConfig.start` random points where the cameras look.
+            None: `SceneConfig.start` random points where most cameras look.
         config: None: `SceneConfig()`.
         background: behind the scene, as `render` takes it.
         checkpoint: a file that takes the state each minute, at the end and at Ctrl-C, and from

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
-from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.camera import Camera, project
 from humangs_jax.io.images import read_image
 from humangs_jax.losses.losses import GAUSSIAN
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians
@@ -23,6 +23,8 @@ nearest points.
 """
 PARALLEL = 1e-3
 """Squared sine of the angle between axes that meet nowhere."""
+CANDIDATES = 16
+"""Random points of which one becomes a Gaussian."""
 SMALLEST = 1e-4
 """Scale of a Gaussian at the start, in extents of the cameras: points may coincide."""
 Points = Gaussians | np.ndarray | Array | tuple[Any, Any] | None
@@ -82,9 +84,7 @@ def _points(
     """Points and colors. Raises: ValueError for others than (n, 3)."""
     rng = np.random.default_rng(config.seed)
     if points is None or (isinstance(points, tuple) and len(points[0]) == 0):
-        middle, reach = _middle(views), float(extent_of(views))
-        shape = (config.start, 3)
-        return middle + rng.uniform(-reach, reach, shape), rng.uniform(0, 1, shape)
+        return _seen_points(views, config.start, rng), rng.uniform(0, 1, (config.start, 3))
     colors = None
     if isinstance(points, tuple):
         points, colors = points
@@ -94,6 +94,26 @@ def _points(
         if array.shape != (len(points), 3) or not len(points) or not np.isfinite(array).all():
             raise ValueError(f"{name}: expected finite numbers (n, 3), got shape {array.shape}")
     return points, colors
+
+
+def _seen_points(
+    views: Sequence[Camera], count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """Points at random in the cube around the cameras, by the square of how many cameras see them.
+
+    Around an object these lie where it is and not between it and the cameras; in a room they lie
+    everywhere.
+    """
+    middle, reach = _middle(views), float(extent_of(views))
+    points = middle + rng.uniform(-reach, reach, (CANDIDATES * count, 3))
+    seen = np.zeros(len(points))
+    for camera in views:
+        pixels, depths = project(camera, jnp.asarray(points, jnp.float32))
+        inside = (pixels > 0) & (pixels < jnp.asarray([camera.width, camera.height]))
+        seen += np.asarray(jnp.all(inside, axis=-1) & (depths > 0))
+    share = seen**2 + 1e-9 * seen.max() + 1e-9  # some are left where nothing is seen
+    chosen = rng.choice(len(points), count, replace=False, p=share / share.sum())
+    return points[chosen]
 
 
 def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
