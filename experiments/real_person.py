@@ -24,7 +24,7 @@ from experiments.real_capture import (
     held_out,
     prepare,
 )
-from experiments.real_people import (
+from experiments.real_rooms import (
     as_fitted,
     camera_errors,
     draw_sheet,
@@ -322,7 +322,7 @@ def real_person(
     `humangs start` on photos of 12 megapixels.
 
     Options:
-    data: where `pose2sim` is downloaded to and what is made of it stays
+    data: unpacked `pose2sim`, with Pose2Sim/Demo_SinglePerson in it; what is made of it stays there
     rows: how their names begin, as "calibrated, refine"
     frames: of the videos, 0 to 99
     pictures: JPEG of the avatar from all sides, and walking

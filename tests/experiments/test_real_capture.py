@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from experiments.real_capture import VideoCamera, background, careful_mask, read_cameras
-from experiments.real_people import camera_errors, seen_from, to_reference
 from experiments.real_person import section
+from experiments.real_rooms import camera_errors, seen_from, to_reference
 from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
