@@ -1,5 +1,9 @@
 """Names and parents of SMPL-X's 55 joints, which the shipped body shares."""
 
+DEFAULT_FPS = 30.0
+"""Frames per second of a motion whose file says none."""
+
+
 BODY_NAMES = (
     *(
         "pelvis",

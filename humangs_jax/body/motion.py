@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
@@ -13,8 +14,6 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.axes import UPRIGHT, upright_matrix
 from humangs_jax.io.reading import check_limit
 
-DEFAULT_FPS = 30.0
-"""Frames per second of a motion that says none."""
 PELVIS = np.array([0.0, -0.35, 0.0])
 """Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about
 it. Other bodies are off by a constant, which `grounded` removes."""

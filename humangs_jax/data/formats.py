@@ -10,7 +10,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from humangs_jax.body.motion import DEFAULT_FPS
+from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.core.registry import FOLDER, Format, Formats, imported
 from humangs_jax.io.reading import visible
 

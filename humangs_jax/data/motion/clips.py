@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.formats import DEFAULT_FPS
 from humangs_jax.data.motion import Reading
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.mesh import parse_glb, read_accessor

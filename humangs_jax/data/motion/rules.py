@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import BODY_NAMES, FINGERS, JOINT_NAMES, PARENTS
-from humangs_jax.body.motion import DEFAULT_FPS, PELVIS
+from humangs_jax.body.joints import BODY_NAMES, DEFAULT_FPS, FINGERS, JOINT_NAMES, PARENTS
+from humangs_jax.body.motion import PELVIS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE
 from humangs_jax.data.formats import MOTIONS, PLACES
