@@ -21,7 +21,7 @@ from experiments.subjects import Scores, score_tasks
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
-from humangs_jax.data.calibration.calibration import distort
+from humangs_jax.data.cameras import distort
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import camera_gains, multiplied
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints

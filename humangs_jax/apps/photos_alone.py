@@ -17,10 +17,10 @@ from humangs_jax.apps import detect
 from humangs_jax.apps.same_people import PhotoPeople, exchanged, same_people
 from humangs_jax.apps.start import photo_files
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
-from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.calibration.importing import ImportReport, import_calibration
 from humangs_jax.data.calibration.photos import upright_mask
 from humangs_jax.data.calibration.videos import named_after
+from humangs_jax.data.cameras import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.keypoints.reading import read_keypoints

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.body_and_masks import points_in_image, surface_points
-from humangs_jax.data.calibration.calibration import (
+from humangs_jax.data.cameras import (
     OPENGL_FROM_OPENCV,
     ROTATION_TO_Y_UP,
     pose_matrix,

@@ -18,7 +18,7 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.calibration.calibration import in_capture_convention, read_calibration
+from humangs_jax.data.cameras import in_capture_convention, read_calibration
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.reading import check_limit, reading
 

@@ -25,15 +25,14 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.configuration import ArgumentError, vary
 from humangs_jax.core.progress import bar, say, text_table
+from humangs_jax.core.registry import imported
 from humangs_jax.data.loading.captures import CaptureSource
 from humangs_jax.data.loading.examples import Mixture
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
-from humangs_jax.people.bank import build_bank
-from humangs_jax.people.subject import seeds_of
 from humangs_jax.training.config import TrainConfig, fitting_losses, missing_networks, read_config
 from humangs_jax.training.forward import METRICS, as_validated, compared_as
 from humangs_jax.training.loop import VALIDATED, train
-from humangs_jax.training.sources import MakeSource, captured_people, on_the_fly_people
+from humangs_jax.training.sources import SYNTHETIC, MakeSource, captured_people
 from humangs_jax.training.state import init_state
 
 BASE = "base"
@@ -380,9 +379,8 @@ def _source(
 ) -> Sequence[str | Path] | MakeSource:
     if not isinstance(people, int):
         return people
-    texture = 128 if config.target_size <= 64 else 512 if config.target_size <= 256 else 1024
-    bank = build_bank(seeds_of(split, 0, people), body, split, texture_size=texture)
-    return on_the_fly_people(bank, each_once=each_once)
+    drawn = imported(f"{SYNTHETIC}.sources:people_of_split")
+    return drawn(people, body, split, config.target_size, each_once)
 
 
 def _validated(folder: Path, step: int) -> dict[str, float]:

@@ -4,9 +4,7 @@ of these.
 A run asks for a new source at every stage, because image sizes differ.
 """
 
-import dataclasses
 import logging
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from jax.sharding import Mesh
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import inexact_leaves
+from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading import (
@@ -28,15 +27,15 @@ from humangs_jax.data.loading import (
     PeopleCache,
     Source,
 )
-from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
-from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
-from humangs_jax.people.subject import SPLITS
-from humangs_jax.people.writer import find_people
+from humangs_jax.data.loading.captures import find_captures
+from humangs_jax.data.sets import MANIFEST
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding
 
 logger = logging.getLogger(__name__)
 
+SYNTHETIC = "humangs_jax.people"
+"""The wing of synthetic people, which a run without them does not import."""
 MakeSource = Callable[[TrainConfig], Source]
 """Configuration of a stage -> examples of its sizes."""
 
@@ -109,41 +108,6 @@ def cached_people(cache: PeopleCache) -> MakeSource:
     return make
 
 
-def on_the_fly_people(
-    bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False
-) -> MakeSource:
-    """People of a bank, rendered for every step on the device that trains; sizes and views are
-    those of the run.
-
-    each_once: each person once, in order, as a validation wants them; otherwise they are drawn at
-    random.
-    """
-
-    def make(config: TrainConfig) -> Source:
-        views = config.views
-        if views.rule != "random":
-            logger.warning(
-                'views.rule "%s" is for written people; on-the-fly people are drawn by "random"',
-                views.rule,
-            )
-        drawn = dataclasses.replace(
-            settings,
-            target_views=views.target_count,
-            input_size=config.model.conventions.image_size,
-            target_size=config.target_size,
-            mixed_pose_share=views.mixed_pose_share,
-            jitter=views.jitter,
-            scattered_share=views.scattered_share,
-            depths=config.loss.depth > 0,
-        )
-        if jax.default_backend() != "cpu":  # whole images, all views at once
-            most = max(views.input_counts) + views.target_count
-            drawn = dataclasses.replace(drawn, views_at_once=most, pixels_per_step=1 << 30)
-        return on_the_fly_source(bank, drawn, views.input_counts, jax.device_count() > 1, each_once)
-
-    return make
-
-
 def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) -> MakeSource:
     """Several of these, each with its share of the examples, see `examples.Mixture`."""
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
@@ -153,11 +117,14 @@ def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> M
     """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md),
     whose body is `body`.
 
-    split: of synthetic captures, see `find_people`.
+    split: of synthetic captures, see `people.writer.find_people`.
     Raises: ValueError if the folder has none of these.
     """
     if (data / "capture.json").is_file() or any(data.glob("*/capture.json")):
-        return captured_people(find_people(data, split), body.model, body.file)
+        folders = find_captures(data)
+        if split is not None and (data / MANIFEST).is_file():
+            folders = imported(f"{SYNTHETIC}.writer:find_people")(data, split)
+        return captured_people(folders, body.model, body.file)
     return cached_people(PeopleCache(open_people(data, body)))
 
 
@@ -180,25 +147,9 @@ def training_people(
             f"synthetic people have the body that comes with the package, not {body_file}"
         )
     if on_the_fly:
-        parts.append(on_the_fly_people(_bank(on_the_fly, out, body)))
+        parts.append(imported(f"{SYNTHETIC}.sources:people_of_run")(on_the_fly, out, body))
     if not parts:
         raise ValueError(
             "nobody to train on: expected a folder of captures, or a number of people on the fly"
         )
     return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
-
-
-def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
-    """The bank in out/people.npz, which one process makes unless it is there."""
-    path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
-    if jax.process_index() == 0:
-        bank = load_bank(path) if path.is_file() else None
-        if bank is None or bank.seeds.tolist() != list(seeds):
-            out.mkdir(parents=True, exist_ok=True)
-            bank = build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True)
-            save_bank(path, bank)
-    if jax.process_count() > 1:
-        from jax.experimental import multihost_utils
-
-        multihost_utils.sync_global_devices("people")
-    return load_bank(path) if bank is None else bank

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from changes import edit_json, edit_text
 
-from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.calibration.rigs import parse_file_storage
+from humangs_jax.data.cameras import read_calibration
 from humangs_jax.data.capture_checks import CaptureError
 from tests.data import calibration_files as written
 

@@ -8,8 +8,8 @@ import pytest
 from changes import changed, edit_json
 from PIL import Image
 
-from humangs_jax.data.calibration.calibration import CONVENTIONS, WORLD_FROM_CAM_OPENGL, undistort
 from humangs_jax.data.calibration.importing import import_cameras
+from humangs_jax.data.cameras import CONVENTIONS, WORLD_FROM_CAM_OPENGL, undistort
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import on_white_background, read_description, read_view
 from humangs_jax.io.images import read_grey, read_image

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from humangs_jax.data.calibration.calibration import (
+from humangs_jax.data.cameras import (
     _squared_reach,
     distort,
     read_calibration,

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
+from humangs_jax.data.cameras import read_calibration
 from humangs_jax.data.capture_checks import CaptureError
 from tests.data import calibration_files as written
 

@@ -14,8 +14,8 @@ from experiments.render_tables import format_table
 from humangs_jax import cli
 from humangs_jax.apps.start import look
 from humangs_jax.cli import captures, fit, start
-from humangs_jax.data.calibration.calibration import CalibratedCamera, read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
+from humangs_jax.data.cameras import CalibratedCamera, read_calibration
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS, CameraFormat, SourceFormat
 from humangs_jax.data.keypoints.keypoints import DetectedImage, detections_of

@@ -11,8 +11,8 @@ import pytest
 from changes import edit_json
 from PIL import Image
 
-from humangs_jax.data.calibration.calibration import distort
 from humangs_jax.data.calibration.importing import import_cameras
+from humangs_jax.data.cameras import distort
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.photos import load_photos

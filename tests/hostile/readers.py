@@ -31,9 +31,9 @@ from humangs_jax.avatar.export.gaussians import load_gaussians, save_gaussians
 from humangs_jax.avatar.frames import FOLLOWING, excerpt, smoothed_path
 from humangs_jax.body.library import load_body, load_hands, load_smplx, save_body
 from humangs_jax.core.configuration import config_to_json
-from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.calibration.loaded import load_cameras
+from humangs_jax.data.cameras import read_calibration
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.subject import open_people

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from humangs_jax.body.library import load_body
+from humangs_jax.people import sources
 from humangs_jax.training import ablation
 from humangs_jax.training.ablation import Ablation, ablate
 from humangs_jax.training.config import Stage
@@ -153,12 +154,11 @@ def test_all_variants_are_compared_on_the_photos_and_targets_of_the_base(
 def test_each_of_the_people_to_compare_on_is_looked_at(trained, tmp_path, monkeypatch):
     counts, made = [], []
 
-    def people(bank, each_once):
-        made.append((bank, each_once))
+    def people(count, body, split, size, each_once):
+        made.append((count, each_once))
         return lambda config: Nobody()
 
-    monkeypatch.setattr(ablation, "build_bank", lambda seeds, body, split, texture_size: len(seeds))
-    monkeypatch.setattr(ablation, "on_the_fly_people", people)
+    monkeypatch.setattr(sources, "people_of_split", people)
     stand_in = ablation.train
 
     def watched(*arguments, validated, **how):

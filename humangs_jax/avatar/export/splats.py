@@ -36,9 +36,9 @@ from humangs_jax.avatar.export.gaussians import (
 )
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
-from humangs_jax.data.motion.clips import node_matrices
 from humangs_jax.io.atomic import replace_file, write_bytes
 from humangs_jax.io.mesh import VERTICES, GlbWriter, count_of, parse_glb, read_accessor
+from humangs_jax.io.nodes import node_matrices
 from humangs_jax.io.reading import Refused, check_limit, shown
 from humangs_jax.io.tensors import tensors_in
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_gaussians

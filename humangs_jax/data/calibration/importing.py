@@ -18,18 +18,6 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
-from humangs_jax.data.calibration.calibration import (
-    ROTATION_TO_Y_UP,
-    CalibratedCamera,
-    Calibration,
-    Checks,
-    PixelCenters,
-    check_calibration,
-    in_capture_convention,
-    likely_unit,
-    read_calibration,
-    undistort,
-)
 from humangs_jax.data.calibration.photos import (
     NO_CAMERA,
     Photo,
@@ -47,6 +35,18 @@ from humangs_jax.data.calibration.photos import (
     with_photos,
 )
 from humangs_jax.data.calibration.videos import photos_of_videos
+from humangs_jax.data.cameras import (
+    ROTATION_TO_Y_UP,
+    CalibratedCamera,
+    Calibration,
+    Checks,
+    PixelCenters,
+    check_calibration,
+    in_capture_convention,
+    likely_unit,
+    read_calibration,
+    undistort,
+)
 from humangs_jax.data.capture_checks import (
     CaptureError,
     check_names,

@@ -12,13 +12,13 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
-from humangs_jax.data.calibration.calibration import (
+from humangs_jax.data.calibration.importing import photo_size_of
+from humangs_jax.data.cameras import (
     CalibratedCamera,
     Calibration,
     in_capture_convention,
     read_calibration,
 )
-from humangs_jax.data.calibration.importing import photo_size_of
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.reading import check_limit, reading

@@ -16,7 +16,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.registry import alternatives
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
-from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
+from humangs_jax.data.cameras import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_path, counted, few
 from humangs_jax.data.folders import (
     SAME_NAME,

@@ -24,7 +24,7 @@ import numpy as np
 import yaml
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.calibration.calibration import (
+from humangs_jax.data.cameras import (
     UNDISTORT_BEFORE,
     CalibratedCamera,
     Calibration,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.calibration.calibration import (
+from humangs_jax.data.cameras import (
     CONVENTIONS,
     UNDISTORT_BEFORE,
     WORLD_FROM_CAM_OPENGL,

@@ -46,7 +46,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.data.calibration.calibration import (
+from humangs_jax.data.cameras import (
     CalibratedCamera,
     Calibration,
     brown_conrady,

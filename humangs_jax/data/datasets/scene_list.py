@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.data.calibration.calibration import intrinsics
+from humangs_jax.data.cameras import intrinsics
 from humangs_jax.data.capture_checks import (
     CaptureError,
     checked_camera,

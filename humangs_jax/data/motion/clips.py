@@ -13,25 +13,33 @@ linearly.
 """
 
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.motion import Reading
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.mesh import parse_glb, read_accessor
+from humangs_jax.io.nodes import (
+    PATHS,
+    Nodes,
+    Tracks,
+    check_finite,
+    node_parents,
+    with_ancestors,
+    world_matrices,
+)
 from humangs_jax.io.reading import (
     Refused,
     check_limit,
     check_unpacked,
     read_bytes,
     read_text,
-    shown,
 )
 
 CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
@@ -189,15 +197,6 @@ def _posed(
 # GLB
 # --------------------------------------------------------------------------------------------------
 
-PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-
-
-Nodes = list[dict[str, Any]]
-Track = tuple[Float[np.ndarray, " keys"], Float[np.ndarray, "keys c"], bool]
-"""Times, values, and whether these stay until the next."""
-Tracks = dict[tuple[int, str], Track]
-"""By node and path."""
-
 
 def read_animation(path: Path, options: Reading | None = None) -> Clip:
     """The skeleton of a GLB file in motion.
@@ -210,15 +209,15 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip:
     if not animations:
         raise Refused("a GLB file without an animation: expected a skeleton in motion")
     animation, said = _chosen(animations, options.clip if options else None)
-    parents = _parents(nodes)
+    parents = node_parents(nodes)
     joints, binding = _joints(content, binary, nodes)
-    order = _with_ancestors(joints, parents)
+    order = with_ancestors(joints, parents)
     check_limit("joints", len(order), "joints")
     tracks = _tracks(content, binary, animation, set(order))
     times, fps = _times(tracks)
     check_unpacked(len(data), 3 * bytes_of_clip(len(times), len(order)))
-    posed = _world(nodes, parents, order, tracks, times)
-    rest = _world(nodes, parents, order, {}, np.zeros(1))
+    posed = world_matrices(nodes, parents, order, tracks, times)
+    rest = world_matrices(nodes, parents, order, {}, np.zeros(1))
     index = {joint: i for i, joint in enumerate(joints)}
     bind = np.stack([binding.get(joint, rest[joint][0]) for joint in joints])
     matrices = np.stack([posed[joint] for joint in joints], axis=1)
@@ -273,17 +272,6 @@ def _humanoid(content: dict[str, Any]) -> dict[int, str]:
     return {}
 
 
-def _parents(nodes: Nodes) -> list[int]:
-    """Parent of each node, -1 for roots. Raises: Refused for a node with two parents."""
-    parents = [-1] * len(nodes)
-    for i, node in enumerate(nodes):
-        for child in node.get("children", []):
-            if type(child) is not int or not 0 <= child < len(nodes) or parents[child] != -1:
-                raise Refused(f"nodes: {shown(child)} is no node, or has two parents")
-            parents[child] = i
-    return parents
-
-
 def _joints(
     content: dict[str, Any], binary: bytes, nodes: Nodes
 ) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
@@ -303,27 +291,8 @@ def _joints(
     inverse = (
         read_accessor(content, binary, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
     )
-    _check(inverse, "inverseBindMatrices")
+    check_finite(inverse, "inverseBindMatrices")
     return joints, dict(zip(joints, np.linalg.inv(inverse), strict=True))
-
-
-def _with_ancestors(joints: Iterable[int], parents: Sequence[int]) -> list[int]:
-    """Joints and the nodes above them, parents first.
-
-    Raises: Refused for nodes that are above themselves.
-    """
-    order: list[int] = []
-    placed: set[int] = set()
-    for joint in joints:
-        path: list[int] = []
-        while joint != -1 and joint not in placed:
-            if len(path) > len(parents):
-                raise Refused("nodes: one lies below itself")
-            path.append(joint)
-            joint = parents[joint]
-        order += reversed(path)
-        placed.update(path)
-    return order
 
 
 def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> int:
@@ -348,14 +317,14 @@ def _tracks(
         values = read_accessor(content, binary, sampler["output"])
         if sampler.get("interpolation") == "CUBICSPLINE":
             values = values.reshape(-1, 3, values.shape[1])[:, 1]  # between the tangents
-        _check(values, path)
+        check_finite(values, path)
         if (
             not len(times)
             or values.shape != (len(times), PATHS[path])
             or not (np.diff(times) > 0).all()
         ):
             raise Refused(f"animation: expected one {path} for each of increasing times")
-        _check(times, "times")
+        check_finite(times, "times")
         tracks[node, path] = times, values, sampler.get("interpolation") == "STEP"
     if not any(path == "rotation" for _, path in tracks):
         raise Refused("an animation that turns no joint: expected a skeleton in motion")
@@ -377,70 +346,6 @@ def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
     return first + np.arange(count) / fps, fps
 
 
-def _world(
-    nodes: Nodes,
-    parents: Sequence[int],
-    order: Sequence[int],
-    tracks: Tracks,
-    times: Float[np.ndarray, " m"],
-) -> dict[int, Float[np.ndarray, "m 4 4"]]:
-    world: dict[int, np.ndarray] = {}
-    for i in order:
-        local = _local(
-            nodes[i], {path: tracks[i, path] for path in PATHS if (i, path) in tracks}, times
-        )
-        world[i] = local if parents[i] == -1 else world[parents[i]] @ local
-    return world
-
-
-def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
-    """Where the nodes of a GLB file lie when nothing moves.
-
-    Raises: Refused; what damaged numbers raise.
-    """
-    parents = _parents(nodes)
-    world = _world(nodes, parents, _with_ancestors(range(len(nodes)), parents), {}, np.zeros(1))
-    return [world[i][0] for i in range(len(nodes))]
-
-
-def _local(
-    node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.ndarray, " m"]
-) -> Float[np.ndarray, "m 4 4"]:
-    local = np.tile(np.eye(4), (len(times), 1, 1))
-    if "matrix" in node:
-        local[:] = np.asarray(node["matrix"], np.float64).reshape(4, 4).T
-        _check(local, "matrix")
-        return local
-    usual = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
-    parts = {}
-    for path, still in usual.items():
-        value = np.asarray(node.get(path, still), np.float64).reshape(1, PATHS[path])
-        _check(value, path)
-        parts[path] = (
-            _sampled(tracks[path], times, path)
-            if path in tracks
-            else np.tile(value, (len(times), 1))
-        )
-    local[:, :3, :3] = (
-        Rotation.from_quat(parts["rotation"]).as_matrix() * parts["scale"][:, None, :]
-    )
-    local[:, :3, 3] = parts["translation"]
-    return local
-
-
-def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[np.ndarray, "m c"]:
-    keys, values, stepped = track
-    if stepped or len(keys) == 1:
-        times = times + 0.01 * (
-            times[1] - times[0] if len(times) > 1 else 1.0
-        )  # keys are rounded to float32
-        return values[np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 1)]
-    times = np.clip(times, keys[0], keys[-1])
-    if path == "rotation":
-        return Slerp(keys, Rotation.from_quat(values))(times).as_quat()
-    return np.stack([np.interp(times, keys, column) for column in values.T], axis=1)
-
-
 def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3 3"]:
     """The rotations in matrices of rotation and scale. Raises: Refused where there is none."""
     linear = matrices[..., :3, :3]
@@ -451,8 +356,3 @@ def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3
         )
     flat = (linear / lengths).reshape(-1, 3, 3)
     return Rotation.from_matrix(flat).as_matrix().reshape(linear.shape)
-
-
-def _check(values: Float[np.ndarray, "..."], what: str) -> None:
-    if not np.isfinite(values).all():
-        raise Refused(f"{what}: expected finite numbers")

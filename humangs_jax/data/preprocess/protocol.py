@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int, UInt8
-from humangs_jax.data.calibration import calibration
+from humangs_jax.data import cameras as calibration
 from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import face_areas, smallest_turns, unit, vertex_crosses

@@ -15,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
-from humangs_jax.data.calibration.unknown import binary_kind, described
 from humangs_jax.data.capture_checks import (
     CaptureError,
     checked_json,
@@ -24,6 +23,7 @@ from humangs_jax.data.capture_checks import (
     floats,
 )
 from humangs_jax.data.formats import CAMERAS, CameraFormat
+from humangs_jax.data.unknown import binary_kind, described
 from humangs_jax.io.reading import limits, reading
 
 ROUNDED_ROTATION = 5e-3
