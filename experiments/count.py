@@ -2,10 +2,13 @@
 
 import ast
 import inspect
+import io
+import itertools
 import os
 import re
 import subprocess
 import sys
+import tokenize
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -139,6 +142,30 @@ def written(text: str) -> str:
     """A page without what scripts write into it, and without code."""
     text = re.sub(r"<!-- (table|formats): .*?<!-- end -->", "", text, flags=re.DOTALL)
     return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def code_tokens(text: str) -> int:
+    """Words and signs of a module, without comments, docstrings and what only lays it out."""
+    layout = {
+        tokenize.COMMENT,
+        tokenize.NL,
+        tokenize.INDENT,
+        tokenize.DEDENT,
+        tokenize.ENCODING,
+        tokenize.ENDMARKER,
+    }
+    kept = [
+        token
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type not in layout
+    ]
+    count, begins = 0, True
+    for token, following in itertools.pairwise([*kept, None]):
+        ends = following is None or following.type == tokenize.NEWLINE
+        docstring = token.type == tokenize.STRING and begins and ends
+        begins = token.type == tokenize.NEWLINE
+        count += not (docstring or begins)
+    return count
 
 
 def helps(root: Path) -> dict[str, Any]:

@@ -1,0 +1,142 @@
+"""How fast the package is, as ratios that machines have in common, and whether a change made it
+slower.
+
+The unit is the CPU time of a plain product of two matrices by the same JAX, which a faster or a
+busier machine changes alike.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from experiments.harness import Run, entry
+from experiments.results import REPOSITORY, markdown_table
+
+MEASURED = {
+    "render": "an image of the demo's avatar, 512 px",
+    "gradient": "the same with its gradient",
+    "reconstruct": "reconstruct the demo's person, 4 photos",
+    "compile_render": "compile the image",
+    "compile_gradient": "compile image and gradient",
+}
+"""Key of a measurement -> how the table calls it."""
+WORKER = REPOSITORY / "experiments" / "speed_worker.py"
+
+
+@entry
+def speed(
+    run: Run,
+    before: str | None = None,
+    turns: int = 3,
+    repeats: int = 5,
+    slower: float = 1.3,
+) -> int:
+    """CPU time of drawing, gradients, reconstruction and compilation, in plain matrix products; and
+    how much code there is, by room.
+
+    With --before each turn measures the other commit, too, in another process, by the same file
+    and by public names. The exit status is 1 if something takes longer by more than --slower; what
+    the other commit cannot do is not compared.
+
+    Options:
+    before: commit, branch or tag to compare with, for instance the last release
+    turns: processes of each
+    repeats: timed iterations in a process
+    slower: factor of a ratio from which on the change is too slow
+    """
+    with _checkout(before) as other:
+        places = {"before": other} if other else {}
+        places["now"] = REPOSITORY
+        samples = {name: [] for name in places}
+        for _ in range(turns):
+            for name, place in places.items():
+                samples[name].append(_measured(place, repeats))
+        rooms = {name: code_by_room(place) for name, place in places.items()}
+    ratios = {name: _ratios(each) for name, each in samples.items()}
+    rows = [
+        [title, *(_shown(own.get(key)) for own in ratios.values())]
+        for key, title in MEASURED.items()
+    ]
+    rows += [
+        [f"code tokens, {room}", *(f"{own.get(room, 0):,}" for own in rooms.values())]
+        for room in rooms["now"]
+    ]
+    numbers = {name: {"ratios": ratios[name], "code": rooms[name]} for name in places}
+    run.show(markdown_table(["in plain products", *places], rows), numbers)
+    too_slow = slower_than(ratios.get("before", {}), ratios["now"], slower)
+    for line in too_slow:
+        print(line)
+    return int(bool(too_slow))
+
+
+def slower_than(before: dict[str, float], now: dict[str, float], factor: float) -> list[str]:
+    """A line for each measurement that takes longer than before by more than a factor."""
+    return [
+        f"{MEASURED[key]}: {now[key]:.2f} plain products, {before[key]:.2f} before:"
+        f" {now[key] / before[key]:.2f} times, allowed are {factor:g}"
+        for key in MEASURED
+        if key in before and key in now and now[key] > factor * before[key]
+    ]
+
+
+def code_by_room(root: Path) -> dict[str, int]:
+    """Tokens of code of each folder of the package at a place, and its public names."""
+    from experiments.count import code_tokens, public_names
+
+    package = root / "humangs_jax"
+    found: dict[str, int] = {}
+    for file in sorted(package.rglob("*.py")):
+        inside = file.relative_to(package).parts
+        room = f"{inside[0]}/" if len(inside) > 1 else "the package itself"
+        found[room] = found.get(room, 0) + code_tokens(file.read_text(encoding="utf-8"))
+    return found | {"public names": len(public_names(root))}
+
+
+@contextmanager
+def _checkout(commit: str | None) -> Iterator[Path | None]:
+    """The files of a commit in a folder that is gone afterwards; None for no commit."""
+    if commit is None:
+        yield None
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "before"
+        git = ["git", "-C", str(REPOSITORY), "worktree"]
+        subprocess.run([*git, "add", "--quiet", "--detach", str(place), commit], check=True)
+        try:
+            yield place
+        finally:
+            subprocess.run([*git, "remove", "--force", str(place)], check=False)
+
+
+def _measured(place: Path, repeats: int) -> dict[str, float]:
+    """What a process with the package of a place measures: CPU milliseconds.
+
+    Raises: OSError with the end of its errors.
+    """
+    environment = os.environ | {"PYTHONPATH": str(place), "OMP_WAIT_POLICY": "passive"}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # compilation is what is measured
+    command = [sys.executable, "-P", str(WORKER), str(repeats)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=place)
+    if done.returncode:
+        raise OSError(f"{place}: {done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _ratios(samples: list[dict[str, float]]) -> dict[str, float]:
+    """Each measurement over the plain product of its process: medians over the processes."""
+    found = {}
+    for key in MEASURED:
+        if all(key in each for each in samples):
+            found[key] = float(np.median([each[key] / each["product"] for each in samples]))
+    return found
+
+
+def _shown(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.3g}"

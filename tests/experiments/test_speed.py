@@ -1,0 +1,60 @@
+"""Speed as ratios to a plain product: what is compared, and what fails a change."""
+
+import pytest
+
+from experiments import speed
+from experiments.count import code_tokens
+from experiments.harness import call
+from experiments.results import REPOSITORY
+
+
+def times(product, **others):
+    """Milliseconds of a process; what is not given takes ten products."""
+    return {"product": product, **dict.fromkeys(speed.MEASURED, 10 * product), **others}
+
+
+def test_a_busier_machine_changes_nothing_and_a_slower_program_is_named():
+    assert speed._ratios([times(2.0), times(5.0), times(3.0)])["render"] == pytest.approx(10)
+    before, now = speed._ratios([times(2.0)]), speed._ratios([times(7.0, render=98.0)])
+    (line,) = speed.slower_than(before, now, 1.3)
+    assert line.startswith(speed.MEASURED["render"]) and "1.40 times, allowed are 1.3" in line
+    assert speed.slower_than(before, now, 1.5) == speed.slower_than({}, now, 1.3) == []
+    del before["render"]  # what the other commit cannot do is not compared
+    assert speed.slower_than(before, now, 1.3) == []
+
+
+def test_a_change_that_is_too_slow_fails_and_the_report_has_code_by_room(monkeypatch, capsys):
+    asked = []
+
+    def measured(place, repeats):
+        asked.append(place)
+        return times(1.0, gradient=30.0 if place == REPOSITORY else 20.0)
+
+    monkeypatch.setattr(speed, "_measured", measured)
+    monkeypatch.setattr(speed, "_checkout", speed.contextmanager(lambda commit: iter([commit])))
+    monkeypatch.setattr(speed, "code_by_room", lambda place: {"core/": 5, "public names": 2})
+    assert call(speed.speed, ["--turns", "2"]) == 0 and len(asked) == 2
+    assert call(speed.speed, ["--turns", "2", "--before", "v1"]) == 1
+    shown = capsys.readouterr().out
+    assert asked[2:] == ["v1", REPOSITORY] * 2  # in turns
+    assert "| the same with its gradient | 20 | 30 |" in shown and "code tokens, core/" in shown
+    assert "30.00 plain products, 20.00 before: 1.50 times" in shown
+    assert call(speed.speed, ["--turns", "1", "--before", "v1", "--slower", "2"]) == 0
+
+
+def test_tokens_are_code_without_comments_docstrings_and_layout():
+    text = '"""A module."""\n\nx = 1  # one\n\n\ndef f(a):\n    """A function."""\n    return "a" + a\n'
+    assert code_tokens(text) == len(
+        ["x", "=", "1", "def", "f", "(", "a", ")", ":", "return", "'a'", "+", "a"]
+    )
+    assert code_tokens(text.replace("  # one", "").replace("\n\n", "\n")) == code_tokens(text)
+
+
+def test_rooms_are_those_of_the_package(tmp_path):
+    files = {"__init__.py": "a = 1", "core/a.py": "b = 2", "core/deep/b.py": "c()"}
+    for name, text in files.items():
+        (tmp_path / "humangs_jax" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "humangs_jax" / name).write_text(text)
+    (tmp_path / "humangs_jax/__init__.pyi").write_text("from humangs_jax.core.a import b as b")
+    rooms = speed.code_by_room(tmp_path)
+    assert rooms == {"the package itself": 3, "core/": 6, "public names": 1}
