@@ -160,10 +160,10 @@ def code_tokens(text: str) -> int:
         if token.type not in layout
     ]
     count, begins = 0, True
-    for token, following in itertools.pairwise([*kept, None]):
-        ends = following is None or following.type == tokenize.NEWLINE
-        docstring = token.type == tokenize.STRING and begins and ends
-        begins = token.type == tokenize.NEWLINE
+    kinds = [token.type for token in kept]
+    for kind, following in itertools.pairwise([*kinds, tokenize.NEWLINE]):
+        docstring = kind == tokenize.STRING and begins and following == tokenize.NEWLINE
+        begins = kind == tokenize.NEWLINE
         count += not (docstring or begins)
     return count
 

@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -100,7 +100,7 @@ def code_by_room(root: Path) -> dict[str, int]:
 
 
 @contextmanager
-def _checkout(commit: str | None) -> Iterator[Path | None]:
+def _checkout(commit: str | None) -> Generator[Path | None]:
     """The files of a commit in a folder that is gone afterwards; None for no commit."""
     if commit is None:
         yield None
