@@ -2,9 +2,9 @@
 
 The person is the only large one of each photo. Where several are large, people of one moment are
 matched by how well they triangulate, over time by where they are, in space or in the photo of one
-camera. Without calibrated cameras the colors of upper body and legs are compared, whatever the
-exposure. Whoever is matched to nobody may still be the person: only who is in a photo together with
-the person is surely somebody else.
+camera. Without calibrated cameras nothing tells who of them is who: colors are no proof, since
+photos are exposed as they like. Whoever is matched to nobody may still be the person: only who is
+in a photo together with the person is surely somebody else.
 """
 
 import dataclasses
@@ -20,22 +20,18 @@ from humangs_jax.fitting.triangulation import (
     Seen,
     comparable,
     in_order_of_time,
-    match_colors,
     match_people,
 )
 from humangs_jax.geometry.camera import Camera
 
 RIVAL = 0.35
 """Somebody with this share of the pixels of the largest person may be meant as well as he."""
-PARTS = ((11, 12, 24, 23), (23, 24, 26, 25))
-"""Corners of upper body and thighs: landmarks of the left and right."""
-LARGE_PEOPLE = 5
-"""In a photo, at most, that are told apart by their colors."""
 
 
 class Found(NamedTuple):
     """A person in a photo. mask: 8 bits, the part of the photo that begins at corner (row, column).
-    area: pixels of the person.
+    area: pixels of the person; of one who is covered by others, as many as there would be without
+    them. covered: somebody else may stand in front.
     mirrored: left and right were exchanged, as other views show; it is repaired. apart: the
     landmarks do not meet those of other photos of the moment: the camera is off, or this is
     somebody else.
@@ -47,21 +43,22 @@ class Found(NamedTuple):
     area: float
     mirrored: bool = False
     apart: bool = False
+    covered: bool = False
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PhotoPeople:
     """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet.
     people: None who is not in it.
-    colors: several are large, and colors tell who is who. unclear: they do not.
+    known: False if several are large, and nothing tells who of them is who of another photo: they
+    are in the order of size.
     """
 
     name: str
     size: tuple[int, int]
     thumbnail: Float[np.ndarray, "h w 3"]
     people: tuple[Found | None, ...]
-    colors: bool = False
-    unclear: bool = False
+    known: bool = True
 
 
 def inside_photo(
@@ -78,16 +75,22 @@ def same_people(
 ) -> list[PhotoPeople]:
     """The photos with people in such an order that the i-th of each is the same person.
 
-    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, or,
-    where several are large, that of colors. frames: the moment of each photo. The person with the
-    most pixels in all photos together is the first.
+    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, see
+    `PhotoPeople.known`.
+    frames: the moment of each photo. The person with the most pixels in all photos together is the
+    first.
     """
     if cameras is not None and len(photos) > 1:
         moments = np.asarray([0] * len(photos) if frames is None else frames)
         rows = _with_only_ones(_matched(photos, cameras, moments), moments)
     else:
-        photos = _by_colors(photos) if len(photos) > 1 else photos
         rows = [list(photo.people) for photo in photos]
+        # of one photo the numbers say who is who
+        known = [len(photos) == 1 or len(_large(row)) < 2 for row in rows]
+        photos = [
+            dataclasses.replace(photo, known=sure)
+            for photo, sure in zip(photos, known, strict=True)
+        ]
     most = max((len(row) for row in rows), default=0)
     ordered = [
         dataclasses.replace(photo, people=(*row, *[None] * (most - len(row))))
@@ -112,55 +115,6 @@ def _large(people: Sequence[Found | None]) -> list[int]:
 def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
     people = zip(*(photo.people for photo in photos), strict=True)
     return [sum((found.area for found in person if found is not None), 0.0) for person in people]
-
-
-def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
-    """The photos, each with its large people in the order of those in the photo that has the most
-    of them; see `unclear`.
-    """
-    found = [
-        [each for each in photo.people if each is not None] for photo in photos
-    ]  # the largest first
-    large = [[people[i] for i in _large(people)][:LARGE_PEOPLE] for people in found]
-    most = max(range(len(photos)), key=lambda v: len(large[v]))
-    if len(large[most]) < 2:
-        return photos
-    first = _colors(photos[most], large[most])
-    ordered = []
-    for photo, people in zip(photos, large, strict=True):
-        order = match_colors(first, _colors(photo, people)) if people else ()
-        if order is None:
-            ordered.append(dataclasses.replace(photo, unclear=True))
-            continue
-        row: list[Found | None] = [None] * len(first)
-        for i, each in zip(order, people, strict=True):
-            row[i] = each
-        ordered.append(
-            dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colors=True)
-        )
-    return ordered
-
-
-def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n parts 3"]:
-    """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in
-    the photo.
-    """
-    height, width = photo.thumbnail.shape[:2]
-    u, v = (
-        each.reshape(-1, 1)
-        for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9))
-    )
-    found = np.full((len(people), len(PARTS), 3), np.nan)
-    for i, each in enumerate(people):
-        for k, part in enumerate(PARTS):
-            a, b, c, d = each.person.points[list(part), :2] * width / photo.size[0]
-            x, y = (
-                np.floor((a * (1 - u) + b * u) * (1 - v) + (d * (1 - u) + c * u) * v).astype(int).T
-            )
-            inside = inside_photo(x, y, width, height)
-            if inside.any():
-                found[i, k] = np.median(photo.thumbnail[y[inside], x[inside]], axis=0)
-    return found
 
 
 Row = list[Found | None]
@@ -264,8 +218,10 @@ def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
     That is somebody large whom no photo shows together with the person.
     """
     people = photos[photo].people
-    if photos[photo].unclear or people[person] is not None:
-        return photos[photo].unclear
+    if not photos[photo].known:
+        return True
+    if people[person] is not None:
+        return False
     shown_with = [
         i
         for each in photos

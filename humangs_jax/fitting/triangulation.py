@@ -244,10 +244,6 @@ a factor.
 """
 STILL_DEGREES, STILL_METRES = 10.0, 0.3
 """A view that has turned and moved by no more than this since the last frame is one camera's."""
-PLAIN = 0.1
-"""Of colors in [0, 1]: how much farther apart the next best order of people has to be."""
-EXPOSURES = np.geomspace(0.25, 4.0, 33)
-"""Factors on the colors of a photo that its exposure may make."""
 SEEN, FEWEST = 0.3, 6
 """Least visibility of a landmark that counts, and least number of those that two views share."""
 
@@ -524,26 +520,3 @@ def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
     seen = row[row[:, 2] >= SEEN, :2]
     seen = seen if len(seen) else row[:, :2]
     return np.median(seen, axis=0), float(np.ptp(seen, axis=0).max())
-
-
-def match_colors(
-    first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]
-) -> tuple[int, ...] | None:
-    """For each of m people of a photo which of n >= m of another one has the same colors; None if
-    that is not plain.
-
-    It is plain if any other order of people leaves larger differences at whatever exposure suits
-    that order best.
-
-    Arguments: colors in [0, 1] of k parts of the body; NaN for parts that are not seen.
-    """
-    apart = np.linalg.norm(
-        second[:, None] - EXPOSURES[:, None, None, None, None] * first[None], axis=-1
-    )
-    seen = np.isfinite(apart)
-    apart = np.where(seen, apart, 0).sum(-1) / np.maximum(seen.sum(-1), 1)
-    options = sorted(
-        (float(min(sum(each[i, j] for i, j in enumerate(order)) for each in apart)), order)
-        for order in itertools.permutations(range(len(first)), len(second))
-    )
-    return options[0][1] if len(options) == 1 or options[1][0] - options[0][0] >= PLAIN else None

@@ -296,7 +296,7 @@ def two_people(mine, detected, monkeypatch):
         people = (bystander._replace(mask=beside), person)
         name = f"cam{v}.png"
         shown[v] = dataclasses.replace(
-            photo, name=name, people=people[:: 1 if v % 2 else -1], unclear=True
+            photo, name=name, people=people[:: 1 if v % 2 else -1], known=False
         )
     points = {
         "person": landmarks_in(truth, COCO_17.names),

@@ -8,14 +8,17 @@ import pytest
 from scipy import ndimage
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.detection.painting import painted_over
 from humangs_jax.detection.people import (
     ENLARGED,
+    SHARES,
     Crop,
     Detection,
     Landmarks,
     Networks,
     _anchors,
     _merged,
+    _people,
     bilinear,
     detect_people,
     distinct,
@@ -23,9 +26,10 @@ from humangs_jax.detection.people import (
     mask_in_photo,
     refined,
     sampled,
-    sharpened,
+    window_detections,
     windows,
 )
+from humangs_jax.detection.sharpening import sharpened
 from humangs_jax.io.images import resized
 
 
@@ -153,6 +157,38 @@ def test_the_smallest_windows_are_looked_at_only_where_nobody_is_large(
     )
     assert len(detect_people(networks, np.zeros((600, 400, 3), np.float32))) == anybody
     assert {side / 600 for side in seen} == shares
+
+
+def test_whoever_stands_half_behind_somebody_is_found_without_what_is_covered(networks, demo):
+    """The detector alone finds one of them: painted over, the first leaves the other one to be seen."""
+    front = demo.masks[0]
+    step = round(0.7 * np.ptp(np.flatnonzero((front > 0.5).any(0))))
+    image, mask = (np.roll(each[2], step, axis=1) for each in (demo.images, demo.masks))
+    room = np.full_like(image, 0.7)
+    photo = image * mask[..., None] + room * (1 - mask[..., None])
+    photo = demo.images[0] * front[..., None] + photo * (1 - front[..., None])
+    alone = _people(networks, photo, window_detections(networks, photo, SHARES))
+    assert len(alone) == 1
+    people = detect_people(networks, photo)
+    assert len(people) == 2
+    seen = {"front": front, "behind": mask * (1 - front)}
+    for true in seen.values():
+        best = max(people, key=lambda each: (each.mask * true).sum())
+        ours, theirs = best.mask > 0.5, true > 0.5
+        assert (ours & theirs).sum() / (ours | theirs).sum() > 0.7
+    both = (people[0].mask > 0.5) & (people[1].mask > 0.5)
+    assert both.sum() < 0.1 * (mask > 0.5).sum()
+
+
+def test_who_is_painted_over_takes_the_colors_around():
+    photo = np.full((90, 120, 3), 0.2, np.float32)
+    photo[:, 60:] = 0.8
+    covered = np.zeros((90, 120), bool)
+    covered[20:70, 20:40] = True
+    shown = np.where(covered[..., None], np.float32(0.5), photo)
+    painted, where = painted_over(shown, covered, 1 / 100)
+    assert where[covered].all() and where.sum() < 1.5 * covered.sum()
+    np.testing.assert_allclose(painted, photo, atol=0.01)
 
 
 PERSON, ROOM = np.asarray([0.7, 0.5, 0.4], np.float32), np.asarray([0.2, 0.3, 0.6], np.float32)

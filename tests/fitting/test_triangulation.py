@@ -23,7 +23,6 @@ from humangs_jax.fitting.triangulation import (
     align_points,
     align_robustly,
     in_order_of_time,
-    match_colors,
     match_people,
     reprojection_errors,
     triangulate,
@@ -506,17 +505,3 @@ def test_of_two_who_are_as_near_in_the_photo_neither_is_taken():
     shown = [[views[0]], [views[0]._replace(people=(row + 0.1 * SIDEWAYS, row - 0.1 * SIDEWAYS))]]
     alone = lambda i: Match((i,), (False,), float("inf"), np.full(3, np.nan))
     assert len(in_order_of_time([[alone(0)], [alone(0), alone(1)]], shown)[0]) == 3
-
-
-@pytest.mark.parametrize("exposure", [0.3, 0.65, 1.0, 1.8])
-def test_colors_match_people_at_any_exposure_or_not_at_all(exposure):
-    rng = np.random.default_rng(0)
-    people = np.asarray([[[0.5, 0.2, 0.2], [0.1, 0.1, 0.3]], [[0.3, 0.5, 0.3], [0.5, 0.45, 0.4]]])
-    seen = people[::-1] * exposure + rng.normal(0, 0.005, people.shape)
-    assert match_colors(people, seen) in ((1, 0), None) and (
-        match_colors(people, seen) or exposure < 0.5
-    )
-    greys = np.full((2, 2, 3), 0.8) * np.asarray([1.0, 0.65])[:, None, None]
-    assert (
-        match_colors(greys, greys[:1] * exposure) is None
-    )  # a dark photo of the light one, or the dark one

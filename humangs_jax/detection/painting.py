@@ -1,0 +1,53 @@
+"""Photos in which somebody is painted over with the colors around."""
+
+import numpy as np
+from scipy import ndimage
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.io.images import resized
+
+LONGEST = 512
+"""Pixels: longest side of the photo in which colors are spread; the detector sees no more."""
+NEAR, FAR = 1 / 32, 1 / 8
+"""Of the longest side: standard deviations over which colors spread, and where none is so near."""
+LEAST_NEAR = 1e-3
+"""Weight of the colors nearby below which those far away count."""
+
+
+def painted_over(
+    photo: Float[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"], margin: float
+) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """Returns the photo with the colors around in place of the covered pixels, and what was
+    painted, which is a little more.
+
+    A plain color in their place has an outline, which the detector takes for that of a person.
+
+    Arguments: margin: how far what is painted reaches beyond the mask, whose rim shows the person;
+    a share of the longest side.
+    """
+    height, width = photo.shape[:2]
+    scale = min(1.0, LONGEST / max(height, width))
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    longest = max(size)
+    share = resized(covered.astype(np.float32), *size)
+    grown = 2 * max(1, round(margin * longest)) + 1
+    small = ndimage.maximum_filter(share > 0.25, size=grown)
+    kept, colors = (~small).astype(np.float32), resized(photo, *size)
+
+    # means of what is kept, weighted by a Gaussian: first of what is near, then, where there is
+    # nothing, of what is far
+    near, near_weight = _spread(colors, kept, NEAR * longest)
+    far, far_weight = _spread(colors, kept, FAR * longest)
+    distant = far / np.maximum(far_weight, 1e-6)[..., None]
+    fill = (near + LEAST_NEAR * distant) / (near_weight + LEAST_NEAR)[..., None]
+    fill = np.clip(fill, 0, 1).astype(np.float32)
+    painted = resized(small.astype(np.float32), width, height) > 0.5
+    return np.where(painted[..., None], resized(fill, width, height), photo), painted
+
+
+def _spread(
+    colors: Float[np.ndarray, "h w 3"], kept: Float[np.ndarray, "h w"], sigma: float
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """The sum of what is kept nearby, and its weight."""
+    summed = [ndimage.gaussian_filter(colors[..., c] * kept, sigma) for c in range(3)]
+    return np.stack(summed, axis=-1), ndimage.gaussian_filter(kept, sigma)

@@ -1,0 +1,80 @@
+"""Edges of the detector's masks, moved to those of the photo.
+
+The masks have 256 pixels a side; a guided filter moves their edges to the photo's (He, Sun, Tang,
+Guided image filtering, 2013): within each window the mask is an affine function of the photo's
+colors, of a reduced photo (Fast guided filter, 2015).
+"""
+
+import numpy as np
+from scipy import ndimage
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.io.images import resized
+
+LEVEL = 0.4
+"""Of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands
+and feet.
+"""
+RADIUS, EPSILON = 2.0, 1e-4
+"""Of the filter: half side of its windows in pixels of the detector's mask, and variance of
+colors that is no edge.
+"""
+STEEPER = 2.0
+"""The filter's masks rise more slowly than true ones by this factor."""
+MOST = 2.0
+"""Pixels of the reduced photo for one of the detector's mask."""
+
+
+def sharpened(
+    mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float
+) -> Float[np.ndarray, "h w"]:
+    """A mask with its edges at those of the photo. pixel: pixels of the photo for one of the
+    detector's mask.
+    """
+    rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
+    if not len(rows):
+        return mask
+    margin = filter_margin(pixel)
+    window = tuple(
+        slice(max(int(each[0]) - margin, 0), int(each[-1]) + 1 + margin) for each in (rows, columns)
+    )
+    guide, own = photo[window], np.clip(mask[window] * 0.5 / LEVEL, 0, 1)
+    height, width = own.shape
+    reduced = min(1.0, MOST / pixel)
+    size = max(1, round(reduced * width)), max(1, round(reduced * height))
+    small = (resized(guide, *size), resized(own, *size)) if reduced < 1 else (guide, own)
+    slopes, offsets = _affine(*small, max(1, round(RADIUS * reduced * pixel)))
+    back = (
+        (lambda values: resized(values, width, height)) if reduced < 1 else (lambda values: values)
+    )
+    found, result = back(offsets).copy(), np.zeros_like(mask)
+    for color in range(3):  # one at a time: all together take gigabytes of a large photo
+        found += back(slopes[..., color]) * guide[..., color]
+    result[window] = np.clip(STEEPER * (found - 0.5) + 0.5, 0, 1)
+    return result
+
+
+def filter_margin(pixel: float) -> int:
+    """Returns how many pixels around a mask `sharpened` looks at."""
+    return int(np.ceil(2 * RADIUS * pixel))
+
+
+def _affine(
+    guide: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], radius: int
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colors, means over
+    the windows of each pixel.
+    """
+    side = 2 * radius + 1
+    mean = lambda x: ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
+    colors, level = mean(guide), mean(mask)
+    together = mean(guide * mask[..., None]) - colors * level[..., None]
+    spread = (
+        mean(guide[..., :, None] * guide[..., None, :])
+        - colors[..., :, None] * colors[..., None, :]
+    )
+    slopes = np.linalg.solve(spread + EPSILON * np.eye(3), together[..., None].astype(float))[
+        ..., 0
+    ]
+    offsets = level - (slopes * colors).sum(-1)
+    return mean(slopes).astype(np.float32), mean(offsets).astype(np.float32)
