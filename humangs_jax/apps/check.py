@@ -170,7 +170,10 @@ def check_capture(
         )
         iou = outside = None
         if capture.masks is not None:
-            iou, outside = _agreement(np.asarray(drawn.covered), capture.masks[i] > MASK_THRESHOLD)
+            covered = np.asarray(drawn.covered)
+            if capture.unknown is not None:
+                covered = covered & ~capture.unknown[i]
+            iou, outside = _agreement(covered, capture.masks[i] > MASK_THRESHOLD)
             if warning is None and outside > MOST_OUTSIDE:
                 warning = WIDER.format(outside, *(FIXED if right else FREE))
         if shown is not capture:

@@ -51,9 +51,10 @@ def around_person(
     K = jnp.asarray(np.asarray(capture.cameras.K) - shift)
     cameras = replace(capture.cameras, K=K, width=int(size[0]), height=int(size[1]))
     masks = None if capture.masks is None else _cut(capture.masks, corners, size)
-    return dataclasses.replace(
-        capture, images=_cut(capture.images, corners, size), masks=masks, cameras=cameras
-    ), corners
+    unknown = None if capture.unknown is None else _cut(capture.unknown, corners, size)
+    images = _cut(capture.images, corners, size)
+    cut = dataclasses.replace(capture, images=images, masks=masks, cameras=cameras, unknown=unknown)
+    return cut, corners
 
 
 def _cut(

@@ -2,6 +2,7 @@
 a numbered sheet.
 
     keypoints.json   the chosen person, for `humangs fit`
+    unknown/NAME.png where somebody else may hide the person, of the photos of a capture
     people.png       the sheet: everybody, with numbers
     masks/NAME.png   of the chosen person
 
@@ -50,6 +51,7 @@ from humangs_jax.io.images import (
     mark_of,
     orientation,
     oriented,
+    read_grey,
     read_image,
     resized,
     to_uint8,
@@ -57,7 +59,7 @@ from humangs_jax.io.images import (
 )
 from humangs_jax.io.reading import write_json
 
-KEYPOINTS_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.png", "masks"
+KEYPOINTS_FILE, SHEET_FILE, MASKS, UNKNOWN = "keypoints.json", "people.png", "masks", "unknown"
 THUMBNAIL = 480
 """Pixels of the longest side of a photo on the sheet."""
 COLORS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
@@ -69,6 +71,10 @@ BEYOND = 0.03
 AREA_OF_CROP = 0.1
 """Pixels of a person over those of the detector's crop; 0.09 to 0.14 of twelve people who stand
 free.
+"""
+LEAST_AGREEMENT = 0.6
+"""Intersection over union of a mask that is given and of the person found there below which
+somebody else may have been found.
 """
 PLAINLY = 0.5
 """Masks or keypoints on somebody else have to leave the person less than this share of what they
@@ -110,7 +116,64 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
         views = read_description(folder / "capture.json")["views"]
         pictures = (read_image(folder / view["image"])[0] for view in views)
     found = detect_photos([f"{name}.png" for name in photos.names], pictures)
+    if photos.masks is not None:
+        found = with_masked(found, photos.masks, photos.images)
     return same_people(found, photos.cameras, photos.frames.tolist())
+
+
+def with_masked(
+    found: list[PhotoPeople],
+    masks: Sequence[Float[np.ndarray, "h w"]],
+    on_white: Sequence[Float[np.ndarray, "h w 3"]],
+) -> list[PhotoPeople]:
+    """The photos with the person of the masks: where nobody found has such a mask, what the
+    detector sees is cut to it.
+
+    Arguments: on_white: the photos with nothing but the masks' pixels.
+    """
+    lost = [
+        v
+        for v, (photo, mask) in enumerate(zip(found, masks, strict=True))
+        if (mask > SEEN).any()
+        and max((_overlap(each, mask) for each in photo.people), default=0.0) < LEAST_AGREEMENT
+    ]
+    if not lost:
+        return found
+    alone = detect_photos([found[v].name for v in lost], [on_white[v] for v in lost])
+    result = list(found)
+    for v, cut in zip(lost, alone, strict=True):
+        own = max(cut.people, key=lambda each: _overlap(each, masks[v]), default=None)
+        if own is None or own.area < PLAINLY * float((masks[v] > SEEN).sum()):
+            continue
+        # whoever had most of the mask before was this person, badly, or somebody in front
+        others = [each for each in found[v].people if not _mostly(each, own, found[v].size)]
+        people = sorted([own, *others], key=lambda each: -(0.0 if each is None else each.area))
+        result[v] = dataclasses.replace(found[v], people=tuple(people))
+    return result
+
+
+def _overlap(found: Found | None, mask: Float[np.ndarray, "h w"]) -> float:
+    """Intersection over union of somebody's mask and a mask of the photo."""
+    if found is None:
+        return 0.0
+    (top, left), (height, width) = found.corner, found.mask.shape
+    own, given = found.mask > 255 * SEEN, mask > SEEN
+    shared = np.count_nonzero(own & given[top : top + height, left : left + width])
+    either = np.count_nonzero(own) + np.count_nonzero(given) - shared
+    return shared / max(either, 1)
+
+
+def _mostly(found: Found | None, other: Found, size: tuple[int, int]) -> bool:
+    """Tells whether most of somebody's mask is on that of another person."""
+    if found is None:
+        return True
+    whole = np.zeros(size[::-1], bool)
+    (top, left), (height, width) = other.corner, other.mask.shape
+    whole[top : top + height, left : left + width] = other.mask > 255 * SEEN
+    (top, left), (height, width) = found.corner, found.mask.shape
+    own = found.mask > 255 * SEEN
+    shared = np.count_nonzero(own & whole[top : top + height, left : left + width])
+    return shared > PLAINLY * max(np.count_nonzero(own), 1)
 
 
 def person_in_capture(
@@ -335,8 +398,9 @@ def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> i
     unclear = [photo.name for i, photo in enumerate(photos) if is_unclear(photos, i, chosen)]
     if unclear:
         raise ValueError(
-            f"{few(unclear)}: which of the people of {sheet} is meant? Nothing tells who of one photo is who of another: cut "
-            "these photos down to one person, leave them out, or give masks or keypoints of the one"
+            f"{few(unclear)}: which of the people of {sheet} is meant? Nothing tells who of one"
+            " photo is who of another: cut these photos down to one person, leave them out, or"
+            " give masks or keypoints of the one"
         )
     return chosen
 
@@ -435,13 +499,19 @@ def write_found(
         for photo, file in zip(photos, files, strict=True) if masks else ():
             (temporary / file).parent.mkdir(parents=True, exist_ok=True)
             write_png(temporary / file, person_mask(photo, person), mark=MASK)
-        if masks and to_capture:
+        if to_capture:
             description = read_description(folder / "capture.json")
-            views = [
-                view | {"mask": file}
-                for view, file in zip(description["views"], files, strict=True)
-            ]
-            write_json(temporary / "capture.json", description | {"views": views})
+            views = []
+            for photo, file, view in zip(photos, files, description["views"], strict=True):
+                named = {"mask": file} if masks else {}
+                given = None if masks or "mask" not in view else read_grey(folder / view["mask"])
+                if (hidden := hidden_by_others(photo, person, given)) is not None:
+                    named["unknown"] = f"{UNKNOWN}/{Path(file).relative_to(MASKS).as_posix()}"
+                    (temporary / named["unknown"]).parent.mkdir(parents=True, exist_ok=True)
+                    write_png(temporary / named["unknown"], hidden.astype(np.float32), mark=MASK)
+                views.append(view | named)
+            if views != description["views"]:
+                write_json(temporary / "capture.json", description | {"views": views})
 
     if not overwrite:
         check_found_place(folder, [photo.name for photo in photos], masks=masks)
@@ -455,6 +525,26 @@ def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
         (top, left), (height, width) = found.corner, found.mask.shape
         mask[top : top + height, left : left + width] = found.mask / np.float32(255)
     return mask
+
+
+def hidden_by_others(
+    photo: PhotoPeople, person: int, mask: Float[np.ndarray, "h w"] | None = None
+) -> Bool[np.ndarray, "h w"] | None:
+    """Where other people in a photo may stand in front of the person; None where nobody does.
+
+    Arguments: mask: of the person, in place of the one that was found.
+    """
+    own = photo.people[person]
+    hidden = np.zeros(photo.size[::-1], bool)
+    for i, other in enumerate(photo.people):
+        if i == person or other is None:
+            continue
+        # whoever was found only once the person was painted over stands behind
+        if own is not None and other.covered and not own.covered:
+            continue
+        hidden |= person_mask(photo, i) > SEEN
+    hidden &= (person_mask(photo, person) if mask is None else mask) <= SEEN
+    return hidden if hidden.any() else None
 
 
 def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:

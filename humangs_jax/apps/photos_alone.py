@@ -24,7 +24,7 @@ from humangs_jax.data.cameras import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.photos import read_description
+from humangs_jax.data.photos import on_white_background, read_description
 from humangs_jax.fitting.person_cameras import PersonCameras, cameras_from_person
 from humangs_jax.fitting.person_moments import PersonViews
 from humangs_jax.io.images import (
@@ -138,7 +138,13 @@ class _Choice(NamedTuple):
 
 def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:
     names = [file.relative_to(images).as_posix() for file in looked_at]
-    photos = same_people(detect.detect_photos(names, map(detect.upright, looked_at)))
+    photos = detect.detect_photos(names, map(detect.upright, looked_at))
+    if choice.masks is not None:
+        masks = [upright_mask(choice.masks, images, file) for file in files]
+        pictures = [detect.upright(file) for file in looked_at]
+        cut = [on_white_background(*pair) for pair in zip(pictures, masks, strict=True)]
+        photos = detect.with_masked(photos, masks, cut)
+    photos = same_people(photos)
     photos, number = _chosen(photos, images, files, choice)
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]

@@ -88,7 +88,12 @@ def unusable_views(capture: Capture) -> dict[int, str]:
         x, y = (
             points_in_image(points[frame], K[i], cam_from_world[i], *mask.shape[::-1]).astype(int).T
         )
-        if not len(x) or (mask[y, x] > MASK_THRESHOLD).mean() < LEAST_SHARE:
+        on_mask = mask[y, x] > MASK_THRESHOLD
+        if capture.unknown is not None:
+            # what may be hidden says nothing, unless that is nearly all
+            seen = ~capture.unknown[i][y, x]
+            on_mask = on_mask[seen] if seen.mean() > LEAST_SHARE else on_mask
+        if not len(on_mask) or on_mask.mean() < LEAST_SHARE:
             found[i] = "mask and posed body hardly meet (`humangs check` draws both)"
     return dict(sorted(found.items()))
 
@@ -236,6 +241,8 @@ class MaskedView:
 
     linear, offset: from the rest pose to the posed body, for each vertex. low, high: x, y of the
     photo's corners.
+    hidden: where somebody may be in front, and no mask ends that would say something; None:
+    nowhere.
     """
 
     coverage: Float[np.ndarray, "h w"]
@@ -244,6 +251,7 @@ class MaskedView:
     offset: Float[np.ndarray, "n 3"]
     low: Float[np.ndarray, "2"]
     high: Float[np.ndarray, "2"]
+    hidden: Float[np.ndarray, "h w"] | None = None
 
     @functools.cached_property
     def mask(self) -> Float[np.ndarray, "h w"]:
@@ -262,6 +270,8 @@ class MaskedView:
         depth = np.maximum(clip[..., 2], 1e-3)
         pixels = clip[..., :2] / depth[..., None]
         within = (clip[..., 2] > 1e-3) & ((pixels > self.low) & (pixels < self.high)).all(-1)
+        if self.hidden is not None:
+            within &= at(self.hidden, pixels) < MASK_THRESHOLD
         return pixels, np.linalg.norm(self.project[0, :3]) / depth, within
 
 
@@ -345,12 +355,14 @@ def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[Masked
         if all(
             np.isfinite(x).all() for x in (rest, *posed[frame])
         ):  # whoever poses the body names what is not
-            views.append(_window(mask, K @ matrix[:3], *posed[frame]))
+            hidden = None if capture.unknown is None else capture.unknown[i]
+            views.append(_window(mask, hidden, K @ matrix[:3], *posed[frame]))
     return views
 
 
 def _window(
     mask: Float[np.ndarray, "h w"],
+    hidden: Bool[np.ndarray, "h w"] | None,
     project: Float[np.ndarray, "3 4"],
     linear: Float[np.ndarray, "n 3 3"],
     offset: Points,
@@ -364,7 +376,8 @@ def _window(
     top, left, bottom, right = top - margin, left - margin, bottom + margin, right + margin
     height, width = mask.shape
     pad = ((max(-top, 0), max(bottom - height, 0)), (max(-left, 0), max(right - width, 0)))
-    window = np.pad(mask[max(top, 0) : bottom, max(left, 0) : right], pad, mode="edge")
+    cut = slice(max(top, 0), bottom), slice(max(left, 0), right)
+    window = np.pad(mask[cut], pad, mode="edge")
     scale = LONGEST / max(window.shape)
     rows, columns = (max(1, round(side * scale)) for side in window.shape)
     x, y = columns / window.shape[1], rows / window.shape[0]
@@ -373,8 +386,19 @@ def _window(
         np.asarray([-left * x, -top * y]),
         np.asarray([(width - left) * x, (height - top) * y]),
     )
+    covers = None
+    if hidden is not None and hidden[cut].any():
+        share = resized(np.pad(hidden[cut], pad, mode="edge").astype(np.float32), columns, rows)
+        # the mask's edge beside it is that of who stands in front
+        covers = ndimage.maximum_filter(share, size=2 * int(np.ceil(NEAR)) + 1)
     return MaskedView(
-        resized(window, columns, rows), to_window @ project, linear, offset, low + NEAR, high - NEAR
+        resized(window, columns, rows),
+        to_window @ project,
+        linear,
+        offset,
+        low + NEAR,
+        high - NEAR,
+        covers,
     )
 
 

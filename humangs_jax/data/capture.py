@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import short_repr
 from humangs_jax.data.capture_checks import (
@@ -92,6 +92,11 @@ class Capture:
     gains: Float[np.ndarray, "v 3"] | None = None
     """By what `data.exposure.equal_exposure` has multiplied red, green and blue of each view; None:
     the colors are as they were photographed."""
+    unknown: Bool[np.ndarray, "v h w"] | None = None
+    """Where somebody or something in front may hide the person; masks are 0 there.
+
+    Nothing is concluded from these pixels.
+    """
 
     __repr__ = short_repr
 
@@ -121,6 +126,7 @@ class Capture:
             self,
             images=self.images[views],
             masks=None if self.masks is None else self.masks[views],
+            unknown=None if self.unknown is None else self.unknown[views],
             cameras=jax.tree.map(lambda leaf: leaf[views], self.cameras),
             frames=self.frames[views],
             names=tuple(self.names[i] for i in views),
@@ -133,8 +139,13 @@ class Capture:
         size = [max(1, round(side * longest / max(height, width))) for side in (width, height)]
         resize = lambda images: np.stack([resized(image, *size) for image in images])
         masks = None if self.masks is None else resize(self.masks)
+        unknown = None if self.unknown is None else resize(self.unknown.astype(np.float32)) > 0
         return dataclasses.replace(
-            self, images=resize(self.images), masks=masks, cameras=self.cameras.resized(*size)
+            self,
+            images=resize(self.images),
+            masks=masks,
+            unknown=unknown,
+            cameras=self.cameras.resized(*size),
         )
 
 
@@ -157,6 +168,7 @@ def capture_from_arrays(
     body_file: str | Path = DEFAULT_BODY,
     displacement: Any | None = None,
     calibrated: bool = True,
+    unknown: Any | None = None,
     source: str = "arrays",
 ) -> Capture:
     """A checked capture from arrays.
@@ -181,6 +193,8 @@ def capture_from_arrays(
         displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
         calibrated: False for cameras that were found from the person: refinement moves them
             further.
+        unknown: (v, h, w), true where somebody or something in front may hide the person, or None.
+            Masks are 0 there, and nothing is concluded from these pixels.
         source: what errors call the arrays.
 
     Returns:
@@ -234,9 +248,14 @@ def capture_from_arrays(
         if fit_masks:
             masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
         images = np.stack([cut_out(*pair) for pair in zip(images, masks, strict=True)])
-    photos = Photos(
-        images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names, calibrated
-    )
+    if unknown is not None:
+        if masks is None:
+            raise CaptureError(source, "unknown", "expected masks, too")
+        unknown = numbers(unknown, source, "unknown", (v, height, width)) > 0
+        images = np.where(unknown[..., None], np.float32(1), images)
+        masks = np.where(unknown, np.float32(0), masks)
+    frames = np.asarray(frames, np.int32)
+    photos = Photos(images, masks, stack_cameras(cameras), frames, names, calibrated, unknown)
     return _assemble(photos, body, body_file, *parameters)
 
 
@@ -431,6 +450,7 @@ def _check_before_writing(capture: Capture) -> None:
         background="white",
         body=capture.body,
         displacement=capture.displacement,
+        unknown=capture.unknown,
         source="capture",
     )
 
@@ -446,6 +466,10 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
         if capture.masks is not None:
             view["mask"] = f"masks/{name}.png"
             write_png(folder / view["mask"], capture.masks[i])
+        if capture.unknown is not None and capture.unknown[i].any():
+            view["unknown"] = f"unknown/{name}.png"
+            (folder / "unknown").mkdir(exist_ok=True)
+            write_png(folder / view["unknown"], capture.unknown[i].astype(np.float32))
         view["frame"] = int(capture.frames[i])
         view["K"] = np.asarray(capture.cameras.K[i], float).tolist()
         view["cam_from_world"] = np.asarray(capture.cameras.cam_from_world[i], float).tolist()

@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.capture_checks import (
     CaptureError,
     checked_camera,
@@ -51,8 +51,10 @@ DEMO_CAPTURE = "demo_capture"
 """Name of the capture of a synthetic person that comes with the package."""
 TOP_KEYS = {"format", "version", "body", "background", "views"}
 OPTIONAL_TOP_KEYS = {"calibrated"}
-VIEW_KEYS = {"image", "mask", "K", "cam_from_world", "frame"}
+VIEW_KEYS = {"image", "mask", "unknown", "K", "cam_from_world", "frame"}
 Background = Literal["photo", "white"]
+LEAST_UNKNOWN = 0.5
+"""Value from which on a pixel of an image of what is unknown is so."""
 OFF_CENTER = 0.05
 """Share of a side by which a principal point has to be nearer to the middle of the turned photo to
 be one of that.
@@ -79,6 +81,11 @@ class Photos:
     """One per view."""
     calibrated: bool = True
     """False: the cameras were found from the person."""
+    unknown: Bool[np.ndarray, "v h w"] | None = None
+    """Where somebody or something in front may hide the person; masks are 0 there.
+
+    None: nowhere.
+    """
 
     @property
     def frame_count(self) -> int:
@@ -139,11 +146,11 @@ def read_description(file: Path) -> dict[str, Any]:
         check_keys(
             expect(view, dict, file, field),
             VIEW_KEYS,
-            VIEW_KEYS - {"mask", "frame"},
+            VIEW_KEYS - {"mask", "unknown", "frame"},
             file,
             f"{field}.",
         )
-        for key in VIEW_KEYS & {"image", "mask"} & view.keys():
+        for key in VIEW_KEYS & {"image", "mask", "unknown"} & view.keys():
             check_inside(
                 file, f"{field}.{key}", expect(view[key], str, file, f"{field}.{key}"), photo=True
             )
@@ -293,10 +300,28 @@ def read_photos(
         checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]")
         for i in range(len(views))
     ]
+    unknown = _read_unknown(folder, views, images.shape[1:3])
+    if unknown is not None:
+        if masks is None:
+            raise CaptureError(file, "views[0].unknown", "expected a mask, too")
+        images[unknown], masks[unknown] = 1, 0
     names = names_from_paths([view["image"] for view in views])
-    return Photos(
-        images, masks, stack_cameras(cameras), frames, names, is_calibrated(folder, description)
-    )
+    calibrated = is_calibrated(folder, description)
+    return Photos(images, masks, stack_cameras(cameras), frames, names, calibrated, unknown)
+
+
+def _read_unknown(
+    folder: Path, views: Sequence[dict[str, Any]], size: tuple[int, int]
+) -> Bool[np.ndarray, "v h w"] | None:
+    """Where each photo may hide the person; None where no view names such a file, or all of them
+    are black.
+    """
+    unknown = np.zeros((len(views), *size), bool)
+    for i, view in enumerate(views):
+        if "unknown" in view:
+            found = read_mask(folder / view["unknown"], "its image", size[1], size[0])
+            unknown[i] = found >= LEAST_UNKNOWN
+    return unknown if unknown.any() else None
 
 
 def _check_orientations(

@@ -57,7 +57,8 @@ class SubjectViews:
     view_count: how many are views, those after them are padding (see `pad_views`); None: all are.
     depths: (v, h, w) mean z of the person in a pixel, metres, where the mask is not 0; 0: unknown
     there. None: unknown everywhere. displacement: (n, 3) of the vertices of the shaped body in the
-    T-pose, metres (`data.body_and_masks`); None: none.
+    T-pose, metres (`data.body_and_masks`); None: none. unknown: (v, h, w) where the person may be
+    hidden, and masks are 0; None: nowhere.
     """
 
     images: Float[Array, "v h w 3"]
@@ -69,6 +70,7 @@ class SubjectViews:
     view_count: Int[Array, ""] | None = None
     depths: Float[Array, "v h w"] | None = None
     displacement: Float[Array, "n 3"] | None = None
+    unknown: Bool[Array, "v h w"] | None = None
 
     def upright(self, body: BodyModel) -> "SubjectViews":
         """The views in a world whose y axis points up; the same object if theirs does.
@@ -285,7 +287,14 @@ def cropped(capture: Capture, size: int) -> Capture:
     if min(side for *_, side in boxes) >= max(height, width):
         return capture
     images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
-    return dataclasses.replace(capture, images=images, masks=masks, cameras=cameras)
+    unknown = capture.unknown
+    if unknown is not None:
+        shares = unknown.astype(np.float32)
+        hidden = [_window(x, *box, 0.0) for x, box in zip(shares, boxes, strict=True)]
+        unknown = np.stack([resized(x, size, size) for x in hidden]) > 0
+    return dataclasses.replace(
+        capture, images=images, masks=masks, cameras=cameras, unknown=unknown
+    )
 
 
 def _squares(

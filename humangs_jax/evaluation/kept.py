@@ -91,7 +91,7 @@ def _capture_key(capture: Capture) -> str:
         "frames": capture.frames,
         "betas": capture.betas,
     }
-    moved = {"displacement": capture.displacement}
+    moved = {"displacement": capture.displacement, "unknown": capture.unknown}
     known = {
         name: np.asarray(array) for name, array in {**arrays, **moved}.items() if array is not None
     }

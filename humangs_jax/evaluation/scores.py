@@ -527,9 +527,12 @@ def score_views(
     for i in range(truth.view_count):
         mask = None if truth.masks is None else np.asarray(truth.masks[i])
         image = on_background(truth.images[i], mask, protocol)
-        yield score_image(
-            predicted[i], image, mask, None if alpha is None else alpha[i], protocol, networks or {}
-        )
+        shown, opacity = predicted[i], None if alpha is None else alpha[i]
+        if truth.unknown is not None:
+            # nothing can be wrong where the person may be hidden
+            shown = np.where(truth.unknown[i][..., None], image, shown)
+            opacity = None if opacity is None else np.where(truth.unknown[i], 0, opacity)
+        yield score_image(shown, image, mask, opacity, protocol, networks or {})
 
 
 def on_background(

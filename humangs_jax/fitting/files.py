@@ -146,10 +146,9 @@ def check_place(
 
 
 def _photo_files(description: dict[str, Any]) -> list[str]:
-    """Images and masks of a capture, as its description has them."""
-    return sorted(
-        {view[key] for view in description["views"] for key in ("image", "mask") if key in view}
-    )
+    """Images and masks of a capture, and what is unknown, as its description has them."""
+    kinds = ("image", "mask", "unknown")
+    return sorted({view[key] for view in description["views"] for key in kinds if key in view})
 
 
 def write_fitted(

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
 
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
@@ -349,7 +350,12 @@ class Scene:
         )
         self.faces = np.asarray(capture.body.faces)
         self.edges = silhouettes.body_edges(self.faces)
-        self.boundaries = [silhouettes.mask_boundary(mask, config.points) for mask in self.masks]
+        self.unknown = looked_at.unknown
+        self.hidden = _with_rim(looked_at.unknown, len(self.masks))
+        self.boundaries = [
+            silhouettes.mask_boundary(mask, config.points, hidden)
+            for mask, hidden in zip(self.masks, self.hidden, strict=True)
+        ]
         kind = None if keypoints is None else keypoints.set
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
@@ -390,10 +396,10 @@ class Scene:
             silhouettes.body_boundary(view, self.faces, self.edges, count)
             for view in self.body_views(moved)
         ]
-        views = zip(boundaries, self.masks, self.boundaries, strict=True)
+        views = zip(boundaries, self.masks, self.boundaries, self.hidden, strict=True)
         matches = [
-            silhouettes.match(boundary, mask, other, reach, count)
-            for boundary, mask, other in views
+            silhouettes.match(boundary, mask, other, reach, count, hidden)
+            for boundary, mask, other, hidden in views
         ]
         return Evidence(
             points=silhouettes.boundary_points(
@@ -440,8 +446,9 @@ class Scene:
 
     def score(self, capture: Capture) -> Score:
         """How well the body of a capture of these photos agrees with masks and keypoints."""
-        pairs = zip(self.body_views(capture), self.masks, strict=True)
-        ious = np.asarray([overlap(view.covered, mask) for view, mask in pairs])
+        known = [None] * len(self.masks) if self.unknown is None else list(~self.unknown)
+        pairs = zip(self.body_views(capture), self.masks, known, strict=True)
+        ious = np.asarray([overlap(view.covered, mask, seen) for view, mask, seen in pairs])
         iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
         loss = 0.0 if iou is None else 1 - iou
         if (
@@ -453,9 +460,33 @@ class Scene:
         return Score(ious, iou, keypoints, loss)
 
 
-def overlap(covered: Bool[np.ndarray, "h w"], mask: Float[np.ndarray, "h w"]) -> float:
-    """Intersection over union of a body and a mask; NaN if the mask is empty."""
+HIDDEN_RIM = 3
+"""Pixels around what is unknown where the edge of a mask is that of whoever stands in front."""
+
+
+def _with_rim(
+    unknown: Bool[np.ndarray, "v h w"] | None, views: int
+) -> list[Bool[np.ndarray, "h w"] | None]:
+    """What is unknown of each view and its rim; None for a view without any."""
+    if unknown is None:
+        return [None] * views
+    return [
+        ndimage.binary_dilation(each, iterations=HIDDEN_RIM) if each.any() else None
+        for each in unknown
+    ]
+
+
+def overlap(
+    covered: Bool[np.ndarray, "h w"],
+    mask: Float[np.ndarray, "h w"],
+    known: Bool[np.ndarray, "h w"] | None = None,
+) -> float:
+    """Intersection over union of a body and a mask where that is known (default: everywhere);
+    NaN if the mask is empty.
+    """
     person = mask > 0.5
+    if known is not None:
+        covered = covered & known
     return (
         float((covered & person).sum() / (covered | person).sum()) if person.any() else float("nan")
     )

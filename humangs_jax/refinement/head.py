@@ -189,7 +189,11 @@ def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops 
     images, masks, cameras = windows(
         np.asarray(views.images)[seen], np.asarray(views.masks)[seen], views.cameras[seen], boxes
     )
-    views = replace(views, images=images, masks=masks, cameras=cameras)
+    unknown = None
+    if views.unknown is not None:
+        hidden = np.asarray(views.unknown)[seen]
+        unknown = windows(np.asarray(views.images)[seen], hidden, views.cameras[seen], boxes)[1] > 0
+    views = replace(views, images=images, masks=masks, cameras=cameras, unknown=unknown)
     pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
     shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved
     drawn = np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))])

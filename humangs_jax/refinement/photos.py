@@ -41,8 +41,12 @@ class Photo(Batchable):
 
 
 def photos_of(views: SubjectViews) -> Photo:
-    """The views of a person as a batch of photos, all of whose pixels count."""
+    """The views of a person as a batch of photos, whose pixels count unless somebody may hide
+    the person there.
+    """
     counted = jnp.ones(views.masks.shape, bool)
+    if views.unknown is not None:
+        counted = ~views.unknown
     leaves = views.images, views.masks, counted, views.cameras, views.rotations, views.translations
     return jax.vmap(Photo)(*leaves)
 
@@ -63,6 +67,10 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
     assert capture.masks is not None
     boxes = [_bounds(mask) for mask in capture.masks]
     images, masks, cameras = windows(capture.images, capture.masks, capture.cameras, boxes)
+    unknown = None
+    if capture.unknown is not None:
+        hidden = windows(capture.images, capture.unknown, capture.cameras, boxes)[1]
+        unknown = hidden > 0
     frames = np.asarray(capture.frames)
     views = SubjectViews(
         images=images,
@@ -71,13 +79,14 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
         rotations=jnp.asarray(capture.poses.rotations)[frames],
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),
+        unknown=unknown,
     )
     return views.upright(capture.body)
 
 
 def windows(
     images: Float[Array | np.ndarray, "v h w 3"],
-    masks: Float[Array | np.ndarray, "v h w"],
+    masks: Float[Array | np.ndarray, "v h w"] | Bool[np.ndarray, "v h w"],
     cameras: Camera,
     boxes: Sequence[Sequence[Sequence[int]]],
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:

@@ -205,7 +205,9 @@ def prepare(
     photos, held = list(photos_of(views)), np.zeros(views.masks.shape, bool)
     if len(photos) < HELD_OUT_PHOTOS:
         held = held_out_blocks(views.masks.shape, config.held_out, config.seed)
-    seen = [replace(photo, counted=jnp.asarray(~h)) for photo, h in zip(photos, held, strict=True)]
+    seen = [
+        replace(photo, counted=photo.counted & ~h) for photo, h in zip(photos, held, strict=True)
+    ]
     graph = graph_of(np.asarray(start.gaussians.means)) if config.iterations else None
     settings = dataclasses.replace(config, **HOST_SETTINGS)
     task = Task(start, fresh, photos, seen, graph, config, settings, clock)

@@ -160,7 +160,9 @@ def test_the_smallest_windows_are_looked_at_only_where_nobody_is_large(
 
 
 def test_whoever_stands_half_behind_somebody_is_found_without_what_is_covered(networks, demo):
-    """The detector alone finds one of them: painted over, the first leaves the other one to be seen."""
+    """The detector alone finds one of them: painted over, the first leaves the other one to be
+    seen.
+    """
     front = demo.masks[0]
     step = round(0.7 * np.ptp(np.flatnonzero((front > 0.5).any(0))))
     image, mask = (np.roll(each[2], step, axis=1) for each in (demo.images, demo.masks))

@@ -141,10 +141,11 @@ def body_boundary(
     return Boundary(positions, normals[edge], ends, shares)
 
 
-def mask_boundary(mask: Float[np.ndarray, "h w"], count: int) -> Boundary:
-    """`count` points where coverage crosses one half, or none.
-
-    The image border is no silhouette.
+def mask_boundary(
+    mask: Float[np.ndarray, "h w"], count: int, hidden: Bool[np.ndarray, "h w"] | None = None
+) -> Boundary:
+    """`count` points where coverage crosses one half, or none. The image border is no silhouette,
+    nor is that of who hides the person.
     """
     from skimage.filters import gaussian
     from skimage.measure import find_contours
@@ -163,6 +164,8 @@ def mask_boundary(mask: Float[np.ndarray, "h w"], count: int) -> Boundary:
         * inside_image(starts, mask.shape)
         * inside_image(ends, mask.shape)
     )
+    if hidden is not None:
+        lengths = lengths * ~_covered(hidden, starts)
     segment, shares = _spread(lengths, count)
     positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
     down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
@@ -225,12 +228,20 @@ class Matches:
 
 
 def match(
-    body: Boundary, mask: Float[np.ndarray, "h w"], boundary: Boundary, reach: float, count: int
+    body: Boundary,
+    mask: Float[np.ndarray, "h w"],
+    boundary: Boundary,
+    reach: float,
+    count: int,
+    hidden: Bool[np.ndarray, "h w"] | None = None,
 ) -> Matches:
     """At most 2 `count` equations of a mask and its boundary, padded with weight 0. reach: pixels,
     how far points look.
+    hidden: where the mask says nothing, since somebody may be in front.
     """
-    pairs = zip(_ends_of_mask(body, mask, reach), _nearest(body, boundary, reach), strict=True)
+    pairs = zip(
+        _ends_of_mask(body, mask, reach, hidden), _nearest(body, boundary, reach), strict=True
+    )
     rows = [np.concatenate(pair) for pair in pairs]
     points, normals, offsets = (padded(x, 2 * count) for x in rows)
     weights = np.arange(2 * count) < len(rows[0])
@@ -242,12 +253,19 @@ Pairs = tuple[Int[np.ndarray, " e"], Float[np.ndarray, "e 2"], Float[np.ndarray,
 """Points of the body's silhouette, and the normals and offsets of their lines."""
 
 
-def _ends_of_mask(body: Boundary, mask: Float[np.ndarray, "h w"], reach: float) -> Pairs:
+def _ends_of_mask(
+    body: Boundary,
+    mask: Float[np.ndarray, "h w"],
+    reach: float,
+    hidden: Bool[np.ndarray, "h w"] | None,
+) -> Pairs:
     """For points of the body, along their normals: where the mask goes from inside to outside."""
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
     covered = np.asarray(_coverage(jnp.asarray(mask), jnp.asarray(places, jnp.float32)))
     seen = inside_image(places, mask.shape)
+    if hidden is not None:
+        seen &= ~_covered(hidden, places.reshape(-1, 2)).reshape(seen.shape)
     ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
     nearest = np.argmin(np.where(ends, np.abs(steps[:-1]), np.inf), axis=1)
     rows = np.arange(len(nearest))
