@@ -86,7 +86,7 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
 
 def windows(
     images: Float[Array | np.ndarray, "v h w 3"],
-    masks: Float[Array | np.ndarray, "v h w"] | Bool[np.ndarray, "v h w"],
+    masks: Float[Array | np.ndarray, "v h w"] | Bool[Array | np.ndarray, "v h w"],
     cameras: Camera,
     boxes: Sequence[Sequence[Sequence[int]]],
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
@@ -99,7 +99,9 @@ def windows(
     )
     corners = [(_corner(box[0], rows, height), _corner(box[1], columns, width)) for box in boxes]
 
-    def crop(arrays: Float[Array | np.ndarray, "v h w *c"]) -> Float[Array, "v rows columns *c"]:
+    def crop(
+        arrays: Float[Array | np.ndarray, "v h w *c"] | Bool[Array | np.ndarray, "v h w"],
+    ) -> Float[Array, "v rows columns *c"]:
         cut = [
             x[top : top + rows, left : left + columns]
             for x, (top, left) in zip(arrays, corners, strict=True)

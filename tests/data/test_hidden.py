@@ -1,0 +1,104 @@
+"""Pixels where somebody may stand in front of the person: nothing is concluded from them, and they are kept with a capture."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from changes import edit_json
+
+from humangs_jax.data.body_and_masks import displacement, unusable_views
+from humangs_jax.data.capture import CaptureError, load_capture, save_capture
+from humangs_jax.data.views import cropped
+from humangs_jax.evaluation.scores import score
+from humangs_jax.fitting.refine import overlap
+from humangs_jax.fitting.residuals.silhouettes import mask_boundary
+from humangs_jax.io.images import read_grey, write_png
+from humangs_jax.refinement.photos import crop_to_person, photos_of
+
+
+@pytest.fixture
+def hidden(demo):
+    """The demo with a bar before the left half of the person in the first photo: the same masks without it, and unknown."""
+    unknown = np.zeros(demo.masks.shape, bool)
+    columns = np.flatnonzero((demo.masks[0] > 0.5).any(0))
+    left, right = columns[0] - 4, (columns[0] + columns[-1]) // 2
+    unknown[0, :, left:right] = True
+    images = np.where(unknown[..., None], np.float32(1), demo.images)
+    masks = np.where(unknown, np.float32(0), demo.masks)
+    return dataclasses.replace(demo, images=images, masks=masks, unknown=unknown)
+
+
+def test_what_is_unknown_is_kept_and_the_mask_is_empty_there(hidden, demo, tmp_path):
+    save_capture(tmp_path / "c", hidden)
+    read = load_capture(tmp_path / "c")
+    np.testing.assert_array_equal(read.unknown, hidden.unknown)
+    assert not read.masks[hidden.unknown].any() and (read.images[hidden.unknown] == 1).all()
+    # the file of the mask may say what it likes there
+    write_png(tmp_path / "c" / "masks" / f"{demo.names[0]}.png", demo.masks[0])
+    assert not load_capture(tmp_path / "c").masks[hidden.unknown].any()
+    for smaller in (read.select([1, 0]), read.resized(128), cropped(read, 128)):
+        assert smaller.unknown.shape == smaller.masks.shape and smaller.unknown.any()
+    assert not (tmp_path / "c" / "unknown" / f"{demo.names[1]}.png").exists()
+
+
+def test_an_image_of_what_is_unknown_is_checked(hidden, tmp_path):
+    save_capture(tmp_path / "c", hidden)
+    write_png(tmp_path / "c" / "unknown" / f"{hidden.names[0]}.png", np.ones((8, 8), np.float32))
+    with pytest.raises(CaptureError, match=r"unknown/.*8 x 8, but its image has 512 x 512"):
+        load_capture(tmp_path / "c")
+    edit_json(tmp_path / "c" / "capture.json", lambda d: [v.pop("mask") for v in d["views"]])
+    with pytest.raises(CaptureError, match=r"unknown"):
+        load_capture(tmp_path / "c")
+
+
+@pytest.mark.slow  # three displacements
+def test_a_body_is_not_carved_where_somebody_stands_in_front(hidden, demo):
+    whole = displacement(demo.body, demo)
+    carved = displacement(demo.body, dataclasses.replace(hidden, unknown=None))
+    kept = displacement(demo.body, hidden)
+    off = lambda moves: float(np.linalg.norm(moves - whole, axis=1).mean())
+    assert off(kept) < 0.25 * off(carved)
+
+
+def test_a_view_is_judged_by_what_it_shows(hidden):
+    """A mask without most of the person does not make the view one of somebody else."""
+    unknown = hidden.masks > 0.5
+    unknown[:, :, :] = unknown | hidden.unknown
+    unknown[0, 200:, :] = True
+    masks = np.where(unknown, np.float32(0), hidden.masks)
+    masks[0, :8, :8] = 1
+    nearly = dataclasses.replace(hidden, unknown=unknown, masks=masks)
+    assert 0 in unusable_views(nearly)
+    assert not unusable_views(hidden)
+
+
+def test_silhouettes_end_where_the_person_does(hidden):
+    mask, unknown = hidden.masks[0], hidden.unknown[0]
+    border = np.flatnonzero(unknown.any(0))[-1] + 1
+    edge = lambda points: np.abs(points.positions[:, 0] - border) < 2
+    assert edge(mask_boundary(mask, 500)).mean() > 0.1
+    grown = np.zeros_like(unknown)
+    grown[:, : border + 3] = True
+    assert not edge(mask_boundary(mask, 500, grown)).any()
+
+
+def test_agreement_of_body_and_mask_is_counted_where_it_is_known(hidden, demo):
+    covered = demo.masks[0] > 0.5
+    assert overlap(covered, hidden.masks[0]) < 0.8
+    assert overlap(covered, hidden.masks[0], ~hidden.unknown[0]) == 1
+
+
+def test_refinement_compares_and_scores_count_what_is_seen(hidden, demo):
+    photos = photos_of(crop_to_person(hidden))
+    counted = np.asarray(photos.counted)
+    assert not counted[0].all() and counted[1:].all()
+    assert not np.asarray(photos.mask)[~counted].any()
+    first = hidden.select([0])
+    assert score(demo.images[:1], first).psnr > 60
+    assert score(demo.images[:1], dataclasses.replace(first, unknown=None)).psnr < 30
+
+
+def test_an_image_of_what_is_unknown_is_grey(hidden, tmp_path):
+    save_capture(tmp_path / "c", hidden)
+    file = tmp_path / "c" / "unknown" / f"{hidden.names[0]}.png"
+    np.testing.assert_array_equal(read_grey(file) > 0.5, hidden.unknown[0])
