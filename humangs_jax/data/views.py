@@ -21,7 +21,7 @@ from humangs_jax.body.resolution import (
     split_with_weights,
     vertex_areas,
 )
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD, usable_views
