@@ -33,8 +33,8 @@ from humangs_jax.detection.people import (
     Networks,
     bilinear,
     detect_people,
-    sharpened,
 )
+from humangs_jax.detection.sharpening import sharpened
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras

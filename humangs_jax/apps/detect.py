@@ -117,7 +117,7 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
         pictures = (read_image(folder / view["image"])[0] for view in views)
     found = detect_photos([f"{name}.png" for name in photos.names], pictures)
     if photos.masks is not None:
-        found = with_masked(found, photos.masks, photos.images)
+        found = with_masked(found, list(photos.masks), list(photos.images))
     return same_people(found, photos.cameras, photos.frames.tolist())
 
 
@@ -173,7 +173,7 @@ def _mostly(found: Found | None, other: Found, size: tuple[int, int]) -> bool:
     (top, left), (height, width) = found.corner, found.mask.shape
     own = found.mask > 255 * SEEN
     shared = np.count_nonzero(own & whole[top : top + height, left : left + width])
-    return shared > PLAINLY * max(np.count_nonzero(own), 1)
+    return bool(shared > PLAINLY * max(np.count_nonzero(own), 1))
 
 
 def person_in_capture(

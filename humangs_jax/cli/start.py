@@ -33,6 +33,10 @@ body, and go on from there.
 """
 
 
+IGNORE = Path("ignore")
+"""As --cameras: the calibration in the folder of photos is not used."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Start:
     """From photos or a video of a person to an avatar in the browser.
@@ -53,7 +57,11 @@ class Start:
     out: Path
     """The capture folder to write, with avatar.npz, avatar.html and check.png in it."""
     cameras: Annotated[
-        Path | None, arg(help=f"Calibration, if it is elsewhere: {CAMERAS.listed()}.")
+        Path | None,
+        arg(
+            help=f"Calibration, if it is elsewhere: {CAMERAS.listed()}. Or ignore: use none of"
+            " those in the folder, and find the cameras from the person."
+        ),
     ] = None
     masks: Path | None = None
     """Folder of the masks, if it is elsewhere."""
@@ -103,9 +111,15 @@ class Start:
             from humangs_jax.apps.start import look
             from humangs_jax.io.atomic import only_writer
 
+        ignored = self.cameras == IGNORE
         material = look(
-            self._photos(), cameras=self.cameras, masks=self.masks, keypoints=self.keypoints
+            self._photos(),
+            cameras=None if ignored else self.cameras,
+            masks=self.masks,
+            keypoints=self.keypoints,
         )
+        if ignored:
+            material = dataclasses.replace(material, cameras=None)
         if self.without_masks:
             material = dataclasses.replace(material, masks=None)
         self._check_lengths(material)
@@ -285,7 +299,8 @@ class Start:
         begun = ours and not (self.out / "body.npz").exists()
         finished = begun or self.overwrite or (self.out / "avatar.html").exists()
         fitted = ours and (self.out / "fit.json").exists() and not finished
-        inputs = (self.photos, self.cameras, self.masks, self.keypoints)
+        cameras = None if self.cameras == IGNORE else self.cameras
+        inputs = (self.photos, cameras, self.masks, self.keypoints)
         require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
         return fitted
 
@@ -334,6 +349,7 @@ class Start:
             from humangs_jax.apps.start import better_body
             from humangs_jax.body.library import load_body
             from humangs_jax.data.photos import load_photos
+            from humangs_jax.fitting.contradiction import find_contradiction
             from humangs_jax.fitting.files import write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
             from humangs_jax.fitting.refine import cameras_are_unseen, refine_capture, usual_config
@@ -349,6 +365,11 @@ class Start:
             keypoints = keypoints_of(
                 photos, material.keypoints, None if found_here else self.person
             )
+            if photos.calibrated and (against := find_contradiction(photos, keypoints)):
+                raise ValueError(
+                    f"{material.cameras}: {against}: correct it, or go on without it by"
+                    " --cameras ignore"
+                )
             fitted = fit_photos(photos, keypoints, load_body())
         with stage("examining the fit"):
             report = fitted.report
