@@ -99,10 +99,10 @@ def _points(
 def _seen_points(
     views: Sequence[Camera], count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """Points at random in the cube around the cameras, by the square of how many cameras see them.
+    """Points at random in the cube around the cameras, by how many cameras see them.
 
-    Around an object these lie where it is and not between it and the cameras; in a room they lie
-    everywhere.
+    The chance is the fourth power of that number. Around an object these lie where it is and not
+    between it and the cameras; in a room they lie everywhere.
     """
     middle, reach = _middle(views), float(extent_of(views))
     points = middle + rng.uniform(-reach, reach, (CANDIDATES * count, 3))
@@ -111,7 +111,7 @@ def _seen_points(
         pixels, depths = project(camera, jnp.asarray(points, jnp.float32))
         inside = (pixels > 0) & (pixels < jnp.asarray([camera.width, camera.height]))
         seen += np.asarray(jnp.all(inside, axis=-1) & (depths > 0))
-    share = seen**2 + 1e-9 * seen.max() + 1e-9  # some are left where nothing is seen
+    share = seen**4 + 1e-9 * seen.max() + 1e-9  # some are left where nothing is seen
     chosen = rng.choice(len(points), count, replace=False, p=share / share.sum())
     return points[chosen]
 

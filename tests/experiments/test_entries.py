@@ -18,6 +18,7 @@ CASES = {
         f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg"
         " --plot FOLDER/a.png"
     ),
+    "scene_fits": "--gaussians 200 --photos 3 --size 32 24 --steps 6 --only",
     "splatting_finite_differences": "--size 32",
     "splatting": "--sizes 64 --repeats 1",
     "splatting_tradeoff": "--size 64 --repeats 1 --image FOLDER/a.png --only preset scale",
@@ -26,7 +27,11 @@ CASES = {
     "training_steps": "--repeats 1 --only",
 }
 """Options of each; the last words are given whole."""
-LAST = {"fit_sequences": ["all frames seen"], "training_steps": ["tiny 32"]}
+LAST = {
+    "fit_sequences": ["all frames seen"],
+    "scene_fits": ["few points, fit_scene"],
+    "training_steps": ["tiny 32"],
+}
 
 
 @pytest.fixture(autouse=True)
