@@ -464,3 +464,34 @@ def test_two_photos_never_share_a_mask(tmp_path):
     with pytest.raises(ValueError, match=r"a\.jpg and a\.png: both masks would be masks/a\.png"):
         write_found(tmp_path, photos, 0)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_others_hide_the_person_where_they_stand_unless_they_are_behind(tmp_path):
+    """What is hidden is written beside the masks of a capture, and without the mask's own pixels."""
+    person, other = found(1, 90.0), found(2, 80.0, corner=(7, 12))
+    shown = photo("a", person, other)
+    hidden = detect.hidden_by_others(shown, 0)
+    assert hidden.sum() == 32 - 6 * 2 and not hidden[person_mask(shown, 0) > 0.5].any()
+    behind = photo("a", person, other._replace(covered=True))
+    assert detect.hidden_by_others(behind, 0) is None
+    assert detect.hidden_by_others(behind, 1) is not None
+    given = person_mask(shown, 1)
+    assert detect.hidden_by_others(shown, 0, given) is None
+    assert detect.hidden_by_others(photo("a", person), 0) is None
+
+
+def test_where_nobody_has_the_mask_the_detector_sees_its_pixels_alone(monkeypatch):
+    """The one in front was found in the second photo; the person is found once the rest is white."""
+    person, front = found(1, 32.0, corner=(5, 10)), found(2, 32.0, corner=(15, 25))
+    photos = [photo("a", person, front), photo("b", front)]
+    masks = [person_mask(photos[0], 0)] * 2
+    asked = []
+
+    def cut(names, images):
+        asked.extend(names)
+        return [photo(name, person) for name in names]
+
+    monkeypatch.setattr(detect, "detect_photos", cut)
+    result = detect.with_masked(photos, masks, [np.ones((30, 40, 3))] * 2)
+    assert asked == ["b"] and result[0] is photos[0]
+    assert {each.corner for each in result[1].people} == {(5, 10), (15, 25)}
