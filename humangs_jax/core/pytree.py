@@ -116,9 +116,15 @@ SHORT = 80
 
 def short_repr(tree: Any) -> str:
     """A dataclass on one line, arrays by type and shape, as equinox prints them:
-    "Gaussians(means=f32[100,3], ...)".
+    "Gaussians(means=f32[100,3], ...)". Fields that nobody has set are left out.
     """
-    shown = [f"{f.name}={_shortened(getattr(tree, f.name))}" for f in dataclasses.fields(tree)]
+    values = {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
+    usual = {field.name: field.default for field in dataclasses.fields(tree)}
+    shown = [
+        f"{name}={_shortened(value)}"
+        for name, value in values.items()
+        if not (isinstance(value, str | None) and value == usual[name])
+    ]
     return f"{type(tree).__name__}({', '.join(shown)})"
 
 
