@@ -52,6 +52,9 @@ FOLLOWED = 640
 """Pixels of the longer side of frames in which the person is followed: twice what the landmark
 network looks at.
 """
+PATIENCE = 8
+"""Frames in a row without anybody after which nobody is looked for: to search a whole frame takes
+ten times as long as to follow somebody."""
 LEAST_FOUND = 0.5
 """Share of the offered frames in which the person has to be found for directions to choose."""
 
@@ -156,13 +159,15 @@ def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
 
 def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterable[Landmarks | None]:
     """The largest person of the first frame that shows one, in all frames; None where the person
-    is not found.
+    is not found. It ends early where nobody is found in `PATIENCE` frames in a row.
     """
-    networks, last = Networks(), None
+    networks, last, missed = Networks(), None, 0
     for frame in bar(frames, total=count, desc="following the person", unit="frame"):
         photo = frame.astype(np.float32) / 255
         found = None if last is None else networks.landmarks(photo, last.again.crop())
         if found is None or found.presence < LEAST_PRESENCE:
             found = next(iter(find_people(networks, photo)), None)
-        last = found
+        last, missed = found, missed + 1 if found is None else 0
+        if missed == PATIENCE:
+            return
         yield found

@@ -75,3 +75,12 @@ def test_photos_of_other_names_have_no_times(tmp_path):
     write_json(tmp_path / MARK, {"rate": 10})
     assert seconds_of_photos(tmp_path, ["front", "back"]) is None
     assert seconds_of_photos(tmp_path, ["frame_00000004", "frame_00000002"]) is None
+
+
+def test_a_video_without_anybody_is_not_searched_to_its_end(monkeypatch):
+    looks = []
+    monkeypatch.setattr(video_photos, "Networks", lambda: None)
+    monkeypatch.setattr(video_photos, "find_people", lambda *_: looks.append(1) or [])
+    blank = [np.zeros((8, 8, 3), np.uint8)] * COUNT
+    assert len(list(video_photos.followed(blank, COUNT))) < COUNT
+    assert len(looks) == video_photos.PATIENCE
