@@ -110,6 +110,7 @@ class Start:
         with stage("starting"):
             from humangs_jax.apps.start import look
             from humangs_jax.io.atomic import only_writer
+            from humangs_jax.io.decoded import decoded_once
 
         ignored = self.cameras == IGNORE
         material = look(
@@ -124,7 +125,7 @@ class Start:
             material = dataclasses.replace(material, masks=None)
         self._check_lengths(material)
         tell(material)
-        with only_writer(self.out, replaced=True):
+        with only_writer(self.out, replaced=True), decoded_once():
             self._go_on(material, limits)
 
     def _check_lengths(self, material: "Material") -> None:
@@ -307,6 +308,9 @@ class Start:
     def _finish(
         self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None
     ) -> None:
+        from humangs_jax.io.decoded import forget_decoded
+
+        forget_decoded()  # the capture has the photos
         self._check(capture)
         self._reconstruct(capture, None if limits is None else estimate, limits)
 
