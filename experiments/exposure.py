@@ -1,0 +1,228 @@
+"""Photos of one person in several lights that share no point of the body: how alike its colors come
+out.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.harness import Run, entry
+from experiments.results import markdown_table
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import (
+    PARTS,
+    body_parts,
+    camera_gains,
+    gains_of,
+    linked_views,
+    part_colors,
+    points_of,
+)
+from humangs_jax.geometry.quaternion import matrix_from_axis_angle
+from humangs_jax.people.subject import (
+    GENERATOR_VERSION,
+    SyntheticSubject,
+    make_subject,
+    pose_subject,
+    seeds_of,
+)
+from humangs_jax.people.surroundings import Lights, cameras_around, sample_lights
+from humangs_jax.people.writer import View, capture_views, sample_pose
+
+LIGHT_STREAM, CAMERA_STREAM, BALANCE_STREAM = 101, 102, 103
+"""Independent random streams of a seed."""
+BALANCE, METERING = (0.15, 0.05, 0.15), 0.15
+"""Standard deviations of the logarithms of a photo's white balance, red, green and blue, and of its
+exposure, besides those of its light."""
+AMBIENT = 0.85
+"""Brightness of a light without directions, in which a part has the color that it is painted in."""
+SETS = {
+    "front, back": (0, 180),
+    "two of the front, two of the back": (0, 25, 180, 205),
+    "left, right": (90, 270),
+    "all around": (0, 90, 180, 270),
+}
+"""Degrees around the person, of its cameras."""
+
+
+class Off(NamedTuple):
+    """How far the color of one side of the person is off that of the other, as logarithms."""
+
+    tint: float
+    """Root mean square over red, green and blue, without their mean."""
+    brightness: float
+    """Absolute value of the mean over red, green and blue."""
+
+
+@entry
+def exposure(
+    run: Run,
+    subjects: int = 12,
+    first: int = 0,
+    size: int = 320,
+    split: Literal["test", "validation"] = "test",
+) -> None:
+    """Photos of one person, each in a light, white balance and exposure of another day: how far the
+    colors of one side are off those of the other.
+
+    Of the typical part of the body, against the same photos in one light without directions.
+    "Common points": what points that two photos both show say about their gains. "In one light": of
+    the same photos in one light the largest logarithm by which a gain of parts is not one.
+
+    Options:
+    subjects: how many people
+    first: index of the first person within the split
+    size: side of the photos in pixels
+    split: seeds of the people; constants were chosen on "validation"
+    """
+    body = load_body()
+    settings = {
+        "split": split,
+        "size": size,
+        "balance": BALANCE,
+        "metering": METERING,
+        "generator": GENERATOR_VERSION,
+    }
+    cases = {
+        str(seed): lambda seed=seed: measured(seed, body, size)
+        for seed in seeds_of(split, first, subjects)
+    }
+    rows = run.rows(cases, settings)
+    table, numbers = [], {}
+    for name in SETS:
+        found = [row[name] for row in rows.values()]
+        rms = {
+            key: np.sqrt(np.mean([np.square(row[key]) for row in found], axis=0)).tolist()
+            for key in ("photographed", "common points", "now")
+        }
+        touched = max(row["in one light"] for row in found)
+        numbers[name] = rms | {"in one light": touched}
+        values = [f"{rms[key][i]:.3f}" for i in (0, 1) for key in rms]
+        table.append([name, *values, f"{touched:.3f}"])
+    header = ["photos"]
+    header += [f"{what}: {key}" for what in Off._fields for key in rms]
+    header += ["in one light"]
+    about = (
+        f"{len(rows)} people of the {split} seeds, photos of {size} px; root mean squares over the"
+        " people, of logarithms."
+    )
+    text = f"{about}\n\n{markdown_table(header, table)}"
+    run.show(text, {"settings": settings, "means": numbers, "people": len(rows)})
+
+
+def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, object]]:
+    """Of each set of photos of a person what `exposure` shows."""
+    subject = make_subject(seed, body)
+    posed = sample_pose(subject, 0)
+    facing = np.asarray(matrix_from_axis_angle(jnp.asarray(posed.rotations[0])))
+    azimuth = np.arctan2(facing[0, 2], facing[2, 2])
+    degrees = sorted({each for angles in SETS.values() for each in angles})
+    rng = np.random.default_rng([seed, CAMERA_STREAM])
+    cameras = cameras_around(rng, posed.vertices, azimuth + np.radians(degrees), size)
+
+    def photographed(lights: Sequence[Lights]) -> Capture:
+        """The photos, each in a light and as a moment."""
+        photos = []
+        for i, light in enumerate(lights):
+            lit = dataclasses.replace(subject, lights=light)
+            person = pose_subject(lit, posed.rotations, posed.translation)
+            photos.append(
+                capture_views(lit, body, [person], [View(0, str(degrees[i]), cameras[i])])
+            )
+        return together(photos)
+
+    own = subject.lights
+    flat = replace(
+        own,
+        strengths=0 * own.strengths,
+        sky=jnp.full(3, AMBIENT),
+        ground=jnp.full(3, AMBIENT),
+        gain=jnp.ones(3),
+    )
+    of_day = [
+        other_day(subject, np.random.default_rng([seed, LIGHT_STREAM, i]))
+        for i in range(len(degrees))
+    ]
+    one, truth, days = (
+        photographed(lights) for lights in ([own] * len(degrees), [flat] * len(degrees), of_day)
+    )
+    one = dataclasses.replace(one, frames=np.zeros(len(degrees), np.int32), poses=one.poses[:1])
+
+    rows = {}
+    for name, angles in SETS.items():
+        views = [degrees.index(angle) for angle in angles]
+        back = np.asarray([90 < angle < 270 or angle == 270 for angle in angles], int)
+        photos = days.select(views)
+        colors, seen = points_of(photos)
+        common = gains_of(colors, seen)
+        gains = {"photographed": np.ones_like(common), "common points": common}
+        gains["now"] = camera_gains(photos)
+        in_flat = points_of(truth.select(views))[0]
+        parts = body_parts(body)
+        row: dict[str, object] = {
+            key: off(colors * each[:, None], in_flat, seen, parts, back)
+            for key, each in gains.items()
+        }
+        same = one.select(views)
+        points = points_of(same)
+        moved = np.log(camera_gains(same) / gains_of(*points))
+        row["in one light"] = float(np.abs(moved).max())
+        row["groups"] = int(linked_views(*points).max()) + 1
+        rows[name] = row
+    return rows
+
+
+def other_day(subject: SyntheticSubject, rng: np.random.Generator) -> Lights:
+    """A light of another day, with the white balance and exposure of another camera."""
+    lights = sample_lights(rng)
+    camera = np.exp(rng.normal(0, BALANCE) + rng.normal(0, METERING))
+    return replace(lights, gain=lights.gain * jnp.asarray(camera, jnp.float32))
+
+
+def together(photos: Sequence[Capture]) -> Capture:
+    """Captures of one photo each as one capture, with a frame for each."""
+    first = photos[0]
+    joined = lambda name: jax.tree.map(
+        lambda *leaves: np.concatenate(leaves), *(getattr(photo, name) for photo in photos)
+    )
+    return dataclasses.replace(
+        first,
+        images=joined("images"),
+        masks=joined("masks"),
+        cameras=joined("cameras"),
+        poses=joined("poses"),
+        frames=np.arange(len(photos), dtype=np.int32),
+        names=tuple(photo.names[0] for photo in photos),
+    )
+
+
+def off(
+    colors: Float[np.ndarray, "v n 3"],
+    truth: Float[np.ndarray, "v n 3"],
+    seen: np.ndarray,
+    parts: Int[np.ndarray, " n"],
+    sides: Int[np.ndarray, " v"],
+) -> Off:
+    """How far the colors of one side are off those of the other, where they are the same in truth:
+    the median over the parts of the body that both sides show.
+    """
+    found, expected = (part_colors(each, seen, parts, sides) for each in (colors, truth))
+    errors = []
+    for part in range(len(PARTS)):
+        colored = [side[part] for side in (*found, *expected)]
+        each = [part_color.color for part_color in colored if part_color is not None]
+        if len(each) < len(colored):
+            continue
+        one, other, true_one, true_other = each
+        errors.append((one - other) - (true_one - true_other))
+    typical = np.median(errors, axis=0)
+    tint = typical - typical.mean()
+    return Off(float(np.sqrt(np.mean(tint**2))), float(abs(typical.mean())))
