@@ -14,11 +14,19 @@ from skimage.transform import resize
 
 from experiments.harness import Run, entry
 from humangs_jax.avatar.animate import animate
+from humangs_jax.avatar.attach_face import with_face
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.frames import a_pose_of, images, motion_views, turntable_views
+from humangs_jax.avatar.frames import (
+    a_pose_of,
+    images,
+    motion_views,
+    rest_pose_of,
+    turntable_views,
+)
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile, write_video
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.geometry.camera import look_at, project
@@ -159,6 +167,57 @@ def readme_pictures(
     )
     write_video(out / "animation.gif", frames, motion.fps)
     run.show(f"{out / 'readme.jpg'}: {strip.shape[1]} x {strip.shape[0]}")
+
+
+EXPRESSIONS: dict[str, dict[str, float]] = {
+    "at rest": {},
+    "smile": {"mouthSmileLeft": 1, "mouthSmileRight": 1,
+              "cheekSquintLeft": 0.6, "cheekSquintRight": 0.6},
+    "jawOpen": {"jawOpen": 1},
+    "aa": {"jawOpen": 0.5, "mouthUpperUpLeft": 0.7, "mouthUpperUpRight": 0.7},
+    "oh": {"jawOpen": 0.4, "mouthFunnel": 0.8},
+    "mouthPucker": {"mouthPucker": 1},
+    "tongueOut": {"tongueOut": 1, "jawOpen": 0.45},
+    "blink": {"eyeBlinkLeft": 1, "eyeBlinkRight": 1},
+    "wink": {"eyeBlinkLeft": 1, "mouthSmileLeft": 0.8, "cheekSquintLeft": 0.6},
+    "surprise": {"browInnerUp": 1, "browOuterUpLeft": 1, "browOuterUpRight": 1,
+                 "eyeWideLeft": 1, "eyeWideRight": 1, "jawOpen": 0.3},
+    "frown": {"browDownLeft": 1, "browDownRight": 1, "mouthFrownLeft": 1, "mouthFrownRight": 1},
+    "cheekPuff, look left": {"cheekPuff": 1, "eyeLookOutLeft": 1, "eyeLookInRight": 1},
+}  # fmt: skip
+"""Twelve faces: coefficients of ARKit's shapes."""
+FACE_CLOSE_UP = 4.6
+"""Focal length over the size of the picture: a head fills it from 1.2 m."""
+
+
+@entry
+def expression_sheet(
+    run: Run, avatar: Path, out: Path = Path("docs/images/expressions.jpg"), size: int = 224
+) -> None:
+    """Twelve expressions of an avatar, close up.
+
+    Options:
+    avatar: avatar.npz of `humangs demo`
+    out: the picture
+    size: side of each face, pixels
+    """
+    person = with_face(Avatar.load(avatar))
+    assert person.face is not None
+    names, rest = person.face.expressions.names, rest_pose_of(person)
+    head = person.rest_joints[person.joint_names.index("head")]
+    focal = FACE_CLOSE_UP * size
+    K = jnp.asarray([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    target = head + jnp.asarray([0, 0.02, 0.04])
+    up = jnp.asarray([0.0, 1, 0])
+    camera = look_at(target + jnp.asarray([0.25, 0.03, 1.2]), target, up, K, size, size)
+    faces = []
+    for shapes in EXPRESSIONS.values():
+        expression = jnp.asarray([shapes.get(name, 0.0) for name in names], jnp.float32)
+        pose = replace(rest, expression=expression)
+        faces.append(np.clip(np.asarray(render(animate(person, pose), camera).rgb), 0, 1))
+    sheet = tile(np.stack(faces), labels=list(EXPRESSIONS), columns=4)
+    Image.fromarray(to_uint8(sheet)).save(out, quality=82)
+    run.show(f"{out}: {sheet.shape[1]} x {sheet.shape[0]}")
 
 
 def _framed(image: np.ndarray, size: int) -> np.ndarray:

@@ -195,8 +195,8 @@ BAD_USAGE = {
     "export me.npz --out x.glb --mesh --motion jump.npz --frame 1": (
         "a file that holds the whole motion"
     ),
-    "export me.npz --out x.ply --mesh": "expected a name ending in .glb or .obj",
-    "export me.npz --out x.sog": "expected a name ending in .ply, .splat, .spz, .glb or .obj",
+    "export me.npz --out x.ply --mesh": "expected a name ending in .glb, .vrma or .obj",
+    "export me.npz --out x.sog": "expected a name ending in .ply, .splat, .spz, .glb, .vrma or .obj",
     "export me.npz --out x.ply --motion jump.npz --frame 9": "--frame 9: jump.npz has 4 frames",
     "export me.npz --out x.spz --rest": "--rest: x.spz has no such fields",
     "export me.npz --out x.ply --spz-version 4": (

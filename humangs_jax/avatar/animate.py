@@ -11,9 +11,18 @@ renderers so.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from humangs_jax.avatar.avatar import Avatar, light_values, relit
-from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
+from humangs_jax.avatar.avatar import Avatar, light_terms, light_values, log_brightness, relit
+from humangs_jax.avatar.face import moved_gaussians, moved_hidden, with_hidden
+from humangs_jax.body.expressions import EYES
+from humangs_jax.body.model import (
+    BodyPose,
+    RestBody,
+    blend_transforms,
+    expressed,
+    joint_transforms,
+)
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
@@ -35,17 +44,24 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
     Args:
         avatar: one person.
-        pose: rotations (j, 3), axis-angle; translation (3,), metres.
+        pose: rotations (j, 3), axis-angle; translation (3,), metres; of an avatar with a face also
+            an expression.
 
     Returns:
         Posed Gaussians, metres. Colors stay, or are re-shaded for the pose if the avatar has a
-        light.
+        light. With an expression those of teeth, tongue and lids come behind the others.
+
+    Raises:
+        ValueError: for an expression of an avatar without a face, or one of another number of
+            coefficients.
 
     Examples:
         >>> image = lambda pose: hg.render(hg.skin(avatar, pose), camera, config).rgb
         >>> loss = lambda pose: jnp.mean((image(pose) - photo) ** 2)
         >>> gradient = jax.grad(loss)(pose)
     """
+    if pose.expression is not None:
+        avatar, pose = with_expression(avatar, pose)
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)
     if avatar.light is not None:
@@ -53,6 +69,65 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
             gaussians, colors=relit(gaussians.colors, avatar.light, transforms[:, :3, :3])
         )
     return skin_gaussians(gaussians, transforms, avatar.skinning)
+
+
+def with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
+    """The avatar in T-pose with the face that a pose makes, and the pose without it but with the
+    joints that it turns.
+
+    Hidden Gaussians become ordinary ones behind the others, which hang on the head. Those of an eye
+    hang on its joint.
+    Raises: ValueError for an avatar without a face, or a pose of other expressions.
+    """
+    face, expression = avatar.face, pose.expression
+    if face is None or expression is None:
+        raise ValueError(
+            "pose.expression: this avatar has no face; avatar.with_face() gives it one where its"
+            " body is known"
+        )
+    rest, pose = expressed(
+        face.expressions, RestBody(avatar.rest_vertices, avatar.rest_joints), pose
+    )
+    stretched = avatar.skinning == "affine"  # the other kind of skinning knows no stretch
+    moved = moved_gaussians(face, avatar.gaussians, expression, stretched)
+    weights, names = avatar.skinning_weights, avatar.joint_names
+    head, eyes = names.index("head"), np.asarray([names.index(name) for name in EYES])
+    turning = face.eyes * weights[:, head, None]
+    weights = weights.at[:, eyes].add(turning).at[:, head].add(-jnp.sum(turning, axis=-1))
+    changed = replace(
+        avatar,
+        gaussians=moved,
+        skinning_weights=weights,
+        rest_vertices=rest.vertices,
+        rest_joints=rest.joints,
+    )
+    return with_hidden_among(changed, moved_hidden(face, expression)), pose
+
+
+def with_hidden_among(avatar: Avatar, hidden: Gaussians) -> Avatar:
+    """The avatar with the hidden Gaussians of its face as ordinary ones behind the others, on
+    the head; without the face.
+    """
+    face, names = avatar.face, avatar.joint_names
+    assert face is not None
+    weights = avatar.skinning_weights
+    on_head = jnp.zeros((len(hidden.means), len(names)), weights.dtype)
+    on_head = on_head.at[:, names.index("head")].set(1)
+    light = avatar.light
+    if light is not None:  # hidden ones have their colors in the light of the photos, too
+        shading = log_brightness(light_terms(face.hidden_normals), light.coefficients)
+        light = replace(
+            light,
+            normals=jnp.concatenate([light.normals, face.hidden_normals]),
+            shading=jnp.concatenate([light.shading, shading]),
+        )
+    return replace(
+        avatar,
+        gaussians=with_hidden(avatar.gaussians, hidden),
+        skinning_weights=jnp.concatenate([weights, on_head]),
+        light=light,
+        face=None,
+    )
 
 
 @checked_arguments
@@ -87,6 +162,7 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
         "pose.rotations": (pose.rotations, FINITE),
         "pose.translation": (pose.translation, FINITE),
         "avatar.rest_joints": (avatar.rest_joints, FINITE),
+        "pose.expression": (pose.expression, FINITE),
     }
     check_values("animate", gaussian_values(avatar.gaussians) | light_values(avatar.light) | moves)
     return _animate(avatar, pose)

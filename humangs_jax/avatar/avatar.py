@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.avatar.face import Face
+from humangs_jax.body.library import expression_arrays, read_expressions
+from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import FINITE, LARGEST, ROUNDING, Values, require_concrete
 from humangs_jax.core.numerics import at_least_float32
@@ -229,6 +232,8 @@ class Avatar(Batchable):
     """The splatting that the Gaussians were trained for, a name in `SPLAT_PRESETS`."""
     light: Light | None = None
     """Of the photos, where it has been estimated; other poses are drawn in it."""
+    face: Face | None = None
+    """What poses with an expression need (`with_face`); None: the face is rigid."""
     one_at_a_time: ClassVar[bool] = True
 
     @property
@@ -245,6 +250,33 @@ class Avatar(Batchable):
         alike = np.isclose(own, own[:, :1], atol=ALIKE).all(axis=(1, 2))
         return own.shape[1] if alike.mean() > 0.5 else None
 
+    @property
+    def expression_names(self) -> tuple[str, ...]:
+        """Of the coefficients of a pose's expression; none without a face."""
+        return () if self.face is None else self.face.expressions.names
+
+    def with_face(self, body: BodyModel | None = None) -> "Avatar":
+        """The avatar with a face, so that poses may have an expression; without one it is drawn as
+        before.
+
+        Args:
+            body: the model that the avatar's vertices are of, with expressions. None: the shipped
+                body.
+
+        Raises:
+            ValueError: if the avatar's vertices are not those of the body, or it has no
+                expressions.
+
+        Examples:
+            >>> avatar = hg.Avatar.load("avatar.npz").with_face()
+            >>> names = avatar.expression_names
+            >>> smile = jnp.asarray(["mouthSmile" in name for name in names], float)
+            >>> gaussians = hg.animate(avatar, hg.replace(pose, expression=smile))
+        """
+        from humangs_jax.avatar.attach_face import with_face
+
+        return with_face(self, body)
+
     def select(self, index: Array | np.ndarray) -> "Avatar":
         """The avatar with these of its Gaussians."""
         light = self.light
@@ -252,7 +284,11 @@ class Avatar(Batchable):
             light = replace(light, normals=light.normals[index], shading=light.shading[index])
         gaussians = jax.tree.map(lambda x: x[index], self.gaussians)
         return replace(
-            self, gaussians=gaussians, skinning_weights=self.skinning_weights[index], light=light
+            self,
+            gaussians=gaussians,
+            skinning_weights=self.skinning_weights[index],
+            light=light,
+            face=None if self.face is None else self.face.select(index),
         )
 
     def save(self, path: str | os.PathLike[str], *, made_from: str | None = None) -> None:
@@ -297,6 +333,8 @@ class Avatar(Batchable):
             name: np.asarray(x if name == "faces" else at_least_float32(x))
             for name, x in values.items()
         }
+        if self.face is not None:
+            values |= _face_arrays(self.face)
         with reading(path, "avatar"):
             _check_arrays(values, len(self.parents))
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
@@ -370,9 +408,14 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
             f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation',"
             " 'exact' or 'inria'"
         )
-    arrays = {name: arrays[name] for name in wanted}
+    of_face = {
+        name: array for name, array in arrays.items() if name.startswith(("face_", "expression_"))
+    }
+    arrays = {name: arrays[name] for name in wanted} | of_face
     _check_arrays(arrays, len(header["parents"]))
+    face = _read_face(of_face, arrays)
     check_checksum(header.get("checksum"), checksum(arrays))
+    arrays = {name: arrays[name] for name in wanted}
     loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
     return cls(
         Gaussians(
@@ -385,7 +428,62 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
         skinning=skinning,
         rendering=rendering,
         light=Light(*(loaded[f"light_{name}"] for name in _LIGHT)) if with_light else None,
+        face=face,
     )
+
+
+_FACE = (
+    *("row", "eyes", "beside", "stretching"),
+    *("hidden_normals", "hidden_directions", "hidden_shown", "in_mouth", "lips", "lip_directions"),
+)
+"""Arrays of a face, in files behind `face_`; and the Gaussians that are hidden, behind
+`face_hidden_`.
+"""
+
+
+def _face_arrays(face: Face) -> dict[str, np.ndarray]:
+    """What a file holds of a face, by key."""
+    arrays = {f"face_{name}": np.asarray(getattr(face, name)) for name in _FACE}
+    hidden = {f"face_hidden_{name}": np.asarray(getattr(face.hidden, name)) for name in _ARRAYS[:5]}
+    return arrays | hidden | expression_arrays(face.expressions)
+
+
+def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> Face | None:
+    """The face in a file of an avatar; None if it has none. Raises: Refused, naming the key."""
+    expressions = read_expressions(
+        of_face, len(arrays["rest_vertices"]), len(arrays["rest_joints"])
+    )
+    if expressions is None:
+        return None
+    keys = [f"face_{name}" for name in _FACE] + [f"face_hidden_{name}" for name in _ARRAYS[:5]]
+    if missing := [key for key in keys if key not in of_face]:
+        raise Refused(f"missing keys {missing}")
+    g, e = len(arrays["means"]), len(expressions.names)
+    q, m = len(np.atleast_1d(of_face["face_hidden_means"])), len(expressions.vertices)
+    check_indices("face_row", of_face["face_row"], (g,), m + 1)
+    check_indices("face_beside", of_face["face_beside"], (m, None), m + 1)
+    unit, lengths, any_number = (-ROUNDING, 1 + ROUNDING), (0.0, LARGEST), (-LARGEST, LARGEST)
+    expected = {
+        "eyes": ((g, 2), unit),
+        "stretching": ((m, of_face["face_beside"].shape[1], 3), any_number),
+        "hidden_normals": ((q, 3), any_number),
+        "hidden_directions": ((q, 3, e), any_number),
+        "hidden_shown": ((q, e), any_number),
+        "in_mouth": ((q,), unit),
+        "lips": ((4, 3), any_number),
+        "lip_directions": ((4, 3, e), any_number),
+        "hidden_means": ((q, 3), any_number),
+        "hidden_quats": ((q, 4), any_number),
+        "hidden_scales": ((q, 3), lengths),
+        "hidden_opacities": ((q,), unit),
+        "hidden_colors": ((q, 3), any_number),
+    }
+    for name, (shape, ends) in expected.items():
+        check_array(f"face_{name}", of_face[f"face_{name}"], shape, *ends)
+    loaded = {name: jnp.asarray(of_face[f"face_{name}"], jnp.float32) for name in expected}
+    hidden = Gaussians(*(loaded.pop(f"hidden_{name}") for name in _ARRAYS[:5]))
+    loaded |= {name: jnp.asarray(of_face[f"face_{name}"], jnp.int32) for name in ("row", "beside")}
+    return Face(hidden=hidden, expressions=expressions, **loaded)
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:

@@ -286,9 +286,7 @@ def excerpt(
     )
     first = min(int(start * motion.fps), count - 1)
     last = max(first + 1, min(round(stop * motion.fps), count))
-    part = replace(
-        motion, rotations=motion.rotations[first:last], translations=motion.translations[first:last]
-    )
+    part = motion.part(slice(first, last))
     part = part if fps is None else part.at_rate(fps)
     if loop == 1:
         return part
@@ -297,11 +295,18 @@ def excerpt(
     travelled = period * (path[-1] - path[0]) * [1, 0, 1]
     moved = np.concatenate([path + i * travelled for i in range(loop)])
     turned = jnp.tile(part.rotations, (loop, 1, 1))
-    return replace(part, rotations=turned, translations=jnp.asarray(moved, jnp.float32))
+    faces = None if part.expressions is None else jnp.tile(part.expressions, (loop, 1))
+    return replace(
+        part,
+        rotations=turned,
+        translations=jnp.asarray(moved, jnp.float32),
+        expressions=faces,
+    )
 
 
 def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
-    """A pose for each frame of a motion, which is put on the floor.
+    """A pose for each frame of a motion, which is put on the floor, with its expression if the
+    avatar has a face.
 
     Raises: ValueError for another number of joints.
     """
@@ -309,7 +314,8 @@ def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
     if joints != len(avatar.parents):
         raise ValueError(f"the motion has {joints} joints, the avatar has {len(avatar.parents)}")
     motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
-    return jax.vmap(BodyPose)(motion.rotations, motion.translations)
+    poses = jax.vmap(BodyPose)(motion.rotations, motion.translations)
+    return replace(poses, expression=motion.expressions_of(avatar.expression_names))
 
 
 def motion_views(

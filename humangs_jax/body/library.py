@@ -14,11 +14,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.expressions import Expressions, shipped_expressions
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import LARGEST, checked_arguments
-from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.arrays import (
     ArrayFile,
     check_array,
@@ -87,7 +88,8 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
             raise TypeError(
                 f"options of SMPL-X files do not apply to {which}: {sorted(smplx_options)}"
             )
-        return read_body(file)
+        body = read_body(file)
+        return body if path else replace(body, expressions=shipped_expressions(len(body.template)))
 
 
 def _indices(array: np.ndarray) -> np.ndarray:
@@ -164,6 +166,8 @@ def save_body(path: str | Path, body: BodyModel) -> None:
     if body.collapse_order is not None:
         arrays["collapse_order"] = _indices(np.asarray(body.collapse_order))
         arrays["collapse_into"] = _indices(np.asarray(body.collapse_into))
+    if body.expressions is not None:
+        arrays |= expression_arrays(body.expressions)
     write_npz(path, arrays)
 
 
@@ -201,6 +205,7 @@ def read_body(path: str | Path) -> BodyModel:
             uvs = uvs / UV_STEPS if uvs.dtype == np.uint16 else uvs
         for name in {"collapse_order", "collapse_into"} & set(arrays):
             check_indices(name, arrays[name], (vertices,), vertices)
+        expressions = read_expressions(arrays, vertices, joints)
         index = lambda key: jnp.asarray(arrays[key], jnp.int32) if key in arrays else None
         return BodyModel(
             template=jnp.asarray(arrays["template"], jnp.float32),
@@ -217,11 +222,63 @@ def read_body(path: str | Path) -> BodyModel:
             uv_faces=index("uv_faces"),
             collapse_order=index("collapse_order"),
             collapse_into=index("collapse_into"),
+            expressions=expressions,
             parents=tuple(parents),
             joint_names=tuple(joint_names),
             shape_names=tuple(str(name) for name in arrays["shape_names"]),
             name=str(arrays["name"]),
         )
+
+
+EXPRESSION = "expression_"
+"""How the keys of expressions begin, in files of bodies and of avatars."""
+EXPRESSION_FIELDS = ("vertices", "directions", "joint_directions", "joint_turns", "names")
+
+
+def expression_arrays(expressions: Expressions) -> dict[str, np.ndarray]:
+    """What files hold of expressions, by key; the arrays as they are."""
+    found = {name: getattr(expressions, name) for name in EXPRESSION_FIELDS}
+    return {
+        f"{EXPRESSION}{name}": np.asarray(value)
+        for name, value in found.items()
+        if value is not None
+    }
+
+
+def read_expressions(
+    arrays: dict[str, np.ndarray], vertices: int, joints: int
+) -> Expressions | None:
+    """The expressions of a body or an avatar with so many vertices and joints; None if its file has
+    none.
+
+    Raises: Refused, naming the key.
+    """
+    found = {
+        name: arrays[f"{EXPRESSION}{name}"]
+        for name in EXPRESSION_FIELDS
+        if f"{EXPRESSION}{name}" in arrays
+    }
+    if not found:
+        return None
+    if missing := [name for name in ("vertices", "directions", "names") if name not in found]:
+        raise Refused(f"key '{EXPRESSION}{missing[0]}' is missing")
+    count, moved = len(np.atleast_1d(found["names"])), len(np.atleast_1d(found["vertices"]))
+    shapes = {
+        "directions": (moved, 3, count),
+        "joint_directions": (joints, 3, count),
+        "joint_turns": (joints, 3, count),
+    }
+    check_indices(f"{EXPRESSION}vertices", found["vertices"], (moved,), vertices)
+    for name in found.keys() & shapes.keys():
+        check_array(f"{EXPRESSION}{name}", found[name], shapes[name], -LARGEST, LARGEST)
+    number = lambda name: jnp.asarray(found[name], jnp.float32) if name in found else None
+    return Expressions(
+        vertices=jnp.asarray(found["vertices"], jnp.int32),
+        directions=jnp.asarray(found["directions"], jnp.float32),
+        joint_directions=number("joint_directions"),
+        joint_turns=number("joint_turns"),
+        names=tuple(str(name) for name in np.atleast_1d(found["names"])),
+    )
 
 
 # SMPL-X
@@ -265,15 +322,24 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
         has_uvs = "vt" in file and "ft" in file
         uvs = file.numbers("vt", (None, 2)) if has_uvs else None
         number = lambda x: jnp.asarray(x, jnp.result_type(float))
+        regressor = number(file.numbers("J_regressor", (JOINTS, n), LARGEST))
+        components = number(directions[..., shape_count:])
+        expressions = Expressions(
+            vertices=jnp.arange(n, dtype=jnp.int32),
+            directions=components,
+            joint_directions=jnp.einsum("jn,nae->jae", regressor, components, precision="highest"),
+            names=names[shape_count:],
+        )
         return BodyModel(
             template=number(template),
             shape_directions=number(directions),
             pose_directions=number(file.numbers("posedirs", (n, 3, 9 * (JOINTS - 1)), LARGEST)),
-            joint_regressor=number(file.numbers("J_regressor", (JOINTS, n), LARGEST)),
+            joint_regressor=regressor,
             skinning_weights=number(weights),
             faces=jnp.asarray(file.indices("f", n), jnp.int32),
             uvs=None if uvs is None else number(uvs),
             uv_faces=None if uvs is None else jnp.asarray(file.indices("ft", len(uvs)), jnp.int32),
+            expressions=expressions if expression_count else None,
             parents=_parents(file),
             joint_names=JOINT_NAMES,
             shape_names=names,

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.expressions import Expressions
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
@@ -249,6 +250,8 @@ class BodyModel:
     """
     texels: Texels | None = None
     """A map of the surface, for networks that work on one: `network.parts`."""
+    expressions: Expressions | None = None
+    """What its face can do; None: nothing."""
     parents: tuple[int, ...] = static_field(default=())
     """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field(default=())
@@ -267,6 +270,10 @@ class BodyPose(Batchable):
     """Axis-angle of each joint relative to its parent, radians."""
     translation: Float[Array, "3"]
     """Metres, applied last."""
+    expression: Float[Array, " e"] | None = None
+    """A coefficient for each of the body's expressions, mostly in [0, 1]; None: a face at rest,
+    without any work for it.
+    """
 
 
 @pytree_dataclass
@@ -328,6 +335,32 @@ def without_expression(body: BodyModel) -> BodyModel:
     )
 
 
+def expressed(
+    expressions: Expressions | None, rest: RestBody, pose: BodyPose
+) -> tuple[RestBody, BodyPose]:
+    """The rest body with the face that the pose makes, and the pose without it but with the joints
+    that it turns.
+
+    Raises: ValueError if the pose has other expressions than the body.
+    """
+    if pose.expression is None:
+        return rest, pose
+    count = 0 if expressions is None else len(expressions.names)
+    if expressions is None or pose.expression.shape != (count,):
+        raise ValueError(
+            f"pose.expression: expected {count} coefficients, the expressions of this body, got"
+            f" shape {pose.expression.shape}"
+        )
+    moved = lambda directions: jnp.einsum("mae,e->ma", directions, pose.expression, precision=EXACT)
+    vertices = rest.vertices.at[expressions.vertices].add(moved(expressions.directions))
+    joints, rotations = rest.joints, pose.rotations
+    if expressions.joint_directions is not None:
+        joints = joints + moved(expressions.joint_directions)
+    if expressions.joint_turns is not None:
+        rotations = rotations + moved(expressions.joint_turns)
+    return RestBody(vertices, joints), BodyPose(rotations, pose.translation)
+
+
 def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
     """R_j - I of joints 1 and up, row-major: what the pose correctives are linear in."""
     matrices = quaternion.matrix_from_axis_angle(rotations[1:])
@@ -343,7 +376,8 @@ def person_vertices(
 
 @checked_arguments
 def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
-    """Pose a shaped body: correctives, blend skinning, translation."""
+    """Pose a shaped body: expression, correctives, blend skinning, translation."""
+    rest, pose = expressed(body.expressions, rest, pose)
     vertices = rest.vertices
     if body.pose_directions is not None:
         features = pose_features(pose.rotations)

@@ -1,6 +1,7 @@
 """Motions: one body pose per frame, of SMPL-X's joints or those of another body."""
 
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,18 +22,48 @@ it. Other bodies are off by a constant, which `grounded` removes."""
 
 @pytree_dataclass
 class Motion:
-    """Poses over time. rotations: (m, j, 3) axis-angle. translations: (m, 3) metres, applied last.
-
-    fps: static.
-    """
+    """Poses over time."""
 
     rotations: Float[Array, "m j 3"]
+    """Axis-angle of each joint relative to its parent, radians."""
     translations: Float[Array, "m 3"]
+    """Metres, applied last."""
     fps: float = static_field(default=DEFAULT_FPS)
+    """Frames per second."""
+    expressions: Float[Array, "m e"] | None = None
+    """Coefficients of expressions, mostly in [0, 1]; None: nothing is known of the face."""
+    expression_names: tuple[str, ...] = static_field(default=())
+    """Which expressions these are, such as ARKit's "jawOpen"."""
 
-    def pose(self, frame: int) -> BodyPose:
-        """One frame."""
-        return BodyPose(self.rotations[frame], self.translations[frame])
+    def pose(self, frame: int, expression_names: Sequence[str] = ()) -> BodyPose:
+        """One frame, with its expression for a face that has these expressions
+        (`avatar.expression_names`).
+        """
+        faces = self.expressions_of(expression_names)
+        expression = None if faces is None else faces[frame]
+        return BodyPose(self.rotations[frame], self.translations[frame], expression)
+
+    def part(self, frames: slice) -> "Motion":
+        """Some of the frames, at the same rate."""
+        faces = None if self.expressions is None else self.expressions[frames]
+        return replace(
+            self,
+            rotations=self.rotations[frames],
+            translations=self.translations[frames],
+            expressions=faces,
+        )
+
+    def expressions_of(self, names: Sequence[str]) -> Float[Array, "m e"] | None:
+        """The coefficients of a face that has these expressions, 0 where the motion says nothing;
+        None if it has none of them.
+        """
+        own = self.expression_names
+        if self.expressions is None or not set(names) & set(own):
+            return None
+        still = jnp.zeros_like(self.expressions[:, :1])
+        known = jnp.concatenate([self.expressions, still], axis=1)
+        index = [own.index(name) if name in own else len(own) for name in names]
+        return known[:, np.asarray(index)]
 
     def at_rate(self, fps: float | int) -> "Motion":
         """The motion at another frame rate, between two frames interpolated: rotations on the
@@ -56,7 +87,11 @@ class Motion:
             high = np.minimum(low + 1, len(self.translations) - 1)
             share = jnp.asarray(times - low, jnp.float32)
             frames = _between(*frames, self.rotations[high], self.translations[high], share)
-        return replace(self, rotations=frames[0], translations=frames[1])
+        faces = self.expressions
+        if faces is not None:
+            high, share = np.minimum(low + 1, len(faces) - 1), jnp.asarray(times - low, jnp.float32)
+            faces = faces[low] + share[:, None] * (faces[high] - faces[low])
+        return replace(self, rotations=frames[0], translations=frames[1], expressions=faces)
 
 
 @jax.jit

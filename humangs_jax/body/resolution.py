@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import sparse
 
+from humangs_jax.body.expressions import Expressions
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
@@ -75,6 +76,7 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
         name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None
     }
     faces = np.asarray(body.faces)
+    moves = None if body.expressions is None else _Moves(body.expressions, len(body.template))
     linear["area"] = vertex_areas(linear["template"], faces)
     weights = sparse.eye_array(len(linear["template"]), format="csr")
     while True:
@@ -99,6 +101,8 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
         means = 0.5 * (weights[edges[long, 0]] + weights[edges[long, 1]])
         weights = sparse.vstack([weights, means], format="csr")
         faces = _cut(faces, midpoint[edge_of_side])
+        if moves is not None:
+            moves.split(edges[long])
     spacing = np.sqrt(
         vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA)
     )
@@ -112,6 +116,7 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
         faces=jnp.asarray(faces, body.faces.dtype),
         joint_regressor=regressor,
         spacing=jnp.asarray(spacing, body.template.dtype),
+        expressions=None if moves is None else moves.expressions(),
         uvs=None,
         uv_faces=None,
         collapse_order=None,
@@ -119,6 +124,57 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
         made_for=None,
     )
     return finer, weights
+
+
+class _Moves:
+    """The expressions of a mesh whose edges are split.
+
+    Most vertices do not move: `row` is then the last one, of zeros.
+    """
+
+    def __init__(self, expressions: Expressions, vertices: int) -> None:
+        self.of_body = expressions
+        directions = np.asarray(expressions.directions)
+        self.directions = np.concatenate([directions, np.zeros_like(directions[:1])])
+        self.row = np.full(vertices, len(directions))
+        self.row[np.asarray(expressions.vertices)] = np.arange(len(directions))
+
+    def split(self, edges: Int[np.ndarray, "e 2"]) -> None:
+        """Add the middles of these edges to the vertices."""
+        still = len(self.directions) - 1
+        moves = (self.row[edges] < still).any(axis=1)
+        middles = self.directions[self.row[edges[moves]]].mean(axis=1)
+        self.directions = np.concatenate(
+            [self.directions[:-1], middles.astype(self.directions.dtype), self.directions[-1:]]
+        )
+        row = np.where(self.row == still, still + len(middles), self.row)
+        added = np.full(len(edges), still + len(middles))
+        added[moves] = still + np.arange(len(middles))
+        self.row = np.concatenate([row, added])
+
+    def expressions(self) -> Expressions:
+        """Those of the mesh as it is now."""
+        vertices = np.flatnonzero(self.row < len(self.directions) - 1)
+        return replace(
+            self.of_body,
+            vertices=jnp.asarray(vertices, jnp.int32),
+            directions=jnp.asarray(self.directions[self.row[vertices]]),
+        )
+
+
+def _kept_moves(
+    expressions: Expressions | None, renumber: Int[np.ndarray, " n"]
+) -> Expressions | None:
+    """Expressions of the vertices that stay. renumber: their new numbers, -1 for those that go."""
+    if expressions is None:
+        return None
+    vertices = renumber[np.asarray(expressions.vertices)]
+    stay = vertices >= 0
+    return replace(
+        expressions,
+        vertices=jnp.asarray(vertices[stay], jnp.int32),
+        directions=jnp.asarray(np.asarray(expressions.directions)[stay]),
+    )
 
 
 def _cut(
@@ -514,6 +570,7 @@ def decimate_with_kept(
         joint_regressor=jnp.asarray(_refit_regressor(body, target, kept), dtype),
         skinning_weights=rows(body.skinning_weights),
         faces=jnp.asarray(renumber[ends[solid]], jnp.int32),
+        expressions=_kept_moves(body.expressions, renumber),
         uvs=uvs,
         uv_faces=uv_faces,
         made_for=None,

@@ -100,6 +100,7 @@ class Animate:
             said = ["turn"] * (self.turn != 0) + ["no-follow"] * (not self.follow)
             _require_no_circle("--camera", self.shot, FROM_THE_SIDE, said)
         with stage("starting"):
+            from humangs_jax.avatar.attach_face import with_face_for
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.avatar.camera_paths import camera_path, file_cameras, one_size
             from humangs_jax.avatar.frames import excerpt, images, motion_poses, motion_views
@@ -111,6 +112,7 @@ class Animate:
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             motion = self.part.load(self.motion, avatar.rest_joints)
+            avatar = with_face_for(avatar, motion)
             with reading(self.motion or "the motion", "motion"):
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             frames = len(motion.translations)

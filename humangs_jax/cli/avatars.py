@@ -474,12 +474,14 @@ class Export:
             require_file(out, suffixes, read=(self.avatar, self.motion))
         self._check(out)
         with stage("starting"):
+            from humangs_jax.avatar.attach_face import with_face_for
             from humangs_jax.avatar.avatar import Avatar
 
             avatar = Avatar.load(self.avatar)
             motion = (
                 None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
             )
+            avatar = avatar if motion is None else with_face_for(avatar, motion)
         if self.html is not None:
             with stage("making the page"):
                 from humangs_jax.viewer.page import write_page
@@ -575,12 +577,7 @@ class Export:
             numbers = range(frame, frame + 1)
         chosen = slice(numbers.start, numbers.stop, numbers.step)
         fps = motion.fps / numbers.step
-        motion = replace(
-            motion,
-            rotations=motion.rotations[chosen],
-            translations=motion.translations[chosen],
-            fps=fps,
-        )
+        motion = replace(motion.part(chosen), fps=fps)
         return motion, None if self.frames is None else numbers
 
 

@@ -426,6 +426,17 @@ MOTIONS = Formats(
         "humangs_jax.data.motion.clips:read_animation",
         (".glb", ".vrma"),
     ),
+    face=MotionFormat(
+        "faces of Live Link Face or with ARKit's names",
+        "humangs_jax.data.motion.face_files:read_table",
+        (".csv",),
+    ),
+    scores=MotionFormat(
+        "faces of MediaPipe",
+        "humangs_jax.data.motion.face_files:read_scores",
+        (".json",),
+        "humangs_jax.data.motion.face_files:has_scores",
+    ),
 )
 """By name, in the order in which keys and files are asked."""
 

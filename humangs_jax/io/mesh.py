@@ -164,6 +164,28 @@ class GlbWriter:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
+    def sparse(self, values: np.ndarray) -> int:
+        """Index of the accessor of an array (n, 3) of which most rows are 0: only the others are
+        in the file.
+        """
+        rows = np.flatnonzero(values.any(axis=1))
+        accessor = {
+            "componentType": 5126,
+            "count": len(values),
+            "type": "VEC3",
+            "min": values.min(axis=0).tolist(),
+            "max": values.max(axis=0).tolist(),
+        }
+        if len(rows):
+            indices = self.bytes_(rows.astype("<u4").tobytes())
+            accessor["sparse"] = {
+                "count": len(rows),
+                "indices": {"bufferView": indices, "componentType": 5125},
+                "values": {"bufferView": self.bytes_(values[rows].astype("<f4").tobytes())},
+            }
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
     def write(self, path: str | os.PathLike[str], document: dict[str, Any]) -> None:
         """Write the file with a glTF document to which arrays, buffer and `asset` are added.
 

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from humangs_jax.avatar.attach_face import faced, shipped_network
 from humangs_jax.avatar.avatar import Avatar, light_values
 from humangs_jax.avatar.export.gaussians import unit_quats
 from humangs_jax.body.joints import PARENTS
@@ -30,17 +31,15 @@ from humangs_jax.body.model import BodyModel, RestBody
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
-from humangs_jax.core.configuration import ArgumentError, config_from_json
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import printable, say
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.rules import page_rules
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.tensors import read_safetensors
-from humangs_jax.network.config import Conventions, HumanGSConfig
-from humangs_jax.network.weights import SHIPPED
 from humangs_jax.rendering.gaussians import added_variance, gaussian_values
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+from humangs_jax.viewer.page_face import pack_face
 
 VERSION = 1
 WEIGHTS = 8
@@ -80,7 +79,8 @@ class Packed:
         light. rest_joints float32 (j, 3): metres. rotations int16 (m, j, 3): axis-angle times step,
         radians. translations float32 (m, 3): metres. Of the motion. shape_directions int16 (s, n,
         3): how vertices move per unit of a shape coefficient, times step, metres. shape_joints
-        float32 (s, j, 3): likewise of joints, metres. Both only if the body is known.
+        float32 (s, j, 3): likewise of joints, metres. Both only if the body is known. face_...: of
+            an avatar with a face, see `page_face.pack_face`; its hidden Gaussians come last.
     """
 
     header: dict[str, Any]
@@ -124,7 +124,6 @@ def pack(
     vertices = np.asarray(avatar.rest_vertices, np.float64)
     header: dict[str, Any] = {
         "version": VERSION,
-        "count": len(avatar.gaussians.means),
         "parents": avatar.parents,
         "joint_names": avatar.joint_names,
         "skinning": avatar.skinning,
@@ -136,7 +135,6 @@ def pack(
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
     arrays: dict[str, np.ndarray] = {}
-    _pack_gaussians(avatar, header, arrays)
     if motion is not None:
         rotations = np.asarray(motion.rotations, np.float64)
         step = max(float(np.abs(rotations).max()), SMALLEST_RANGE) / 32767
@@ -150,6 +148,10 @@ def pack(
         }
     if body is not None:
         _pack_shape(avatar, body, header, arrays)
+    if avatar.face is not None and len(avatar.expression_names) < 255:
+        avatar = pack_face(avatar, motion, header, arrays)
+    header["count"] = len(avatar.gaussians.means)
+    _pack_gaussians(avatar, header, arrays)
     return _joined(header, arrays)
 
 
@@ -283,7 +285,7 @@ def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
 
 
 SCRIPTS = (
-    *("kinematics", "scene", "camera", "splatting", "motion_files", "skeletons", "glb"),
+    *("kinematics", "scene", "face", "camera", "splatting", "motion_files", "skeletons", "glb"),
     *("controls", "saving", "embedding", "main"),
 )
 SHADERS = ("whole.vert", "project.frag", "splat.vert", "splat.frag", "background.frag")
@@ -314,7 +316,7 @@ def page_html(
         motion = grounded(
             motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents
         )
-    packed = pack(avatar, motion, known_body(avatar), name)
+    packed = pack(faced(avatar), motion, known_body(avatar), name)
     header = json.dumps(packed.header, separators=(",", ":"))
     parts = {
         "title": html.escape(printable(title)),
@@ -433,20 +435,9 @@ def known_body(avatar: Avatar) -> BodyModel | None:
         return None
     body = load_body()
     if len(avatar.rest_vertices) != len(body.template):
-        body = gaussian_body(body, _shipped_network())
+        body = gaussian_body(body, shipped_network())
     same = np.array_equal(body.faces, avatar.faces) and avatar.gaussians_per_vertex is not None
     return body if same and fitted_shape(avatar, body) is not None else None
-
-
-def _shipped_network() -> HumanGSConfig:
-    """The network of the shipped weights, without reading their tensors; the default one if none
-    are shipped.
-    """
-    with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
-        metadata = read_safetensors(file, lambda key: False)[2] if file.exists() else {}
-    return HumanGSConfig(
-        conventions=config_from_json(Conventions, metadata.get("conventions", "{}"))
-    )
 
 
 def page_script(*names: str) -> str:

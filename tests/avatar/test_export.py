@@ -303,9 +303,9 @@ def test_the_function_checks_as_the_command_does(tmp_path):
     avatar = Avatar.load(tmp_path / "me.npz")
     jump = Motion(jnp.zeros((4, 1, 3)), jnp.zeros((4, 3)), 24.0)
     for name, options, message in (
-        ("x.sog", {}, "expected a name ending in .ply, .splat, .spz, .glb or .obj"),
+        ("x.sog", {}, "expected a name ending in .ply, .splat, .spz, .glb, .vrma or .obj"),
         ("x.spz", {"rest_fields": True}, "no rest fields: expected a name ending in .ply"),
-        ("x.ply", {"mesh": True}, "expected a name ending in .glb or .obj for a mesh"),
+        ("x.ply", {"mesh": True}, "expected a name ending in .glb, .vrma or .obj for a mesh"),
         ("x.ply", {"motion": jump}, "each of the 4 frames, got no numbers"),
         ("x.ply", {"motion": jump, "numbers": [1, 2]}, "each of the 4 frames, got 2 numbers"),
     ):

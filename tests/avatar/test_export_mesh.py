@@ -89,9 +89,8 @@ def mesh():
     vertices, weights = np.asarray(one.rest_vertices), np.asarray(one.skinning_weights)[::2]
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     texture = np.full((4, 4, 3), 128, np.uint8)
-    return BodyMesh(
-        vertices, normals, np.asarray(one.faces), vertices[:, :2] * 0.5 + 0.5, texture, weights
-    )
+    uvs, source = vertices[:, :2] * 0.5 + 0.5, np.arange(len(vertices))
+    return BodyMesh(vertices, normals, np.asarray(one.faces), uvs, texture, weights, source)
 
 
 def dance(frames=3):

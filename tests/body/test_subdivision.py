@@ -66,6 +66,7 @@ def test_spacing_says_how_much_closer_vertices_are(body):
         joint_regressor=jnp.zeros((55, n)),
         skinning_weights=jnp.ones((n, 55)) / 55,
         faces=jnp.asarray([[0, 1, 2], [0, 2, 3]]),
+        expressions=None,
     )
     coarse, fine = split_long_edges(flat, 0.8), split_long_edges(flat, 0.4)
     assert len(coarse.template) == 9 and len(fine.template) == 25

@@ -4,6 +4,7 @@ exist.
 
 import json
 import re
+import struct
 
 import honest_files as honest
 from hostile_cases import case, changed, edited, json_case, setting, written
@@ -20,6 +21,7 @@ JSON_READERS = (
     "coco",
     "mmpose",
     "lhm",
+    "face scores",
     "configuration",
     "manifest",
 )
@@ -52,6 +54,45 @@ for reader in JSON_READERS:
         )
 for reader in ("json", "openpose", "transforms"):
     case("100 MB", reader, changed(reader, lambda _: b"[" + b"1," * (50 << 20) + b"1]"), item=5)
+
+
+def edited_glb(reader, change):
+    """The honest GLB file of a reader with another JSON."""
+
+    def edit(data):
+        length = struct.unpack_from("<I", data, 12)[0]
+        header = json.dumps(change(json.loads(data[20 : 20 + length]))).encode()
+        header += b" " * (-len(header) % 4)
+        chunks = struct.pack("<II", len(header), 0x4E4F534A) + header + data[20 + length :]
+        return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+    return changed(reader, edit)
+
+
+TABLES = {
+    "no line": "",
+    "a line of names alone": honest.face_table().splitlines()[0],
+    "words for numbers": honest.face_table().replace("0.25", "soft", 1),
+    "a number that is none": honest.face_table().replace("0.25", "nan", 1),
+    "numbers without end": honest.face_table().replace("0.25", "1e999", 1),
+    "a line that is cut off": honest.face_table()[:-20],
+    "other columns": "time,speed\n0,1\n",
+    "a million columns": ",".join(["JawOpen"] * 1_000_000),
+    "a quote that does not end": honest.face_table() + '"' + "x" * 300_000,
+    "zeros of another program": honest.face_table().replace("0.25", "0\0"),
+}
+for kind, data in TABLES.items():
+    case(kind, "face table", written("face.csv", data), item=6)
+for kind, score in {"a word": '"soft"', "a list": "[1]", "NaN": "NaN", "yes": "true"}.items():
+    text = json.dumps(honest.face_scores()).replace("0.5", score, 1)
+    case(f"a score that is {kind}", "face scores", written("face.json", text), item=6)
+for kind, changes in {
+    "times that stand still": {"accessors.0.count": 1},
+    "a mesh that is not there": {"nodes.0.mesh": 7},
+    "names that are numbers": {"meshes.0.extras": {"targetNames": [1, 2, 3, 4, 5, 6]}},
+    "names of nobody": {"meshes.0.extras": {"targetNames": "jawOpen"}},
+}.items():
+    case(kind, "glb face", edited_glb("glb face", setting(changes)), item=4)
 
 YAML = {
     "lists in lists": "a: " + "[" * 3000 + "]" * 3000,

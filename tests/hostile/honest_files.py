@@ -393,6 +393,49 @@ def write_glb_motion(path):
     writer.write(path, {"nodes": nodes, "skins": [skin], "animations": [animation]})
 
 
+SHAPES = ("jawOpen", "mouthSmileLeft", "mouthSmileRight", "eyeBlinkLeft", "eyeBlinkRight", "odd")
+
+
+def write_glb_face(path, vrm=False):
+    """A face in two frames: weights of the shapes of a mesh, or expressions of a VRM animation."""
+    writer, weights = GlbWriter(), np.linspace(0, 1, 2 * len(SHAPES))
+    times = writer.array("SCALAR", np.arange(2.0))
+    if not vrm:
+        output = writer.array("SCALAR", weights)
+        channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+        animation = {"channels": [channel], "samplers": [{"input": times, "output": output}]}
+        mesh = {"primitives": [], "extras": {"targetNames": list(SHAPES)}}
+        writer.write(path, {"nodes": [{"mesh": 0}], "meshes": [mesh], "animations": [animation]})
+        return
+    channels, samplers = [], []
+    for i, values in enumerate(weights.reshape(2, -1).T):
+        output = writer.array("VEC3", values[:, None] * (1.0, 0, 0))
+        samplers.append({"input": times, "output": output})
+        channels.append({"sampler": i, "target": {"node": i, "path": "translation"}})
+    custom = {name: {"node": i} for i, name in enumerate(SHAPES[:-1])}
+    expressions = {"custom": custom, "preset": {"happy": {"node": len(SHAPES) - 1}}}
+    extension = {"specVersion": "1.0", "humanoid": {"humanBones": {}}, "expressions": expressions}
+    document = {
+        "nodes": [{"name": name} for name in SHAPES],
+        "extensions": {"VRMC_vrm_animation": extension},
+        "animations": [{"channels": channels, "samplers": samplers}],
+    }
+    writer.write(path, document)
+
+
+def face_table():
+    """As Live Link Face writes it."""
+    names = ("EyeBlinkLeft", "JawOpen", "MouthSmileLeft", "MouthSmileRight", "TongueOut", "HeadYaw")
+    lines = [f"09:41:07:{i:02}.{i}00,61,{','.join(['0.25'] * len(names))}" for i in range(3)]
+    return "\n".join([f"Timecode,BlendShapeCount,{','.join(names)}", *lines, ""])
+
+
+def face_scores():
+    """As programs with MediaPipe write them."""
+    scores = [{"index": i, "score": 0.5, "categoryName": name} for i, name in enumerate(SHAPES)]
+    return {"fps": 25, "frames": [{"faceBlendshapes": [{"categories": scores}]}, {}]}
+
+
 def sphere():
     import trimesh
 

@@ -296,6 +296,13 @@ ROWS = {
     "easymocap motion": (load_motion, honest.write_easymocap_motion, "000000.json"),
     "bvh": (load_motion, written("m.bvh", BVH)),
     "glb motion": (load_motion, saved("m.glb", honest.write_glb_motion)),
+    "glb face": (load_motion, saved("m.glb", honest.write_glb_face)),
+    "vrma face": (
+        load_motion,
+        saved("m.vrma", functools.partial(honest.write_glb_face, vrm=True)),
+    ),
+    "face table": (load_motion, written("face.csv", honest.face_table)),
+    "face scores": (load_motion, written("face.json", as_json(honest.face_scores))),
     "3dgs": (
         load_gaussians,
         saved("a.ply", lambda path: save_gaussians(path, random_gaussians(harmonics=3))),

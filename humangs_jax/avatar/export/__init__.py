@@ -83,6 +83,10 @@ EXPORTS = Formats(
         ),
         **{"mesh": True, "animated": True},
     ),
+    vrma=ExportFormat(
+        *("the motion alone, for VRM characters", f"{HERE}.vrma:write_vrma", (".vrma",)),
+        **{"mesh": True, "animated": True},
+    ),
     obj=ExportFormat(
         *("the body as a textured mesh in a pose", f"{HERE}.mesh:write_poses", (".obj",)),
         **{"mesh": True, "beside": (".mtl", ".png")},

@@ -435,7 +435,8 @@ def export(
         form(path, files, avatar, motion, up or form.up, name)
         return files
     for i, file in enumerate(files):
-        gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(i))
+        pose = None if motion is None else motion.pose(i, avatar.expression_names)
+        gaussians = avatar.gaussians if pose is None else animate(avatar, pose)
         if numbers is None:
             gaussians = grounded_gaussians(gaussians)
         if form.backwards:  # before up is elsewhere: the half turn is about the vertical axis

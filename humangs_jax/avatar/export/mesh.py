@@ -23,10 +23,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
+from humangs_jax.avatar.attach_face import faced
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, Up, files_beside
 from humangs_jax.avatar.export.gaussians import up_matrix, up_turn
-from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
+from humangs_jax.body.model import (
+    BodyPose,
+    RestBody,
+    blend_transforms,
+    expressed,
+    joint_transforms,
+)
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.core.checks import BOUNDED, check_values
@@ -60,7 +67,7 @@ class BodyMesh:
 
     vertices: (u, 3) metres. normals: (u, 3). faces: (f, 3), counter-clockwise from outside. uvs:
     (u, 2), v up. texture: (t, t, 3) bytes, row 0 on top (v = 1). weights: (u, j) skinning weights,
-    rows sum to 1.
+    rows sum to 1. source: (u,) which vertex each is of the body.
     """
 
     vertices: Float[np.ndarray, "u 3"]
@@ -69,18 +76,22 @@ class BodyMesh:
     uvs: Float[np.ndarray, "u 2"]
     texture: UInt8[np.ndarray, "t t 3"]
     weights: Float[np.ndarray, "u j"]
+    source: Int[np.ndarray, " u"]
 
     def posed(self, avatar: Avatar, pose: BodyPose) -> "BodyMesh":
         """The mesh in a pose of the avatar's joints; normals by the rotations of blended
         transforms.
         """
-        transforms = joint_transforms(
-            avatar.rest_joints, avatar.parents, pose.rotations, pose.translation
-        )
+        rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
+        still = jnp.asarray(self.vertices)
+        if pose.expression is not None and avatar.face is not None:
+            rest, pose = expressed(avatar.face.expressions, rest, pose)
+            still = rest.vertices[self.source]
+        transforms = joint_transforms(rest.joints, avatar.parents, pose.rotations, pose.translation)
         blended = blend_transforms(jnp.asarray(self.weights), transforms)
         normals = np.einsum("uab,ub->ua", np.asarray(blended[:, :3, :3]), self.normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        vertices = np.asarray(transform.apply(blended, jnp.asarray(self.vertices)))
+        vertices = np.asarray(transform.apply(blended, still))
         return dataclasses.replace(self, vertices=vertices, normals=normals.astype(np.float32))
 
 
@@ -113,7 +124,8 @@ def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     texture = np.rint(255 * np.clip(fill_gaps(colors, known), 0, 1)).astype(np.uint8)
     at = atlas.vertices
     weights = vertex_weights(avatar)[at]
-    return BodyMesh(vertices[at], normals[at], np.asarray(atlas.faces), atlas.uvs, texture, weights)
+    faces = np.asarray(atlas.faces)
+    return BodyMesh(vertices[at], normals[at], faces, atlas.uvs, texture, weights, np.asarray(at))
 
 
 def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
@@ -175,7 +187,10 @@ def skin_colors(
 def write_animation(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
-    """All of a motion in one `.glb`, see `write_mesh_glb`."""
+    """All of a motion in one `.glb`, see `write_mesh_glb`; with the expressions of a body that
+    is known.
+    """
+    avatar = faced(avatar)
     write_mesh_glb(path, avatar, body_mesh(avatar), motion, name, up)
 
 
@@ -203,7 +218,7 @@ def write_mesh_glb(
             _armature(avatar, up),
             {"name": "body", "mesh": 0, "skin": 0},
         ],
-        "meshes": [{"name": "body", "primitives": [_primitive(writer, _standing(mesh, up))]}],
+        "meshes": [_mesh(writer, avatar, _standing(mesh, up), up)],
         "skins": [_skin(writer, avatar, mesh, up)],
         "materials": [
             {
@@ -227,7 +242,7 @@ def write_mesh_glb(
         ],
     }
     if motion is not None:
-        document["animations"] = [_animation(writer, avatar, motion, name)]
+        document["animations"] = [_animation(writer, avatar, motion, name, skeleton)]
     writer.write(path, document)
 
 
@@ -273,6 +288,28 @@ def _armature(avatar: Avatar, up: Up) -> dict[str, Any]:
     return {"name": "armature", "rotation": [*xyz, w], "children": [avatar.parents.index(-1)]}
 
 
+def _mesh(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str, Any]:
+    """The mesh; of an avatar with a face, its expressions are morph targets, named in `extras` as
+    all programs read them.
+    """
+    primitive = _primitive(writer, mesh)
+    if avatar.face is None:
+        return {"name": "body", "primitives": [primitive]}
+    expressions = avatar.face.expressions
+    offsets = np.zeros((len(avatar.rest_vertices), 3, len(expressions.names)), np.float32)
+    turned = np.einsum("ab,mbe->mae", up_matrix(up), np.asarray(expressions.directions))
+    offsets[np.asarray(expressions.vertices)] = turned
+    targets = [
+        {"POSITION": writer.sparse(each[mesh.source])} for each in np.moveaxis(offsets, -1, 0)
+    ]
+    return {
+        "name": "body",
+        "primitives": [primitive | {"targets": targets}],
+        "weights": [0.0] * len(targets),
+        "extras": {"targetNames": list(expressions.names)},
+    }
+
+
 def _primitive(writer: GlbWriter, mesh: BodyMesh) -> dict[str, Any]:
     joints, weights = strongest(mesh.weights)
     small = "u1" if mesh.weights.shape[1] <= 256 else "<u2"
@@ -302,25 +339,34 @@ def _skin(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str
     }
 
 
-def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> dict[str, Any]:
-    """Every joint that turns, and where the root is."""
+def _animation(
+    writer: GlbWriter, avatar: Avatar, motion: Motion, name: str, mesh_node: int
+) -> dict[str, Any]:
+    """Every joint that turns, where the root is, and the expressions of an avatar with a face."""
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
     rotations = np.asarray(motion.rotations)
-    quats = _continuous(np.asarray(quaternion.from_axis_angle(motion.rotations)))
+    quats = continuous(np.asarray(quaternion.from_axis_angle(motion.rotations)))
     root = avatar.parents.index(-1)
     tracks = [
         (j, "rotation", "VEC4", quats[:, j][:, [1, 2, 3, 0]])
         for j in range(rotations.shape[1])
         if rotations[:, j].any()
     ]
-    tracks.append(
-        (
-            root,
-            "translation",
-            "VEC3",
-            np.asarray(motion.translations) + np.asarray(avatar.rest_joints)[root],
-        )
-    )
+    places = np.asarray(motion.translations) + np.asarray(avatar.rest_joints)[root]
+    tracks.append((root, "translation", "VEC3", places))
+    names = () if avatar.face is None else avatar.face.expressions.names
+    face = motion.expressions_of(names)
+    if face is not None:  # the weights of a frame one after the other
+        tracks.append((mesh_node, "weights", "SCALAR", np.asarray(face).reshape(-1)))
+    return tracks_of(writer, times, tracks, name)
+
+
+def tracks_of(
+    writer: GlbWriter, times: int, tracks: Sequence[tuple[int, str, str, np.ndarray]], name: str
+) -> dict[str, Any]:
+    """An animation of (node, path, kind of array, values), all at the same times. times: their
+    accessor.
+    """
     samplers = [
         {"input": times, "output": writer.array(kind, values), "interpolation": "LINEAR"}
         for *_, kind, values in tracks
@@ -332,7 +378,7 @@ def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> 
     return {"name": name, "channels": channels, "samplers": samplers}
 
 
-def _continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]:
+def continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]:
     """Quaternions (m, j, 4) of unit length, each on the side of the one before: some players
     interpolate numbers.
     """
@@ -382,7 +428,12 @@ def write_poses(
     for i, file in enumerate(files):
         still = dataclasses.replace(mesh, vertices=mesh.vertices - floor)
         write_obj(
-            file, still if motion is None else mesh.posed(avatar, motion.pose(i)), material, up
+            file,
+            still
+            if motion is None
+            else mesh.posed(avatar, motion.pose(i, avatar.expression_names)),
+            material,
+            up,
         )
 
 

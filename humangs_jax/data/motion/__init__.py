@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +22,7 @@ from humangs_jax.core.registry import alternatives
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
 from humangs_jax.data.formats import MOTIONS, MotionFormat
 from humangs_jax.data.motion import rules, skeleton
+from humangs_jax.data.motion.face_tracks import FaceTrack, checked_track
 from humangs_jax.geometry.axes import UPRIGHT, standing_axis
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.reading import FileError, check_limit, open_file, reading
@@ -71,6 +72,7 @@ class Poses(NamedTuple):
     see `rules.up_axis`.
     frames: (m,) numbers of the frames, whose gaps are filled; None: consecutive. said: lines for
     the user about the file.
+    face: what the file says of the face.
     """
 
     rotations: Float[np.ndarray, "m j 3"]
@@ -81,6 +83,7 @@ class Poses(NamedTuple):
     also: tuple[str, ...] = ()
     frames: np.ndarray | None = None
     said: str = ""
+    face: FaceTrack | None = None
 
 
 @checked_arguments
@@ -166,7 +169,14 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
     check_limit("rate", rate, "frames per second")
     if rate < SLOWEST:
         raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
-    motion = Motion(jnp.asarray(rotations), jnp.asarray(translations), rate)
+    names, faces = ((), None) if found.face is None else checked_track(found.face, len(rotations))
+    motion = Motion(
+        jnp.asarray(rotations),
+        jnp.asarray(translations),
+        rate,
+        None if faces is None else jnp.asarray(faces),
+        names,
+    )
     if isinstance(found, Poses) and found.frames is not None:
         motion, filled = _without_gaps(motion, found.frames, path)
         said = "; ".join(filter(None, (said, filled)))
@@ -230,7 +240,12 @@ def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
 
 def save_motion(path: str | Path, motion: Motion) -> None:
     """Write our own format, compressed; the file appears whole or not at all."""
-    write_npz(
-        path,
-        {"rotations": motion.rotations, "translations": motion.translations, "fps": motion.fps},
-    )
+    arrays: dict[str, Any] = {
+        "rotations": motion.rotations,
+        "translations": motion.translations,
+        "fps": motion.fps,
+    }
+    if motion.expressions is not None:
+        arrays["expressions"] = motion.expressions
+        arrays["expression_names"] = np.asarray(motion.expression_names)
+    write_npz(path, arrays)

@@ -16,6 +16,7 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import PLACES, ArrayKeys
 from humangs_jax.data.motion import MotionError, Poses, Reading, skeleton
+from humangs_jax.data.motion.face_tracks import FaceTrack, checked_track
 from humangs_jax.data.motion.people import SHOWN, Person, are_rotations, format_of, read_people
 from humangs_jax.data.motion.rules import (
     COLUMNS,
@@ -30,6 +31,7 @@ from humangs_jax.data.motion.skeleton import Clip
 from humangs_jax.data.motion.vectors import frames_first
 from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.arrays import ArrayFile
+from humangs_jax.io.reading import Refused
 from humangs_jax.io.restricted_pickle import as_array
 from humangs_jax.io.tensors import read_values
 
@@ -62,6 +64,7 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
         else _posed(file, form)
     )
     moves = _placed(file, form, rotations)
+    face = _face(file, form, len(rotations))
     frames = (
         person.frames
         if person.frames is not None and len(person.frames) == len(rotations)
@@ -76,7 +79,43 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
         form.also,
         frames,
         "; ".join(file.said),
+        face,
     )
+
+
+EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
+"""Keys of SMPL-X's expressions, the first that is there; ours have names."""
+
+
+def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
+    """The expressions of a person; those of other programs that fit no frames are left out, which
+    is said.
+
+    Raises: MotionError for a file of ours.
+    """
+    ours = form.kind == "ours"
+    key = "expressions" if ours else file.first(EXPRESSIONS)
+    if key not in file.values:
+        return None
+    values = np.atleast_1d(file.numbers(key, None))
+    if values.ndim == 1 and not ours:  # one face for all frames
+        values = np.broadcast_to(values, (count, len(values)))
+    if values.shape[:1] == (count,) and not ours:
+        values = values.reshape(count, -1)
+    if ours:
+        named = [str(name) for name in np.ravel(file.values.get("expression_names", ()))]
+        names = tuple(named)
+    else:
+        names = tuple(f"expression_{i}" for i in range(values.shape[-1]))
+    track = FaceTrack(names, values)
+    try:
+        checked_track(track, count)
+    except Refused as error:
+        if ours:
+            raise
+        file.said.append(f"{key} is left out: {error}")
+        return None
+    return track
 
 
 def _chosen(path: Path, people: list[Person], number: int | None) -> Person:

@@ -22,7 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.motion import Reading
+from humangs_jax.data.motion import Poses, Reading
+from humangs_jax.data.motion.face_files import animated_face, face_alone
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.io.nodes import (
@@ -198,8 +199,9 @@ def _posed(
 # --------------------------------------------------------------------------------------------------
 
 
-def read_animation(path: Path, options: Reading | None = None) -> Clip:
-    """The skeleton of a GLB file in motion.
+def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
+    """The skeleton of a GLB file in motion, with its face; the face alone of one that turns
+    nothing.
 
     Raises: OSError; Refused and what damaged numbers raise.
     """
@@ -209,6 +211,9 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip:
     if not animations:
         raise Refused("a GLB file without an animation: expected a skeleton in motion")
     animation, said = _chosen(animations, options.clip if options else None)
+    alone = face_alone(content, binary, animation, said)
+    if alone is not None:
+        return alone
     parents = node_parents(nodes)
     joints, binding = _joints(content, binary, nodes)
     order = with_ancestors(joints, parents)
@@ -225,7 +230,9 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip:
     bones = _humanoid(content)
     names = tuple(bones.get(joint, str(nodes[joint].get("name", ""))) for joint in joints)
     above = tuple(index.get(_next_joint(parents, joint, index), -1) for joint in joints)
-    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", said)
+    face, of_face = animated_face(content, binary, animation, times)
+    said = "; ".join(filter(None, (said, of_face)))
+    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", said, face)
 
 
 SHOWN = 12

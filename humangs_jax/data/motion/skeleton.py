@@ -34,6 +34,7 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import read_body
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.motion import rules
+from humangs_jax.data.motion.face_tracks import FaceTrack
 from humangs_jax.data.motion.matching import matched
 from humangs_jax.data.motion.rules import sampled_frames, up_axis
 from humangs_jax.geometry.axes import CLEARLY_UP, nearest_axis, upright_matrix
@@ -48,7 +49,8 @@ class Clip:
     names: of its s joints. parents: -1 for roots; parents come first. rest: (s, 3) places in the
     rest pose. turns: (m, s, 3, 3) rotation of each joint from the rest pose to the frame, in the
     world. places: (m, s, 3). fps: frames per second. up: the axis that the format says is up; None:
-    found from the rest pose. said: lines for the user about the file.
+    found from the rest pose. said: lines for the user about the file. face: what the file says of
+    the face.
     """
 
     names: tuple[str, ...]
@@ -59,6 +61,7 @@ class Clip:
     fps: float
     up: str | None = None
     said: str = ""
+    face: FaceTrack | None = None
 
 
 def bytes_of_clip(frames: int, joints: int) -> int:

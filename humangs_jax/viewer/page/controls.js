@@ -26,13 +26,14 @@ const SHAPE_REACH = 1.5;  // how far a shape slider goes from the person's own v
 const element = (id) => document.getElementById(id);
 const plainName = (name) => name.replace(/_/g, " ").replace(/(\D)(\d)$/, "$1 $2");
 const plainShape = (name) => PLAIN_SHAPES.get(name) ?? plainName(name);
+const plainExpression = (name) => name.replace(/_/g, " ").replace(/([a-z])([A-Z])/g, "$1 $2").toLowerCase();
 const inDegrees = (value) => `${round(value)}°`;
 const signed = (value) => `${value > 0 ? "+" : ""}${value.toFixed(1)}`.replace("-0.0", "0.0").replace("+0.0", "0.0");
 const counted = (amount, thing) => `${amount.toLocaleString("en")} ${thing}${amount === 1 ? "" : "s"}`;
 
 function makeControls(app) {
   const { scene } = app;
-  element("facts").textContent = counted(scene.count, "Gaussian");
+  element("facts").textContent = counted(scene.count - (scene.header.face?.hidden ?? 0), "Gaussian");
 
   for (const button of element("modes").children) button.onclick = () => app.setMode(button.dataset.mode);
   element("play").onclick = () => app.setPlaying(!app.playing);
@@ -45,6 +46,7 @@ function makeControls(app) {
   element("show-help").onclick = () => element("help").showModal();
   element("reset-joints").onclick = () => resetJoints();
   element("reset-shape").onclick = () => resetShape();
+  element("reset-face").onclick = () => resetFace();
   const showPanel = (open) => {
     document.body.classList.toggle("closed", !open);
     element("toggle-panel").setAttribute("aria-expanded", String(open));
@@ -137,7 +139,39 @@ function makeControls(app) {
     for (const input of element("joints").querySelectorAll("input")) input.set(0);
     jointsChanged();
   }
-  const { shape } = scene.header;
+  const { face, shape } = scene.header;
+  if (face) {
+    element("face-section").hidden = false;
+    element("idle").onchange = (event) => app.idle.set(event.target.checked);
+    element("idle").checked = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+    app.idle.set(element("idle").checked);
+    const taken = new Set();
+    for (const [title, pattern] of REGIONS) {
+      const members = face.names.map((name, e) => [name, e]).filter(([name, e]) => pattern.test(name) && !taken.has(e));
+      if (!members.length) continue;
+      const details = document.createElement("details"), summary = document.createElement("summary");
+      summary.textContent = title;
+      details.append(summary);
+      details.dataset.members = members.map(([, e]) => e).join();
+      for (const [name, e] of members) {
+        taken.add(e);
+        const range = { low: 0, high: 1, value: 0, home: 0, step: 0.01, shown: (v) => v.toFixed(2) };
+        details.append(sliderRow(plainExpression(name), name, range, (v) => { app.expression[e] = v; faceChanged(); }));
+      }
+      element("face").append(details);
+    }
+  }
+  function faceChanged() {
+    for (const details of element("face").children)
+      details.firstChild.classList.toggle("changed", details.dataset.members.split(",").some((e) => app.expression[e] !== 0));
+    element("reset-face").hidden = !app.expression.some((v) => v !== 0);
+    app.invalidate();
+  }
+  function resetFace() {
+    app.expression.fill(0);
+    for (const input of element("face").querySelectorAll("input")) input.set(0);
+    faceChanged();
+  }
   if (shape) {
     element("shape-section").hidden = false;
     shape.names.forEach((name, s) => {
@@ -212,7 +246,7 @@ function makeControls(app) {
     else {
       const act = new Map(Object.entries({
         " ": () => app.setPlaying(!app.playing), t: () => app.setMode("rest"), a: () => app.setMode("a"), m: () => app.setMode("motion"),
-        f: () => app.framePerson(), r: () => { resetJoints(); if (shape) resetShape(); },
+        f: () => app.framePerson(), r: () => { resetJoints(); if (face) resetFace(); if (shape) resetShape(); },
         g: () => element("ground").click(), p: () => element("toggle-panel").click(),
         h: () => { document.body.classList.toggle("hidden"); app.invalidate(); },
         b: () => { const at = BACKGROUNDS.indexOf(anyColor.value); setBackground(BACKGROUNDS[(at + 1) % BACKGROUNDS.length]); },

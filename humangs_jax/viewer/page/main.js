@@ -10,12 +10,14 @@ const FOLLOW_SECONDS = 0.4;  // the camera follows the mean of the path over so 
 async function start() {
   document.body.classList.remove("unable");  // this browser reads the page's scripts
   if (typeof DecompressionStream === "undefined") throw new Error("DecompressionStream is missing.");
-  const scene = await readScene(), canvas = element("view"), renderer = makeRenderer(canvas, scene);
+  const scene = await readScene();
+  applyFace(scene, null);
+  const canvas = element("view"), renderer = makeRenderer(canvas, scene);
   const distance = (0.54 * scene.height) / Math.tan(FIELD_OF_VIEW / 2) + 0.3 * scene.height;
   const orbit = makeOrbit([0, 0.5 * scene.height, 0], distance), home = { ...orbit };
   const app = {
     scene, orbit, mode: scene.motion ? "motion" : "a", motionName: scene.header.motion?.name, frame: 0, playing: Boolean(scene.motion), speed: 1,
-    degrees: scene.names.map(() => [0, 0, 0]), betas: scene.header.shape ? [...scene.header.shape.betas] : [],
+    degrees: scene.names.map(() => [0, 0, 0]), expression: new Float32Array(scene.header.face?.names.length ?? 0), idle: null, betas: scene.header.shape ? [...scene.header.shape.betas] : [],
     follow: true, look: { background: [1, 1, 1], transparent: false, ground: 1 },
     invalidate, setMode, setPlaying, setFrame, stepFrame, setShape, setMotion, framePerson, picture, setRecording,
   };
@@ -84,6 +86,20 @@ async function start() {
     return [a[0] + t * (b[0] - a[0]), 0, a[1] + t * (b[1] - a[1])];
   }
 
+  function currentFace() {
+    if (!scene.header.face) return null;
+    const moving = app.mode === "motion" ? motionFace(scene.motion, app.frame) : null;
+    const idle = !moving && app.idle?.on ? app.idle.coefficients() : null;
+    return app.expression.map((x, e) => x + (moving?.[e] ?? 0) + (idle?.[e] ?? 0));
+  }
+
+  function makeFace(coefficients) {
+    if (!applyFace(scene, coefficients)) return;
+    renderer.setMeans();
+    sorter.setMeans(scene.means);
+    worker?.postMessage({ means: scene.means });
+  }
+
   function drawPose(camera, pose, look, now) {
     const { rows, joints } = poseJoints(scene.rest, scene.parents, scene.order, pose.quats, pose.translation);
     const [a, b, c] = camera.rotation.slice(6), depthRows = new Float32Array(4 * scene.parents.length);
@@ -100,6 +116,7 @@ async function start() {
 
   function draw() {
     const look = recordedSize ? { ...app.look, transparent: false } : app.look;  // videos have no transparency
+    makeFace(currentFace());
     drawPose(currentCamera(), currentPose(), look, false);
   }
   function drawFull() {
@@ -176,6 +193,7 @@ async function start() {
   function setShape(betas) {
     app.betas = betas;
     applyShape(scene, betas);
+    applyFace(scene, currentFace());
     renderer.setMeans();
     sorter.setMeans(scene.means);
     worker?.postMessage({ means: scene.means });
@@ -213,6 +231,7 @@ async function start() {
     invalidate();
   }
 
+  if (scene.header.face) app.idle = makeIdle(scene.header.face, invalidate);
   const controls = makeControls(app);
   makeSaving(app, canvas);
   applyOptions(app, controls, location.search);
@@ -240,11 +259,12 @@ async function start() {
       setMode(kept.mode);
       if (scene.motion) setFrame(kept.frame);
     },
-    firstImage, floats: renderer.floats, gaussians: scene.count,
+    firstImage, floats: renderer.floats, gaussians: scene.count - (scene.header.face?.hidden ?? 0),
     // Draws one image at once: { K, cam_from_world, width, height }, a pose { rotations, translation } or { frame },
     // and a background; nothing but the person. `resume` goes back to the page.
     draw(view) {
       exact = exactCamera(view);
+      makeFace(view.expression ?? null);
       document.body.classList.add("exact");
       Object.assign(canvas.style, { width: `${view.width / devicePixelRatio}px`, height: `${view.height / devicePixelRatio}px` });
       drawPose(exact, exactPose(view), { background: view.background || [1, 1, 1], ground: 0 }, true);
@@ -263,7 +283,7 @@ async function start() {
         K: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
         cam_from_world: [...nested(r, 3).map((row, i) => [...row, t[i]]), [0, 0, 0, 1]], width: camera.width, height: camera.height,
         rotations: pose.quats.map(axisAngleFromQuat), translation: pose.translation, betas: app.betas,
-        frame: app.frame, mode: app.mode, playing: app.playing, background: app.look.background,
+        expression: currentFace(), frame: app.frame, mode: app.mode, playing: app.playing, background: app.look.background,
       };
     },
     // Plays `frames` images of the motion, one after the other, and resolves with their number per second.
@@ -281,6 +301,7 @@ async function start() {
     // Pauses, and resolves when the image on the screen is final: full resolution, and sorted for its view.
     async settle() {
       setPlaying(false);
+      app.idle?.set(false);
       const wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
       do await wait(STILL_MS + 100); while (scheduled || sorting);
       quality = 0;

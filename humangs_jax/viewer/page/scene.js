@@ -19,8 +19,8 @@ async function readScene() {
   const rest = rows3(arrays.rest_joints), [bottom, top] = header.rest_bounds;
   const lowestJoint = Math.min(...rest.map((joint) => joint[1]));
   return {
-    header, arrays, count, means, rest,
-    canonicalMeans: means.slice(), canonicalRest: rest,
+    header, arrays, count, means, rest, faceKey: null,
+    canonicalMeans: means.slice(), shapedMeans: means.slice(), canonicalRest: rest,
     parents: header.parents, names: header.joint_names, order: jointOrder(header.parents),
     soleBelowJoint: lowestJoint - bottom[1], height: top[1] - bottom[1],
     center: scaled(add(bottom, top), 0.5), floor: bottom[1],
@@ -41,7 +41,10 @@ function unpackMotion(header, arrays) {
       const at = 3 * (f * joints + j), r = arrays.rotations;
       return quatFromAxisAngle(r[at] * step, r[at + 1] * step, r[at + 2] * step);
     }));
-  return { quats, translations: rows3(arrays.translations), fps };
+  const values = arrays.motion_faces, names = header.face?.names.length ?? 0;
+  const faces = values && Array.from({ length: frames }, (_, f) =>
+    Float32Array.from(values.subarray(names * f, names * (f + 1)), (v) => v * header.motion.face_step));
+  return { quats, translations: rows3(arrays.translations), fps, faces: faces ?? null };
 }
 
 // Three texels of four 32-bit numbers for each Gaussian; project.frag takes them apart.
@@ -90,7 +93,8 @@ function harmonicTexels(scene) {
 // Moves canonical means and joints for shape coefficients. The Gaussians of a vertex move with it and keep their sizes.
 function applyShape(scene, betas) {
   const { shape } = scene.header, directions = scene.arrays.shape_directions, joints = scene.arrays.shape_joints;
-  const j = scene.parents.length, vertices = directions.length / (3 * betas.length), perVertex = scene.count / vertices;
+  const j = scene.parents.length, vertices = directions.length / (3 * betas.length);
+  const hidden = scene.header.face?.hidden ?? 0, first = scene.count - hidden, perVertex = first / vertices;
   const moved = new Float32Array(3 * vertices), rest = scene.canonicalRest.map((p) => [...p]);
   betas.forEach((beta, s) => {
     const change = beta - shape.betas[s];
@@ -99,13 +103,15 @@ function applyShape(scene, betas) {
     for (let p = 0; p < 3 * j; p++) rest[(p / 3) | 0][p % 3] += change * joints[3 * j * s + p];
   });
   for (let i = 0; i < scene.count; i++) {
-    const v = Math.floor(i / perVertex);
+    const v = i < first ? Math.floor(i / perVertex) : scene.arrays.face_vertices[i - first];
     for (let c = 0; c < 3; c++) scene.means[3 * i + c] = scene.canonicalMeans[3 * i + c] + moved[3 * v + c];
   }
+  scene.shapedMeans.set(scene.means);
+  scene.faceKey = null;
   scene.rest = rest;
   const [bottom, top] = scene.header.rest_bounds;
   let low = 0, count = 0;  // the soles: the lowest 2 % of the body
-  for (let i = 0; i < scene.count; i++)
+  for (let i = 0; i < first; i++)
     if (scene.canonicalMeans[3 * i + 1] < bottom[1] + 0.02 * (top[1] - bottom[1])) {
       low += moved[3 * Math.floor(i / perVertex) + 1];
       count++;

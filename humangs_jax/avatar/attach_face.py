@@ -1,0 +1,334 @@
+"""A face for an avatar on a body with expressions: which Gaussians move how, and those that
+photos do not show.
+"""
+
+import functools
+import logging
+from collections.abc import Callable
+from importlib import resources
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.face import BLINKS, Face
+from humangs_jax.body.expressions import EYES, PARTS, Expressions, FaceParts, shipped_parts
+from humangs_jax.body.joints import PARENTS
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel
+from humangs_jax.body.motion import Motion
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.configuration import config_from_json
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.mesh import mesh_edges, unit
+from humangs_jax.io.tensors import read_safetensors
+from humangs_jax.network.config import Conventions, HumanGSConfig
+from humangs_jax.network.weights import SHIPPED
+from humangs_jax.rendering.gaussians import Gaussians
+
+logger = logging.getLogger(__name__)
+COLORS = {
+    "upper_teeth": (0.84, 0.80, 0.72),
+    "lower_teeth": (0.78, 0.74, 0.66),
+    "tongue": (0.66, 0.33, 0.32),
+    "mouth": (0.27, 0.10, 0.10),
+}
+"""RGB of what no photo shows; lids have the color of the skin around the eye."""
+CLOSING = 4.0
+"""Opacity of a lid per unit of its blink."""
+OPAQUE = 0.97
+COVER = 0.6
+"""Standard deviation of a hidden Gaussian over the side of its face: neighbors overlap without
+gaps.
+"""
+THICKNESS = 0.25
+"""Of a hidden Gaussian, over its smaller side."""
+LID_LIFT = 0.003
+"""Metres by which lids lie in front of the body's: Gaussians of the eye are as thick."""
+EYE = (0.0165, 0.0095, 0.005, 0.03)
+"""Metres: half the width and height of the opening between the lids, and the depths before the
+centre of the eye between which Gaussians show the eye."""
+SOFT = 0.3
+"""Of the opening: over so much of it a Gaussian belongs to the eye in part."""
+AROUND_EYE = (0.02, 0.045)
+"""Metres from the centre of an eye, of the skin whose color its lids get."""
+BESIDE = 8
+"""Vertices beside one, from which its stretch is found."""
+RIDGE = 0.01
+"""Of the sum of the squared edges: skin is not stretched along its normal, which edges tell
+little about.
+"""
+NEAR = {"mouth": 0.06, "lid": 0.04}
+"""Metres around teeth or lids: how vertices there lie against those of the mean body says where
+these belong.
+"""
+FEWEST = 12
+"""Vertices that tell more than a shift."""
+
+
+# Bodies of avatars
+# --------------------------------------------------------------------------------------------------
+
+
+def shipped_network() -> HumanGSConfig:
+    """The network of the shipped weights, without reading their tensors; the default one if none
+    are shipped.
+    """
+    with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
+        metadata = read_safetensors(file, lambda key: False)[2] if file.exists() else {}
+    return HumanGSConfig(
+        conventions=config_from_json(Conventions, metadata.get("conventions", "{}"))
+    )
+
+
+def body_of(avatar: Avatar) -> BodyModel | None:
+    """The shipped body, with the vertices that carry Gaussians, if the face of the avatar is one of
+    it; else None.
+
+    The avatar's own vertices may be displaced, and followed by those of a skirt.
+    """
+    if avatar.parents != PARENTS:
+        return None
+    whole = load_body()
+    for body in (whole, gaussian_body(whole, shipped_network())):
+        if _has_face(avatar, body):
+            return body
+    return None
+
+
+def _has_face(avatar: Avatar, body: BodyModel) -> bool:
+    """Whether all triangles in which the body's expressions show are also the avatar's."""
+    if body.expressions is None or len(avatar.rest_vertices) < len(body.template):
+        return False
+    faces, own = np.asarray(body.faces), np.asarray(avatar.faces)
+    faces = faces[np.isin(faces, np.asarray(body.expressions.vertices)).any(axis=1)]
+    number = lambda corners: np.dot(corners.astype(np.int64), (1 << 42, 1 << 21, 1))
+    return bool(np.isin(number(faces), number(own)).all())
+
+
+# Attaching
+# --------------------------------------------------------------------------------------------------
+
+
+def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
+    """See `Avatar.with_face`. One that has a face is returned as it is."""
+    if avatar.face is not None:
+        return avatar
+    found = body_of(avatar) if body is None else body
+    if found is None or found.expressions is None or not _has_face(avatar, found):
+        name = "the shipped body" if body is None else f"the body '{body.name}'"
+        raise ValueError(f"with_face: the avatar's vertices are not those of {name} with a face")
+    expressions = found.expressions
+    return replace(avatar, face=_face(avatar, found, "eyeBlinkLeft" in expressions.names))
+
+
+def faced(avatar: Avatar) -> Avatar:
+    """The avatar with a face where its body is known, else as it is."""
+    found = body_of(avatar) if avatar.face is None else None
+    return avatar if found is None else with_face(avatar, found)
+
+
+def with_face_for(avatar: Avatar, motion: Motion) -> Avatar:
+    """The avatar with a face if the motion has expressions for one; where its body is not known,
+    a line says so.
+    """
+    if motion.expressions is None or avatar.face is not None:
+        return avatar
+    try:
+        return with_face(avatar)
+    except ValueError as error:
+        logger.warning("the expressions of the motion are left out: %s", error)
+        return avatar
+
+
+def _face(avatar: Avatar, body: BodyModel, of_arkit: bool) -> Face:
+    expressions = body.expressions
+    assert expressions is not None
+    count, vertices = len(avatar.rest_vertices), np.asarray(expressions.vertices)
+    row_of_vertex = np.full(count, len(vertices))
+    row_of_vertex[vertices] = np.arange(len(vertices))
+    row = row_of_vertex[_vertex_of_gaussians(avatar)]
+    eyes = _eyes(avatar) if of_arkit else np.zeros((len(row), 2), np.float32)
+    row[eyes.sum(axis=1) > 0.5] = len(vertices)  # what shows the eye does not go with the lids
+    beside, stretching = _stretching(avatar, vertices, row_of_vertex)
+    hidden = _hidden(avatar, body, row < len(vertices)) if of_arkit else _nothing(expressions)
+    return Face(
+        row=jnp.asarray(row, jnp.int32),
+        eyes=jnp.asarray(eyes),
+        beside=jnp.asarray(beside, jnp.int32),
+        stretching=jnp.asarray(stretching, jnp.float32),
+        expressions=expressions,
+        **hidden,
+    )
+
+
+def _stretching(
+    avatar: Avatar, vertices: Int[np.ndarray, " m"], row: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k 3"]]:
+    """For each vertex that moves the rows of those beside it, and their w, see `avatar.face`."""
+    edges, _ = mesh_edges(np.asarray(avatar.faces))
+    pairs = np.concatenate([edges, edges[:, ::-1]])
+    pairs = pairs[row[pairs[:, 0]] < len(vertices)]
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    starts = np.searchsorted(pairs[:, 0], pairs[:, 0])
+    rank = np.arange(len(pairs)) - starts
+    pairs, rank = pairs[rank < BESIDE], rank[rank < BESIDE]
+    own, other = row[pairs[:, 0]], pairs[:, 1]
+    places = np.asarray(avatar.rest_vertices, np.float64)
+    beside = np.full((len(vertices), BESIDE), len(vertices))
+    apart = np.zeros((len(vertices), BESIDE, 3))
+    beside[own, rank] = row[other]
+    apart[own, rank] = places[other] - places[pairs[:, 0]]
+    squares = np.einsum("mka,mkb->mab", apart, apart)
+    ridge = RIDGE * np.trace(squares, axis1=1, axis2=2)[:, None, None] + 1e-12
+    return beside, apart @ np.linalg.inv(squares + ridge * np.eye(3))
+
+
+def _vertex_of_gaussians(avatar: Avatar) -> Int[np.ndarray, " g"]:
+    """The vertex that each Gaussian belongs to: the nearest one where refinement has added some."""
+    each, count = avatar.gaussians_per_vertex, len(avatar.rest_vertices)
+    if each is not None:
+        return np.repeat(np.arange(count), each)
+    return KDTree(np.asarray(avatar.rest_vertices)).query(np.asarray(avatar.gaussians.means))[1]
+
+
+def _eyes(avatar: Avatar) -> Float[np.ndarray, "g 2"]:
+    """Shares by which Gaussians belong to the eyes: those that are seen between the lids of open
+    eyes.
+    """
+    means = np.asarray(avatar.gaussians.means)
+    shares = []
+    for name in EYES:
+        offset = means - np.asarray(avatar.rest_joints)[avatar.joint_names.index(name)]
+        radius = np.linalg.norm(offset[:, :2] / EYE[:2], axis=1)
+        inside = np.clip((1 + SOFT - radius) / SOFT, 0, 1)
+        shares.append(inside * (offset[:, 2] > EYE[2]) * (offset[:, 2] < EYE[3]))
+    return np.stack(shares, axis=1).astype(np.float32)
+
+
+# What photos do not show
+# --------------------------------------------------------------------------------------------------
+
+
+def _nothing(expressions: Expressions) -> dict[str, Any]:
+    """The fields of a face without hidden Gaussians: SMPL-X's own mesh has eyes and an inside of
+    the mouth.
+    """
+    e = len(expressions.names)
+    empty = Gaussians(*(jnp.zeros((0, *shape)) for shape in ((3,), (4,), (3,), (), (3,))))
+    shapes = {
+        "hidden_normals": (0, 3),
+        "hidden_directions": (0, 3, e),
+        "hidden_shown": (0, e),
+        "in_mouth": (0,),
+        "lips": (4, 3),
+        "lip_directions": (4, 3, e),
+    }
+    return {"hidden": empty} | {name: jnp.zeros(shape) for name, shape in shapes.items()}
+
+
+@functools.cache
+def _shipped_parts() -> FaceParts:
+    return shipped_parts(np.asarray(load_body().template))
+
+
+def _hidden(avatar: Avatar, body: BodyModel, follows: np.ndarray) -> dict[str, Any]:
+    """The fields of a face about its hidden Gaussians. follows: which Gaussians move with the
+    face.
+    """
+    expressions = body.expressions
+    assert expressions is not None
+    parts, names = _shipped_parts(), expressions.names
+    corners, colors = parts.corners.copy(), np.zeros((len(parts.parts), 3))
+    shown = np.zeros((len(parts.parts), len(names)))
+    moves = np.asarray(expressions.vertices)
+    before, after = np.asarray(body.template)[moves], np.asarray(avatar.rest_vertices)[moves]
+
+    in_mouth = ~np.isin(parts.parts, [PARTS.index("left_lid"), PARTS.index("right_lid")])
+    of_mouth = _map_around(corners[in_mouth], before, after, NEAR["mouth"])
+    corners[in_mouth], lips = of_mouth(corners[in_mouth]), of_mouth(parts.lips)
+    for name, color in COLORS.items():
+        colors[parts.parts == PARTS.index(name)] = color
+
+    drawn = (
+        corners.copy()
+    )  # lids have the shape that they have when closed: they are folded when open
+    for side, eye, blink in zip(("left", "right"), EYES, BLINKS, strict=True):
+        lid, at = parts.parts == PARTS.index(f"{side}_lid"), names.index(blink)
+        corners[lid] = _map_around(corners[lid], before, after, NEAR["lid"])(corners[lid])
+        drawn[lid] = corners[lid] + parts.directions[lid, ..., at]
+        colors[lid] = _skin_around(avatar, eye, follows)
+        shown[lid, at] = CLOSING
+
+    hidden, normals = _gaussians_of(corners, drawn, colors, in_mouth)
+    arrays = {
+        "hidden_normals": normals,
+        "hidden_directions": parts.directions.mean(axis=1),
+        "hidden_shown": shown,
+        "in_mouth": in_mouth,
+        "lips": lips,
+        "lip_directions": parts.lip_directions,
+    }
+    return {"hidden": hidden} | {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items()}
+
+
+def _map_around(
+    points: Float[np.ndarray, "*p 3"],
+    before: Float[np.ndarray, "m 3"],
+    after: Float[np.ndarray, "m 3"],
+    reach: float,
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The affine map that takes the vertices `before` around points to those `after`; a shift
+    where there are few.
+    """
+    middle = points.reshape(-1, 3).mean(axis=0)
+    distance = np.linalg.norm(before - middle, axis=1)
+    near = distance <= max(reach, np.sort(distance)[min(FEWEST, len(distance)) - 1])
+    shift, centre = (after - before)[near].mean(axis=0), before[near].mean(axis=0)
+    linear = np.zeros((3, 3))
+    if near.sum() >= FEWEST:
+        moved = (after - before)[near] - shift
+        linear = np.linalg.lstsq(before[near] - centre, moved, rcond=None)[0]
+    return lambda places: places + shift + (places - centre) @ linear
+
+
+def _skin_around(avatar: Avatar, eye: str, follows: np.ndarray) -> Float[np.ndarray, "3"]:
+    """The median color of the skin below and beside an eye."""
+    offset = (
+        np.asarray(avatar.gaussians.means)
+        - np.asarray(avatar.rest_joints)[avatar.joint_names.index(eye)]
+    )
+    distance = np.linalg.norm(offset, axis=1)
+    near = (distance > AROUND_EYE[0]) & (distance < AROUND_EYE[1])
+    near &= follows & (offset[:, 2] > 0) & (offset[:, 1] < 0)
+    if not near.any():
+        near = np.ones(len(offset), bool)
+    return np.median(np.asarray(avatar.gaussians.colors)[near], axis=0)
+
+
+def _gaussians_of(
+    corners: Float[np.ndarray, "q 4 3"],
+    drawn: Float[np.ndarray, "q 4 3"],
+    colors: Float[np.ndarray, "q 3"],
+    in_mouth: np.ndarray,
+) -> tuple[Gaussians, Float[np.ndarray, "q 3"]]:
+    """A flat Gaussian for each face, and its normal. corners: at rest. drawn: as they are when
+    they are seen.
+    """
+    first = (drawn[:, 1] + drawn[:, 2] - drawn[:, 0] - drawn[:, 3]) / 2
+    second = (drawn[:, 2] + drawn[:, 3] - drawn[:, 0] - drawn[:, 1]) / 2
+    normals = unit(np.cross(first, second))
+    sides = np.stack([np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)], axis=1)
+    scales = np.concatenate([COVER * sides, THICKNESS * sides.min(axis=1, keepdims=True)], axis=1)
+    axes = np.stack([unit(first), np.cross(normals, unit(first)), normals], axis=-1)
+    means = corners.mean(axis=1) + np.where(in_mouth, 0, LID_LIFT)[:, None] * normals
+    number = lambda x: jnp.asarray(x, jnp.float32)
+    quats, opacities = quaternion.from_matrix(number(axes)), np.full(len(means), OPAQUE)
+    return (
+        Gaussians(number(means), quats, number(scales), number(opacities), number(colors)),
+        normals,
+    )

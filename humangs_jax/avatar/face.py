@@ -1,0 +1,138 @@
+"""The face of an avatar: what its Gaussians do when a pose has an expression.
+
+A Gaussian moves by the offset d of the vertex i that it belongs to, before skinning, and is
+stretched as the skin around it is: with p the places of vertices at rest and k those beside i,
+
+    A_i = I + sum_k (d_k - d_i) w_ik^T,
+    w_ik = (sum_k (p_k - p_i)(p_k - p_i)^T + ridge)^-1 (p_k - p_i).
+
+Gaussians that show an eye turn with the joint of the eye instead, and fade when the lids close.
+Photos hardly show teeth, tongue and closed lids: these are Gaussians with colors of their own,
+which are drawn only while an expression shows them. `avatar.attach_face.with_face` makes a face.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.expressions import Expressions
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
+from humangs_jax.geometry.transform import EXACT
+from humangs_jax.rendering.gaussians import Gaussians
+
+BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
+"""The expressions that close the left and the right eye."""
+SMALLEST_OPENING = 0.001
+"""Metres: half of what the lips are apart where the mouth begins to show its inside."""
+RIM = 0.3
+"""Of the opening's radius, over which its inside fades towards the lips: Gaussians are some
+millimetres wide.
+"""
+BEFORE_LIPS = 0.004
+"""Metres in front of the lips, where a tongue is seen whole."""
+
+
+@pytree_dataclass
+class Face(Batchable):
+    """The expressions of an avatar of g Gaussians and j joints; m vertices move, and q Gaussians
+    are hidden at rest.
+    """
+
+    row: Int[Array, " g"]
+    """The row of `expressions.directions` that each Gaussian follows; m: it stays."""
+    eyes: Float[Array, "g 2"]
+    """Shares in [0, 1] by which each Gaussian belongs to the left and to the right eye."""
+    beside: Int[Array, "m k"]
+    """Rows of the vertices beside each one that moves; m: one that stays."""
+    stretching: Float[Array, "m k 3"]
+    """The w of each of these, 1 / metres."""
+    hidden_normals: Float[Array, "q 3"]
+    """Unit normals of the hidden Gaussians, for the light."""
+    hidden_directions: Float[Array, "q 3 e"]
+    """How they move, metres per unit of a coefficient."""
+    hidden_shown: Float[Array, "q e"]
+    """How much opacity they get for a unit of a coefficient: the sum is clipped to [0, 1]."""
+    in_mouth: Float[Array, " q"]
+    """1 for those of the mouth, which are seen between the lips alone; 0 for lids."""
+    lips: Float[Array, "4 3"]
+    """Metres in T-pose: the inner edges of the upper and the lower lip in the middle, the left
+    and the right corner.
+    """
+    lip_directions: Float[Array, "4 3 e"]
+    """How these move per unit of a coefficient, metres."""
+    hidden: Gaussians
+    """Teeth, tongue, the inside of the mouth and closed lids in T-pose, with the opacities that
+    they have when shown.
+    """
+    expressions: Expressions
+    """Of the avatar's rest vertices."""
+
+    def select(self, index: Array | np.ndarray) -> "Face":
+        """The face of an avatar with these of its Gaussians."""
+        return replace(self, row=self.row[index], eyes=self.eyes[index])
+
+    def without_expression(self) -> Float[Array, " e"]:
+        """The coefficients of a face at rest."""
+        return jnp.zeros(len(self.expressions.names), self.hidden_shown.dtype)
+
+
+def moved_hidden(face: Face, expression: Float[Array, " e"]) -> Gaussians:
+    """The hidden Gaussians in T-pose, where and as visible as an expression makes them."""
+    moves = jnp.einsum("qae,e->qa", face.hidden_directions, expression, precision=EXACT)
+    shown = jnp.clip(jnp.einsum("qe,e->q", face.hidden_shown, expression, precision=EXACT), 0, 1)
+    means = face.hidden.means + moves
+    lips = face.lips + jnp.einsum("lae,e->la", face.lip_directions, expression, precision=EXACT)
+    seen = jnp.where(face.in_mouth > 0, between_lips(means, lips), shown)
+    return replace(face.hidden, means=means, opacities=face.hidden.opacities * seen)
+
+
+def between_lips(points: Float[Array, "q 3"], lips: Float[Array, "4 3"]) -> Float[Array, " q"]:
+    """How much of each point is seen through the opening of the mouth, an ellipse; all of one
+    before the lips.
+    """
+    upper, lower, left, right = lips
+    center = (upper + lower) / 2
+    height = jnp.maximum((upper[1] - lower[1]) / 2, 0)
+    width = jnp.maximum((left[0] - right[0]) / 2, SMALLEST_OPENING)
+    apart = (points - center)[:, :2] / jnp.stack([width, height + SMALLEST_OPENING])
+    radius = jnp.sqrt(jnp.sum(jnp.square(apart), axis=-1) + SMALLEST_OPENING**2)
+    inside = jnp.clip((1 - radius) / RIM, 0, 1)
+    before = jnp.clip((points[:, 2] - center[2]) / BEFORE_LIPS, 0, 1)
+    opened = jnp.clip((height - SMALLEST_OPENING) / SMALLEST_OPENING, 0, 1)
+    return opened * jnp.maximum(inside, before)
+
+
+def moved_gaussians(
+    face: Face, gaussians: Gaussians, expression: Float[Array, " e"], stretched: bool
+) -> Gaussians:
+    """The Gaussians of an avatar in T-pose, with an expression; eyes fade as far as their lids
+    close.
+    """
+    moves = jnp.einsum("mae,e->ma", face.expressions.directions, expression, precision=EXACT)
+    moves = jnp.concatenate([moves, jnp.zeros_like(moves[:1])])
+    opacities, names = gaussians.opacities, face.expressions.names
+    if all(name in names for name in BLINKS):
+        closed = jnp.stack([expression[names.index(name)] for name in BLINKS])
+        opacities = opacities * (1 - jnp.sum(face.eyes * jnp.clip(closed, 0, 1), axis=-1))
+    moved = replace(gaussians, means=gaussians.means + moves[face.row], opacities=opacities)
+    if not stretched:
+        return moved
+    apart = moves[face.beside] - moves[:-1, None]
+    stretch = jnp.einsum("mka,mkb->mab", apart, face.stretching, precision=EXACT)
+    stretch = jnp.concatenate([stretch, jnp.zeros_like(stretch[:1])]) + jnp.eye(3)
+    return replace(moved, deformations=stretch[face.row])
+
+
+def with_hidden(gaussians: Gaussians, hidden: Gaussians) -> Gaussians:
+    """Both together. hidden: without harmonics or low-pass, which become those of the others."""
+    fields = {}
+    if gaussians.harmonics is not None:
+        shape = (len(hidden.means), *gaussians.harmonics.shape[1:])
+        fields["harmonics"] = jnp.zeros(shape, gaussians.harmonics.dtype)
+    if gaussians.low_pass is not None:
+        fields["low_pass"] = jnp.full(len(hidden.means), jnp.median(gaussians.low_pass))
+    if gaussians.deformations is not None:
+        fields["deformations"] = jnp.broadcast_to(jnp.eye(3), (len(hidden.means), 3, 3))
+    hidden = replace(hidden, **fields)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, hidden)

@@ -1,0 +1,153 @@
+"""Expressions of a face: named directions in which vertices move, such as the 52 shapes of ARKit or
+the components of SMPL-X.
+
+A pose may carry one coefficient for each (`BodyPose.expression`). Vertices move in the T-pose,
+before skinning:
+
+    rest'(e) = rest + directions e,
+    joints'(e) = joints + joint_directions e,
+    rotations'(e) = rotations + joint_turns e.
+
+The shapes of the shipped body come from `assets/face.npz`, and with them what photos hardly show:
+teeth, tongue, the inside of the mouth and the skin of closed lids (`FaceParts`).
+"""
+
+import functools
+from importlib import resources
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.checks import LARGEST
+from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.io.arrays import check_array, check_indices, read_npz
+from humangs_jax.io.reading import Refused, check_limit, reading
+
+FORMAT = "humangs-face-1"
+STEP = 1e-5
+"""Metres, of offsets in files: int16 then spans +-0.33 m."""
+EYES = ("left_eye", "right_eye")
+PARTS = ("upper_teeth", "lower_teeth", "tongue", "left_lid", "right_lid", "mouth")
+"""What `FaceParts.parts` counts; "mouth" is the skin inside of it."""
+KEYS = (
+    *("format", "names", "counts", "vertices", "offsets", "eye_turns"),
+    *("lips", "inside_vertices", "part_faces", "parts"),
+)
+"""What a file of `assets/face.npz`'s format has."""
+
+
+@pytree_dataclass
+class Expressions:
+    """The expressions of a body of j joints: e directions, in which m of its vertices move."""
+
+    vertices: Int[Array, " m"]
+    """Indices of the vertices that move, increasing."""
+    directions: Float[Array, "m 3 e"]
+    """Metres per unit of a coefficient, in the T-pose."""
+    joint_directions: Float[Array, "j 3 e"] | None = None
+    """Metres per unit; None: joints stay where they are."""
+    joint_turns: Float[Array, "j 3 e"] | None = None
+    """Axis-angle in radians per unit, added to the rotations of the pose; None: no joint turns."""
+    names: tuple[str, ...] = static_field(default=())
+    """Of the directions."""
+
+
+@pytree_dataclass
+class FaceParts:
+    """Parts of the shipped face that photos hardly show, as quadrilaterals; their vertices move
+    with the expression, too.
+    """
+
+    corners: Float[np.ndarray, "q 4 3"]
+    """Metres, on the mean body in T-pose."""
+    directions: Float[np.ndarray, "q 4 3 e"]
+    """How each corner moves per unit of a coefficient, metres."""
+    parts: Int[np.ndarray, " q"]
+    """Index into `PARTS`."""
+    lips: Float[np.ndarray, "4 3"]
+    """Metres: the inner edges of the upper and the lower lip in the middle, the left and the
+    right corner of the mouth.
+    """
+    lip_directions: Float[np.ndarray, "4 3 e"]
+    """How these move per unit of a coefficient, metres."""
+
+
+@functools.cache
+def _shipped() -> dict[str, np.ndarray]:
+    with resources.as_file(resources.files("humangs_jax") / "assets" / "face.npz") as file:
+        return read_face(file)
+
+
+def read_face(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of a face file, with `rows`: for each offset its vertex and its shape.
+
+    Raises: ValueError, naming the key.
+    """
+    with reading(path, "face file"):
+        arrays, _ = read_npz(path)
+        if str(arrays.get("format")) != FORMAT:
+            raise Refused(f"expected a file of the format {FORMAT}")
+        if missing := sorted(set(KEYS) - set(arrays)):
+            raise Refused(f"key '{missing[0]}' is missing")
+        names, count = arrays["names"], len(arrays["vertices"])
+        check_indices("counts", arrays["counts"], (len(names),), count + 1)
+        check_array("offsets", arrays["offsets"], (3, count), -LARGEST, LARGEST)
+        check_array("eye_turns", arrays["eye_turns"], (len(names), 2, 3), -LARGEST, LARGEST)
+        check_array("inside_vertices", arrays["inside_vertices"], (None, 3), -LARGEST, LARGEST)
+        ends = np.cumsum(arrays["counts"].astype(np.int64))
+        if not len(names) or ends[-1] != count:
+            raise Refused(f"counts: expected a sum of {count}, the number of offsets")
+        steps = arrays["vertices"].astype(np.int64)
+        sums = np.cumsum(steps)
+        before = np.concatenate([[0], sums[ends[:-1] - 1]])
+        shape = np.repeat(np.arange(len(names)), np.diff(ends, prepend=0))
+        rows = np.stack([sums - before[shape], shape], axis=1)
+        check_indices("part_faces", arrays["part_faces"], (None, 4), 1 << 16)
+        check_indices("lips", arrays["lips"], (4,), 1 << 16)
+        check_indices("parts", arrays["parts"], (len(arrays["part_faces"]),), len(PARTS))
+        check_limit("plain_bytes", 12 * len(names) * (1 << 16), "bytes of expressions")
+        return arrays | {"rows": rows}
+
+
+def _dense(arrays: dict[str, np.ndarray], count: int) -> Float[np.ndarray, "count 3 e"]:
+    """The offsets of this many vertices in metres, those inside of the mouth last."""
+    dense = np.zeros((count, 3, len(arrays["names"])), np.float32)
+    vertices, shapes = arrays["rows"].T
+    dense[vertices, :, shapes] = arrays["offsets"].T * np.float32(STEP)
+    return dense
+
+
+@functools.cache
+def shipped_expressions(body_vertices: int) -> Expressions:
+    """The 52 shapes of ARKit on the shipped body; eyes turn by their joints."""
+    arrays = _shipped()
+    names = tuple(str(name) for name in arrays["names"])
+    dense = _dense(arrays, body_vertices + len(arrays["inside_vertices"]))[:body_vertices]
+    moved = np.flatnonzero(dense.any(axis=(1, 2)))
+    turns = np.zeros((len(JOINT_NAMES), 3, len(names)), np.float32)
+    for side, eye in enumerate(EYES):
+        turns[JOINT_NAMES.index(eye)] = arrays["eye_turns"][:, side].T
+    return Expressions(
+        vertices=jnp.asarray(moved, jnp.int32),
+        directions=jnp.asarray(dense[moved]),
+        joint_turns=jnp.asarray(turns),
+        names=names,
+    )
+
+
+def shipped_parts(template: Float[np.ndarray, "n 3"]) -> FaceParts:
+    """Teeth, tongue, lids and the inside of the mouth. template: of the shipped body."""
+    arrays = _shipped()
+    places = np.concatenate([template, arrays["inside_vertices"]]).astype(np.float32)
+    faces = arrays["part_faces"].astype(np.int64)
+    directions, lips = _dense(arrays, len(places)), arrays["lips"].astype(np.int64)
+    return FaceParts(
+        corners=places[faces],
+        directions=directions[faces],
+        parts=arrays["parts"].astype(np.int64),
+        lips=places[lips],
+        lip_directions=directions[lips],
+    )

@@ -1,0 +1,145 @@
+"""Expressions over time, as files have them: their names, and which of ARKit's shapes stand for
+the presets of others.
+"""
+
+import dataclasses
+import re
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.io.reading import Refused
+
+ARKIT = (
+    "browDownLeft", "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight",
+    "cheekPuff", "cheekSquintLeft", "cheekSquintRight", "eyeBlinkLeft", "eyeBlinkRight",
+    "eyeLookDownLeft", "eyeLookDownRight", "eyeLookInLeft", "eyeLookInRight", "eyeLookOutLeft",
+    "eyeLookOutRight", "eyeLookUpLeft", "eyeLookUpRight", "eyeSquintLeft", "eyeSquintRight",
+    "eyeWideLeft", "eyeWideRight", "jawForward", "jawLeft", "jawOpen", "jawRight", "mouthClose",
+    "mouthDimpleLeft", "mouthDimpleRight", "mouthFrownLeft", "mouthFrownRight", "mouthFunnel",
+    "mouthLeft", "mouthLowerDownLeft", "mouthLowerDownRight", "mouthPressLeft", "mouthPressRight",
+    "mouthPucker", "mouthRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower",
+    "mouthShrugUpper", "mouthSmileLeft", "mouthSmileRight", "mouthStretchLeft",
+    "mouthStretchRight", "mouthUpperUpLeft", "mouthUpperUpRight", "noseSneerLeft",
+    "noseSneerRight", "tongueOut",
+)  # fmt: skip
+"""The names of the 52 shapes, in the order of the alphabet."""
+PRESETS = {
+    "happy": {"mouthSmile": 0.8, "cheekSquint": 0.5},
+    "angry": {"browDown": 1.0, "mouthPress": 0.5, "noseSneer": 0.4},
+    "sad": {"browInnerUp": 0.8, "mouthFrown": 0.7},
+    "relaxed": {"mouthSmile": 0.4, "eyeBlink": 0.3},
+    "surprised": {"browInnerUp": 0.8, "browOuterUp": 0.8, "eyeWide": 0.7, "jawOpen": 0.3},
+    "aa": {"jawOpen": 0.6},
+    "ih": {"jawOpen": 0.25, "mouthStretch": 0.3, "mouthSmile": 0.2},
+    "ou": {"mouthPucker": 0.8, "jawOpen": 0.1},
+    "ee": {"mouthSmile": 0.4, "mouthStretch": 0.4, "jawOpen": 0.15},
+    "oh": {"jawOpen": 0.4, "mouthFunnel": 0.7},
+    "blink": {"eyeBlink": 1.0},
+    "blinkleft": {"eyeBlinkLeft": 1.0},
+    "blinkright": {"eyeBlinkRight": 1.0},
+    "neutral": {},
+    "lookup": {"eyeLookUp": 1.0},
+    "lookdown": {"eyeLookDown": 1.0},
+    "lookleft": {"eyeLookOutLeft": 1.0, "eyeLookInRight": 1.0},
+    "lookright": {"eyeLookInLeft": 1.0, "eyeLookOutRight": 1.0},
+    # of VRM 0
+    "joy": {"mouthSmile": 0.8, "cheekSquint": 0.5},
+    "sorrow": {"browInnerUp": 0.8, "mouthFrown": 0.7},
+    "fun": {"mouthSmile": 0.5},
+    "a": {"jawOpen": 0.6},
+    "i": {"jawOpen": 0.25, "mouthStretch": 0.3, "mouthSmile": 0.2},
+    "u": {"mouthPucker": 0.8, "jawOpen": 0.1},
+    "e": {"mouthSmile": 0.4, "mouthStretch": 0.4, "jawOpen": 0.15},
+    "o": {"jawOpen": 0.4, "mouthFunnel": 0.7},
+    "blink_l": {"eyeBlinkLeft": 1.0},
+    "blink_r": {"eyeBlinkRight": 1.0},
+}  # fmt: skip
+"""Shapes of ARKit for a weight of 1 of the presets of VRM, whose names are compared without case; a
+name without a side stands for both."""
+FARTHEST = 10.0
+"""The largest coefficient that a track may have, either sign: shapes are made for 0 to 1,
+components of SMPL-X for some 3.
+"""
+_PLAIN = {name.lower(): name for name in ARKIT}
+
+
+@dataclasses.dataclass(frozen=True)
+class FaceTrack:
+    """Expressions of a file for each of its frames."""
+
+    names: tuple[str, ...]
+    """As the file has them."""
+    values: Float[np.ndarray, "m e"]
+    """A row for each frame."""
+
+
+def arkit_name(name: str) -> str | None:
+    """Which of ARKit's shapes a name in a file is: without case, "Blend.EyeBlink_L" is
+    "eyeBlinkLeft"; None: none of them.
+    """
+    plain = re.split(r"[.:|]", name)[-1]
+    plain = re.sub(r"_l$", "left", re.sub(r"_r$", "right", plain.lower()))
+    plain = re.sub(r"[^a-z]", "", plain)
+    return _PLAIN.get(plain)
+
+
+def of_preset(name: str) -> dict[str, float] | None:
+    """ARKit's shapes and their weights for a preset of VRM or a name of ARKit; None for another
+    name.
+    """
+    own = arkit_name(name)
+    if own is not None:
+        return {own: 1.0}
+    shapes = PRESETS.get(name.lower())
+    if shapes is None:
+        return None
+    found = {}
+    for shape, weight in shapes.items():
+        sides = [shape] if shape in ARKIT else [f"{shape}Left", f"{shape}Right"]
+        found |= dict.fromkeys(sides, weight)
+    return found
+
+
+def as_arkit(track: FaceTrack) -> tuple[FaceTrack | None, tuple[str, ...]]:
+    """A track of names of ARKit, of presets and of others, as one of ARKit's shapes; and the
+    names that stand for none.
+    """
+    values = np.zeros((len(track.values), len(ARKIT)))
+    unknown = []
+    known = False
+    for name, column in zip(track.names, track.values.T, strict=True):
+        shapes = of_preset(name)
+        if shapes is None:
+            unknown.append(name)
+            continue
+        known = True
+        for shape, weight in shapes.items():
+            values[:, ARKIT.index(shape)] += weight * column
+    return (FaceTrack(ARKIT, values) if known else None), tuple(unknown)
+
+
+def clipped(values: Float[np.ndarray, "m e"]) -> Float[np.ndarray, "m e"]:
+    """Coefficients within what ARKit's shapes are made for, -1 to 2: trackers overshoot.
+
+    What is no number stays.
+    """
+    return np.where(np.isfinite(values), np.clip(values, -1, 2), values)
+
+
+def checked_track(
+    track: FaceTrack, frames: int
+) -> tuple[tuple[str, ...], Float[np.ndarray, "m e"]]:
+    """Names and float32 values of a track.
+
+    Raises: Refused unless it has a finite row of numbers for each frame.
+    """
+    values = np.asarray(track.values, np.float64)
+    if values.shape != (frames, len(track.names)):
+        raise Refused(
+            f"expressions: expected shape ({frames}, {len(track.names)}), a row for each frame, got"
+            f" {values.shape}"
+        )
+    if not (np.isfinite(values).all() and np.abs(values).max(initial=0) <= FARTHEST):
+        raise Refused(f"expressions: expected numbers between -{FARTHEST:g} and {FARTHEST:g}")
+    return track.names, values.astype(np.float32)
