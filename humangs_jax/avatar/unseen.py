@@ -237,7 +237,7 @@ def attended(
         shares = shares[:, :count] + shares[:, count:]
         mixed = jnp.where(near, need[rows], 0)[:, None]
         found = own + mixed * (jnp.matmul(shares, values, precision=EXACT) - own)
-        return jnp.where(mixed > 0, found, own)
+        return jnp.where(mixed > 0, found, own).astype(values.dtype)
 
     def block(rows: Int[Array, " r"]) -> Float[Array, "r c"]:
         return lax.cond(jnp.any(need[rows] > 0), guess, lambda rows: values[rows], rows)

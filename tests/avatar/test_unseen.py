@@ -168,6 +168,12 @@ def test_guesses_of_a_batch_are_those_of_each(body, rest, normals):
         np.testing.assert_allclose(together[i], one(shown[i]), atol=2e-5)
 
 
+def test_guesses_keep_the_number_type_of_the_values():
+    values = jnp.asarray([[1.0], [0.0]], jnp.float16)
+    found = attended(values, jnp.asarray([0, 1.0]), jnp.asarray([1.0, 0]), line(0.2, 0.21))
+    assert found.dtype == jnp.float16 and found[1, 0] == 1
+
+
 def test_guesses_have_gradients():
     need, sure = jnp.asarray([0.0, 1, 0.5]), jnp.asarray([1.0, 0, 0])
     total = lambda values: jnp.sum(attended(values, need, sure, line(0.2, 0.21, 0.19)))
