@@ -1,0 +1,106 @@
+"""What an avatar is like where no photo was: guesses from what the photos show, against none."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.harness import Run, entry, means
+from experiments.results import cells, markdown_table
+from experiments.subjects import RING, People
+from humangs_jax.avatar import reconstruct as reconstruction
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.unseen import with_guesses
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.skirt import with_skirt
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.scores import PROTOCOLS, mean_scores, score_views
+from humangs_jax.losses.loss_networks import load_lpips
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.humangs import apply_humangs
+
+CASES = {
+    1: ("one, in front", (0,), (5, 6, 7)),
+    2: ("two, 60 degrees apart", (0, 2), (6, 7, 8)),
+    4: ("four, all around", (0, 3, 6, 9), (1, 5, 8, 10)),
+}
+"""By their number, photos, and the views to compare with: those of the other side, or between the
+photos. Numbers of cameras on a ring, 30 degrees apart, the first in front."""
+BEFORE, AFTER = "network alone", "guessed"
+SHOWN = {"psnr": ("PSNR", 2), "psnr_fg": ("foreground", 2), "lpips_alex": ("LPIPS alex", 4)}
+
+
+@entry
+def unseen(
+    run: Run,
+    people: People = People(8, held_out=1, poses=0, pose_views=1),
+    photos: tuple[int, ...] = tuple(CASES),
+) -> None:
+    """Avatars of few photos from the other side, with and without guesses; needs extra `lpips`.
+
+    Four photos from all around are to lose nothing by guesses. Other cameras than --held-out.
+
+    Options:
+    photos: their numbers
+    """
+    start, lpips = people.start(), load_lpips("alex")
+    protocol = dataclasses.replace(PROTOCOLS["humangs"], lpips=("alex",))
+    person = functools.cache(lambda seed: start.subject(seed, (RING,)).photos)
+
+    def scores(avatar: Avatar, truth: Capture) -> dict[str, Any]:
+        drawn = draw_views(avatar, truth)
+        rows = score_views(drawn.images, truth, protocol, drawn.alpha, {"alex": lpips})
+        mean = mean_scores(list(rows))
+        return {name: mean[name] for name in SHOWN}
+
+    def measure(seed: int, count: int) -> dict[str, Any]:
+        given, others = (person(seed).select(list(views)) for views in CASES[count][1:])
+        made = both_avatars(start.variables, start.config, given)
+        return {name: scores(avatar, others) for name, avatar in made.items()}
+
+    cases = {
+        f"{count} photos: {seed}": functools.partial(measure, seed, count)
+        for count in photos  # those of one number share a program
+        for seed in start.seeds
+    }
+    found = run.rows(cases, start.settings)
+    table, numbers, said = [], {}, []
+    for count in photos:
+        case, rows = CASES[count][0], [found[f"{count} photos: {seed}"] for seed in start.seeds]
+        mean = means(rows)
+        table += [[case, state, *cells(mean[state], SHOWN)] for state in (BEFORE, AFTER)]
+        gain = mean[AFTER]["lpips_alex"] / mean[BEFORE]["lpips_alex"] - 1
+        better = sum(row[AFTER]["lpips_alex"] < row[BEFORE]["lpips_alex"] for row in rows)
+        said.append(f"{case}: LPIPS {100 * gain:+.0f} %, lower for {better} of {len(rows)}")
+        numbers[str(count)] = {"means": mean, "lpips": gain, "better": better}
+    header = ["photos", "avatar", *(heading for heading, _ in SHOWN.values())]
+    shown = markdown_table(header, table, "ll" + "r" * len(SHOWN))
+    seeds = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {start.size} px"
+    text = f"{seeds}. Guessed against the network alone: {'; '.join(said)}.\n\n{shown}"
+    run.show(text, {"settings": start.settings, "cases": numbers})
+
+
+def both_avatars(variables: Any, config: HumanGSConfig, capture: Capture) -> dict[str, Avatar]:
+    """The avatars of a capture as the network makes it, and with guesses, by one pass."""
+    body = gaussian_body(capture.body, config)
+    views, _ = reconstruction._views(capture, body, config)
+    if views.displacement is not None:
+        worn = with_skirt(body, capture, np.asarray(views.displacement))
+        if worn is not None:
+            body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
+    inputs = reconstruction._prepare(body, views, config)
+    sized = reconstruction.fit_buffers(inputs.foreground, inputs.view_count, config)
+    outputs = _network(variables, sized, inputs)
+    made = {BEFORE: outputs, AFTER: with_guesses(outputs, inputs, body, sized)}
+    return {
+        name: reconstruction.completed_avatar(each, body, views, sized)
+        for name, each in made.items()
+    }
+
+
+_network = jax.jit(lambda v, c, i: apply_humangs(v, i, c)[0])
