@@ -39,6 +39,10 @@ UNSEEN, SEEN = 0.15, 0.45
 first nothing is known of it, above the second nothing is guessed; between them both are mixed."""
 SPREAD = 0.015
 """Metres in the space of the features, over which sources are averaged."""
+LEAST_HIDDEN = 1 / 3
+"""Share of the vertices that no photo shows, below which nothing is guessed. Of people who are
+shown from all around, folds and the insides of hands are left, which the network knows better.
+"""
 DEPTH = 0.5
 """What a metre from front to back counts: the back of a trunk is like its front more than like
 its sides.
@@ -183,7 +187,8 @@ def guessed(
     """
     count = len(rest)
     sure = jnp.clip((shown - UNSEEN) / (SEEN - UNSEEN), 0, 1)
-    need = jnp.where(regions.free, 1 - sure, 0)
+    one_sided = jnp.mean(shown < UNSEEN) > LEAST_HIDDEN
+    need = jnp.where(regions.free & one_sided, 1 - sure, 0)
     glance = jnp.clip((shown - GLANCE[0]) / (GLANCE[1] - GLANCE[0]), 0, 1)
     given = jnp.where(regions.sources, jnp.where(regions.head, glance, sure), 0)
 

@@ -119,6 +119,13 @@ def test_what_photos_show_keeps_its_bits(body, rest, normals):
     assert (colors_of(half)[~shown] != colors_of(own)[~shown]).any(axis=1).mean() > 0.5
 
 
+def test_people_who_are_shown_from_all_around_keep_their_bits(body, rest, normals):
+    own = gaussians_on(rest, np.random.default_rng(0).random((len(rest), 3)))
+    around = jnp.where(jnp.abs(normals[:, 1]) < 0.8, 1.0, 0.0)  # neither from above nor from below
+    found = guessed(own, rest, normals, around, body_regions(body, rest))
+    jax.tree.map(np.testing.assert_array_equal, found, own)
+
+
 def test_without_anything_shown_nothing_is_guessed(body, rest, normals):
     own = gaussians_on(rest, np.random.default_rng(0).random((len(rest), 3)))
     found = guessed(own, rest, normals, jnp.zeros(len(rest)), body_regions(body, rest))
