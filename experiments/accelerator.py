@@ -23,12 +23,12 @@ from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.bank import build_bank
-from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
-from humangs_jax.people.subject import SPLITS
 from humangs_jax.refinement.refine import refine
 from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.splatting import render
+from humangs_jax.synthetic.bank import build_bank
+from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig, on_the_fly_example
+from humangs_jax.synthetic.subject import SPLITS
 
 SCENES = (
     (20_000, 256),

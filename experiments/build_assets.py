@@ -20,9 +20,9 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.motion import Motion
-from humangs_jax.data.motion import save_motion
-from humangs_jax.people.subject import split_of
-from humangs_jax.people.writer import Layout, write_person
+from humangs_jax.motion import save_motion
+from humangs_jax.synthetic.subject import split_of
+from humangs_jax.synthetic.writer import Layout, write_person
 
 ASSETS = REPOSITORY / "humangs_jax" / "assets"
 PACKAGE = "@mediapipe/pose@0.5.1675469404"

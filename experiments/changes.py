@@ -19,8 +19,8 @@ from humangs_jax.body.library import load_body
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import resized
-from humangs_jax.people.subject import make_subject, seeds_of
-from humangs_jax.people.writer import View, capture_views, sample_pose
+from humangs_jax.synthetic.subject import make_subject, seeds_of
+from humangs_jax.synthetic.writer import View, capture_views, sample_pose
 
 SEED_INDEX, SIZE, VIEWS = 1, 256, 4
 """The first person of the validation seeds that is taken, pixels, photos."""

@@ -27,15 +27,15 @@ from humangs_jax.data.exposure import (
     points_of,
 )
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
-from humangs_jax.people.subject import (
+from humangs_jax.synthetic.subject import (
     GENERATOR_VERSION,
     SyntheticSubject,
     make_subject,
     pose_subject,
     seeds_of,
 )
-from humangs_jax.people.surroundings import Lights, cameras_around, sample_lights
-from humangs_jax.people.writer import View, capture_views, sample_pose
+from humangs_jax.synthetic.surroundings import Lights, cameras_around, sample_lights
+from humangs_jax.synthetic.writer import View, capture_views, sample_pose
 
 LIGHT_STREAM, CAMERA_STREAM, BALANCE_STREAM = 101, 102, 103
 """Independent random streams of a seed."""

@@ -16,18 +16,18 @@ from experiments.results import markdown_table
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
+from humangs_jax.capture.detection.people import Networks, detect_people
+from humangs_jax.capture.fitting.landmark_fit import fit_landmarks
+from humangs_jax.capture.fitting.residuals.keypoints import Observations, expected_noise
+from humangs_jax.capture.fitting.triangulation import triangulate, triangulate_robustly
+from humangs_jax.capture.keypoints.keypoints import KEYPOINT_SETS, MEDIAPIPE_33, mirrored_name
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS, MEDIAPIPE_33, mirrored_name
-from humangs_jax.data.motion import load_motion
-from humangs_jax.detection.people import Networks, detect_people
-from humangs_jax.fitting.landmark_fit import fit_landmarks
-from humangs_jax.fitting.residuals.keypoints import Observations, expected_noise
-from humangs_jax.fitting.triangulation import triangulate, triangulate_robustly
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
-from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.subject import make_subject
-from humangs_jax.people.surroundings import cameras_around, spread_azimuths
+from humangs_jax.motion import load_motion
+from humangs_jax.synthetic.poses import sample_rotations
+from humangs_jax.synthetic.subject import make_subject
+from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
 
 POSE_STREAM, CAMERA_STREAM, ERROR_STREAM = 21, 22, 23
 SIZE = 512

@@ -12,10 +12,10 @@ from experiments.results import markdown_table
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.people import anatomy, surroundings
-from humangs_jax.people.subject import DEMO, make_subject, padded, pose_subject, render_view
-from humangs_jax.people.writer import sample_motion, sample_pose
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.synthetic import anatomy, surroundings
+from humangs_jax.synthetic.subject import DEMO, make_subject, padded, pose_subject, render_view
+from humangs_jax.synthetic.writer import sample_motion, sample_pose
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
 """Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be.

@@ -17,10 +17,10 @@ from humangs_jax.network.config import Conventions
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.vertex_decoder import VertexDecoder
-from humangs_jax.people.on_the_fly import OnTheFlyConfig
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig
 from humangs_jax.training.config import PRESETS as RUNS
 from humangs_jax.training.config import TrainConfig
 

@@ -18,11 +18,11 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.images import to_uint8
 from humangs_jax.losses.losses import masked_psnr, psnr
+from humangs_jax.motion import load_motion
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import render
 from humangs_jax.viewer.page import write_page

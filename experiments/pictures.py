@@ -28,9 +28,9 @@ from humangs_jax.avatar.video import tile, write_video
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture, load_capture
-from humangs_jax.data.motion import load_motion
 from humangs_jax.geometry.camera import look_at, project
 from humangs_jax.io.images import to_uint8
+from humangs_jax.motion import load_motion
 from humangs_jax.rendering.splatting import render
 
 CROP = 0.75

@@ -19,24 +19,24 @@ from scipy import ndimage
 
 from experiments.subjects import Scores, score_tasks
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.core.array_types import Bool, Float, UInt8
-from humangs_jax.core.progress import bar
-from humangs_jax.data.cameras import distort
-from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import camera_gains, multiplied
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
-from humangs_jax.data.masks import person_box
-from humangs_jax.data.photos import on_white_background, write_description
-from humangs_jax.detection.people import (
+from humangs_jax.capture.detection.people import (
     LANDMARK_SIZE,
     DetectedPerson,
     Networks,
     bilinear,
     detect_people,
 )
-from humangs_jax.detection.sharpening import sharpened
+from humangs_jax.capture.detection.sharpening import sharpened
+from humangs_jax.capture.fitting.refine import CaptureRefineConfig, Scene
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.core.array_types import Bool, Float, UInt8
+from humangs_jax.core.progress import bar
+from humangs_jax.data.cameras import distort
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import camera_gains, multiplied
+from humangs_jax.data.masks import person_box
+from humangs_jax.data.photos import on_white_background, write_description
 from humangs_jax.evaluation.cases import draw_views
-from humangs_jax.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import resized, to_uint8, write_png

@@ -43,12 +43,12 @@ from humangs_jax.apps.start import better_body
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
+from humangs_jax.capture.fitting.fit_capture import FittedCapture, fit_photos
+from humangs_jax.capture.fitting.refine import refine_capture, usual_config
 from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos, load_photos
 from humangs_jax.evaluation.scores import mean_scores
-from humangs_jax.fitting.fit_capture import FittedCapture, fit_photos
-from humangs_jax.fitting.refine import refine_capture, usual_config
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.refine import refine

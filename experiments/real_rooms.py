@@ -33,21 +33,26 @@ from humangs_jax.avatar.frames import images, motion_views, turntable_views
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile
 from humangs_jax.body.library import load_body
+from humangs_jax.capture.detection.people import Networks, bilinear
+from humangs_jax.capture.fitting.fit_capture import fit_photos
+from humangs_jax.capture.fitting.person_cameras import cameras_from_person
+from humangs_jax.capture.fitting.person_moments import PersonViews
+from humangs_jax.capture.fitting.refine import (
+    CaptureRefineConfig,
+    Scene,
+    moved_capture,
+    posed_vertices,
+)
+from humangs_jax.capture.fitting.state import StateStd
+from humangs_jax.capture.fitting.triangulation import Similarity, align_points
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
-from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import Photos
-from humangs_jax.detection.people import Networks, bilinear
-from humangs_jax.fitting.fit_capture import fit_photos
-from humangs_jax.fitting.person_cameras import cameras_from_person
-from humangs_jax.fitting.person_moments import PersonViews
-from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, moved_capture, posed_vertices
-from humangs_jax.fitting.state import StateStd
-from humangs_jax.fitting.triangulation import Similarity, align_points
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import image_size, read_image, resized, to_uint8
+from humangs_jax.motion import load_motion
 
 PHOTOS, NOVEL = 4, 4
 COLUMNS = 6

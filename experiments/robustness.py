@@ -26,7 +26,7 @@ from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.subject import seeds_of
+from humangs_jax.synthetic.subject import seeds_of
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.diagnose import Recorder, observe_subject
 from humangs_jax.training.forward import draw_targets, white_backgrounds

@@ -4,7 +4,7 @@ rows depend on.
 Photos are from a ring of `RING` cameras of the published protocol, evenly spaced but for the
 generator's jitter, number 0 the most frontal one. N photos are every (RING / N)-th camera, so each
 person is rendered once for all numbers of photos. Held-out cameras and novel poses are those of
-`humangs_jax.people.writer.write_person` for the same seed; images have 8 bits as on disk.
+`humangs_jax.synthetic.writer.write_person` for the same seed; images have 8 bits as on disk.
 
 A row of scores is {"novel": scores, "animation": scores}: held-out views in the pose of the photos,
 and in poses that no photo shows; means over views, under the protocol "humangs".
@@ -38,9 +38,9 @@ from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import SHIPPED, load_weights
-from humangs_jax.people.subject import GENERATOR_VERSION, PosedSubject, make_subject, seeds_of
-from humangs_jax.people.surroundings import cameras_around, spread_azimuths
-from humangs_jax.people.writer import (
+from humangs_jax.synthetic.subject import GENERATOR_VERSION, PosedSubject, make_subject, seeds_of
+from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
+from humangs_jax.synthetic.writer import (
     CAMERA_STREAM,
     HELD_OUT_STREAM,
     View,

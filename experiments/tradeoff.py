@@ -45,9 +45,9 @@ from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.io.images import resized
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.network.weights import SHIPPED, load_weights
-from humangs_jax.people.subject import GENERATOR_VERSION, seeds_of
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
 from humangs_jax.refinement.refine import refine_with_report
+from humangs_jax.synthetic.subject import GENERATOR_VERSION, seeds_of
 
 SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
 """Held-out views of a person: of the pose of the photos; novel poses; views of each."""

@@ -24,9 +24,9 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.losses.loss_networks import load_loss_networks
 from humangs_jax.network.weights import load_weights, save_weights
-from humangs_jax.people.bank import build_bank
-from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
-from humangs_jax.people.subject import seeds_of
+from humangs_jax.synthetic.bank import build_bank
+from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig, on_the_fly_example
+from humangs_jax.synthetic.subject import seeds_of
 from humangs_jax.training import config as presets
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.state import init_state

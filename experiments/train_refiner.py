@@ -43,9 +43,6 @@ from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.losses.losses import structural_dissimilarity
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.bank import build_bank, load_bank, save_bank
-from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
-from humangs_jax.people.subject import seeds_of
 from humangs_jax.refinement.learned import (
     Refiner,
     Signals,
@@ -63,6 +60,9 @@ from humangs_jax.refinement.photos import Photo
 from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import render
+from humangs_jax.synthetic.bank import build_bank, load_bank, save_bank
+from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig, on_the_fly_example
+from humangs_jax.synthetic.subject import seeds_of
 
 FIRST_SEED = 6000
 """Of the training range, after those of the shipped network."""

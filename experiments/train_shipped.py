@@ -37,9 +37,9 @@ from humangs_jax.network.weights import (
     save_weights,
     variables_from_tensors,
 )
-from humangs_jax.people.bank import load_bank
-from humangs_jax.people.sources import on_the_fly_people
-from humangs_jax.people.writer import Layout, write_set
+from humangs_jax.synthetic.bank import load_bank
+from humangs_jax.synthetic.sources import on_the_fly_people
+from humangs_jax.synthetic.writer import Layout, write_set
 from humangs_jax.training.config import TrainConfig, small
 from humangs_jax.training.loop import TrainingInterrupted, train
 from humangs_jax.training.sources import training_people

@@ -35,7 +35,7 @@ from humangs_jax.losses.perceptual import (
     channels,
     convolutions,
 )
-from humangs_jax.people.writer import Layout, write_person
+from humangs_jax.synthetic.writer import Layout, write_person
 from humangs_jax.training import sharding
 from humangs_jax.training.config import PRESETS
 from humangs_jax.training.state import init_state

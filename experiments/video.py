@@ -24,8 +24,8 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import load_motion
 from humangs_jax.io.images import to_uint8
+from humangs_jax.motion import load_motion
 
 WALKED = 2.5
 """Metres."""

@@ -14,11 +14,11 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
+from humangs_jax.capture.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.io.images import read_image, write_png
 from humangs_jax.io.reading import write_json
-from humangs_jax.people.writer import Layout, write_person
+from humangs_jax.synthetic.writer import Layout, write_person
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 SEED, VIEWS, SIZE, NOISE = 4_000_009, 4, 512, 2.0

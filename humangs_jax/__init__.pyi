@@ -10,7 +10,7 @@ from .data.capture import load_capture as load_capture
 from .data.capture import capture_from_arrays as capture_from_arrays
 from .data.capture import save_capture as save_capture
 from .avatar.reconstruct import stack_captures as stack_captures
-from .data.motion import load_motion as load_motion
+from .motion import load_motion as load_motion
 
 # bodies
 from .body.model import BodyModel as BodyModel, BodyPose as BodyPose
@@ -41,7 +41,7 @@ from .avatar.export.gaussians import (
     load_gaussians as load_gaussians,
     save_gaussians as save_gaussians,
 )
-from .data.calibration.loaded import load_cameras as load_cameras
+from .capture.calibration.loaded import load_cameras as load_cameras
 from .geometry.camera import Camera as Camera, look_at as look_at, orbit as orbit
 from .rendering.splatting import render as render, render_views as render_views
 from .rendering.reference import render_reference as render_reference

@@ -16,7 +16,9 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import re
 import signal
+import sys
 import zlib
 from pathlib import Path
 
@@ -112,10 +114,54 @@ for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isc
     setattr(owner, name, scaled_comparison(getattr(owner, name)))
 
 
+CORE = (
+    *("core", "geometry", "io", "body", "rendering", "network", "losses", "scenes"),
+    *("data", "avatar", "refinement", "evaluation", "training"),
+)
+"""Rooms of the core; their tests run with the wings hidden."""
+WINGS = ("capture", "motion", "synthetic", "viewer")
+"""Rooms that the core does not import."""
+NEEDS_WINGS = re.compile(
+    rf"humangs_jax\.({'|'.join((*WINGS, 'apps', 'cli'))})\b|from experiments|command_line|motion_cases"
+)
+"""What the text of a test has that looks at the core and a wing, or a command, together."""
+
+
+class HiddenWings:
+    """Refuses to import a wing."""
+
+    def find_spec(self, name, path=None, target=None):
+        package, _, inside = name.partition(".")
+        if package == "humangs_jax" and inside.split(".")[0] in WINGS:
+            raise ModuleNotFoundError(f"{name} is hidden by --core-alone")
+
+
 def pytest_addoption(parser):
+    parser.addoption(
+        "--core-alone",
+        action="store_true",
+        help="hide capture/, motion/, synthetic/ and viewer/, and run the tests of the core",
+    )
     parser.addoption(
         "--slice", metavar="I/N", help="run only the I-th (from 0) of N slices of the tests"
     )
+
+
+def pytest_configure(config):
+    if config.getoption("--core-alone"):
+        sys.meta_path.insert(0, HiddenWings())
+
+
+def pytest_ignore_collect(collection_path, config):
+    """With --core-alone: what is no test of the core's rooms, or imports a wing itself."""
+    if not config.getoption("--core-alone"):
+        return None
+    inside = collection_path.relative_to(Path(__file__).parent).parts
+    if not inside or collection_path.is_dir():
+        return bool(inside) and inside[0] not in CORE
+    if collection_path.suffix != ".py":
+        return True
+    return inside[0] not in CORE or NEEDS_WINGS.search(collection_path.read_text()) is not None
 
 
 def pytest_collection_modifyitems(config, items):

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES
-from humangs_jax.data.motion.rules import joint_places
-from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.motion.rules import joint_places
+from humangs_jax.motion.skeleton import shipped_joints
 
 INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
 FPS, FRAMES = 30.0, 48

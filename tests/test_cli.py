@@ -315,14 +315,14 @@ def test_bars_are_hidden_by_quiet(capsys):
 def test_a_check_goes_on_where_the_fit_does_not_know_a_view(
     capture_folder, tmp_path, monkeypatch, humangs
 ):
+    from humangs_jax.capture.fitting.files import UnknownViewError
     from humangs_jax.cli.fit import Detections
-    from humangs_jax.fitting.files import UnknownViewError
 
     def changed(*_):
         raise UnknownViewError("the capture's fit knows no view x: fit it again")
 
     monkeypatch.setattr(Detections, "read_or_recorded", changed)
-    monkeypatch.setattr("humangs_jax.detection.people.available", lambda: False)
+    monkeypatch.setattr("humangs_jax.capture.detection.people.available", lambda: False)
     code, out, error = humangs("check", capture_folder, "--out", tmp_path / "check.png")
     assert code == 0 and "no view x: fit it again; the check does without that fit" in error
     assert (

@@ -21,8 +21,8 @@ from humangs_jax.body.motion import Motion
 from humangs_jax.cli import options
 from humangs_jax.core.configuration import marks_in
 from humangs_jax.data.capture import load_capture, save_capture
-from humangs_jax.data.motion import save_motion
 from humangs_jax.io.images import write_png
+from humangs_jax.motion import save_motion
 
 
 @pytest.fixture(scope="module")

@@ -20,12 +20,12 @@ from humangs_jax.data.loading.captures import CaptureFolder, find_captures
 from humangs_jax.data.loading.examples import StoredSubject
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.people.fabrics import Fabric, random_color
-from humangs_jax.people.outfits import Garment
-from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.subject import Person, PosedSubject, describe, make_subject, seeds_of
-from humangs_jax.people.surroundings import cameras_around, sample_lights, spread_azimuths
-from humangs_jax.people.writer import HELD_OUT, View, capture_views, stand
+from humangs_jax.synthetic.fabrics import Fabric, random_color
+from humangs_jax.synthetic.outfits import Garment
+from humangs_jax.synthetic.poses import sample_rotations
+from humangs_jax.synthetic.subject import Person, PosedSubject, describe, make_subject, seeds_of
+from humangs_jax.synthetic.surroundings import cameras_around, sample_lights, spread_azimuths
+from humangs_jax.synthetic.writer import HELD_OUT, View, capture_views, stand
 from humangs_jax.training.sources import MakeSource
 
 SIZE, POSES = 32, 8

@@ -24,15 +24,15 @@ from humangs_jax.apps.quick_check import faults
 from humangs_jax.avatar.video import contact_sheet
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, pose_body, shape_body
+from humangs_jax.capture.fitting.camera_errors import find_camera_errors
+from humangs_jax.capture.fitting.fit_capture import Examination
+from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.progress import text_table
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD, displacement
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.skirt import with_skirt
-from humangs_jax.fitting.camera_errors import find_camera_errors
-from humangs_jax.fitting.fit_capture import Examination
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import to_uint8

@@ -27,12 +27,12 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import contact_sheet, side_by_side, write_video
 from humangs_jax.core.progress import COMPILING, stage
 from humangs_jax.data.capture import Capture, load_capture
-from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import add_files, check_ours
 from humangs_jax.io.reading import read_json, write_json
+from humangs_jax.motion import load_motion
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report

@@ -25,17 +25,7 @@ from humangs_jax.apps.same_people import (
     same_people,
 )
 from humangs_jax.apps.start import photo_files, scan_photos
-from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.core.progress import bar
-from humangs_jax.data.capture import Capture
-from humangs_jax.data.capture_checks import few
-from humangs_jax.data.folders import unused_line
-from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, read_people, write_people
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
-from humangs_jax.data.masks import box_of
-from humangs_jax.data.photos import Photos, load_photos, read_description
-from humangs_jax.detection.people import (
+from humangs_jax.capture.detection.people import (
     LANDMARK_SIZE,
     SEEN,
     Landmarks,
@@ -44,7 +34,17 @@ from humangs_jax.detection.people import (
     mask_in_window,
     mask_window,
 )
-from humangs_jax.detection.sharpening import filter_margin, sharpened
+from humangs_jax.capture.detection.sharpening import filter_margin, sharpened
+from humangs_jax.capture.keypoints.formats import ImagePeople, SeenPerson, read_people, write_people
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.core.progress import bar
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.capture_checks import few
+from humangs_jax.data.folders import unused_line
+from humangs_jax.data.masks import box_of
+from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.io.atomic import MOVE_AWAY, add_files, check_ours
 from humangs_jax.io.images import (
     MASK,

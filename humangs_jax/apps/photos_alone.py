@@ -1,7 +1,8 @@
 """Photos without a calibration -> a capture without a body: the people in them are found, and from
 the person the cameras.
 
-See `fitting.person_cameras`; who is who in several photos: `apps.detect`. Large photos are reduced
+See `capture.fitting.person_cameras`; who is who in several photos: `apps.detect`. Large photos are
+reduced
 first: nothing that comes after looks at more than some hundred pixels of a person.
 """
 
@@ -16,17 +17,17 @@ import numpy as np
 from humangs_jax.apps import detect
 from humangs_jax.apps.same_people import PhotoPeople, exchanged, same_people
 from humangs_jax.apps.start import photo_files
+from humangs_jax.capture.calibration.importing import ImportReport, import_calibration
+from humangs_jax.capture.calibration.photos import upright_mask
+from humangs_jax.capture.calibration.videos import named_after
+from humangs_jax.capture.fitting.person_cameras import PersonCameras, cameras_from_person
+from humangs_jax.capture.fitting.person_moments import PersonViews
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.capture.keypoints.reading import read_keypoints
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
-from humangs_jax.data.calibration.importing import ImportReport, import_calibration
-from humangs_jax.data.calibration.photos import upright_mask
-from humangs_jax.data.calibration.videos import named_after
 from humangs_jax.data.cameras import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import few
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
-from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.photos import on_white_background, read_description
-from humangs_jax.fitting.person_cameras import PersonCameras, cameras_from_person
-from humangs_jax.fitting.person_moments import PersonViews
 from humangs_jax.io.images import (
     DIAGONAL_35MM,
     cropped_from,

@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float, Int, UInt
-from humangs_jax.data.keypoints.formats import SeenPerson
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
-from humangs_jax.fitting.triangulation import (
+from humangs_jax.capture.fitting.triangulation import (
     Seen,
     comparable,
     in_order_of_time,
     match_people,
 )
+from humangs_jax.capture.keypoints.formats import SeenPerson
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.core.array_types import Bool, Float, Int, UInt
 from humangs_jax.geometry.camera import Camera
 
 RIVAL = 0.35

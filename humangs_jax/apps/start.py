@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.capture.calibration.photos import MASK_FOLDERS, is_transparent
 from humangs_jax.core.array_types import Float, PyTree
 from humangs_jax.data.body_and_masks import usable_views
-from humangs_jax.data.calibration.photos import MASK_FOLDERS, is_transparent
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import equal_exposure

@@ -1,6 +1,6 @@
 """The photos of a video: its sharp frames, from all sides of the person.
 
-The person is followed through the frames that are offered (`data.calibration.frame_choice`),
+The person is followed through the frames that are offered (`capture.calibration.frame_choice`),
 reduced to `FOLLOWED` pixels: where one frame has found the person, the landmark network alone looks
 at the next. That tells which way the person faces in each, and which pose is the usual one.
 """
@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.apps.start import has_photos
-from humangs_jax.core.array_types import Float, UInt
-from humangs_jax.core.progress import bar
-from humangs_jax.data.calibration.frame_choice import (
+from humangs_jax.capture.calibration.frame_choice import (
     FRAMES,
     LONGER_SIDE,
     PHOTOS,
@@ -26,23 +24,25 @@ from humangs_jax.data.calibration.frame_choice import (
     offered_frames,
     unusual,
 )
-from humangs_jax.data.calibration.videos import (
+from humangs_jax.capture.calibration.videos import (
     color_frames,
     find_videos,
     frame_rate,
     grey_frames,
     write_frames,
 )
-from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.folders import is_video
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
-from humangs_jax.detection.people import (
+from humangs_jax.capture.detection.people import (
     LEAST_PRESENCE,
     Landmarks,
     Networks,
     available,
     find_people,
 )
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.core.progress import bar
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.folders import is_video
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.reading import read_json, reading, write_json
 

@@ -37,7 +37,7 @@ def keypoints_of(views: Any, file: Path | None, person: int | None) -> Any:
 
     Raises: see `read_keypoints`.
     """
-    from humangs_jax.data.keypoints.reading import read_keypoints
+    from humangs_jax.capture.keypoints.reading import read_keypoints
 
     height, width = views.images.shape[1:3]
     return None if file is None else read_keypoints(file, views.names, width, height, person=person)
@@ -45,7 +45,7 @@ def keypoints_of(views: Any, file: Path | None, person: int | None) -> Any:
 
 def keypoints_wanted() -> tuple[str, ...]:
     """What `humangs fit` has to be told: nothing where it finds keypoints itself."""
-    from humangs_jax.detection.people import available
+    from humangs_jax.capture.detection.people import available
 
     return (
         ()
@@ -180,7 +180,7 @@ class ImportCameras:
         inputs = (self.source, self.images, self.masks)
         require_replaceable(self.out, self.overwrite, "capture.json", inputs)
         with stage("starting"):
-            from humangs_jax.data.calibration.importing import import_cameras
+            from humangs_jax.capture.calibration.importing import import_cameras
 
         options = {
             name: value for name, value in vars(self).items() if name not in ("what", "max_frames")
@@ -267,7 +267,7 @@ class Synth:
                     f" means {value}"
                 )
         with stage("starting"):
-            from humangs_jax.people.writer import Layout, write_set
+            from humangs_jax.synthetic.writer import Layout, write_set
 
         layout = Layout(
             small.get("size", self.size),

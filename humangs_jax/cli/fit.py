@@ -44,8 +44,8 @@ class Detections:
         """The keypoints of the views; without a file of them those of the fit in the capture's
         folder, and its record.
         """
+        from humangs_jax.capture.fitting.files import FIT_FILE, read_fit_record
         from humangs_jax.data.photos import capture_folder
-        from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         file = capture_folder(capture) / FIT_FILE
         if self.keypoints is not None or not file.exists():
@@ -156,11 +156,11 @@ class Fit:
     def _fit_keypoints(self) -> None:
         with stage("starting"):
             from humangs_jax.body.library import load_body
+            from humangs_jax.capture.detection.people import available
+            from humangs_jax.capture.fitting.files import check_place, write_fitted
+            from humangs_jax.capture.fitting.fit_capture import fit_photos
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
-            from humangs_jax.detection.people import available
-            from humangs_jax.fitting.files import check_place, write_fitted
-            from humangs_jax.fitting.fit_capture import fit_photos
 
         target = check_place(
             self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body)
@@ -201,9 +201,13 @@ class Fit:
 
     def _refine(self) -> None:
         with stage("starting"):
+            from humangs_jax.capture.fitting.files import check_place, write_fitted
+            from humangs_jax.capture.fitting.refine import (
+                cameras_are_unseen,
+                refine_capture,
+                usual_config,
+            )
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.fitting.files import check_place, write_fitted
-            from humangs_jax.fitting.refine import cameras_are_unseen, refine_capture, usual_config
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
@@ -261,9 +265,9 @@ class Check:
 
             unasked = [sheet, *([self.out] if self.out == DEFAULT_SHEET else [])]
             check_ours(unasked, is_own_output, "choose another name by --out, or move it away")
+            from humangs_jax.capture.detection.people import available
+            from humangs_jax.capture.fitting.files import UnknownViewError
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.detection.people import available
-            from humangs_jax.fitting.files import UnknownViewError
 
         with stage("reading the capture"):
             capture = load_capture(self.capture, fit_masks=True)
@@ -282,7 +286,7 @@ class Check:
         if keypoints is not None:
             with stage("examining the fit"):
                 from humangs_jax.apps.check import fit_sheet
-                from humangs_jax.fitting.fit_capture import examine
+                from humangs_jax.capture.fitting.fit_capture import examine
 
                 examination = examine(capture, keypoints, record)
                 fit_sheet(capture, keypoints, examination, sheet)

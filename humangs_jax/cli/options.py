@@ -90,7 +90,7 @@ class PartOfMotion:
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
         """The motion of a file; None: the shipped walk. Raises: MotionError."""
-        from humangs_jax.data.motion import load_motion
+        from humangs_jax.motion import load_motion
 
         if path is None and (
             said := [name for name, value in vars(self).items() if value is not None]

@@ -22,10 +22,10 @@ from humangs_jax.data.formats import CAMERAS, KEYPOINTS, START_MARK
 
 if TYPE_CHECKING:
     from humangs_jax.apps.start import HeldOut, Material
-    from humangs_jax.data.calibration.importing import ImportReport
+    from humangs_jax.capture.calibration.importing import ImportReport
+    from humangs_jax.capture.fitting.files import FitRecord
+    from humangs_jax.capture.fitting.refine import RefinedCapture
     from humangs_jax.data.capture import Capture
-    from humangs_jax.fitting.files import FitRecord
-    from humangs_jax.fitting.refine import RefinedCapture
 
 MARK = START_MARK
 """In a capture folder that `humangs start` imported: a later run may replace it until it has a
@@ -187,7 +187,7 @@ class Start:
     def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """From where an earlier run came to an end, if there was one."""
         from humangs_jax.apps.start import missing
-        from humangs_jax.detection.people import available
+        from humangs_jax.capture.detection.people import available
         from humangs_jax.io.reading import read_json
 
         if self._resumes():
@@ -316,7 +316,7 @@ class Start:
 
     def _import(self, material: "Material") -> "ImportReport":
         with stage("importing photos and cameras"):
-            from humangs_jax.data.calibration.importing import import_cameras
+            from humangs_jax.capture.calibration.importing import import_cameras
 
             assert material.cameras is not None
             report = import_cameras(
@@ -352,11 +352,15 @@ class Start:
             from humangs_jax.apps.detect import MASKS
             from humangs_jax.apps.start import better_body
             from humangs_jax.body.library import load_body
+            from humangs_jax.capture.fitting.contradiction import find_contradiction
+            from humangs_jax.capture.fitting.files import write_fitted
+            from humangs_jax.capture.fitting.fit_capture import fit_photos
+            from humangs_jax.capture.fitting.refine import (
+                cameras_are_unseen,
+                refine_capture,
+                usual_config,
+            )
             from humangs_jax.data.photos import load_photos
-            from humangs_jax.fitting.contradiction import find_contradiction
-            from humangs_jax.fitting.files import write_fitted
-            from humangs_jax.fitting.fit_capture import fit_photos
-            from humangs_jax.fitting.refine import cameras_are_unseen, refine_capture, usual_config
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 
@@ -407,7 +411,7 @@ class Start:
             report = (tight if capture is tight.capture else loose).report
             tell(f"\n{report}")
         if self.height is not None:
-            from humangs_jax.fitting.person_cameras import scaled_to_height
+            from humangs_jax.capture.fitting.person_cameras import scaled_to_height
 
             capture = scaled_to_height(capture, self.height)
         write_fitted(self.out, self.out, capture, report, record)
@@ -424,7 +428,7 @@ class Start:
             return bodies, record
         with stage("looking for movement between the photos"):
             from humangs_jax.apps.video_photos import seconds_of_photos
-            from humangs_jax.fitting.own_poses import (
+            from humangs_jax.capture.fitting.own_poses import (
                 find_movement,
                 fit_own_poses,
                 movement_line,

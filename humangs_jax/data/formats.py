@@ -108,7 +108,10 @@ class SourceFormats(Formats[F]):
         return "; ".join(map(str, self.values()))
 
 
-_CAMERAS, _KEYPOINTS = "humangs_jax.data.calibration.", "humangs_jax.data.keypoints.formats:read_"
+_CAMERAS, _KEYPOINTS = (
+    "humangs_jax.capture.calibration.",
+    "humangs_jax.capture.keypoints.formats:read_",
+)
 _MODELS = ("", "sparse/0/", "sparse/")
 CAMERAS = SourceFormats(
     colmap=CameraFormat(
@@ -228,7 +231,7 @@ KEYPOINTS = SourceFormats(
 # Motions
 # --------------------------------------------------------------------------------------------------
 
-ARRAYS = "humangs_jax.data.motion.arrays:read_arrays"
+ARRAYS = "humangs_jax.motion.arrays:read_arrays"
 ARRAY_SUFFIXES = (".npz", ".pkl", ".pickle", ".pt", ".pth", ".npy", ".smpl", ".json", FOLDER)
 PLACES = {
     "all": (0, 55),
@@ -418,24 +421,22 @@ MOTIONS = Formats(
     tcmr=_arrays("TCMR", "pose verts", "all=pose", use=_ALONE | {"stays": True}),
     local=_arrays("WHAM of one camera", "pose frame_ids", "all=pose", use=_ALONE | {"stays": True}),
     smpl=_arrays("SMPL (pose)", "pose", "all=pose", up="z", also=("y", "-y")),
-    bvh=MotionFormat(
-        "skeletons of other programs", "humangs_jax.data.motion.clips:read_bvh", (".bvh",)
-    ),
+    bvh=MotionFormat("skeletons of other programs", "humangs_jax.motion.clips:read_bvh", (".bvh",)),
     glb=MotionFormat(
         "skeletons of other programs",
-        "humangs_jax.data.motion.clips:read_animation",
+        "humangs_jax.motion.clips:read_animation",
         (".glb", ".vrma"),
     ),
     face=MotionFormat(
         "faces of Live Link Face or with ARKit's names",
-        "humangs_jax.data.motion.face_files:read_table",
+        "humangs_jax.motion.face_files:read_table",
         (".csv",),
     ),
     scores=MotionFormat(
         "faces of MediaPipe",
-        "humangs_jax.data.motion.face_files:read_scores",
+        "humangs_jax.motion.face_files:read_scores",
         (".json",),
-        "humangs_jax.data.motion.face_files:has_scores",
+        "humangs_jax.motion.face_files:has_scores",
     ),
 )
 """By name, in the order in which keys and files are asked."""

@@ -34,7 +34,7 @@ from humangs_jax.training.sharding import batch_sharding
 
 logger = logging.getLogger(__name__)
 
-SYNTHETIC = "humangs_jax.people"
+SYNTHETIC = "humangs_jax.synthetic"
 """The wing of synthetic people, which a run without them does not import."""
 MakeSource = Callable[[TrainConfig], Source]
 """Configuration of a stage -> examples of its sizes."""
@@ -117,7 +117,7 @@ def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> M
     """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md),
     whose body is `body`.
 
-    split: of synthetic captures, see `people.writer.find_people`.
+    split: of synthetic captures, see `synthetic.writer.find_people`.
     Raises: ValueError if the folder has none of these.
     """
     if (data / "capture.json").is_file() or any(data.glob("*/capture.json")):

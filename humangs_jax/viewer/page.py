@@ -33,10 +33,10 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import printable, say
-from humangs_jax.data.motion import load_motion
-from humangs_jax.data.motion.rules import page_rules
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
+from humangs_jax.motion import load_motion
+from humangs_jax.motion.rules import page_rules
 from humangs_jax.rendering.gaussians import added_variance, gaussian_values
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.viewer.page_face import pack_face

@@ -24,12 +24,12 @@ from humangs_jax.apps.detect import (
     write_found,
 )
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.capture.detection.people import Crop, Detection, Landmarks, mask_in_photo
+from humangs_jax.capture.detection.sharpening import sharpened
+from humangs_jax.capture.keypoints.formats import SeenPerson
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.capture.keypoints.reading import read_keypoints
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.keypoints.formats import SeenPerson
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
-from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.detection.people import Crop, Detection, Landmarks, mask_in_photo
-from humangs_jax.detection.sharpening import sharpened
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import read_grey, to_uint8, write_png
 

@@ -13,7 +13,7 @@ from humangs_jax import cli
 from humangs_jax.apps import demo, detect
 from humangs_jax.avatar.export import mesh
 from humangs_jax.avatar.video import write_video
-from humangs_jax.detection import people as blazepose
+from humangs_jax.capture.detection import people as blazepose
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import MASK, is_own_picture, mark_of, write_png
 from tests.apps.test_detect import found, photo

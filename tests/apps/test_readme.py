@@ -216,8 +216,8 @@ def person():
 @pytest.mark.parametrize("page", ON_A_PERSON)
 def test_the_blocks_of_a_page_on_a_person_run(page, person, files):
     if page == "docs/data.md":
-        from humangs_jax.people.bank import build_bank
-        from humangs_jax.people.writer import Layout, write_set
+        from humangs_jax.synthetic.bank import build_bank
+        from humangs_jax.synthetic.writer import Layout, write_set
 
         write_set(files / "people", 2, Layout(128, views=4), "train", 0, workers=1)
         person = person | {

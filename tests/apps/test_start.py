@@ -21,20 +21,20 @@ from humangs_jax.avatar.video import write_video
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.resolution import decimate
+from humangs_jax.capture.calibration.importing import import_calibration
+from humangs_jax.capture.detection import people as blazepose
+from humangs_jax.capture.fitting import fit_capture
+from humangs_jax.capture.fitting.person_cameras import PersonCameras
+from humangs_jax.capture.fitting.person_moments import PersonViews
+from humangs_jax.capture.fitting.refine import usual_config
+from humangs_jax.capture.keypoints.formats import SeenPerson
+from humangs_jax.capture.keypoints.keypoints import COCO_17, MEDIAPIPE_33
 from humangs_jax.cli.start import Start
 from humangs_jax.data import exposure
-from humangs_jax.data.calibration.importing import import_calibration
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import equal_exposure, multiplied
-from humangs_jax.data.keypoints.formats import SeenPerson
-from humangs_jax.data.keypoints.keypoints import COCO_17, MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
-from humangs_jax.detection import people as blazepose
-from humangs_jax.fitting import fit_capture
-from humangs_jax.fitting.person_cameras import PersonCameras
-from humangs_jax.fitting.person_moments import PersonViews
-from humangs_jax.fitting.refine import usual_config
 from humangs_jax.geometry.camera import Camera, orbit
 from humangs_jax.io.images import read_image, to_uint8, write_png
 from humangs_jax.io.reading import write_json
@@ -422,7 +422,7 @@ def test_refinement_takes_cameras_for_calibrated_if_the_capture_says_so(tmp_path
         configs.append(config)
         raise ValueError("far enough")
 
-    monkeypatch.setattr("humangs_jax.fitting.refine.refine_capture", refine_capture)
+    monkeypatch.setattr("humangs_jax.capture.fitting.refine.refine_capture", refine_capture)
     demo = load_capture("demo_capture")
     alone = dataclasses.replace(demo.select([0]), frames=np.zeros(1, np.int32))
     for capture, calibrated in ((demo, True), (demo, False), (alone, True), (alone, False)):

@@ -6,9 +6,9 @@ import pytest
 from humangs_jax.apps import video_photos
 from humangs_jax.apps.video_photos import MARK, photos_of_video, seconds_of_photos
 from humangs_jax.avatar.video import write_video
-from humangs_jax.detection.people import Crop, Detection, Landmarks
+from humangs_jax.capture.detection.people import Crop, Detection, Landmarks
 from humangs_jax.io.reading import read_json, write_json
-from tests.data.test_frame_choice import turning
+from tests.capture.test_frame_choice import turning
 
 COUNT = 40
 

@@ -14,9 +14,9 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import save_motion
 from humangs_jax.geometry.camera import intrinsics_from_fov, look_at, orbit, stack_cameras
 from humangs_jax.io.images import read_image
+from humangs_jax.motion import save_motion
 
 TARGET = jnp.asarray([0.0, 0.9, 0.0])
 BLENDER = np.diag([1.0, -1, -1, 1])

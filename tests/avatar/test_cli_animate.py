@@ -12,8 +12,8 @@ from exr_files import read_exr
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.motion import Motion
 from humangs_jax.cli.animate import Animate, Render
-from humangs_jax.data.motion import save_motion
 from humangs_jax.io.images import read_image
+from humangs_jax.motion import save_motion
 
 
 @pytest.fixture

@@ -37,9 +37,9 @@ from humangs_jax.body.motion import Motion
 from humangs_jax.cli import avatars
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import imported
-from humangs_jax.data.motion import save_motion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.mesh import parse_glb, read_accessor
+from humangs_jax.motion import save_motion
 from humangs_jax.rendering.gaussians import covariances, widened
 from humangs_jax.rendering.projection import project_gaussians as project
 

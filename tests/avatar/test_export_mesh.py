@@ -32,9 +32,9 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import RestBody
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import load_motion, save_motion
-from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.io.mesh import parse_glb, read_accessor
+from humangs_jax.motion import load_motion, save_motion
+from humangs_jax.motion.skeleton import shipped_joints
 from humangs_jax.rendering.gaussians import Gaussians
 
 VALIDATOR = Path(os.environ.get("HUMANGS_NPM", ".")) / "node_modules" / "gltf-validator"

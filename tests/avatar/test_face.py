@@ -18,8 +18,8 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import rest_pose, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import load_motion, save_motion
 from humangs_jax.io.reading import FileError
+from humangs_jax.motion import load_motion, save_motion
 from humangs_jax.rendering.gaussians import Gaussians
 
 SKIN = 0.6

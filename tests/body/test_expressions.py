@@ -13,7 +13,7 @@ from humangs_jax.body.library import load_body, read_body, save_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
 from humangs_jax.body.resolution import decimate, split_long_edges
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion.face_tracks import ARKIT
+from humangs_jax.motion.face_tracks import ARKIT
 
 
 @pytest.fixture(scope="module")

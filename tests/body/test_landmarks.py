@@ -10,13 +10,13 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.landmarks import Place, landmark_model, mirrored_name, pose_landmarks, side_of
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
-from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import (
+from humangs_jax.capture.keypoints.keypoints import (
     COCO_17,
     COCO_WHOLEBODY_133,
     MEDIAPIPE_33,
     OPENPOSE_67,
 )
+from humangs_jax.core.pytree import replace
 
 ATOL = 2e-6  # metres, float32
 SYMMETRY = 0.004  # metres: the shipped body's feet are not quite mirror images

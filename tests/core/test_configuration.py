@@ -20,7 +20,7 @@ from humangs_jax.core.configuration import (
     configuration,
     vary,
 )
-from humangs_jax.people.on_the_fly import OnTheFlyConfig
+from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig
 from humangs_jax.training import config
 
 

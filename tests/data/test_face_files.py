@@ -17,9 +17,9 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import MotionError, load_motion
-from humangs_jax.data.motion.face_tracks import ARKIT, arkit_name, of_preset
 from humangs_jax.io.mesh import GlbWriter
+from humangs_jax.motion import MotionError, load_motion
+from humangs_jax.motion.face_tracks import ARKIT, arkit_name, of_preset
 from humangs_jax.rendering.gaussians import Gaussians
 
 

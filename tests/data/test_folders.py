@@ -14,12 +14,12 @@ import humangs_jax as hg
 from humangs_jax.apps.start import look, photo_files
 from humangs_jax.apps.video_photos import video_of
 from humangs_jax.avatar.video import contact_sheet, write_video
-from humangs_jax.data.calibration.importing import import_cameras
+from humangs_jax.capture.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.datasets.multiview import numbered
 from humangs_jax.data.folders import photo_of_mask, photos_in, scan_folder, unused_line
 from humangs_jax.io.images import DRAWN, MASK, PHOTO_SUFFIXES, is_own_picture, mark_of, write_png
-from tests.data import calibration_files as written
+from tests.capture import calibration_files as written
 
 FILES, NAMES = written.FILES, written.NAMES
 CLIP = np.full((3, written.HEIGHT, written.WIDTH, 3), 0.5)

@@ -13,14 +13,14 @@ import pytest
 from experiments.render_tables import format_table
 from humangs_jax import cli
 from humangs_jax.apps.start import look
+from humangs_jax.capture.calibration.importing import import_cameras
+from humangs_jax.capture.keypoints.keypoints import DetectedImage, detections_of
+from humangs_jax.capture.keypoints.reading import read_keypoints
 from humangs_jax.cli import captures, fit, start
-from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.cameras import CalibratedCamera, read_calibration
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS, CameraFormat, SourceFormat
-from humangs_jax.data.keypoints.keypoints import DetectedImage, detections_of
-from humangs_jax.data.keypoints.reading import read_keypoints
-from tests.data import calibration_files as written
+from tests.capture import calibration_files as written
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from changes import edit_json
 
+from humangs_jax.capture.fitting.refine import overlap
+from humangs_jax.capture.fitting.residuals.silhouettes import mask_boundary
 from humangs_jax.data.body_and_masks import displacement, unusable_views
 from humangs_jax.data.capture import CaptureError, load_capture, save_capture
 from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.scores import score
-from humangs_jax.fitting.refine import overlap
-from humangs_jax.fitting.residuals.silhouettes import mask_boundary
 from humangs_jax.io.images import read_grey, write_png
 from humangs_jax.refinement.photos import crop_to_person, photos_of
 

@@ -20,9 +20,9 @@ from humangs_jax.data.loading.examples import MIX_BLOCK, block_counts, source_at
 from humangs_jax.data.sets import DATA_SET, SYNTHETIC, begin_set
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.people.on_the_fly import GeneratedSource
-from humangs_jax.people.subject import GENERATOR_VERSION, SPLITS, TRAIN, split_of, subject_key
-from humangs_jax.people.writer import find_people
+from humangs_jax.synthetic.on_the_fly import GeneratedSource
+from humangs_jax.synthetic.subject import GENERATOR_VERSION, SPLITS, TRAIN, split_of, subject_key
+from humangs_jax.synthetic.writer import find_people
 
 SIZE = 4
 

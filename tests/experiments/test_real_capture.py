@@ -8,7 +8,7 @@ import pytest
 from experiments.real_capture import VideoCamera, background, careful_mask, read_cameras
 from experiments.real_person import section
 from experiments.real_rooms import camera_errors, seen_from, to_reference
-from humangs_jax.fitting.triangulation import Similarity
+from humangs_jax.capture.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
 PIXEL = 1e-6

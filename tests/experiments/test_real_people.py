@@ -15,9 +15,9 @@ from experiments.harness import Run
 from experiments.held_out_photos import in_shared_pose
 from experiments.real_capture import unpacked
 from experiments.real_people import Case, measure, section, turning_man, write_transforms
+from humangs_jax.capture.fitting.own_poses import with_own_poses
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.fitting.own_poses import with_own_poses
 
 COUNT = 16
 

@@ -8,8 +8,8 @@ import pytest
 from experiments import subjects as people
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.people.subject import DEMO
-from humangs_jax.people.writer import Layout, write_person
+from humangs_jax.synthetic.subject import DEMO
+from humangs_jax.synthetic.writer import Layout, write_person
 
 SIZE = 48
 pytestmark = pytest.mark.slow

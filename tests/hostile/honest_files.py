@@ -13,11 +13,11 @@ from PIL import Image
 from small import tetrahedron
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.data.keypoints.keypoints import COCO_17
-from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.capture.keypoints.keypoints import COCO_17
 from humangs_jax.io.mesh import GlbWriter
+from humangs_jax.motion.skeleton import shipped_joints
 from humangs_jax.network.weights import expected_variables, save_weights
-from humangs_jax.people.subject import GENERATOR_VERSION
+from humangs_jax.synthetic.subject import GENERATOR_VERSION
 from humangs_jax.training.config import tiny
 
 K = [[60.0, 0, 5], [0, 60, 6], [0, 0, 1]]

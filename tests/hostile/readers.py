@@ -30,22 +30,20 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export.gaussians import load_gaussians, save_gaussians
 from humangs_jax.avatar.frames import FOLLOWING, excerpt, smoothed_path
 from humangs_jax.body.library import load_body, load_hands, load_smplx, save_body
+from humangs_jax.capture.calibration.importing import import_cameras
+from humangs_jax.capture.calibration.loaded import load_cameras
+from humangs_jax.capture.fitting.files import read_fit_record
+from humangs_jax.capture.keypoints.reading import read_keypoints
 from humangs_jax.core.configuration import config_to_json
-from humangs_jax.data.calibration.importing import import_cameras
-from humangs_jax.data.calibration.loaded import load_cameras
 from humangs_jax.data.cameras import read_calibration
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
-from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.loading.captures import read_summary
-from humangs_jax.data.motion import load_motion
-from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
 from humangs_jax.data.sets import SYNTHETIC, begin_set
-from humangs_jax.fitting.files import read_fit_record
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.images import (
     check_image,
@@ -61,9 +59,11 @@ from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors
 from humangs_jax.losses.loss_networks import load_vgg19
+from humangs_jax.motion import load_motion
+from humangs_jax.motion.skeleton import shipped_joints
 from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.bank import load_bank
+from humangs_jax.synthetic.bank import load_bank
 from humangs_jax.training.config import read_config, tiny
 from humangs_jax.training.diagnose import first_failed_step
 

@@ -31,14 +31,14 @@ from humangs_jax.apps.quick_check import Faults
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, shape_body
+from humangs_jax.capture.fitting.files import FitRecord
+from humangs_jax.capture.fitting.refine import RefinedCapture
+from humangs_jax.capture.fitting.report import FitReport
+from humangs_jax.capture.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture, save_capture
-from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.evaluation.scores import Scores, score_names
-from humangs_jax.fitting.files import FitRecord
-from humangs_jax.fitting.refine import RefinedCapture
-from humangs_jax.fitting.report import FitReport
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.network.presets import tiny
@@ -52,13 +52,13 @@ from humangs_jax.training.forward import METRICS
 HEAVY = (
     *("apps.check", "apps.demo", "avatar.frames", "avatar.layers", "avatar.video"),
     *(
-        "data.calibration.importing",
-        "people.writer",
+        "capture.calibration.importing",
+        "synthetic.writer",
         "refinement.refine",
         "training.diagnose",
         "viewer.page",
     ),
-    *("fitting.fit_capture", "fitting.refine", "network.conversion"),
+    *("capture.fitting.fit_capture", "capture.fitting.refine", "network.conversion"),
 )
 LATE = (
     "orbax.checkpoint",
@@ -240,7 +240,7 @@ def stand_ins(variant):
             some_cameras(views),
         ),
         "avatar.layers.draw": lambda _, poses, *__: iter(some_renderings(variant, len(poses))),
-        "detection.people.available": lambda: False,
+        "capture.detection.people.available": lambda: False,
         "apps.check._body_image": shown,
         "apps.check.faults": lambda capture: Faults(
             (), (None,) * capture.view_count, (1.0,) * capture.view_count, set()
@@ -260,15 +260,15 @@ def stand_ins(variant):
         "apps.demo.draw_painted_body": lambda *_: None,
         "apps.demo.motion_frames": frames,
         "evaluation.run.score_views": scored,
-        "fitting.fit_capture.fit_photos": fitted,
-        "fitting.refine.refine_capture": refined,
+        "capture.fitting.fit_capture.fit_photos": fitted,
+        "capture.fitting.refine.refine_capture": refined,
         "network.conversion.load_checkpoint": converted,
         "network.conversion.describe": lambda _: "a network",
         "losses.loss_networks.collect_loss_networks": lambda _: ({"x": np.ones(999)}, ["VGG-19"]),
-        "people.writer.make_subject": person,
-        "people.writer.sample_pose": posed,
-        "people.writer.capture_views": views_of,
-        "people.writer.cameras_around": lambda rng, vertices, azimuths, size: some_cameras(
+        "synthetic.writer.make_subject": person,
+        "synthetic.writer.sample_pose": posed,
+        "synthetic.writer.capture_views": views_of,
+        "synthetic.writer.cameras_around": lambda rng, vertices, azimuths, size: some_cameras(
             len(azimuths), size
         ),
         "training.loop.train_step": step,

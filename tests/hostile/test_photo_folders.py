@@ -19,9 +19,9 @@ from experiments.your_photos import in_a_room
 from humangs_jax import cli
 from humangs_jax.apps import detect
 from humangs_jax.avatar.video import write_video
+from humangs_jax.capture.detection.people import find_people
+from humangs_jax.capture.keypoints.formats import read_people
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.keypoints.formats import read_people
-from humangs_jax.detection.people import find_people
 from humangs_jax.io.images import read_grey, resized, to_uint8
 
 HEIC = Path(__file__).parents[1] / "io" / "phone.heic"

@@ -18,8 +18,7 @@ from PIL import Image
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export.gaussians import load_gaussians
-from humangs_jax.data.keypoints.reading import read_detections
-from humangs_jax.data.motion import load_motion
+from humangs_jax.capture.keypoints.reading import read_detections
 from humangs_jax.io import reading as module
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.images import read_image
@@ -40,6 +39,7 @@ from humangs_jax.io.reading import (
     shown,
     walk,
 )
+from humangs_jax.motion import load_motion
 
 DOCS = Path(__file__).parents[2] / "docs" / "security.md"
 

@@ -10,9 +10,9 @@ from refinement_cases import HEIGHT
 
 from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.frames import capture_renderings
+from humangs_jax.capture.fitting.own_poses import with_own_poses
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.fitting.own_poses import with_own_poses
 from humangs_jax.refinement import head as heads
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.config import HEAD, RefineConfig

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from humangs_jax.body.library import load_body
-from humangs_jax.people import sources
+from humangs_jax.synthetic import sources
 from humangs_jax.training import ablation
 from humangs_jax.training.ablation import Ablation, ablate
 from humangs_jax.training.config import Stage

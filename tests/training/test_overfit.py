@@ -19,7 +19,7 @@ from humangs_jax.network import presets
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
-from humangs_jax.people.writer import Layout, write_person
+from humangs_jax.synthetic.writer import Layout, write_person
 from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 from humangs_jax.training.forward import evaluate
 from humangs_jax.training.state import init_state

@@ -16,9 +16,9 @@ from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.data.loading import CaptureSource
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.losses.loss_networks import NO_NETWORKS
-from humangs_jax.people.bank import build_bank
-from humangs_jax.people.sources import on_the_fly_people
-from humangs_jax.people.subject import SPLITS
+from humangs_jax.synthetic.bank import build_bank
+from humangs_jax.synthetic.sources import on_the_fly_people
+from humangs_jax.synthetic.subject import SPLITS
 from humangs_jax.training.config import PRESETS, fitting_losses
 from humangs_jax.training.sources import (
     captured_people,

@@ -21,8 +21,8 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import load_motion, save_motion
 from humangs_jax.geometry import transform
+from humangs_jax.motion import load_motion, save_motion
 from humangs_jax.viewer.page import page_server, write_page
 
 pytestmark = [

@@ -23,7 +23,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion import save_motion
+from humangs_jax.motion import save_motion
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.viewer import page
 

@@ -18,7 +18,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import rest_pose, shape_body
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.motion.face_tracks import ARKIT
+from humangs_jax.motion.face_tracks import ARKIT
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.viewer.page import pack, page_html, page_script
 

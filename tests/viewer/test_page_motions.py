@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.formats import MOTIONS
-from humangs_jax.data.motion import load_motion
-from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.io.images import is_own_picture, read_image, write_png
 from humangs_jax.io.mesh import GlbWriter
+from humangs_jax.motion import load_motion
+from humangs_jax.motion.skeleton import shipped_joints
 from humangs_jax.viewer.page import page_script
 
 NODE = shutil.which("node")

@@ -1,5 +1,5 @@
 // An animation of a GLB file, on the joints of its skin: as read_animation in
-// humangs_jax/data/motion/clips.py.
+// humangs_jax/motion/clips.py.
 // The rest pose is the one in which the skin was bound to the mesh, without a skin that of the nodes.
 // A place in space is { m: 3 x 3, t: [x, y, z] }.
 

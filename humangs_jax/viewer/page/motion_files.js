@@ -1,5 +1,5 @@
 // Motions that people drop onto the page: .npz (ours, AMASS and others), .bvh (skeletons.js) and .glb
-// (glb.js). Formats and their conventions are those of humangs_jax/data/motion/, and so are the tables
+// (glb.js). Formats and their conventions are those of humangs_jax/motion/, and so are the tables
 // (RULES, from rules.py); a file that is refused says in one line what was expected. What comes from a
 // file is never the key of an object, which has keys of its own such as "constructor".
 
@@ -171,7 +171,7 @@ function rotationMatrix(m, key) {
   return m;
 }
 
-// ---- Which way is up: as humangs_jax/data/motion/rules.py --------------------------------------------------------------
+// ---- Which way is up: as humangs_jax/motion/rules.py --------------------------------------------------------------
 
 // The world turned so that y is up.
 function turnedUp(motion, format, scene) {

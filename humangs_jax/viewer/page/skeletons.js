@@ -1,4 +1,4 @@
-// Skeletons of other programs in motion, brought to the scene's joints: as humangs_jax/data/motion/clips.py and skeleton.py.
+// Skeletons of other programs in motion, brought to the scene's joints: as humangs_jax/motion/clips.py and skeleton.py.
 
 const CHANNELS = ["xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation"];
 
@@ -65,7 +65,7 @@ function bvhJoints(text) {
   return joints;
 }
 
-// A Map from each joint of ours that the file has to the index of the file's: as humangs_jax/data/motion/matching.py. place, posed:
+// A Map from each joint of ours that the file has to the index of the file's: as humangs_jax/motion/matching.py. place, posed:
 // in the rest pose and in the first frame.
 function matchJoints(joints, scene, place, posed) {
   const parents = joints.map((j) => j.parent), plain = plainNames(joints.map((j) => j.name));

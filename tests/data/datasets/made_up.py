@@ -21,9 +21,9 @@ from humangs_jax.body.resolution import decimate
 from humangs_jax.data.datasets.subject import BodyParameters, FileBody, posed_people, turned
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import to_uint8
-from humangs_jax.people.bank import bake_subject, lit_texture
-from humangs_jax.people.subject import DEMO, describe, make_subject, pose_subject, render_view
-from humangs_jax.people.writer import sample_motion, sample_pose
+from humangs_jax.synthetic.bank import bake_subject, lit_texture
+from humangs_jax.synthetic.subject import DEMO, describe, make_subject, pose_subject, render_view
+from humangs_jax.synthetic.writer import sample_motion, sample_pose
 
 SEEDS = (3_000_271, 3_000_584)
 """People who are written, of the split "demo"."""

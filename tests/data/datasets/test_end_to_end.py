@@ -19,14 +19,14 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.video import write_video
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import pose_body, shape_body
+from humangs_jax.capture.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
-from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import Settings, preprocess
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
-from humangs_jax.people.subject import render_view
+from humangs_jax.synthetic.subject import render_view
 
 TIGHT_IOU = 0.9
 """Least mean overlap of the posed body and the silhouette of a person in tight clothes."""

@@ -1,0 +1,1 @@
+"""From photos to a capture: detection, keypoints, calibration, cameras of the person, fitting."""

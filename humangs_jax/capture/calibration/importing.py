@@ -1,0 +1,478 @@
+"""`import_cameras`: photos and the calibration that another tool made of their cameras -> a capture
+folder without body.
+
+docs/cameras.md describes the formats and their conventions. Photos are copied as they are, or
+undistorted where the lens asks for it; capture.json names body.npz, which `humangs fit` makes.
+"""
+
+import dataclasses
+import functools
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from humangs_jax.capture.calibration.photos import (
+    NO_CAMERA,
+    Photo,
+    Turn,
+    check_masks,
+    find_photos,
+    find_turns,
+    has_alpha,
+    is_transparent,
+    photo_of,
+    photo_size,
+    turn_notes,
+    turned_cameras,
+    unused_photos,
+    with_photos,
+)
+from humangs_jax.capture.calibration.videos import photos_of_videos
+from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
+from humangs_jax.data.cameras import (
+    ROTATION_TO_Y_UP,
+    CalibratedCamera,
+    Calibration,
+    Checks,
+    PixelCenters,
+    check_calibration,
+    in_capture_convention,
+    likely_unit,
+    read_calibration,
+    undistort,
+)
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    check_names,
+    check_place,
+    checked_camera,
+    counted,
+    few,
+)
+from humangs_jax.data.folders import STILL, Unused, scan_folder, unused_line
+from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
+from humangs_jax.io.reading import check_limit, reading, write_json
+
+SIZES_SHOWN = 5
+"""In a report."""
+NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with a pose of its own"
+NO_COMMON_FRAME = (
+    "no two cameras have a photo of the same frame: photos of one frame must have the same file"
+    " name"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportReport:
+    """What was imported and how it was read; `str(report)` is what the command line prints."""
+
+    out: Path
+    cameras: int
+    frames: int
+    views: int
+    width: int
+    height: int
+    undistorted: int
+    turned: int
+    """Photos that were turned upright by their EXIF orientation."""
+    heic: int
+    """Photos that were HEIC, or their masks."""
+    masks: bool
+    """Whether it has mask files."""
+    checks: Checks
+    read_as: str
+    notes: tuple[str, ...]
+    """Further lines."""
+    warnings: tuple[str, ...]
+    """Likely mistakes."""
+    unused: tuple[Unused, ...] = ()
+    """What the folder of photos holds besides."""
+
+    def __str__(self) -> str:
+        photos, cameras = counted(self.views, "photo"), counted(self.cameras, "camera")
+        size = f"{self.width} x {self.height}"
+        lines = [
+            f"{self.out}: {photos} of {size} pixels: {cameras}, {counted(self.frames, 'frame')}",
+            self.read_as,
+        ]
+        if self.undistorted:
+            lines.append(f"lens distortion removed from {counted(self.undistorted, 'photo')}")
+        if self.checks.reprojection is not None:
+            error, points = (
+                self.checks.reprojection,
+                counted(self.checks.observations, "observation"),
+            )
+            lines.append(f"mean reprojection error: {error:.3g} px ({points})")
+        if self.checks.distance is not None:
+            lines.append(f"the cameras stand {self.checks.distance:.3g} m from where they look")
+        lonely = [each for each in self.unused if each.why.because.startswith(NO_CAMERA)]
+        expected = unused_line(each for each in self.unused if each not in lonely)
+        warnings = [line for line in (unused_line(lonely), *self.warnings) if line is not None]
+        lines += [*self.notes, *([] if expected is None else [expected])]
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in warnings)])
+
+
+def import_cameras(
+    source: str | Path,
+    images: str | Path,
+    out: str | Path,
+    *,
+    masks: str | Path | None = None,
+    scale: float | None = None,
+    up: str | None = None,
+    pixel_centers: str | None = None,
+    every: int = 1,
+    frames: int | None = None,
+    overwrite: bool = False,
+    also: Mapping[str, object] | None = None,
+) -> ImportReport:
+    """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is
+    still to be made.
+
+    Arguments:
+        source: file or folder of any format in docs/cameras.md; its content decides which one.
+        images: folder of the photos, or of a video of each camera (CAMERA.mp4). masks: folder of
+            their masks, named alike.
+        out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
+        scale: metres per unit of the source; None: the format's unit, else the one that puts the
+            cameras near a person.
+        up: the axis of the source's world that points up, "+y", "-z", ...; None: the format's.
+        every, frames: of videos, the frame step and the largest number of frames.
+        pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0),
+            "half": (0.5, 0.5);
+            None: as the format says.
+        also: name -> content of JSON files that appear in the folder together with the capture.
+
+    Raises: ValueError for an option, CaptureError (one line: file, field, what was expected) for
+    everything else.
+    """
+    source, images, out = Path(source), Path(images), Path(out)
+    masks = None if masks is None else Path(masks)
+    _check_options(scale, up, pixel_centers, every, frames)
+    for folder in (images, masks):
+        if folder is not None and not folder.is_dir():
+            raise CaptureError(folder, "", "no such folder")
+    check_place(out, overwrite, (source, images, masks))
+    with photos_of_videos(images, masks, out, every, frames) as found:
+        calibration = read_calibration(
+            source, functools.partial(photo_size_of, found.images, source)
+        )
+        calibration, left_out = with_photos(calibration, found.images)
+        report = import_calibration(
+            calibration,
+            found.images,
+            out,
+            masks=found.masks,
+            scale=scale,
+            up=up,
+            pixel_centers=pixel_centers,
+            also=also,
+        )
+    unused = report.unused
+    if found.images != images:  # frames of videos, which are all used
+        unused = tuple(Unused(photo, STILL) for photo in scan_folder(images).photos)
+    notes = (*report.notes, *found.notes, *([] if left_out is None else [left_out]))
+    return dataclasses.replace(
+        report, unused=unused, notes=notes, warnings=(*report.warnings, *found.warnings)
+    )
+
+
+def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
+    """Width and height of the photo of that name.
+
+    A name without photo gets those of another: its camera is left out later.
+    """
+    try:
+        return photo_size(photo_of(images, name, source))
+    except CaptureError:
+        photos = scan_folder(images).photos
+        if not photos:
+            raise
+        return photo_size(photos[0])
+
+
+def import_calibration(
+    calibration: Calibration,
+    images: Path,
+    out: Path,
+    *,
+    masks: Path | None = None,
+    scale: float | None = None,
+    up: str | None = None,
+    pixel_centers: str | None = None,
+    also: Mapping[str, object] | None = None,
+) -> ImportReport:
+    """`import_cameras` of a calibration in memory, which replaces a capture that is there."""
+    up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
+    about_unit = None
+    if scale is None:
+        scale, about_unit = likely_unit(calibration)
+    photos = find_photos(calibration, images, masks)
+    check_repeats(calibration.file, [photo.image for photo in photos])
+    turns = find_turns(calibration, photos)
+    canvas = _canvas(images, photos, turns)
+    about_masks = check_masks(photos)
+    converted = turned_cameras(
+        in_capture_convention(calibration, scale, up, pixel_centers), photos, turns
+    )
+    for camera in converted.cameras:
+        assert camera.width is not None and camera.height is not None  # those of its photos
+        checked_camera(
+            camera.K,
+            camera.cam_from_world,
+            camera.width,
+            camera.height,
+            calibration.file,
+            camera.name,
+        )
+    checks = check_calibration(calibration, converted, up)
+    frames, cameras = (
+        1 + max(photo.frame for photo in photos),
+        calibration.stations or len(converted.cameras),
+    )
+    notes, warnings = turn_notes(photos, turns)
+    if heic := sum(map(_of_phones, photos)):
+        notes.append(f"written as PNG: {counted(heic, 'HEIC photo')}")
+    notes += _padding_notes(turns, canvas)
+    warnings += about_masks
+    notes += [] if about_unit is None else [about_unit]
+    if calibration.mask_key is not None:
+        named = f"{calibration.mask_key} of {calibration.file.name}"
+        if masks is not None:
+            warnings.append(f"{named}: not used, the masks are those in {masks}")
+        elif photos[0].mask is not None:
+            notes.append(f"masks: those of {named}")
+        else:
+            first = next(camera.mask for camera in calibration.cameras if camera.mask)
+            warnings.append(f"{named}: no such mask, {first}: imported without masks")
+    if cameras > 1 and frames == len(photos) > 1:
+        warnings.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
+    names = names_from_paths([photo.key + ".png" for photo in photos])
+    check_names(names, len(photos), images)
+    cut: list[str] = []
+
+    def write(folder: Path) -> None:
+        cut.extend(_write(folder, converted, photos, turns, names, canvas))
+        for name, content in (also or {}).items():
+            write_json(folder / name, content)
+
+    replace_folder(out, write, mark="capture.json")
+    if cut:
+        warnings.append(
+            f"the person is cut off where white was added to {few(cut, 1)}: it is taken for"
+            " background"
+        )
+    centers = "whole numbers (0.5 added to cx and cy)" if pixel_centers == "integer" else "+0.5"
+    said = f"{calibration.format} ({calibration.file}): {calibration.convention}"
+    return ImportReport(
+        out=out,
+        cameras=cameras,
+        frames=frames,
+        views=len(photos),
+        width=canvas[0],
+        height=canvas[1],
+        undistorted=sum(converted.cameras[photo.camera].distortion is not None for photo in photos),
+        turned=sum(turn.rewrites for turn in turns),
+        heic=heic,
+        masks=photos[0].mask is not None,
+        checks=checks,
+        read_as=f"read as: {said}; {up} up; {scale:g} m per unit; pixel centres at {centers}",
+        notes=tuple(notes),
+        warnings=(*checks.warnings, *warnings),
+        unused=tuple(unused_photos(photos, images, calibration)),
+    )
+
+
+def _check_options(
+    scale: float | None, up: str | None, pixel_centers: str | None, every: int, frames: int | None
+) -> None:
+    if scale is not None and not 0 < scale < float("inf"):
+        raise ArgumentError(
+            "scale", f"{scale:g}: expected metres per unit of the source, more than 0"
+        )
+    for name, word, known in (
+        ("up", up, tuple(ROTATION_TO_Y_UP)),
+        ("pixel_centers", pixel_centers, get_args(PixelCenters)),
+    ):
+        if word is not None and word not in known:
+            raise ArgumentError(name, f"{word}: expected one of {', '.join(known)}")
+    for name, value in (("every", every), ("frames", frames)):
+        if value is not None and value < 1:
+            raise ArgumentError(name, f"{value}: expected at least 1")
+
+
+def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[int, int]:
+    """Width and height of what is written: the largest of all photos, upright.
+
+    Raises: CaptureError if the photos of one camera have several sizes, or if so much may not be
+    read together.
+    """
+    first = {}
+    for photo, turn in zip(photos, turns, strict=True):
+        other, size = first.setdefault(photo.camera, (photo, turn.size))
+        if turn.size != size:
+            own, known = (_by(*each) for each in (turn.size, size))
+            problem = (
+                f"{own}, but {other.image.name} of the same camera has {known}: expected one size"
+                " of a camera"
+            )
+            raise CaptureError(photo.image, "size", problem)
+    width, height = (max(turn.size[axis] for turn in turns) for axis in (0, 1))
+    if any(turn.size != (width, height) for turn in turns):
+        with reading(images, "folder of photos", CaptureError):
+            what = (
+                f"pixels ({_by(width, height)}), to which photos of several sizes would be padded"
+            )
+            check_limit("pixels", width * height, what)
+            check_limit(
+                "capture_pixels", width * height * len(photos), f"{what}, {len(photos):,} of them"
+            )
+    return width, height
+
+
+def _by(width: int, height: int) -> str:
+    return f"{width} x {height}"
+
+
+def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> list[str]:
+    counts = Counter(turn.size for turn in turns)
+    if set(counts) == {canvas}:
+        return []
+    sizes = ", ".join(
+        f"{count} of {_by(*size)}"
+        for size, count in sorted(counts.items(), reverse=True)[:SIZES_SHOWN]
+    )
+    more = ", ..." if len(counts) > SIZES_SHOWN else ""
+    return [
+        f"photos of {len(counts)} sizes ({sizes}{more}): white was added on the right and below, so"
+        f" that all have {_by(*canvas)}; pixels keep their places: keypoints of the upright photos"
+        " still fit"
+    ]
+
+
+# Writing
+# --------------------------------------------------------------------------------------------------
+
+
+def _write(
+    folder: Path,
+    calibration: Calibration,
+    photos: Sequence[Photo],
+    turns: Sequence[Turn],
+    names: Sequence[str],
+    canvas: tuple[int, int],
+) -> list[str]:
+    """Returns the names of photos whose person reaches a rim where the photo is padded."""
+    (folder / "images").mkdir(parents=True)
+    if photos[0].mask is not None:
+        (folder / "masks").mkdir()
+    straight = all(camera.distortion is None for camera in calibration.cameras)
+    rewrites = [
+        turn.rewrites or turn.size != canvas or _of_phones(photo)
+        for photo, turn in zip(photos, turns, strict=True)
+    ]
+    changed = not straight or any(rewrites)
+    transparent = changed and any(is_transparent(photo.image) for photo in photos)
+    straight = straight and not transparent
+    views, cut = [], []
+    for photo, turn, name, rewritten in zip(photos, turns, names, rewrites, strict=True):
+        camera = calibration.cameras[photo.camera]
+        if not changed or (straight and not rewritten and not read_checked(has_alpha, photo.image)):
+            files = _copy(folder, photo, name)
+        else:
+            files, at_rim = _rewrite(folder, photo, turn, name, camera, transparent, canvas)
+            cut += [photo.image.name] if at_rim else []
+        matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
+        views.append({**files, "frame": photo.frame, **matrices})
+    write_description(folder, views, calibrated=not calibration.estimated)
+    return cut
+
+
+def _of_phones(photo: Photo) -> bool:
+    """Whether the photo or its mask is HEIC, which captures have none of: other programs cannot
+    read it.
+    """
+    return any(
+        file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask)
+    )
+
+
+def _copy(folder: Path, photo: Photo, name: str) -> dict[str, str]:
+    files = {"image": f"images/{name}{photo.image.suffix}"}
+    shutil.copyfile(photo.image, folder / files["image"])
+    if photo.mask is not None:
+        files["mask"] = f"masks/{name}{photo.mask.suffix}"
+        shutil.copyfile(photo.mask, folder / files["mask"])
+    return files
+
+
+def _rewrite(
+    folder: Path,
+    photo: Photo,
+    turn: Turn,
+    name: str,
+    camera: CalibratedCamera,
+    transparent: bool,
+    canvas: tuple[int, int],
+) -> tuple[dict[str, str], bool]:
+    """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it
+    does not see are white and background.
+
+    A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`,
+    is left out.
+    Returns: the paths for capture.json, and whether the person reaches a rim where the photo is
+    padded.
+    """
+    image, alpha = read_checked(read_image, photo.image)
+    image = turn.upright(image, turn.photo)
+    alpha = turn.upright(alpha, turn.photo) if transparent and alpha is not None else None
+    mask = (
+        alpha
+        if photo.mask is None
+        else turn.upright(read_checked(read_grey, photo.mask), turn.mask)
+    )
+    if camera.distortion is not None:
+        image = undistort(image, camera.K, camera.distortion, fill=1.0)
+        mask, alpha = (
+            x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0)
+            for x in (mask, alpha)
+        )
+    if photo.mask is not None and alpha is not None:
+        image = np.concatenate([image, alpha[..., None]], axis=-1)
+    at_rim = False
+    if mask is not None:
+        person, (height, width) = mask > MASK_THRESHOLD, mask.shape
+        at_rim = (width < canvas[0] and person[:, -1].any()) or (
+            height < canvas[1] and person[-1].any()
+        )
+    image, mask = _padded(image, canvas, 1.0), None if mask is None else _padded(mask, canvas, 0.0)
+    files = {"image": f"images/{name}.png"}
+    write_png(folder / files["image"], image)
+    if mask is not None:
+        files["mask"] = f"masks/{name}.png"
+        (folder / "masks").mkdir(exist_ok=True)
+        write_png(folder / files["mask"], mask)
+    return files, bool(at_rim)
+
+
+def _padded(
+    pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float
+) -> Float[np.ndarray, "height width *c"]:
+    """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added
+    are opaque white.
+    """
+    (height, width), (right, below) = pixels.shape[:2], canvas
+    margins = ((0, below - height), (0, right - width), *((0, 0),) * (pixels.ndim - 2))
+    return (
+        pixels
+        if pixels.shape[:2] == (below, right)
+        else np.pad(pixels, margins, constant_values=fill)
+    )

@@ -1,0 +1,557 @@
+"""Videos -> photos: of synchronised cameras, a folder for each; of one camera, its best frames. By
+ffmpeg (imageio-ffmpeg).
+
+    CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0,
+                                                 every, 2 every ...
+
+All videos of several cameras have to begin at the same moment. Where their rates differ, or one
+lacks frames, those of one moment are found by time (`moments`), and the numbers are those of
+moments. Masks are videos of the same names.
+
+What a video says about itself is obeyed: pixels that are not square are scaled to square ones, and
+colors of high dynamic range or of wide primaries are converted to those of sRGB. Other videos keep
+their values.
+
+Which frames of one video become photos: `frame_choice`.
+"""
+
+import contextlib
+import re
+import subprocess
+import tempfile
+import threading
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from humangs_jax.capture.calibration.moments import Moments, find_moments, nearest, progressions
+from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.folders import VIDEO_SUFFIXES, is_video, scan_folder
+from humangs_jax.io.color_spaces import Encoding, cube, of_code_points
+from humangs_jax.io.images import image_in
+from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
+
+CONTAINERS = "mov,matroska,avi,mpegts"
+"""Formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat,
+playlists).
+"""
+LONGEST_SECONDS = 3600
+"""After which ffmpeg is stopped."""
+
+
+def find_videos(folder: Path) -> dict[str, Path]:
+    """Name of the camera -> its video, of the videos in a folder.
+
+    Raises: CaptureError for two videos of one camera.
+    """
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if is_video(path):
+            if path.stem in found:
+                raise CaptureError(
+                    path,
+                    "",
+                    f"camera {path.stem} has {found[path.stem].name} already: expected one video",
+                )
+            found[path.stem] = path
+    return found
+
+
+class _Shown(NamedTuple):
+    """What is to be done with frames so that they are as a player shows them."""
+
+    shape: str = ""
+    """ffmpeg's filter that makes pixels square."""
+    matrix: str = "auto"
+    encoding: Encoding | None = None
+    """Of colors that are not sRGB's."""
+    about: str = ""
+    """The colors, in words."""
+    rate: float | None = None
+    """Frames a second in the mean."""
+    from_zero: bool = False
+    """Whether times of such files count from their beginning."""
+
+
+class VideoPhotos(NamedTuple):
+    """Folders of photos and masks, and what is to be told about how they came from videos."""
+
+    images: Path
+    masks: Path | None
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@contextlib.contextmanager
+def photos_of_videos(
+    images: Path, masks: Path | None, place: Path, every: int = 1, most: int | None = None
+) -> Generator[VideoPhotos]:
+    """Folders of photos and masks. Those of videos are written beside `place` and removed in the
+    end; others are as given.
+
+    Where photos and videos are in one folder, as a phone stores the clips of Live Photos, the
+    photos are what is meant.
+
+    Arguments: every: step of frames, or of moments, from 0. most: photos of a camera, None: all.
+    Who asks for these means the videos.
+    Raises: CaptureError naming the video, also if every or most ask something of folders that hold
+    none.
+    """
+    asked = every != 1 or most is not None
+    given = {"images": images} if masks is None else {"images": images, "masks": masks}
+    if not asked:
+        given = {kind: folder for kind, folder in given.items() if not _has_photos(folder)}
+    videos = {kind: find_videos(folder) for kind, folder in given.items()}
+    if not any(videos.values()):
+        if asked:
+            raise CaptureError(
+                images,
+                "",
+                f"no video ({', '.join(VIDEO_SUFFIXES)}): frames can be chosen of videos only",
+            )
+        yield VideoPhotos(images, masks)
+        return
+    videos = {"images": videos.get("images", {})} | (
+        {} if masks is None else {"masks": videos.get("masks", {})}
+    )
+    if lonely := sorted(set(videos["images"]) ^ set(videos.get("masks", videos["images"]))):
+        raise CaptureError(
+            masks or images,
+            lonely[0],
+            "expected a video of photos and one of masks, or folders of both",
+        )
+    beside = next(folder for folder in place.resolve().parents if folder.is_dir())
+    with tempfile.TemporaryDirectory(dir=beside, prefix=f".{place.name}.video-") as temporary:
+        own, mattes = Path(temporary) / "images", Path(temporary) / "masks"
+        moments, seconds = _moments(videos["images"], every, most)
+        pixels = 0
+        for camera, path in videos["images"].items():
+            chosen = None if moments is None else moments.frames[camera][::every][:most]
+            pixels = split_video(path, own / camera, every, most, pixels, chosen=chosen)
+        pixels = 0
+        for camera, path in videos.get("masks", {}).items():
+            chosen = (
+                None
+                if moments is None
+                else _mask_frames(path, camera, moments, seconds)[::every][:most]
+            )
+            photos = videos["images"][camera]
+            pixels = split_video(
+                path, mattes / camera, every, most, pixels, chosen=chosen, mask_of=photos
+            )
+        notes = [note for path in videos["images"].values() if (note := _color_note(path))]
+        notes += [] if moments is None else moments.notes
+        warnings = () if moments is None else moments.warnings
+        with named_after(own, images), named_after(mattes, masks or images):
+            yield VideoPhotos(
+                own, mattes if "masks" in videos else masks, tuple(dict.fromkeys(notes)), warnings
+            )
+
+
+def _has_photos(folder: Path) -> bool:
+    """Whether a folder or one in it holds a photo."""
+    return bool(scan_folder(folder).photos)
+
+
+@contextlib.contextmanager
+def named_after(temporary: Path, folder: Path) -> Generator[None]:
+    """Errors about a temporary folder name the folder that it was made of, since the temporary one
+    is gone when they are read.
+
+    Raises: CaptureError.
+    """
+    try:
+        yield
+    except ValueError as error:
+        said = str(error)
+        if str(temporary) not in said:
+            raise
+        raise CaptureError("", "", said.replace(str(temporary), str(folder))) from error
+
+
+def _moments(
+    videos: Mapping[str, Path], every: int, most: int | None
+) -> tuple[Moments | None, float | None]:
+    """The moments of several videos, or None of one, or of the first frames; and the seconds that
+    were looked at, None: all.
+    """
+    if len(videos) < 2 or most == 1:
+        return None, None
+    rates = []
+    for path in videos.values():
+        with reading(path, "video", CaptureError):
+            rates += filter(None, [_shown(path).rate])
+    seconds = None if most is None or not rates else (most * every + 1) / min(rates)
+    return (
+        find_moments({camera: frame_times(path, seconds) for camera, path in videos.items()}),
+        seconds,
+    )
+
+
+def _mask_frames(
+    path: Path, camera: str, moments: Moments, seconds: float | None
+) -> list[int | None]:
+    """The numbers of a camera's masks at the moments: those of its photos if there are as many,
+    else by their own times.
+    """
+    times = frame_times(path, seconds)
+    if len(times) == moments.counts[camera] or not np.isfinite(times).all():
+        return moments.frames[camera]
+    numbers = nearest(times - times[0], moments.times)
+    photos = moments.frames[camera]
+    return [
+        number if photo is not None else None for number, photo in zip(numbers, photos, strict=True)
+    ]
+
+
+def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, " n"]:
+    """Seconds of its file at which the frames of a video are shown, in order, up to some; NaN where
+    it does not say.
+
+    Raises: CaptureError naming the video.
+    """
+    with reading(path, "video", CaptureError):
+        command = _ffmpeg(path, "metadata=mode=add:key=a:value=a,metadata=mode=print:file=-")
+        command += ["-copyts"] if _shown(path).from_zero else []
+        command += [] if seconds is None else ["-t", f"{seconds:.6f}"]
+        lines = _finished(path, [*command, "-f", "null", "-"]).decode(errors="replace")
+        found = re.findall(r"^frame:.*pts_time:(\S+)", lines, re.MULTILINE)
+        if not found:
+            raise _said(path, b"")
+        return np.asarray([float(each) if each != "NOPTS" else np.nan for each in found])
+
+
+def split_video(
+    path: Path,
+    folder: Path,
+    every: int = 1,
+    most: int | None = None,
+    before: int = 0,
+    *,
+    chosen: Sequence[int | None] | None = None,
+    mask_of: Path | None = None,
+) -> int:
+    """Write frames of a video as 00000000.png, ... into a new folder.
+
+    Arguments: before: pixels of the frames of other videos, which count towards the limit
+    `video_pixels`. chosen: in place of `every` and `most`, the frame for each file, ascending;
+    there is no file for None. mask_of: the video whose masks these are: its shape is theirs, and
+    their values are no colors.
+    Returns: pixels of all frames so far.
+    Raises: CaptureError naming the video.
+    """
+    with reading(path, "video", CaptureError):
+        shown = _shown(path) if mask_of is None else _shown_as_mask(path, mask_of)
+        width, height = _frame_size(path, shown)
+        folder.mkdir(parents=True)
+        if chosen is None:
+            room = max(0, limits().video_pixels - before) // (width * height)
+            count = _run(
+                path,
+                folder,
+                f"not(mod(n\\,{every}))",
+                room + 1 if most is None else min(most, room + 1),
+                shown,
+            )
+        else:
+            count = sum(number is not None for number in chosen)
+            _check_pixels(before + count * width * height, count, width, height)
+            _write_chosen(path, folder, chosen, shown)
+        pixels = before + count * width * height
+        _check_pixels(pixels, count, width, height)
+        return pixels
+
+
+def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown: _Shown) -> None:
+    places = [place for place, number in enumerate(chosen) if number is not None]
+    numbers = [number for number in chosen if number is not None]
+    if not numbers:
+        raise Refused("has no frame at the moments of the others")
+    if _run(path, folder, _expression(numbers), len(numbers), shown) != len(numbers):
+        raise Refused(
+            f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it"
+            " goes with"
+        )
+    for i, place in reversed(
+        list(enumerate(places))
+    ):  # from the end: a name is free when it is taken
+        (folder / f"{i:08d}.png").rename(folder / f"{place:08d}.png")
+
+
+MOST_RUNS = 2000
+"""Terms of an expression of ffmpeg, which is an argument of a program."""
+
+
+def _expression(numbers: Sequence[int]) -> str:
+    """ffmpeg's condition for frames of these numbers.
+
+    Raises: Refused for too many that follow no rule.
+    """
+    terms = [
+        (
+            f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))"
+            if step
+            else f"eq(n\\,{first})"
+        )
+        for first, step, last in progressions(numbers)
+    ]
+    if len(terms) > MOST_RUNS:
+        count = f"{len(numbers):,} frames to be paired by time with those of other rates"
+        raise Refused(f"{count}: expected a larger step, or fewer frames")
+    return "+".join(terms)
+
+
+def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
+    open_file(path).close()  # no devices, no pipes, not too large
+    filters = shown.shape or "null"
+    first = _finished(
+        path,
+        [*_ffmpeg(path, filters), "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"],
+    )
+    if not first:
+        raise _said(path, b"")
+    with image_in(first) as image:
+        return image.size
+
+
+# What a video says about itself
+# ---------------------------------------------------------------------------------------
+
+STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
+COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
+"""Matrix, primaries and curve, behind the format of pixels: yuv420p10le(tv,
+bt2020nc/bt2020/arib-std-b67, progressive).
+"""
+PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
+RATE = re.compile(r", ([\d.]+)(k?) fps\b")
+PRIMARIES = {"bt2020": 9, "smpte432": 12}
+TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
+"""ffmpeg's names of what H.273 numbers; videos of all others are shown as sRGB."""
+WIDEST_PIXEL = 4
+"""Sides of a pixel that is not square, over each other; the widest in use is 2."""
+SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
+"""Only makes frames larger: nothing is lost."""
+TABLE = "colors.cube"
+
+
+def _shown(path: Path) -> _Shown:
+    """What ffmpeg prints of a video. Raises: OSError; Refused for pixels that nobody shows."""
+    open_file(path).close()
+    # without an output ffmpeg fails, after it has printed what is there
+    printed = subprocess.run(
+        _opened(path, "info"), capture_output=True, timeout=LONGEST_SECONDS, check=False
+    ).stderr
+    text = printed.decode(errors="replace")
+    line = STREAM.search(text)
+    if line is None:
+        return _Shown()  # what reads its frames says what is wrong
+    rate, shape, colors = RATE.search(line[1]), PIXEL_SHAPE.search(line[1]), COLORS.search(line[1])
+    a_second = float(rate[1]) * (1000 if rate[2] else 1) if rate else None
+    found = _Shown(rate=a_second, from_zero="Input #0, mpegts" not in text)
+    if shape is not None and shape[1] != shape[2]:
+        wide, high = int(shape[1]), int(shape[2])
+        if max(wide, high) > WIDEST_PIXEL * min(wide, high):
+            problem = (
+                f"its pixels are {wide} to {high} wide to high: expected at most {WIDEST_PIXEL} to"
+                " 1, or square ones"
+            )
+            raise Refused(problem)
+        found = found._replace(shape=SQUARE)
+    return found if colors is None else _with_colors(found, *colors.groups())
+
+
+def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _Shown:
+    bright = transfer in TRANSFERS
+    code = PRIMARIES.get(primaries, PRIMARIES["bt2020"] if bright and primaries == "unknown" else 1)
+    encoding = of_code_points(code, TRANSFERS.get(transfer, 1))
+    if encoding is None:
+        return shown
+    wide = matrix.startswith("bt2020") or (bright and matrix == "unknown")
+    return shown._replace(
+        matrix="bt2020" if wide else "auto", encoding=encoding, about=f"{primaries}, {transfer}"
+    )
+
+
+def _shown_as_mask(path: Path, photos: Path) -> _Shown:
+    """Of a video of masks: the shape of its photos' pixels if frames have the size of theirs and
+    say nothing; no colors.
+    """
+    own, theirs = _shown(path), _shown(photos)
+    as_stored = _Shown()
+    if (
+        not own.shape
+        and theirs.shape
+        and _frame_size(path, as_stored) == _frame_size(photos, as_stored)
+    ):
+        width, height = _frame_size(photos, theirs)
+        return _Shown(shape=f"scale=w={width}:h={height},setsar=1")
+    return own._replace(encoding=None)
+
+
+def _color_note(path: Path) -> str | None:
+    with reading(path, "video", CaptureError):
+        shown = _shown(path)
+    return (
+        None
+        if shown.encoding is None
+        else f"videos with other colors than sRGB's ({shown.about}): converted"
+    )
+
+
+def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
+    what = (
+        f"pixels in the frames of the videos, {count:,} or more of {width} x {height} in this one"
+    )
+    check_limit("video_pixels", pixels, what)
+
+
+def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
+    """Write these frames of a video, counted from 0 and in order, as frame_00000017.png, ... into a
+    new folder.
+
+    Raises: CaptureError naming the video.
+    """
+    with reading(path, "video", CaptureError):
+        folder.mkdir(parents=True)
+        if _run(
+            path, folder, "+".join(f"eq(n\\,{i})" for i in chosen), len(chosen), _shown(path)
+        ) != len(chosen):
+            raise Refused("its frames are not the same when they are read again")
+        for i, frame in enumerate(chosen):
+            (folder / f"{i:08d}.png").rename(folder / f"frame_{frame:08d}.png")
+
+
+def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"]]:
+    """All frames of a video, one after the other, grey and no larger than that.
+
+    Raises: CaptureError naming the video.
+    """
+    return (frame[..., 0] for frame in _small_frames(path, longer_side, "gray", None))
+
+
+def color_frames(
+    path: Path, longer_side: int, chosen: Sequence[int]
+) -> Iterator[UInt[np.ndarray, "h w 3"]]:
+    """These frames of a video, counted from 0 and in order, in colors as stored, no larger than
+    that.
+
+    Raises: CaptureError naming the video.
+    """
+    return _small_frames(path, longer_side, "rgb24", chosen)
+
+
+def _small_frames(
+    path: Path, longer_side: int, pixels: str, chosen: Sequence[int] | None
+) -> Iterator[UInt[np.ndarray, "h w c"]]:
+    """Frames as ffmpeg's format `pixels` has them, see `grey_frames` and `color_frames`."""
+    with reading(path, "video", CaptureError):
+        width, height = _frame_size(path, _shown(path))
+        room, scale = (
+            limits().video_pixels // (width * height),
+            min(1.0, longer_side / max(width, height)),
+        )
+        w, h = (max(1, round(side * scale)) for side in (width, height))
+        select = "" if chosen is None else f"select={_expression(chosen)},"
+        command = [*_ffmpeg(path, f"{select}scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
+        command += ["-f", "rawvideo", "-pix_fmt", pixels, "pipe:1"]
+        size = w * h * (1 if pixels == "gray" else 3)
+        with (
+            tempfile.TemporaryFile() as said,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said) as process,
+        ):
+            assert process.stdout is not None
+            clock, count = threading.Timer(LONGEST_SECONDS, process.kill), 0
+            clock.start()
+            try:
+                while len(data := process.stdout.read(size)) == size:
+                    count += 1
+                    _check_pixels(count * width * height, count, width, height)
+                    yield np.frombuffer(data, np.uint8).reshape(h, w, -1)
+                if process.wait():
+                    said.seek(0)
+                    raise _said(path, said.read())
+            finally:
+                clock.cancel()
+                process.kill()
+
+
+def frame_rate(path: Path) -> float | None:
+    """Frames a second of a video in the mean; None where it does not say.
+
+    Raises: CaptureError naming the video.
+    """
+    with reading(path, "video", CaptureError):
+        return _shown(path).rate
+
+
+def _opened(path: Path, verbosity: str = "error") -> list[str]:
+    """The beginning of a command of ffmpeg: the program, and the video."""
+    import imageio_ffmpeg
+
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-hide_banner",
+        "-v",
+        verbosity,
+        "-nostdin",
+        "-xerror",
+    ]
+    # a playlist in disguise may name other files and hosts; pictures may be larger than what is
+    # read later
+    command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
+    return [*command, "-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
+
+
+def _ffmpeg(path: Path, filters: str) -> list[str]:
+    return [*_opened(path), "-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough"]
+
+
+def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int:
+    """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there
+    are.
+    """
+    table, filters = folder / TABLE, [f"select={select}", *filter(None, [shown.shape])]
+    if shown.encoding is not None:
+        table.write_text(cube(shown.encoding))
+        whole = (
+            f"scale=in_color_matrix={shown.matrix}:flags=accurate_rnd+full_chroma_int,format=rgb48"
+        )
+        filters += [whole, f"lut3d=file={TABLE}:interp=tetrahedral", "format=rgb24"]
+    # a PNG would say for each program in its own words that its values are a video's
+    filters += ["setparams=color_primaries=unknown:color_trc=unknown"]
+    command = [
+        *_ffmpeg(path, ",".join(filters)),
+        "-frames:v",
+        str(most),
+        "-y",
+        "-start_number",
+        "0",
+        "%08d.png",
+    ]
+    _finished(path, command, folder)  # in the folder: its path may hold a % of its own
+    table.unlink(missing_ok=True)
+    if not (count := sum(1 for _ in folder.iterdir())):
+        raise _said(path, b"")
+    return count
+
+
+def _finished(path: Path, command: Sequence[str], folder: Path | None = None) -> bytes:
+    try:
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise Refused(
+            f"its frames take more than {LONGEST_SECONDS:,} seconds: expected a shorter video"
+        ) from None
+    if done.returncode:
+        raise _said(path, done.stderr)
+    return done.stdout
+
+
+def _said(path: Path, text: bytes) -> ValueError:
+    said = " ".join(text.decode(errors="replace").split()) or "no frame"
+    return ValueError(said.replace(f"file:{path.resolve()}", path.name))

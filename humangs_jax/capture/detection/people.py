@@ -1,0 +1,638 @@
+"""All people of a photo, small ones too, whichever way up the photo is, by BlazePose
+(https://arxiv.org/abs/2006.10204).
+
+Its result: 33 landmarks of a person, metric 3D landmarks, a mask.
+
+Two networks, run by LiteRT. The detector looks at a square window of the photo and finds, for each
+person, the middle of the hips and a point whose distance from it is the size of the body. The
+landmark network looks at the square around them, turned so that the person stands upright. Pre- and
+postprocessing are mediapipe's for its pose graph, in numpy: bilinear samples from the crop's
+corner, no antialiasing. The networks depend on both.
+
+Pixels of the networks are mediapipe's: (x, y), the centre of the first at 0. `detect_people` adds
+our half pixel.
+
+The detector finds people from a third of its window's side on, so it looks at the whole photo and
+at windows of a half of its longer side that overlap by half, and, where nobody in these is large,
+of a quarter. What several windows find is one person if the landmarks agree.
+
+Of people who stand close together the detector finds some. So these are painted over with the
+colors around them, and it looks again, until it finds nobody more: see `find_people`.
+"""
+
+import contextlib
+import functools
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Generator, Sequence
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from humangs_jax.capture.detection.painting import painted_over
+from humangs_jax.core.array_types import Bool, Float
+
+DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_heavy.tflite"
+"""Files of `assets/blazepose`.
+
+The lite and full landmark networks exchange left and right often, heavy hardly ever.
+"""
+DETECTOR_SIZE, LANDMARK_SIZE = 224, 256
+"""Pixels a side of the two networks' inputs."""
+LANDMARK_COUNT = 33
+ALIGNMENT = 6
+"""The landmark network's further points; the first two are the detector's, found again."""
+STRIDES = ((8, 2), (16, 2), (32, 6))
+"""Of the detector's grids, and how many anchors a cell has."""
+LEAST_SCORE = 0.5
+"""Of a detection."""
+SAME_BOX = 0.3
+"""Intersection over union from which on detections of one window are one person."""
+ENLARGED = 1.25
+"""Side of the crop over the diameter of the circle through the detector's second point."""
+PEAK, WINDOW = 0.5, 7
+"""Least height of the heatmap around a landmark that is moved to the centroid, and side of the
+window.
+"""
+
+
+class Crop(NamedTuple):
+    """A square of the photo.
+
+    center: (2,) pixels; side: pixels; angle: radians, by which its upright is turned clockwise.
+    """
+
+    center: Float[np.ndarray, "2"]
+    side: float
+    angle: float
+
+    @property
+    def turn(self) -> Float[np.ndarray, "2 2"]:
+        """The rotation from the crop's axes to the photo's."""
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        return np.asarray([[c, -s], [s, c]])
+
+    def to_photo(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Points of the crop, in [0, 1], in pixels of the photo."""
+        return self.center + (points - 0.5) * self.side @ self.turn.T
+
+    def from_photo(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Pixels of the photo in the crop, which is [0, 1] x [0, 1]."""
+        return (pixels - self.center) @ self.turn / self.side + 0.5
+
+
+class Detection(NamedTuple):
+    """A person in a window. score: in [0, 1].
+
+    hips, head: (2,) pixels; the second is a point at the body's size from the hips.
+    """
+
+    score: float
+    hips: Float[np.ndarray, "2"]
+    head: Float[np.ndarray, "2"]
+
+    def crop(self) -> Crop:
+        """The square that the landmark network looks at."""
+        x, y = self.head - self.hips
+        return Crop(
+            self.hips, 2 * ENLARGED * float(np.hypot(x, y)), float(np.pi / 2 - np.arctan2(-y, x))
+        )
+
+
+class Landmarks(NamedTuple):
+    """What the landmark network says of a crop.
+
+    pixels: (33, 2). visibility: (33,) probability that a landmark is seen and not hidden. world:
+    (33, 3) metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
+    person of average size. presence: probability of a person.
+    mask: (256, 256) probability, of the crop. again: where the detector's points are. covered:
+    somebody else was painted over before this person was found, and may stand in front.
+    """
+
+    pixels: Float[np.ndarray, "33 2"]
+    visibility: Float[np.ndarray, " 33"]
+    world: Float[np.ndarray, "33 3"]
+    presence: float
+    mask: Float[np.ndarray, "256 256"]
+    crop: Crop
+    again: Detection
+    covered: bool = False
+
+
+def available() -> bool:
+    """Whether LiteRT is installed."""
+    return importlib.util.find_spec("ai_edge_litert") is not None
+
+
+class Networks:
+    """The two networks. Raises: ImportError, saying what to install, without LiteRT."""
+
+    def __init__(self) -> None:
+        try:
+            with _silent():
+                # optional, and then unknown to type checkers
+                interpreter = importlib.import_module("ai_edge_litert.interpreter").Interpreter
+        except ImportError as error:
+            raise ImportError(
+                "finding people in photos needs LiteRT: pip install 'humangs_jax[photos]' (there is"
+                " none for Macs with Intel processors: give keypoints and masks of another program"
+                " there, see docs/your_photos.md)"
+            ) from error
+        folder = resources.files("humangs_jax") / "assets" / "blazepose"
+        self._runs = [self._load(interpreter, folder / name) for name in (DETECTOR, LANDMARKS)]
+
+    @staticmethod
+    def _load(interpreter: Any, file: Any) -> Any:
+        with _silent():
+            network = interpreter(model_content=file.read_bytes(), num_threads=1)
+            network.allocate_tensors()
+        return network
+
+    def _run(self, which: int, image: Float[np.ndarray, "size size 3"]) -> dict[str, np.ndarray]:
+        network = self._runs[which]
+        network.set_tensor(network.get_input_details()[0]["index"], image[None].astype(np.float32))
+        network.invoke()
+        return {
+            output["name"]: network.get_tensor(output["index"])[0]
+            for output in network.get_output_details()
+        }
+
+    def detect(self, photo: Float[np.ndarray, "h w 3"], window: Crop) -> list[Detection]:
+        """People in an upright window of a photo with values in [0, 1]; black around it.
+
+        The best first.
+        """
+        outputs = self._run(0, 2 * sampled(photo, window, DETECTOR_SIZE, outside=0.0) - 1)
+        scores, raw = _sigmoid(outputs["Identity_1"][:, 0]), outputs["Identity"]
+        kept = scores > LEAST_SCORE
+        points = raw[kept] / DETECTOR_SIZE + np.tile(_anchors()[kept], 6)
+        points[:, 2:4] -= _anchors()[kept]  # width and height are no places
+        return [
+            Detection(float(score), *(window.to_photo(box[i : i + 2]) for i in (4, 6)))
+            for score, box in _merged(scores[kept], points)
+        ]
+
+    def landmarks(self, photo: Float[np.ndarray, "h w 3"], crop: Crop) -> Landmarks:
+        """Landmarks of the person in a crop of a photo with values in [0, 1]."""
+        outputs = self._run(1, sampled(photo, crop, LANDMARK_SIZE))
+        raw = outputs["Identity"].reshape(LANDMARK_COUNT + ALIGNMENT, 5).astype(np.float64)
+        points = refined(raw[:, :2] / LANDMARK_SIZE, _sigmoid(outputs["Identity_3"]))
+        pixels = crop.to_photo(points)
+        world = outputs["Identity_4"].reshape(-1, 3)[:LANDMARK_COUNT].astype(np.float64)
+        world[:, :2] = world[:, :2] @ crop.turn.T
+        presence = float(outputs["Identity_1"][0])
+        return Landmarks(
+            pixels=pixels[:LANDMARK_COUNT],
+            visibility=_sigmoid(raw[:LANDMARK_COUNT, 3]),
+            world=world,
+            presence=presence,
+            mask=_sigmoid(outputs["Identity_2"][..., 0]),
+            crop=crop,
+            again=Detection(presence, *pixels[LANDMARK_COUNT : LANDMARK_COUNT + 2]),
+        )
+
+
+def sampled(
+    photo: Float[np.ndarray, "h w 3"], crop: Crop, size: int, outside: float | None = None
+) -> Float[np.ndarray, "size size 3"]:
+    """A crop of the photo, bilinear. outside: value beyond the photo; None: that of its edge."""
+    steps = np.arange(size) / size
+    points = crop.to_photo(np.stack(np.meshgrid(steps, steps), axis=-1))
+    return bilinear(photo, points, outside)
+
+
+def bilinear(
+    image: Float[np.ndarray, "h w *c"],
+    points: Float[np.ndarray, "a b 2"],
+    outside: float | None = None,
+) -> Float[np.ndarray, "a b *c"]:
+    """Values between pixels; whole numbers are pixels. outside: value beyond the image; None: that
+    of its edge.
+    """
+    height, width = image.shape[:2]
+    x, y = points[..., 0], points[..., 1]
+    inside = (x > -1) & (x < width) & (y > -1) & (y < height)
+    x, y = x.clip(0, width - 1), y.clip(0, height - 1)
+    left, top = (
+        np.minimum(x.astype(int), max(width - 2, 0)),
+        np.minimum(y.astype(int), max(height - 2, 0)),
+    )
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    shape = x.shape + (1,) * (image.ndim - 2)
+    u, v = (x - left).reshape(shape).astype(np.float32), (y - top).reshape(shape).astype(np.float32)
+    upper = image[top, left] * (1 - u) + image[top, right] * u
+    lower = image[bottom, left] * (1 - u) + image[bottom, right] * u
+    values = upper * (1 - v) + lower * v
+    return (
+        values if outside is None else np.where(inside.reshape(shape), values, np.float32(outside))
+    )
+
+
+def refined(
+    points: Float[np.ndarray, "n 2"], heatmaps: Float[np.ndarray, "m m n"]
+) -> Float[np.ndarray, "n 2"]:
+    """Points in [0, 1], moved to the centroid of the heatmap around them where it has a peak."""
+    size, half, moved = len(heatmaps), WINDOW // 2, points.copy()
+    for i, (column, row) in enumerate(np.trunc(points * size).astype(int)):
+        if not (0 <= column < size and 0 <= row < size):
+            continue
+        rows, columns = (
+            np.arange(max(0, at - half), min(size, at + half + 1)) for at in (row, column)
+        )
+        heights = heatmaps[rows[:, None], columns, i].astype(np.float64)
+        if heights.max() >= PEAK:
+            moved[i] = (
+                np.asarray([heights.sum(0) @ columns, heights.sum(1) @ rows]) / heights.sum() / size
+            )
+    return moved
+
+
+def mask_at(found: Landmarks, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """The mask of a crop at pixels of the photo; 0 outside of the crop."""
+    return bilinear(found.mask, found.crop.from_photo(pixels)[None] * LANDMARK_SIZE, outside=0.0)[0]
+
+
+def mask_in_photo(found: Landmarks, width: int, height: int) -> Float[np.ndarray, "height width"]:
+    """The mask of a crop at the size of the photo; 0 outside of the crop."""
+    mask = np.zeros((height, width), np.float32)
+    window = mask_window(found, width, height)
+    mask[window] = mask_in_window(found, window)
+    return mask
+
+
+Window = tuple[slice, slice]
+"""Rows and columns of a photo."""
+
+
+def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> Window:
+    """Returns the part of a photo that a crop reaches, and so many pixels around it; it may be
+    empty.
+    """
+    corners = found.crop.to_photo(np.asarray([[0.0, 0], [0, 1], [1, 0], [1, 1]]))
+    left, top = (np.floor(corners.min(0)).astype(int) - margin).clip(0, [width, height]).tolist()
+    right, bottom = (
+        (np.ceil(corners.max(0) + 1).astype(int) + margin).clip(0, [width, height]).tolist()
+    )
+    return slice(top, max(bottom, top)), slice(left, max(right, left))
+
+
+def mask_in_window(found: Landmarks, window: Window) -> Float[np.ndarray, "h w"]:
+    """The mask of a crop at the pixels of a part of the photo; 0 outside of the crop."""
+    from PIL import Image
+
+    rows, columns = window
+    width, height = columns.stop - columns.start, rows.stop - rows.start
+    if not (width and height):
+        return np.zeros((height, width), np.float32)
+    corners = np.asarray([[0.0, 0], [1, 0], [0, 1]]) + np.asarray([columns.start, rows.start])
+    origin, right_of, below = found.crop.from_photo(corners) * LANDMARK_SIZE
+    across, down = right_of - origin, below - origin
+    # Pillow counts from corners of pixels and adds the half pixel of the target itself; it is ten
+    # times faster than numpy
+    start = origin + 0.5 - (across + down) / 2
+    affine = tuple(np.stack([across, down, start], axis=-1).ravel().tolist())
+    picture = Image.fromarray(found.mask.astype(np.float32))
+    return np.array(
+        picture.transform(
+            (width, height), Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR
+        )
+    )
+
+
+@functools.cache
+def _anchors() -> Float[np.ndarray, "a 2"]:
+    grids = []
+    for stride, copies in STRIDES:
+        middles = (np.arange(DETECTOR_SIZE // stride) + 0.5) * stride / DETECTOR_SIZE
+        grids.append(
+            np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2).repeat(copies, axis=0)
+        )
+    return np.concatenate(grids)
+
+
+def _merged(
+    scores: Float[np.ndarray, " n"], boxes: Float[np.ndarray, "n 12"]
+) -> list[tuple[float, np.ndarray]]:
+    """Weighted non-maximum suppression: what overlaps the best is averaged by score."""
+    left, merged = np.argsort(-scores), []
+    while len(left):
+        same = _overlaps(boxes[left[0]], boxes[left]) > SAME_BOX
+        same[0] = True
+        weights = scores[left[same], None]
+        merged.append(
+            (float(scores[left[0]]), (boxes[left[same]] * weights).sum(0) / weights.sum())
+        )
+        left = left[~same]
+    return merged
+
+
+def _overlaps(
+    box: Float[np.ndarray, "12"], boxes: Float[np.ndarray, "n 12"]
+) -> Float[np.ndarray, " n"]:
+    low = np.maximum(box[:2] - box[2:4] / 2, boxes[:, :2] - boxes[:, 2:4] / 2)
+    high = np.minimum(box[:2] + box[2:4] / 2, boxes[:, :2] + boxes[:, 2:4] / 2)
+    shared = np.prod(np.maximum(high - low, 0), axis=1)
+    return shared / np.maximum(np.prod(box[2:4]) + np.prod(boxes[:, 2:4], axis=1) - shared, 1e-12)
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-np.clip(x, -80, 80)))
+
+
+@contextlib.contextmanager
+def _silent() -> Generator[None]:
+    """Without the line that LiteRT's C++ prints on standard error when it starts."""
+    sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed
+        yield
+        return
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+# All people of a photo
+# -------------------------------------------------------------------------------------------------
+
+SHARES, SMALL_SHARES = (1.0, 0.5), (0.25,)
+"""Sides of the windows over the photo's longer side; the second, most of all windows, where nobody
+is large.
+"""
+LARGE = 0.4
+"""Of the photo's longer side. Windows of a half find people from a sixth of it on, whose crops are
+a fifth: whoever needs smaller windows has at most a quarter of the pixels of a person with a crop
+of two fifths, and is not the one who is meant."""
+SMALLEST = 0.06
+"""Of the photo's longer side: a person whose crop is smaller is somebody in the background, or
+nobody.
+"""
+MOST_CROPS = 16
+"""The landmark network looks at, best detections first."""
+SAME_HIPS, SAME_SIZE = 0.15, 1.6
+"""Two detections are one person if their hips are nearer than this share of the larger crop, and
+the sides of the crops differ by at most this factor."""
+LEAST_PRESENCE, LEAST_ON_MASK, MOST_SHARED = 0.95, 0.8, 0.5
+"""Of a person: presence; share of the landmarks in the photo that lie on the mask; share of the
+smaller mask that both have. Measured on 8 photos of a laboratory with 2 to 3 people each: legs,
+lamps and chairs that the detector takes for people have 0.69 to 0.88, 0.33 to 0.76 or 0.77 to 0.94;
+people 0.999, 0.94 and 0.02 at the worst."""
+LARGER = 1.25
+"""Side of the second crop over the first, at the most: the mask has 256 pixels a side, whatever the
+side.
+"""
+MOST_LOOKS, SETTLED = 4, 0.05
+"""Looks of the landmark network at a person, at most, and the drift of the crop (see `_settled`)
+below which it has found it.
+"""
+LEAST_ON_REST = 0.6
+"""`LEAST_ON_MASK` of a person who is partly painted over, whose mask then has holes: 0.67 to 1 of
+ten people; of what was taken for people in sixteen photos of one person, presence and share were at
+most 0.95 and 0.79, 1.0 and 0.4."""
+PAINTED = 0.4
+"""Probability from which on a pixel of a mask is painted over; the detector's masks end there."""
+MARGINS = (1 / 150, 1 / 100)
+"""Of the longest side: how far what is painted reaches beyond a mask; the second is tried where the
+first shows nobody. Too little leaves a rim that looks like a person, too much hides who stands
+behind."""
+MOST_PAINTINGS = 8
+"""Times that a photo is painted over, at most."""
+LEAST_SIZE = 0.4
+"""Side of the crop of a person who was found by painting over, of the largest one's, at least.
+Smaller ones, in photos of two to six people, were what is left of a person whose mask ends too
+early."""
+SEEN = 0.5
+"""Probability from which on a pixel of a mask is a person's."""
+
+
+class DetectedPerson(NamedTuple):
+    """A person in a photo.
+
+    pixels: (33, 2) landmarks, the centre of the first pixel at (0.5, 0.5). visibility: (33,) in [0,
+    1]. world: (33, 3) metres from the middle of the hips in the camera's axes, of a person of
+    average size. presence: in [0, 1]. mask: (h, w) probability.
+    side: pixels of the crop that holds the person.
+    """
+
+    pixels: Float[np.ndarray, "33 2"]
+    visibility: Float[np.ndarray, " 33"]
+    world: Float[np.ndarray, "33 3"]
+    presence: float
+    mask: Float[np.ndarray, "h w"]
+    side: float
+
+
+def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[DetectedPerson]:
+    """The people of a photo with values in [0, 1], the largest first."""
+    height, width = photo.shape[:2]
+    found = find_people(networks, photo)
+    return [
+        DetectedPerson(p.pixels + 0.5, *p[1:4], mask_in_photo(p, width, height), p.crop.side)
+        for p in found
+    ]
+
+
+def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Landmarks]:
+    """Returns the people as `detect_people`, with masks of the crops alone, which are small
+    whatever the size of the photo.
+
+    Who was found is painted over, and the photo is looked at again, until there is nobody more.
+    """
+    longest = max(photo.shape[:2])
+    detections = window_detections(networks, photo, SHARES)
+    found = _people(networks, photo, detections)
+    if not any(person.crop.side >= LARGE * longest for person in found):
+        smaller = window_detections(networks, photo, SMALL_SHARES)
+        found = _people(networks, photo, detections + smaller) if smaller else found
+    margins = list(MARGINS if found else ())
+    for _ in range(MOST_PAINTINGS):
+        if not margins:
+            break
+        further = _hidden_people(networks, photo, found, margins[0])
+        found += further
+        if not further:
+            margins.pop(0)
+    return sorted(found, key=lambda person: -person.crop.side)
+
+
+def _hidden_people(
+    networks: Networks, photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
+) -> list[Landmarks]:
+    """The people that the detector finds once those found before are painted over; their masks
+    are without those.
+    """
+    height, width = photo.shape[:2]
+    painted, covered = _painted_over(photo, found, margin)
+    detections = window_detections(networks, painted, SHARES)
+    least = LEAST_SIZE * max(person.crop.side for person in found)
+    further = [
+        person
+        for person in _people(networks, painted, detections, covered)
+        if person.crop.side >= least
+        and not any(_shared(person, other, width, height) > MOST_SHARED for other in found)
+    ]
+    return [person._replace(mask=_without(person, found), covered=True) for person in further]
+
+
+def _painted_over(
+    photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
+) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """The photo with the colors around the people in their place, and where that is."""
+    height, width = photo.shape[:2]
+    covered = np.zeros((height, width), bool)
+    for person in found:
+        window = mask_window(person, width, height)
+        covered[window] |= mask_in_window(person, window) > PAINTED
+    return painted_over(photo, covered, margin)
+
+
+def _without(person: Landmarks, found: list[Landmarks]) -> Float[np.ndarray, "256 256"]:
+    """The mask of a person without what of the crop other people cover."""
+    steps = np.arange(LANDMARK_SIZE) / LANDMARK_SIZE
+    pixels = person.crop.to_photo(np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2))
+    mask = person.mask.ravel().copy()
+    for other in found:
+        mask *= 1 - mask_at(other, pixels)
+    return mask.reshape(LANDMARK_SIZE, LANDMARK_SIZE)
+
+
+def _people(
+    networks: Networks,
+    photo: Float[np.ndarray, "h w 3"],
+    detections: list[Detection],
+    covered: Bool[np.ndarray, "h w"] | None = None,
+) -> list[Landmarks]:
+    """The landmarks of those detections that are people, the largest first.
+
+    covered: where the photo was painted over; landmarks there say nothing about the mask, and not
+    more than half may be there.
+    """
+    height, width = photo.shape[:2]
+    found = []
+    best_first = sorted(detections, key=lambda detection: -detection.score)
+    for detection in distinct(best_first, max(height, width))[:MOST_CROPS]:
+        person, drift = _settled(networks, photo, detection.crop())
+        on_mask = _on_mask(person, width, height, covered)
+        least = LEAST_ON_MASK if covered is None else LEAST_ON_REST
+        if person.presence >= LEAST_PRESENCE and on_mask >= least:
+            found.append((drift, person))
+    kept: list[Landmarks] = []
+    # crops far off that still drift towards a person have wrong landmarks: the one that settled
+    # speaks for the person
+    for _, person in sorted(
+        found, key=lambda pair: pair[0] > SETTLED
+    ):  # among these the detector's best
+        if not any(
+            _shared(*pair, width, height) > MOST_SHARED
+            for o in kept
+            for pair in ((person, o), (o, person))
+        ):
+            kept.append(person)
+    return sorted(kept, key=lambda person: -person.crop.side)
+
+
+def _settled(
+    networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop
+) -> tuple[Landmarks, float]:
+    """Landmarks of a crop that they confirm, and how far they would still move it, a share of its
+    side.
+
+    The landmark network knows hips and size better than the detector. It looks at least twice.
+    """
+    look, drift = networks.landmarks(photo, crop), np.inf
+    for _ in range(MOST_LOOKS - 1):
+        if look.presence < LEAST_PRESENCE or drift < SETTLED:
+            break
+        again = look.again.crop()
+        crop = again._replace(side=min(again.side, LARGER * crop.side))
+        look = networks.landmarks(photo, crop)
+        after = look.again.crop()
+        drift = (np.hypot(*(after.center - crop.center)) + abs(after.side - crop.side)) / crop.side
+    return look, float(drift)
+
+
+def window_detections(
+    networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]
+) -> list[Detection]:
+    """What the detector finds in the windows with these shares of the longer side."""
+    height, width = photo.shape[:2]
+    return [
+        each for window in windows(width, height, shares) for each in networks.detect(photo, window)
+    ]
+
+
+def windows(
+    width: int, height: int, shares: Sequence[float] = (*SHARES, *SMALL_SHARES)
+) -> list[Crop]:
+    """Upright squares that cover a photo: one around it, then smaller ones that overlap by half,
+    without those beside it.
+    """
+    longest, found = max(width, height), []
+    for share in shares:
+        side = share * longest
+        steps = [
+            1 if size <= side else int(np.ceil(2 * (size - side) / side)) + 1
+            for size in (width, height)
+        ]
+        starts = [
+            np.asarray([(size - side) / 2]) if count == 1 else np.linspace(0, size - side, count)
+            for size, count in zip((width, height), steps, strict=True)
+        ]
+        found += [
+            Crop(np.asarray([x, y]) + side / 2, side, 0.0) for y in starts[1] for x in starts[0]
+        ]
+    return found
+
+
+def distinct(detections: list[Detection], longest: int) -> list[Detection]:
+    """Detections of different people, of those given best first."""
+    kept: list[Detection] = []
+    for detection in detections:
+        side = detection.crop().side
+        if side >= SMALLEST * longest and not any(
+            _same_detection(detection, other) for other in kept
+        ):
+            kept.append(detection)
+    return kept
+
+
+def _same_detection(a: Detection, b: Detection) -> bool:
+    sides = sorted((a.crop().side, b.crop().side))
+    return (
+        float(np.hypot(*(a.hips - b.hips))) < SAME_HIPS * sides[1]
+        and sides[1] < SAME_SIZE * sides[0]
+    )
+
+
+def _on_mask(
+    person: Landmarks, width: int, height: int, covered: Bool[np.ndarray, "h w"] | None = None
+) -> float:
+    """The share of the landmarks in the photo that lie on the mask; 0 if none lies in the photo,
+    or most where it is covered.
+    """
+    points = person.pixels[_inside(person.pixels, width, height)]
+    if covered is not None:
+        column, row = np.round(points).astype(int).T
+        hidden = covered[row, column]
+        if 2 * hidden.sum() > len(points):
+            return 0.0
+        points = points[~hidden]
+    return float(np.mean(mask_at(person, points) > SEEN)) if len(points) else 0.0
+
+
+def _shared(person: Landmarks, other: Landmarks, width: int, height: int) -> float:
+    own = person.crop.to_photo(np.argwhere(person.mask > SEEN)[:, ::-1] / LANDMARK_SIZE)
+    own = own[_inside(own, width, height)]
+    return float(np.mean(mask_at(other, own) > SEEN)) if len(own) else 0.0
+
+
+def _inside(pixels: Float[np.ndarray, "n 2"], width: int, height: int) -> Bool[np.ndarray, " n"]:
+    return np.all((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5), axis=-1)

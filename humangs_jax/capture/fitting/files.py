@@ -1,0 +1,223 @@
+"""What fits write: fit.npz and fit.json beside the body.npz of a capture.
+
+fit.npz, the input of a fit to keypoints and how well its result is known:
+
+    set, names (v,), points (v, k, 2), confidences (v, k)    the keypoints, as
+                                                             `humangs_jax.capture.keypoints` stores
+                                                             them
+    noise (m,)               std of the detections, pixels
+    joint_std (m, j)         of the joints' positions, metres
+    determined (m, j)        share of the joints' rotations that the views determine
+    shape_covariance (s, s)
+    places (k, 3), certainty (k,)    of the set, as the fit found them, metres and weights
+
+fit.json is the report (`FitReport.to_json`).
+"""
+
+import dataclasses
+import shutil
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.body.landmarks import usual_certainty
+from humangs_jax.capture.fitting.report import FitReport
+from humangs_jax.capture.keypoints.keypoints import KEYPOINT_SETS, Keypoints
+from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.data.capture import Capture, capture_parameters
+from humangs_jax.data.capture_checks import CaptureError, few, numbers
+from humangs_jax.data.photos import capture_folder, read_description
+from humangs_jax.io.arrays import ArrayFile, write_npz
+from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
+from humangs_jax.io.reading import reading, write_json
+
+FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
+FOUND = ("noise", "joint_std", "determined", "shape_covariance")
+KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
+
+
+# fit.npz
+# --------------------------------------------------------------------------------------------------
+
+
+class UnknownViewError(ValueError):
+    """A capture has views that its fit does not know: photos were added after it."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FitRecord:
+    """Contents of fit.npz, see the module."""
+
+    keypoints: Keypoints
+    names: tuple[str, ...]
+    noise: Float[np.ndarray, " m"]
+    joint_std: Float[np.ndarray, "m j"]
+    determined: Float[np.ndarray, "m j"]
+    shape_covariance: Float[np.ndarray, "s s"]
+
+    def of_views(self, names: Sequence[str]) -> Keypoints:
+        """The keypoints of views, in their order. Raises: UnknownViewError."""
+        if missing := [name for name in names if name not in self.names]:
+            raise UnknownViewError(f"the capture's fit knows no view {few(missing)}: fit it again")
+        rows = [self.names.index(name) for name in names]
+        points, confidences = (
+            getattr(self.keypoints, name)[rows] for name in ("points", "confidences")
+        )
+        return dataclasses.replace(self.keypoints, points=points, confidences=confidences)
+
+
+def write_fit_record(path: str | Path, record: FitRecord) -> None:
+    """Write fit.npz, whole or not at all."""
+    kind = record.keypoints.set
+    arrays = {
+        "set": np.asarray(kind.name),
+        "names": np.asarray(record.names),
+        "points": record.keypoints.points.astype(np.float32),
+        "confidences": record.keypoints.confidences.astype(np.float32),
+        **{key: np.asarray(getattr(record, key), np.float32) for key in FOUND},
+        "places": kind.offsets.astype(np.float32),
+        "certainty": np.asarray(kind.certainty or usual_certainty(kind.names), np.float32),
+    }
+    write_npz(path, arrays, compressed=False)
+
+
+def read_fit_record(path: str | Path) -> FitRecord:
+    """Read fit.npz. Raises: CaptureError naming file and key."""
+    path = Path(path)
+    with reading(path, "fit.npz", CaptureError):
+        file = ArrayFile.open(path, CaptureError)
+        if missing := [key for key in KEYS if key not in file and key not in file.pickled]:
+            raise CaptureError(
+                path, missing[0], "missing: expected a file that `humangs fit` wrote"
+            )
+        own = lambda key, shape=None: numbers(file.array(key), path, key, shape)
+        name, names = str(file.array("set")), tuple(map(str, file.array("names")))
+        if name not in KEYPOINT_SETS:
+            raise CaptureError(
+                path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}"
+            )
+        kind = KEYPOINT_SETS[name]
+        v, k = len(names), len(kind.names)
+        kind = kind.adapted(own("places", (k, 3)), own("certainty", (k,)))
+        keypoints = Keypoints(own("points", (v, k, 2)), own("confidences", (v, k)), kind)
+        noise = own("noise", (None,))
+        joint_std = own("joint_std", (len(noise), None))
+        return FitRecord(
+            keypoints,
+            names,
+            noise,
+            joint_std,
+            own("determined", joint_std.shape),
+            own("shape_covariance"),
+        )
+
+
+# Captures
+# --------------------------------------------------------------------------------------------------
+
+
+def check_place(
+    source: str | Path,
+    out: str | Path | None,
+    overwrite: bool,
+    inputs: Iterable[str | Path | None] = (),
+) -> Path:
+    """The folder that a fit of the capture `source` is written to, checked before the work begins.
+
+    Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced.
+    inputs: further files and folders that the fit reads, None is left out; another folder that is
+    replaced may hold none of them, nor a photo.
+    Raises: ValueError if something would be overwritten without `overwrite`; OSError for a place
+    that cannot be written to; see also `check_replaceable`.
+    """
+    source = capture_folder(source)
+    target = source if out is None else Path(out)
+    description = read_description(source / "capture.json")
+    if target.resolve() != source.resolve():
+        photos = (source / file for file in _photo_files(description))
+        check_replaceable(target, overwrite, "capture.json", (source, *inputs, *photos))
+    elif (body := target / description["body"]).exists() and not overwrite:
+        raise ArgumentError("overwrite", f"is needed: {body} exists; or another folder for the fit")
+    check_writable(target)
+    return target
+
+
+def _photo_files(description: dict[str, Any]) -> list[str]:
+    """Images and masks of a capture, and what is unknown, as its description has them."""
+    kinds = ("image", "mask", "unknown")
+    return sorted({view[key] for view in description["views"] for key in kinds if key in view})
+
+
+def write_fitted(
+    source: str | Path,
+    target: str | Path,
+    capture: Capture,
+    report: FitReport,
+    record: FitRecord | None = None,
+) -> None:
+    """Write cameras and body of a capture: into the capture folder `source` itself, or with its
+    photos into another folder.
+
+    Arguments: record: of a fit to keypoints. None: a fit.npz of the source no longer holds; it is
+    left out or removed.
+    """
+    source, target = capture_folder(source), Path(target)
+    description = read_description(source / "capture.json")
+    contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
+    name, arrays = description["body"], capture_parameters(target, capture)
+
+    def write_fit(folder: Path):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_npz(folder / name, arrays, compressed=False)
+        for file, content in contents.items():
+            write_json(folder / file, content)
+        if record is not None:
+            write_fit_record(folder / FIT_FILE, record)
+
+    def write(folder: Path):
+        folder.mkdir()
+        for file in _photo_files(description):
+            _copy(source, folder, file)
+        write_fit(folder)
+
+    if target.resolve() == source.resolve():
+        invalid = () if record is not None else (FIT_FILE,)  # a record of other cameras
+        add_files(
+            target, write_fit, invalid=invalid, last=name
+        )  # `humangs start` asks for the body
+    else:
+        check_place(source, target, overwrite=True)
+        replace_folder(target, write, mark="capture.json")
+
+
+def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, Any]:
+    """capture.json with the cameras and the frames of the capture where they have changed."""
+    views = []
+    for i, view in enumerate(description["views"]):
+        new = {
+            name: np.asarray(getattr(capture.cameras, name)[i], float)
+            for name in ("K", "cam_from_world")
+        }
+        same = {
+            name: np.array_equal(np.asarray(view[name], np.float32), value)
+            for name, value in new.items()
+        }
+        changed = {name: value.tolist() for name, value in new.items() if not same[name]}
+        frame = int(capture.frames[i])
+        if view.get("frame", 0) != frame:
+            changed["frame"] = frame
+        views.append(view | changed)
+    return description | {"views": views}
+
+
+def _copy(source: Path, folder: Path, file: str) -> None:
+    target = folder / file
+    if not target.resolve().is_relative_to(folder.resolve()):
+        raise CaptureError(
+            source / "capture.json", file, "lies outside of the capture folder: fit it in place"
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source / file, target)

@@ -1,0 +1,429 @@
+"""From photos with cameras and keypoints to a capture with a body: how well it is known, and how it
+agrees with the keypoints.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.landmarks import LandmarkModel, kind_of, landmark_model
+from humangs_jax.body.model import BodyModel, without_expression
+from humangs_jax.capture.fitting.camera_errors import CameraError, find_camera_errors, mended
+from humangs_jax.capture.fitting.files import FitRecord
+from humangs_jax.capture.fitting.landmark_fit import (
+    FEW,
+    MOTION_SCALE,
+    ROBUST_SCALES,
+    LandmarkFit,
+    accelerations,
+    fit_landmarks,
+    keypoint_problem,
+)
+from humangs_jax.capture.fitting.report import (
+    Change,
+    FitReport,
+    ViewReport,
+    keypoint_warnings,
+    limit_violations,
+    undetermined_joints,
+)
+from humangs_jax.capture.fitting.residuals.keypoints import (
+    PLACE_STD,
+    KeypointProblem,
+    Observations,
+    body_errors,
+    found_noise,
+    frame_residuals,
+    group_by_frame,
+)
+from humangs_jax.capture.fitting.swaps import find_exchanged_hands, find_swaps
+from humangs_jax.capture.keypoints.keypoints import Keypoints
+from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import DEFAULT_BODY, Capture
+from humangs_jax.data.capture_checks import few
+from humangs_jax.data.photos import Photos
+
+UNSEEN = 1e-8
+"""Least information about position and orientation; keeps the inverse finite for frames without
+keypoints.
+"""
+
+
+class Uncertainty(NamedTuple):
+    """The uncertainty of a fit of m frames.
+
+    joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j)
+    share of the prior's variance of a joint's rotation, mean over axes, that the views remove: 1
+    all, 0 nothing, as for joints that no keypoint depends on.
+    shape_covariance: (s, s).
+    """
+
+    joint_covariances: Float[np.ndarray, "m j 3 3"]
+    determined: Float[np.ndarray, "m j"]
+    shape_covariance: Float[np.ndarray, "s s"]
+
+    @property
+    def joint_std(self) -> Float[np.ndarray, "m j"]:
+        """(m, j) metres: root mean square of the expected distance from the true joint."""
+        return np.sqrt(np.trace(self.joint_covariances, axis1=-2, axis2=-1))
+
+
+def fit_uncertainty(
+    model: LandmarkModel, observations: Observations, fit: LandmarkFit
+) -> Uncertainty:
+    """The covariance of a fit to these observations, in float64."""
+    model = replace(model, certainty=fit.certainty)
+    derivatives = _derivatives(model, replace(observations, noise=fit.noise), fit)
+    residuals_by, joints_by = (np.asarray(x, np.float64) for x in derivatives)
+    shapes = len(fit.betas)
+    by_pose, by_shape = np.split(residuals_by, [residuals_by.shape[-1] - shapes], axis=-1)
+    own = np.linalg.inv(
+        np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1])
+    )
+    coupling = np.einsum("mra,mrs->mas", by_pose, by_shape)
+    carried = own @ coupling
+    shape_information = np.einsum("mrs,mrt->st", by_shape, by_shape) - np.einsum(
+        "mas,mat->st", coupling, carried
+    )
+    shape = np.linalg.inv(shape_information + np.eye(shapes))
+    poses = own + carried @ shape @ carried.swapaxes(-1, -2)
+    mixed = -carried @ shape
+    whole = np.block(
+        [
+            [poses, mixed],
+            [mixed.swapaxes(-1, -2), np.broadcast_to(shape, (len(own), shapes, shapes))],
+        ]
+    )
+    covariances = np.einsum("mjap,mpq,mjbq->mjab", joints_by, whole, joints_by, optimize=True)
+    return Uncertainty(covariances, _determined(keypoint_problem(model), poses), shape)
+
+
+def _determined(
+    problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]
+) -> Float[np.ndarray, "m j"]:
+    """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order
+    global_orient, transl, body_pose.
+    """
+    joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
+    left = variances[:, 6:].reshape(len(poses), len(joints), 3)
+    std = np.radians(problem.origin.std.global_orient) * np.sqrt(variances[:, :3])
+    determined = np.zeros((len(poses), len(problem.prior.std)))
+    determined[:, joints] = 1 - np.clip(left.mean(-1), 0, 1)
+    determined[:, 0] = 1 - np.clip((std / np.pi).max(-1), 0, 1)
+    return determined
+
+
+@jax.jit
+def _derivatives(
+    model: LandmarkModel, observations: Observations, fit: LandmarkFit
+) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
+    """Of residuals and joints of each frame by its unknowns: global_orient, transl, body_pose, then
+    the shape.
+    """
+    problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
+    poses = jnp.concatenate(
+        [state.global_orient, state.transl, state.body_pose.reshape(m, -1)], axis=1
+    )
+    p = poses.shape[1]
+
+    def both(vector, seen):
+        pose = {
+            "global_orient": vector[:3],
+            "transl": vector[3:6],
+            "body_pose": vector[6:p].reshape(-1, 3),
+        }
+        moved = replace(state, betas=vector[p:], **pose)
+        found = frame_residuals(problem, seen, moved, ROBUST_SCALES[-1])
+        found.pop("shape")
+        return (
+            jnp.concatenate([leaf.ravel() for leaf in found.values()]),
+            problem.landmarks_and_joints(moved)[1],
+        )
+
+    vectors = jnp.concatenate([poses, jnp.tile(state.betas, (m, 1))], axis=1)
+    return jax.lax.map(lambda each: jax.jacfwd(both)(*each), (vectors, observations))
+
+
+OUTLIER = 5.0
+"""Standard deviations of the noise beyond which a keypoint is an outlier: the robust scale of the
+last stage of a fit.
+"""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Examination:
+    """The report on a body and keypoints, and the arrays behind it, of v views and k keypoints.
+
+    landmarks: (v, k, 2) of the body, pixels. compared, outliers: (v, k).
+    """
+
+    report: FitReport
+    landmarks: Float[np.ndarray, "v k 2"]
+    compared: Bool[np.ndarray, "v k"]
+    outliers: Bool[np.ndarray, "v k"]
+
+
+def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = None) -> Examination:
+    """Compare the body of a capture with keypoints of its views, in the order of the views.
+
+    Arguments: record: of the fit to these keypoints, if that is known: its noise (default: from the
+    median error), and what the views determine.
+    Raises: ValueError if the number of views differs, the record is of fewer frames, or the body
+    has none of the landmarks.
+    """
+    if len(keypoints.points) != capture.view_count:
+        raise ValueError(
+            f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}"
+        )
+    names = capture.body.joint_names
+    if record is not None and (
+        len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(names)
+    ):
+        raise ValueError(
+            f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]}"
+            f" joints, but the capture has {capture.frames.max() + 1} and {len(names)}: fit it"
+            " again"
+        )
+    observations, views = group_by_frame(capture, keypoints)
+    expected, poses = (
+        np.asarray(observations.noise),
+        jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses),
+    )
+    kind = keypoints.set
+    model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
+    errors = np.asarray(
+        body_errors(model, jnp.asarray(capture.betas), poses, observations, np.arange(len(views)))
+    )
+    compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
+    lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
+    frames = np.asarray([_quantile(own, 0.5) for own in lengths])
+    if record is None:
+        noise, undetermined = (
+            np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)),
+            (),
+        )
+    else:
+        noise, shown = record.noise[: len(views)], np.flatnonzero(compared.any((1, 2)))
+        undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
+    outliers = compared & (lengths * np.asarray(model.certainty) > OUTLIER * noise[:, None, None])
+
+    frame_of, slot_of = np.argwhere(views >= 0)[np.argsort(views[views >= 0])].T
+    by_view = lambda values: values[frame_of, slot_of]
+    numbers = zip(
+        capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True
+    )
+    rows = tuple(_view_report(*own) for own in numbers)
+    violations = limit_violations(names, poses)
+    hands = find_exchanged_hands(keypoints, capture.names)
+    explained = {swap.views[0] for swap in hands}
+    others = find_swaps(observations, kind, views, capture.names)
+    others = (
+        swap
+        for swap in others
+        if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead))
+    )
+    swaps = (*others, *hands)
+    report = FitReport(
+        fitted="keypoints",
+        errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},
+        views=rows,
+        violations=violations,
+        swaps=swaps,
+        undetermined=undetermined,
+        notes=_worst_frame(frames),
+        warnings=(
+            *(
+                f"{error}, as the keypoints show: `humangs fit` turns it back"
+                for error in find_camera_errors(capture, keypoints)
+            ),
+            *keypoint_warnings(rows, expected, violations, swaps),
+        ),
+    )
+    landmarks = by_view(errors + np.asarray(observations.points))
+    return Examination(report, landmarks, by_view(compared), by_view(outliers))
+
+
+def _worst_frame(frames: Float[np.ndarray, " m"]) -> tuple[str, ...]:
+    known = np.flatnonzero(np.isfinite(frames))
+    if len(frames) < 2 or not len(known):
+        return ()
+    worst = known[np.argmax(frames[known])]
+    middle = np.median(frames[known])
+    return (
+        f"frames: median error {middle:.1f} px, worst in frame {worst}: {frames[worst]:.1f} px",
+    )
+
+
+def _view_report(
+    name: str, frame: int, lengths: Float[np.ndarray, " k"], outliers: Bool[np.ndarray, " k"]
+) -> ViewReport:
+    count = int(np.isfinite(lengths).sum())
+    share = float(outliers.sum() / max(count, 1))
+    return ViewReport(name, frame, count, _quantile(lengths, 0.5), _quantile(lengths, 0.9), share)
+
+
+def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
+    """A quantile of the values that are not NaN; NaN if all are."""
+    known = values[np.isfinite(values)]
+    return float(np.quantile(known, share)) if known.size else float("nan")
+
+
+FAR_MM = 10.0
+"""Millimetres between places of landmarks that are worth a line."""
+FAR = 4.0
+"""A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of
+half their distance.
+"""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FittedCapture:
+    """A fit in memory: the capture with its body, and the record that is stored beside it.
+
+    notes, warnings: of the fit itself. camera_errors: turns of cameras, which the capture's are
+    without.
+    """
+
+    capture: Capture
+    record: FitRecord
+    fit: LandmarkFit
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    camera_errors: tuple[CameraError, ...] = ()
+
+    @functools.cached_property
+    def report(self) -> FitReport:
+        """How good it is. Made when asked for: it tries exchanges of views."""
+        report = examine(self.capture, self.record.keypoints, self.record).report
+        notes, warnings = (*report.notes, *self.notes), (*report.warnings, *self.warnings)
+        return dataclasses.replace(report, notes=notes, warnings=warnings)
+
+
+def fit_photos(
+    photos: Photos,
+    keypoints: Keypoints,
+    body: BodyModel,
+    *,
+    body_file: str = DEFAULT_BODY,
+    smoothness: float = 0.0,
+    fixed_cameras: bool = False,
+) -> FittedCapture:
+    """Find shape and poses of the person in photos, and turn cameras back that the keypoints show
+    to be turned.
+
+    Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes
+    from, see `Capture`.
+    smoothness: see `fit_landmarks`. fixed_cameras: they stay as they are, as do those that were
+    found from the person.
+    Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or
+    the body's root is not its first joint.
+    """
+    if len(keypoints.points) != len(photos.names):
+        raise ValueError(
+            f"keypoints of {len(keypoints.points)} views, but there are {len(photos.names)} photos"
+        )
+    if body.parents.index(-1) != 0:
+        raise ValueError(
+            f"body '{body.name}': expected the root to be its first joint, got joint"
+            f" {body.parents.index(-1)}"
+        )
+    fixed_cameras = (
+        fixed_cameras or not photos.calibrated
+    )  # found from such keypoints, which tell nothing new about them
+    errors = () if fixed_cameras else find_camera_errors(photos, keypoints)
+    photos = mended(photos, errors) if errors else photos
+    kind = keypoints.set
+    model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
+    observations, _ = group_by_frame(photos, keypoints)
+    seen = np.asarray(observations.confidences) * np.asarray(model.known) > 0
+    if not seen.any():
+        raise ValueError("no view has a keypoint that the body has: nothing to fit")
+    fit = fit_landmarks(model, observations, smoothness)
+    found = fit_uncertainty(model, observations, fit)
+    capture = Capture(
+        **vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file
+    )
+    moved = np.zeros((len(kind.names), 3))
+    if fit.state.places is not None:
+        moved = model.by_landmark(PLACE_STD * fit.state.places)
+    keypoints = dataclasses.replace(
+        keypoints, set=kind.adapted(kind.offsets + moved, np.asarray(fit.certainty))
+    )
+    known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
+    record = FitRecord(keypoints, photos.names, *known)
+    notes = (*_places(model, fit), *(f"{error}: turned back" for error in errors))
+    motion = _motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), smoothness)
+    warnings = (*_blind_frames(seen, smoothness > 0 and len(seen) > 2), *motion)
+    return FittedCapture(capture, record, fit, notes, warnings, errors)
+
+
+def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
+    """A line about landmarks that the detector sees elsewhere, if the fit looked for them."""
+    if fit.state.places is None:
+        return
+    moved = 1000 * PLACE_STD * np.linalg.norm(np.asarray(fit.state.places), axis=-1)
+    kinds = {
+        group: kind_of(model.names[row])
+        for row, (group, _) in zip(model.placed, model.groups, strict=True)
+    }
+    far = [
+        f"{kinds[group]} {moved[group]:.0f} mm"
+        for group in np.argsort(-moved)[:3]
+        if moved[group] > FAR_MM
+    ]
+    if far:
+        yield (
+            "the detector sees landmarks beside where the body has them, which is undone:"
+            f" {', '.join(far)}"
+        )
+
+
+def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str]:
+    """Warnings about frames (m, c, k) with few keypoints or a single view. smooth: whether the
+    motion is.
+    """
+    taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
+    single = []
+    for frame, views in enumerate(seen):
+        points, cameras = int(views.any(0).sum()), int(views.any(1).sum())
+        if points < FEW:
+            yield f"frame {frame}: {points} keypoints are seen: its pose is {taken}"
+        elif cameras == 1:
+            single.append(str(frame))
+    if single:
+        frames, each = ("frame", "") if len(single) == 1 else ("frames", "each ")
+        told = f"{each}seen by one view: distance and height are hardly determined"
+        yield f"{frames} {few(single)}: {told}"
+
+
+def _motion_warnings(
+    joints: Float[np.ndarray, "m j 3"], held: float, smoothness: float
+) -> Iterator[str]:
+    """Warnings about motion that was to be smooth. held: the smoothness to which accelerations were
+    held.
+    """
+    if not smoothness:
+        return
+    if len(joints) < 3:
+        yield f"smoothness: {len(joints)} frames have no acceleration: it changes nothing"
+        return
+    if not held:
+        yield "smoothness: the keypoints contradict a smooth motion: frames are fitted one by one"
+    elif held > 1.5 * smoothness:
+        yield (
+            f"smoothness {smoothness:g}: the keypoints contradict it: accelerations are held to"
+            f" {held:g} instead"
+        )
+    off = np.linalg.norm(accelerations(joints), axis=-1).mean(-1) / 2
+    around = np.linalg.norm(joints[2:] - joints[:-2], axis=-1).mean(-1)
+    for frame in 1 + np.flatnonzero(off > FAR * around / 2 + MOTION_SCALE * smoothness):
+        yield (
+            f"frame {frame}: {off[frame - 1]:.2f} m from where the frames beside it would have it:"
+            " is it somebody else?"
+        )

@@ -1,0 +1,495 @@
+"""A body through keypoints: rigid, points, body, hands, then all frames together with one shape.
+Pure; vmap it over people.
+
+    rigid   position and orientation of a resting body, from the best of several starts
+    points  body joints and shape against triangulated points; skipped by frames without any
+    body    the same against the keypoints of every view
+    hands   all joints that a keypoint depends on, with a smaller robust scale
+    person  all frames at once: one shape, the noise that was found, of each landmark too, and, of
+            several frames that several views show, the places at which the detector sees its
+            landmarks
+    motion  where requested, the same with smooth motion, which is expected weakly first: see
+            `smooth_motion`
+
+The first four are one program that runs with other weights and other free unknowns, because
+compilation dominates the time.
+"""
+
+import functools
+import itertools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.joints import BODY_NAMES
+from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
+from humangs_jax.body.model import BodyPose
+from humangs_jax.capture.fitting.residuals.keypoints import (
+    RAYLEIGH_MEDIAN,
+    KeypointProblem,
+    Observations,
+    Targets,
+    focal_lengths,
+    found_noise,
+    frame_residuals,
+    in_cameras,
+    keypoint_errors,
+    keypoint_residuals,
+    trunk_weights,
+)
+from humangs_jax.capture.fitting.state import (
+    FREE,
+    FitState,
+    betas_of,
+    frame_axes,
+    half_squares,
+    pose_of,
+    pose_prior,
+    robust,
+    solve,
+    state_of,
+    usual_origin,
+    zero_state,
+)
+from humangs_jax.capture.fitting.triangulation import triangulate_robustly
+from humangs_jax.capture.keypoints.keypoints import mirrored_name
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.transform import EXACT
+
+PLACED_FRAMES = 4
+"""With this many frames a fit finds where the detector sees its landmarks: fewer say too little
+about both shape and places.
+"""
+USUAL_COUNT, LEAST_RATIO = 16, 0.5
+"""Keypoints that what is usual counts for, and its least share, where the noise of a landmark is
+found.
+"""
+ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
+"""Of keypoint errors in the stages rigid, points, body, hands and person, standard deviations."""
+STARTS = (4, 2)
+"""Orientations that are followed, for one view and for several."""
+STEPS = PERSON_STEPS = 150
+"""Of the solver in a stage of one frame, and for all frames together, at most."""
+TOLERANCE = 3e-4
+"""Of the unknowns, which are of unit size."""
+
+
+@pytree_dataclass
+class LandmarkFit:
+    """A person in m frames. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j,
+    3) metres.
+
+    noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's
+    origin. smoothness: () the acceleration that the motion was held to, metres per frame squared;
+    0: to none. certainty: (k,) of the landmarks.
+    """
+
+    betas: Float[Array, " s"]
+    poses: BodyPose
+    landmarks: Float[Array, "m k 3"]
+    joints: Float[Array, "m j 3"]
+    noise: Float[Array, " m"]
+    state: FitState
+    smoothness: Float[Array, ""]
+    certainty: Float[Array, " k"]
+
+
+@checked_arguments
+def fit_landmarks(
+    model: LandmarkModel, observations: Observations, smoothness: float = 0.0
+) -> LandmarkFit:
+    """Shape and poses of one person.
+
+    Arguments: observations: a batch of m frames, in their order in time where motion is to be
+    smooth. smoothness: expected acceleration of joints, metres per frame squared; 0: frames are
+    independent. The result is finite for all finite observations; frames without keypoints rest in
+    the prior's usual pose, or with smooth motion are interpolated.
+    """
+    fit = _fit_frames(model, observations)
+    return (
+        smooth_motion(model, observations, fit, smoothness)
+        if smoothness and len(fit.noise) > 2
+        else fit
+    )
+
+
+@jax.jit
+def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
+    """All stages but the motion."""
+    problem = keypoint_problem(model)
+    states = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)
+    observations = replace(observations, noise=_noise_found(problem, observations, states))
+    model = replace(model, certainty=_certainty_found(problem, observations, states))
+    problem = keypoint_problem(model)
+    groups = len({group for group, _ in model.groups})
+    many = (
+        groups
+        and observations.points.shape[0] >= PLACED_FRAMES
+        and observations.points.shape[1] > 1
+    )
+    places = jnp.zeros((groups, 3)) if many else None
+    start = replace(states, betas=jnp.median(states.betas, axis=0), places=places)
+    residuals = lambda state: _person_residuals(problem, observations, state)
+    state, _ = solve(residuals, start, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
+    return _result(problem, observations.noise, state, jnp.zeros(()))
+
+
+def _result(
+    problem: KeypointProblem,
+    noise: Float[Array, " m"],
+    state: FitState,
+    smoothness: Float[Array, ""],
+) -> LandmarkFit:
+    betas = betas_of(problem.origin, state)
+    poses = _poses(problem, state)
+    landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model_of(state), betas, pose))(
+        poses
+    )
+    return LandmarkFit(
+        betas, poses, landmarks, joints, noise, state, smoothness, problem.model.certainty
+    )
+
+
+def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
+    return jax.vmap(lambda own: pose_of(problem.origin, own), in_axes=(frame_axes(state),))(state)
+
+
+def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
+    """The problem in which every joint is free that moves a landmark; the others rest in the usual
+    pose.
+    """
+    prior, joints = pose_prior(model.joint_names), tuple(j for j in model.movers if j > 0)
+    origin = usual_origin(prior, joints, model.joint_directions.shape[-1])
+    return KeypointProblem(model, prior, origin)
+
+
+def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
+    """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
+    several = seen.points.shape[0] > 1
+    points, counts, weights = triangulate_robustly(seen)
+    starts = _rigid_starts(problem, seen, points, counts, STARTS[several])
+    targets = Targets(points, counts >= 2, _metres_per_pixel(seen, points, weights))
+    stages = _stages(problem, targets)
+
+    def run(state, stage):
+        weighted = replace(seen, confidences=seen.confidences * stage.views)
+        residuals = lambda y: frame_residuals(problem, weighted, y, stage.scale, stage.targets)
+        return solve(residuals, state, STEPS, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
+
+    states, costs = jax.vmap(lambda start: jax.lax.scan(run, start, stages))(starts)
+    best = jnp.argmin(costs[:, -1])
+    return jax.tree.map(lambda leaf: leaf[best], states)
+
+
+# The start of a frame
+# ------------------------------------------------------------------------------------------------
+
+COARSE = 30.0
+"""Robust scale of keypoints while the body rests, standard deviations."""
+
+
+def _rigid_starts(
+    problem: KeypointProblem,
+    observations: Observations,
+    points: Float[Array, "k 3"],
+    counts: Float[Array, " k"],
+    kept: int,
+) -> FitState:
+    """The `kept` best positions and orientations of a resting body, a batch.
+
+    The trunk of a resting body is turned onto triangulated points (Kabsch 1976); the 24
+    orientations of a cube compete with it. The position for an orientation solves linear equations.
+    The best by keypoints are kept.
+
+    Arguments: points, counts: triangulated landmarks (k, 3) and how many views agree with each
+    (k,), 0: unknown.
+    """
+    resting = zero_state(problem.origin)
+    landmarks, joints = problem.landmarks_and_joints(resting)
+    pelvis = joints[0]
+    weights = trunk_weights(problem.model.names) * problem.known
+    product = functools.partial(jnp.matmul, precision=EXACT)
+    turned = _kabsch(landmarks, points, weights * (counts >= 2))
+    rotations = jnp.concatenate([turned[None], jnp.asarray(cube_rotations(), jnp.float32)])
+    positions = jax.vmap(
+        lambda r: _position(observations, product(landmarks - pelvis, r.T), weights)
+    )(rotations)
+    vectors = quaternion.to_axis_angle(quaternion.from_matrix(rotations))
+    start = lambda vector, position: replace(
+        resting,
+        global_orient=vector / math.radians(FREE.global_orient),
+        transl=(position - pelvis) / FREE.transl,
+    )
+    starts = jax.vmap(start)(vectors, positions)
+
+    def cost(state):
+        errors = keypoint_residuals(
+            problem.model, observations, problem.landmarks_and_joints(state)[0], COARSE
+        )
+        return 0.5 * jnp.sum(weights[:, None] * jnp.square(errors))
+
+    best = jnp.argsort(jax.vmap(cost)(starts))[:kept]
+    return jax.tree.map(lambda leaf: leaf[best], starts)
+
+
+def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
+    """The rotations that map the axes to each other."""
+    signed = (
+        np.eye(3)[list(order)] * np.asarray(signs)[:, None]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1, -1), repeat=3)
+    )
+    return np.stack([m for m in signed if np.linalg.det(m) > 0])
+
+
+def _kabsch(
+    a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
+) -> Float[Array, "3 3"]:
+    """The rotation about weighted centres that takes points a to b best; the identity where nothing
+    is known.
+    """
+    share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
+    centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
+    u, _, vt = jnp.linalg.svd(
+        jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a, precision=EXACT)
+        + 1e-9 * jnp.eye(3)
+    )
+    sign = jnp.sign(jnp.linalg.det(jnp.matmul(u, vt, precision=EXACT)))
+    return jnp.matmul(u * jnp.stack([jnp.ones(()), jnp.ones(()), sign]), vt, precision=EXACT)
+
+
+def _position(
+    observations: Observations,
+    offsets: Float[Array, "k 3"],
+    weights: Float[Array | np.ndarray, " k"],
+) -> Float[Array, "3"]:
+    """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a
+    detection over the focal length, x (z + t_z) = X + t_x and likewise y, linear in t.
+    """
+    rotation = observations.cam_from_world[:, :3, :3]
+    xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
+    known = in_cameras(observations, offsets)
+    rows = rotation[:, None, :2] - xy[..., None] * rotation[:, None, 2:]
+    right = xy * known[..., 2:] - known[..., :2]
+    w = observations.confidences * weights
+    matrix = jnp.einsum("ck,ckia,ckib->ab", w, rows, rows, precision=EXACT)
+    vector = jnp.einsum("ck,ckia,cki->a", w, rows, right, precision=EXACT)
+    scale = jnp.maximum(jnp.trace(matrix), 1e-9)
+    return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
+
+
+def _metres_per_pixel(
+    seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]
+) -> Float[Array, ""]:
+    centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
+    distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
+    each = distance / seen.K[:, :1, 0]
+    return jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4
+
+
+# Stages
+# --------------------------------------------------------------------------------------------------
+
+
+@pytree_dataclass
+class _Stage:
+    """One run of the solver. views: (k,) weights of keypoints.
+
+    targets: triangulated points with weights. free: what moves.
+    """
+
+    views: Float[Array, " k"]
+    targets: Targets
+    scale: Float[Array, ""]
+    free: FitState
+
+
+BODY = (*BODY_NAMES, "jaw")
+"""Joints that move before the hands do."""
+
+
+def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
+    model, resting = problem.model, zero_state(problem.origin)
+    trunk = jnp.asarray(trunk_weights(model.names))
+    body = np.asarray([model.joint_names[j] in BODY for j in problem.origin.joints])[:, None]
+    ones, none = jnp.ones_like(trunk), jnp.zeros_like(trunk)
+    free = lambda shape, joints: replace(
+        resting,
+        betas=jnp.full(resting.betas.shape, shape),
+        global_orient=jnp.ones(3, bool),
+        transl=jnp.ones(3, bool),
+        body_pose=jnp.broadcast_to(jnp.asarray(joints), resting.body_pose.shape),
+    )
+    triangulated = jnp.any(targets.known)
+    in_space = lambda share: replace(targets, known=targets.known * share)
+    scale = lambda stage: jnp.asarray(ROBUST_SCALES[stage])
+    stages = [
+        _Stage(trunk, in_space(0.0), scale(0), free(False, False)),
+        _Stage(jnp.where(triangulated, none, ones), in_space(1.0), scale(1), free(True, body)),
+        _Stage(ones, in_space(0.0), scale(2), free(True, body)),
+        _Stage(ones, in_space(0.0), scale(3), free(True, True)),
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
+
+
+def _noise_found(
+    problem: KeypointProblem, observations: Observations, states: FitState
+) -> Float[Array, " m"]:
+    def of_frame(seen, state):
+        lengths = jnp.linalg.norm(
+            keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1
+        )
+        return found_noise(
+            jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan), seen.noise
+        )
+
+    return jax.vmap(of_frame)(observations, states)
+
+
+def _certainty_found(
+    problem: KeypointProblem, observations: Observations, states: FitState
+) -> Float[Array, " k"]:
+    """(k,) of landmarks, from the errors of the first stages in the frames that several views show:
+    a robust noise of each pair, over that of all. The fewer there are, the nearer to the usual.
+    """
+    model, pair = (
+        problem.model,
+        np.asarray([problem.model.names.index(mirrored_name(n)) for n in problem.model.names]),
+    )
+
+    def lengths(seen, state):
+        errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0]) / seen.noise
+        known = (seen.confidences > 0) & (problem.known > 0)
+        shared = known & (jnp.sum(known, axis=0) > 1)
+        return jnp.where(shared, jnp.linalg.norm(errors, axis=-1), jnp.nan)
+
+    found = jax.vmap(lengths)(observations, states)
+    found = jnp.stack([found, found[..., pair]])
+    count = jnp.sum(~jnp.isnan(found), axis=(0, 1, 2)) / (1 + (pair != np.arange(len(pair))))
+    ratio = jnp.nan_to_num(jnp.nanmedian(found, axis=(0, 1, 2)) / RAYLEIGH_MEDIAN, nan=1.0)
+    usual = 1 / model.certainty
+    variance = (USUAL_COUNT * usual**2 + count * ratio**2) / (USUAL_COUNT + count)
+    return 1 / jnp.maximum(jnp.sqrt(variance), LEAST_RATIO * usual)
+
+
+def _person_residuals(
+    problem: KeypointProblem, observations: Observations, state: FitState
+) -> dict[str, Float[Array, "..."]]:
+    """All frames at once with one shape."""
+    of_frame = lambda seen, own: frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
+    found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
+    found["shape"] = state.betas  # once, whatever the number of frames
+    if state.places is not None:
+        found["places"] = state.places
+    return found
+
+
+# Smooth motion
+# --------------------------------------------------------------------------------------------------
+
+MOTION_LEVELS = (64.0, 16.0, 4.0, 1.0)
+"""Multiples of the expected acceleration, one solve each. Weak ones first: frames that one view
+hardly determines come together before anything pulls hard."""
+MOTION_SCALE = 5.0
+"""Robust scale of accelerations, multiples of the expected one: a frame that shows somebody else
+hardly pulls the others.
+"""
+FEW = 6
+"""Keypoints below which a frame's pose is mostly the prior's. Smooth motion interpolates it."""
+
+
+@jax.jit
+def smooth_motion(
+    model: LandmarkModel,
+    observations: Observations,
+    fit: LandmarkFit,
+    smoothness: float | Float[Array, ""],
+) -> LandmarkFit:
+    """A fit whose joints move as smoothly as `smoothness` expects, and as its keypoints allow.
+
+    Arguments: observations: those of the fit. fit: without smooth motion, of at least three frames.
+
+    The result is that of the last of `MOTION_LEVELS` which follows the keypoints of every frame as
+    well as the fit does, up to their noise: the robust cost of a frame may exceed the fit's by the
+    number of its unknowns. That is twice what the true pose exceeds it by on average, because a fit
+    with p unknowns takes up p of the squared normal errors and half of them are the cost. If no
+    level does, the fit itself.
+    """
+    problem = keypoint_problem(replace(model, certainty=fit.certainty))
+    seen = replace(observations, noise=fit.noise)
+    axes = frame_axes(fit.state)
+
+    def costs(state):
+        """(m,) of the keypoints of each frame."""
+        landmarks = jax.vmap(lambda own: problem.landmarks_and_joints(own)[0], in_axes=(axes,))(
+            state
+        )
+        errors = lambda each, points: half_squares(
+            keypoint_residuals(problem.model, each, points, ROBUST_SCALES[-1])
+        )
+        return jax.vmap(errors)(seen, landmarks)
+
+    observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
+    limit = costs(fit.state) + jnp.minimum(6 + 3 * len(problem.origin.joints), observed)
+
+    def run(carry, std):
+        state, kept, held = carry
+
+        def residuals(y):
+            joints = jax.vmap(lambda own: problem.landmarks_and_joints(own)[1], in_axes=(axes,))(y)
+            motion = robust(accelerations(joints) / std, MOTION_SCALE)
+            return _person_residuals(problem, seen, y) | {"motion": motion}
+
+        state, _ = solve(residuals, state, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
+        good = jnp.all(costs(state) <= limit)
+        kept, held = jax.tree.map(
+            lambda new, old: jnp.where(good, new, old), (state, std), (kept, held)
+        )
+        return (state, kept, held), None
+
+    start = _bridged(problem, seen, fit.state)
+    kept = jax.tree.map(
+        lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state
+    )
+    carry = (start, kept, jnp.zeros(()))
+    (_, state, held), _ = jax.lax.scan(run, carry, smoothness * jnp.asarray(MOTION_LEVELS))
+    return _result(problem, fit.noise, state, held)
+
+
+def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) -> Any:
+    """(m - 2, j, 3) of the frames but the first and the last, metres per frame squared."""
+    return joints[2:] - 2 * joints[1:-1] + joints[:-2]
+
+
+def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> FitState:
+    """The state with the poses of frames that show nothing interpolated between their nearest
+    neighbours that show something.
+    """
+    m = len(seen.noise)
+    shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW
+    frames = jnp.arange(m)
+    before = jax.lax.cummax(jnp.where(shown, frames, -1))
+    after = jax.lax.cummin(jnp.where(shown, frames, m), reverse=True)
+    low, high = jnp.where(before < 0, after, before), jnp.where(after >= m, before, after)
+    low, high = (jnp.clip(x, 0, m - 1) for x in (low, high))
+    share = (frames - low) / jnp.maximum(high - low, 1)
+    poses, betas = _poses(problem, state), betas_of(problem.origin, state)
+    rotations, translations = poses.rotations, poses.translation
+    between = replace(
+        poses,
+        rotations=quaternion.interpolate(rotations[low], rotations[high], share[:, None]),
+        translation=translations[low] + share[:, None] * (translations[high] - translations[low]),
+    )
+    bridged = jax.vmap(lambda pose: state_of(problem.origin, betas, pose))(between)
+    pick = lambda new, old: jnp.where(shown.reshape(m, *[1] * (old.ndim - 1)), old, new)
+    moved = {
+        name: pick(getattr(bridged, name), getattr(state, name))
+        for name in ("global_orient", "transl", "body_pose")
+    }
+    return replace(state, **moved)

@@ -1,0 +1,266 @@
+"""Cameras of photos of one moment, from the person in them: no calibration, no board.
+
+Where the cameras stand is known up to a similarity. Size and axes come from the person: metres by
+the detector's 3D landmarks, or by the person's height where that is given; y up by the cameras,
+which people hold level, and by the body.
+
+Which photos are of that moment, and the cameras up to that similarity: `person_moments`.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import shape_body
+from humangs_jax.capture.fitting.person_bundle import (
+    Rig,
+)
+from humangs_jax.capture.fitting.person_moments import (
+    FEWEST,
+    SEEN,
+    SMALLEST,
+    USUAL_FOCAL,
+    USUAL_STD,
+    PersonViews,
+    Trial,
+    across,
+    best_trial,
+    cleaned,
+    explain,
+    known_landmarks,
+    middle_of,
+    under_bar,
+)
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.camera import Camera
+
+LEVEL, UPRIGHT = 4.0, 15.0
+"""Stds of the roll of a camera and of the lean of a body, degrees."""
+BONES_STD, STATURE_STD = 0.01, 0.001
+"""Metres by which joints and stature may differ from those of a scaled person."""
+STATURE = 1.52
+"""Stature over trunk, thigh and shin together, of the shipped body's mean person."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PersonCameras:
+    """Cameras around a person who stands on y = 0 at x = z = 0, facing +z.
+
+    views: photos that are used. The rest is of these: cameras: one of each. landmarks: (c, k, 3)
+    metres, of the person in each.
+    moments: 1, or as many as photos: then each camera stands in a world of its own. mirrored: (c,)
+    whether the detector exchanged left and right. errors: (c,) median distance of landmarks from
+    their pixels, pixels. warnings: what a user should know.
+    """
+
+    views: tuple[int, ...]
+    cameras: tuple[Camera, ...]
+    landmarks: Float[np.ndarray, "c k 3"]
+    mirrored: Bool[np.ndarray, " c"]
+    moments: int
+    errors: Float[np.ndarray, " c"]
+    warnings: tuple[str, ...]
+
+
+def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> PersonCameras:
+    """Cameras of photos from the person in them: of one moment, if one set of landmarks explains
+    them all, else each on its own.
+
+    One photo of many that contradicts the others is left out.
+
+    Arguments: height: of the person without shoes, metres. Without it the person has the size of
+    the detector's 3D landmarks.
+    Raises: ValueError naming the photo, if one shows too little of the person, or where no camera
+    is found.
+    """
+    _check(seen, height)
+    seen = cleaned(seen)
+    explained = explain(seen)
+    if explained.trial is not None:
+        views = explained.views
+        found = _cameras(seen.select(views), explained.trial, height)
+        return dataclasses.replace(
+            found, views=views, warnings=(*found.warnings, *explained.warnings)
+        )
+
+    # each photo shows a person, and has a world, of its own
+    every = range(len(seen.photos))
+    alone = [seen.select([view]) for view in every]
+    found = [
+        _cameras(own, best_trial(own), height) for own in under_bar(alone, "cameras of each photo")
+    ]
+    warnings = (*explained.warnings, *(warning for each in found for warning in each.warnings))
+    names = ("landmarks", "mirrored", "errors")
+    joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in names}
+    cameras = tuple(each.cameras[0] for each in found)
+    return PersonCameras(
+        tuple(every), cameras, moments=len(found), warnings=tuple(dict.fromkeys(warnings)), **joined
+    )
+
+
+def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCameras:
+    """Cameras and landmarks of a trial of these photos, in the world of the person."""
+    rig = trial.rig
+    if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):
+        raise ValueError(
+            f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the"
+            " person"
+        )
+    medians = np.asarray(
+        [np.median(e[w > SEEN]) for e, w in zip(trial.pixels, trial.evidence.weights, strict=True)]
+    )
+    cameras, landmarks = _in_world(seen, rig, height)
+    views, every = (
+        tuple(range(len(cameras))),
+        np.broadcast_to(landmarks, (len(cameras), *landmarks.shape)),
+    )
+    warnings = tuple(_warnings(seen, trial.mirrored, height))
+    return PersonCameras(views, cameras, every, trial.mirrored, 1, medians, warnings)
+
+
+# What is given
+# --------------------------------------------------------------------------------------------------
+
+
+def _check(seen: PersonViews, height: float | None) -> None:
+    views = len(seen.points)
+    if not views:
+        raise ValueError("no photo of the person: expected one or more")
+    counts = {len(x) for x in (seen.visibility, seen.world, seen.sizes, seen.focal, seen.photos)}
+    if counts != {views} or {len(seen.names)} != {
+        x.shape[1] for x in (seen.points, seen.visibility, seen.world)
+    }:
+        raise ValueError(
+            f"expected points, visibility, world, sizes, focal and photos of {views} views"
+        )
+    if height is not None and not 0.3 < height < 3:
+        raise ValueError(f"height {height:g}: expected metres between 0.3 and 3")
+    for photo, points, visible in zip(seen.photos, seen.points, known_landmarks(seen), strict=True):
+        if visible.sum() < FEWEST:
+            raise ValueError(
+                f"{photo}: {visible.sum()} landmarks of the person are seen, expected {FEWEST} or"
+                " more"
+            )
+        if np.ptp(points[visible], axis=0).max() < SMALLEST:
+            raise ValueError(
+                f"{photo}: all landmarks of the person lie within {SMALLEST:.0f} pixels"
+            )
+    for photo, world, visible in zip(seen.photos, seen.world, known_landmarks(seen), strict=True):
+        if not np.ptp(world[visible], axis=0).any():
+            raise ValueError(f"{photo}: all 3D landmarks of the person are one point")
+    for photo, focal in zip(seen.photos, seen.focal, strict=True):
+        if focal <= 0 or np.isinf(focal):
+            raise ValueError(
+                f"{photo}: focal length {focal:g}: expected pixels, or NaN where it is unknown"
+            )
+
+
+# The world
+# --------------------------------------------------------------------------------------------------
+
+
+def _in_world(
+    seen: PersonViews, rig: Rig, height: float | None
+) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
+    """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this
+    height.
+    """
+    points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
+    names = seen.names
+    hips, shoulders, ankles = (
+        middle_of(points, names, part) for part in ("hip", "shoulder", "ankle")
+    )
+    body = (shoulders - ankles) / np.linalg.norm(shoulders - ankles)
+    level = rotations[:, 0]  # images' x axes: horizontal if the cameras are level
+    precision = level.T @ level / LEVEL**2 + np.eye(3) / UPRIGHT**2
+    up = np.linalg.solve(precision, body)
+    up /= np.linalg.norm(up)
+    left = across(points, names)
+    left -= (left @ up) * up
+    left /= np.linalg.norm(left)
+    world_from_rig = np.stack([left, up, np.cross(left, up)])
+    scale = 1.0
+    if height is not None:
+        part = lambda a, b: np.mean(
+            [
+                np.linalg.norm(points[names.index(f"{s}_{a}")] - points[names.index(f"{s}_{b}")])
+                for s in ("left", "right")
+            ]
+        )
+        scale = height / (
+            STATURE
+            * (np.linalg.norm(shoulders - hips) + part("hip", "knee") + part("knee", "ankle"))
+        )
+    turned = scale * points @ world_from_rig.T
+    middle = scale * world_from_rig @ hips
+    origin = np.asarray([middle[0], turned[:, 1].min(), middle[2]])
+    cameras = []
+    for (width, tall), rotation, place, f in zip(seen.sizes, rotations, places, focal, strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation @ world_from_rig.T
+        matrix[:3, 3] = scale * place + matrix[:3, :3] @ origin
+        cameras.append(
+            Camera.from_opencv(
+                [[f, 0, width / 2], [0, f, tall / 2], [0, 0, 1]], matrix, width, tall
+            )
+        )
+    return tuple(cameras), turned - origin
+
+
+def _warnings(
+    seen: PersonViews, mirrored: Bool[np.ndarray, " c"], height: float | None
+) -> Iterator[str]:
+    if height is None:
+        yield (
+            "the person's height is not given: lengths are a detector's guess, often 6 to 11 % too"
+            " small"
+        )
+    if not np.isfinite(seen.focal).any():
+        yield (
+            f"no photo says its focal length: {USUAL_FOCAL:.0f} mm of 35-mm film, give or take"
+            f" {USUAL_STD:.0%}, is supposed"
+        )
+    for photo in np.asarray(seen.photos, object)[mirrored]:
+        yield f"{photo}: the detector exchanged left and right; they are changed back"
+
+
+def scaled_to_height(capture: Capture, height: float) -> Capture:
+    """A capture in which the person is so tall at rest, metres: cameras, places and shape change
+    alike; photos show the same.
+    """
+    betas = np.asarray(capture.betas, np.float64)
+    before = shape_body(capture.body, jnp.asarray(betas, jnp.float32))
+    heights = np.asarray(before.vertices)[:, 1]
+    top, bottom = int(np.argmax(heights)), int(np.argmin(heights))
+    directions = np.asarray(capture.body.shape_directions, np.float64)[..., : len(betas)]
+    scale = height / float(heights[top] - heights[bottom])
+    # joints as if all of the body were scaled, the stature exactly so
+    joints = np.asarray(before.joints, np.float64)
+    bones = np.einsum(
+        "jn,nas->jas", np.asarray(capture.body.joint_regressor, np.float64), directions
+    )
+    rows = [
+        (bones - bones[:1]).reshape(-1, len(betas)) / BONES_STD,
+        (directions[top, 1] - directions[bottom, 1])[None] / STATURE_STD,
+        np.eye(len(betas)),
+    ]
+    wanted = [
+        (scale - 1) * (joints - joints[:1]).ravel() / BONES_STD,
+        [(height - float(heights[top] - heights[bottom])) / STATURE_STD],
+        np.zeros(len(betas)),
+    ]
+    betas = betas + np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
+    after = shape_body(capture.body, jnp.asarray(betas, jnp.float32))
+    roots = scale * (before.joints[0] + capture.poses.translation)
+    matrices = capture.cameras.cam_from_world
+    return dataclasses.replace(
+        capture,
+        betas=np.asarray(betas, np.float32),
+        poses=replace(capture.poses, translation=roots - after.joints[0]),
+        cameras=replace(capture.cameras, cam_from_world=matrices.at[:, :3, 3].multiply(scale)),
+        displacement=None if capture.displacement is None else scale * capture.displacement,
+    )

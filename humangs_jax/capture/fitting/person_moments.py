@@ -1,0 +1,434 @@
+"""Whether photos of a person are of one moment, and the cameras about that moment, from the
+person's landmarks.
+
+A detector that takes a back for a front exchanges left and right of a whole view. The other views
+tell: each view is mirrored on trial. That all are mirrored is told by the body, whose toes and nose
+are in front.
+
+A trial is an adjustment with some views mirrored. While trials are compared they are as exact as
+that needs; the one that is taken is then made as exact as it can be.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.capture.fitting.person_bundle import (
+    COARSE,
+    EXACT,
+    ROBUST_SCALES,
+    Evidence,
+    Rig,
+    adjust,
+    align_views,
+    pixel_errors,
+    place_person,
+)
+from humangs_jax.capture.fitting.residuals.keypoints import NOISE, OUTER, in_camera_axes
+from humangs_jax.capture.keypoints.keypoints import mirrored_name
+from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.core.progress import bar, watched
+from humangs_jax.io.images import DIAGONAL_35MM
+
+USUAL_FOCAL, USUAL_STD, EXIF_STD = 29.0, 0.2, 0.03
+"""35-mm equivalent of a telephone's main camera, mm, and stds of the logarithm of focal lengths:
+supposed, and of EXIF.
+"""
+SEEN, FEWEST = 0.1, 6
+"""Least visibility of a landmark that counts, and least number of those in a photo."""
+SMALLEST = 16.0
+"""Pixels: a person who is smaller in a photo is a point."""
+LEAST_ANGLE = 4.0
+"""Degrees between the directions from which photos see the person; below it they are taken one by
+one.
+"""
+CLEARLY = 0.7
+"""A view is mirrored if the cost is then less than this share of what it is without."""
+ONE_MOMENT = 0.02
+"""Rms distance of the landmarks from the person's points, a share of the person's size in the
+photo, up to which the photos show one moment. Measured on a man in a laboratory: 7 moments, four
+cameras each, 0.007 to 0.014; photos of several moments 0.045 to 0.073, with one photo of another
+moment among four 0.033."""
+DOUBTFUL = 0.012
+"""The same distance above which mirrorings are also tried from the other end, all views mirrored.
+Detections of one moment with an error of 3 pixels of 900 leave 0.004 to 0.007, a mirrored view 0.02
+and more."""
+FEWEST_WITHOUT, MOMENT_WITHOUT = 4, 0.015
+"""Photos of which one may be left out because it contradicts the others, and the distance up to
+which these are of one moment: three of four photos of several moments leave 0.021 or more."""
+FAR = 0.2
+"""Share of the person's size; errors above count as this one."""
+DECIDING = 8
+"""Photos that decide between one moment and several, at most; others are compared with what these
+say.
+"""
+ANOTHER_MOMENT = 0.03
+"""Rms distance of the landmarks of one such photo, a share of the person's size, above which it
+shows another moment.
+"""
+BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PersonViews:
+    """What a detector sees of one person in c photos of one moment.
+
+    points: (c, k, 2) pixels, centres at +0.5. visibility: (c, k) in [0, 1]; 0: not seen. world: (c,
+    k, 3) metres about the middle of the hips in the camera's axes (x right, y down, z away), as if
+    the camera looked straight at the person. names: of the landmarks, see `KeypointSet`. sizes:
+    (width, height) of the photos, pixels. focal: (c,) pixels, NaN where unknown.
+    photos: their names.
+    """
+
+    points: Float[np.ndarray, "c k 2"]
+    visibility: Float[np.ndarray, "c k"]
+    world: Float[np.ndarray, "c k 3"]
+    names: tuple[str, ...]
+    sizes: tuple[tuple[int, int], ...]
+    focal: Float[np.ndarray, " c"]
+    photos: tuple[str, ...]
+
+    def select(self, views: Sequence[int]) -> "PersonViews":
+        """Some of the photos, in this order."""
+        rows, few = list(views), lambda values: tuple(values[view] for view in views)
+        arrays = {
+            name: getattr(self, name)[rows] for name in ("points", "visibility", "world", "focal")
+        }
+        return dataclasses.replace(self, sizes=few(self.sizes), photos=few(self.photos), **arrays)
+
+
+def known_landmarks(seen: PersonViews) -> Bool[np.ndarray, "c k"]:
+    """Those that are seen, and finite."""
+    finite = np.isfinite(seen.points).all(-1) & np.isfinite(seen.world).all(-1)
+    return finite & (np.nan_to_num(seen.visibility) > SEEN)
+
+
+def cleaned(seen: PersonViews) -> PersonViews:
+    """The same with zeros for all that is not known."""
+    known = known_landmarks(seen)
+    return dataclasses.replace(
+        seen,
+        points=np.where(known[..., None], seen.points, 0.0),
+        visibility=np.where(known, seen.visibility, 0.0),
+        world=np.where(known[..., None], seen.world, 0.0),
+    )
+
+
+# What explains the photos
+# --------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trial:
+    """Cameras if these views are mirrored. cost: of the adjustment. error: see
+    `_relative_error`.
+    """
+
+    mirrored: Bool[np.ndarray, " c"]
+    rig: Rig
+    cost: float
+    evidence: Evidence
+
+    @property
+    def error(self) -> float:
+        return _relative_error(self._shares, self.evidence.weights)
+
+    def of_view(self, view: int) -> float:
+        """Rms distance of the landmarks of one photo, a share of the person's size in it."""
+        seen = self.evidence.weights[view] > SEEN
+        return float(np.sqrt(np.mean(np.minimum(self._shares[view][seen], FAR) ** 2)))
+
+    @property
+    def _shares(self) -> Float[np.ndarray, "c k"]:
+        return self.pixels * (NOISE / self.evidence.noise)[:, None]
+
+    @property
+    def pixels(self) -> Float[np.ndarray, "c k"]:
+        """Distances of landmarks from their pixels."""
+        return np.linalg.norm(pixel_errors(self.evidence, self.rig), axis=-1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Explanation:
+    """What explains the landmarks of photos. trial: cameras of `views` about one person; None: each
+    photo stands alone.
+
+    views: all photos, or all but one. warnings: what a user should know of it.
+    """
+
+    trial: Trial | None
+    views: tuple[int, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def explain(seen: PersonViews) -> Explanation:
+    """Whether one person in one pose explains all photos, all but one of them, or none of them
+    together.
+    """
+    every = tuple(range(len(seen.photos)))
+
+    # a few photos decide
+    chosen = _different(seen)
+    trial, views = best_trial(seen.select(chosen)), chosen
+    if trial.error > ONE_MOMENT and len(chosen) >= FEWEST_WITHOUT:
+        trial, views = _without_one(seen, chosen) or (trial, chosen)
+    if trial.error > ONE_MOMENT:
+        return Explanation(None, every)
+
+    # the others have to agree, but for one
+    if len(chosen) < len(every):
+        trial, views = _with_others(
+            seen, trial, views, [view for view in every if view not in chosen]
+        )
+    if len(views) < len(every) - 1 or trial.error > ONE_MOMENT:
+        return Explanation(None, every)
+
+    # from one side the landmarks of one photo decide nothing about the others
+    angle = _angle(trial.rig)
+    if len(every) > 1 and angle < LEAST_ANGLE:
+        which = (
+            "all photos"
+            if len(views) == len(every)
+            else ", ".join(seen.photos[view] for view in views)
+        )
+        side = (
+            f"{which} are from one side (directions differ by {angle:.1f} degrees, expected"
+            f" {LEAST_ANGLE:.0f} or more)"
+        )
+        return Explanation(None, every, (f"{side}: each photo stands for itself",))
+
+    out = [seen.photos[view] for view in every if view not in views]
+    left = "left out: it shows another moment than the others, or was not understood"
+    return Explanation(trial, views, tuple(f"{photo}: {left}" for photo in out))
+
+
+def _without_one(
+    seen: PersonViews, chosen: tuple[int, ...]
+) -> tuple[Trial, tuple[int, ...]] | None:
+    """Cameras of all photos but one, if they are of one moment then."""
+    rests = [tuple(v for v in chosen if v != out) for out in chosen]
+    trials = [
+        _try(seen.select(rest), np.zeros(len(rest), bool))
+        for rest in under_bar(rests, "cameras without one photo")
+    ]
+    best = int(np.argmin([trial.error for trial in trials]))
+    if trials[best].error >= MOMENT_WITHOUT:
+        return None
+    found = best_trial(seen.select(rests[best]))
+    return (found, rests[best]) if found.error <= ONE_MOMENT else None
+
+
+def _with_others(
+    seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
+) -> tuple[Trial, tuple[int, ...]]:
+    """Cameras of further photos, too: of those that show the person of the trial, mirrored or
+    not.
+    """
+    mirrored = dict(zip(views, trial.mirrored, strict=True))
+    for view in under_bar(others, "cameras of further photos"):
+        pair = seen.select([*views, view])
+        tries = [_try(pair, np.append(trial.mirrored, flip)) for flip in (False, True)]
+        best = min(tries, key=lambda each: each.cost)
+        if best.of_view(-1) < ANOTHER_MOMENT:
+            mirrored[view] = bool(best.mirrored[-1])
+    used = tuple(sorted(mirrored))
+    return _polished(_try(seen.select(used), np.asarray([mirrored[view] for view in used]))), used
+
+
+def _different(seen: PersonViews) -> tuple[int, ...]:
+    """Up to `DECIDING` photos, from sides that differ: always the one that is farthest from all
+    that were chosen.
+    """
+    count = len(seen.photos)
+    if count <= DECIDING:
+        return tuple(range(count))
+    _, start = evidence_of(seen, np.zeros(count, bool))
+    towards = _directions(start)
+    chosen = [int(np.argmax(seen.visibility.sum(1)))]
+    while len(chosen) < DECIDING:
+        nearest = np.max(towards @ towards[chosen].T, axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(np.argmin(nearest)))
+    return tuple(sorted(chosen))
+
+
+def under_bar(items: Sequence[Any], what: str) -> Iterator[Any]:
+    """Items under a bar, if there are several and a program shows one."""
+    yield from bar(items, desc=what, leave=False, shown=watched() and len(items) > 1)
+
+
+# Trials
+# --------------------------------------------------------------------------------------------------
+
+
+def best_trial(seen: PersonViews) -> Trial:
+    """The cameras that explain the landmarks best, whichever views are mirrored."""
+    views = len(seen.points)
+    found = _try(seen, np.zeros(views, bool))
+    if views > 1:
+        found = _least(seen, found)
+        if found.error > DOUBTFUL:
+            found = min(
+                found, _least(seen, _try(seen, np.ones(views, bool))), key=lambda each: each.cost
+            )
+        if handedness(found.rig.landmarks, seen.names) < 0:
+            found = _try(seen, ~found.mirrored)
+    return _polished(found)
+
+
+def _least(seen: PersonViews, start: Trial) -> Trial:
+    """View after view is mirrored while that explains the landmarks clearly better."""
+    views = np.arange(len(seen.points))
+    while True:
+        flips = [start.mirrored ^ (views == v) for v in views]
+        trials = [_try(seen, flip) for flip in under_bar(flips, "cameras with a view mirrored")]
+        best = min(trials, key=lambda each: each.cost)
+        if not best.cost < CLEARLY * start.cost:
+            return start
+        start = best
+
+
+def _try(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> Trial:
+    """Cameras as exact as a comparison needs."""
+    evidence, start = evidence_of(seen, mirrored)
+    return Trial(mirrored, *adjust(evidence, start, COARSE), evidence)
+
+
+def _polished(trial: Trial) -> Trial:
+    """The same as exact as they can be."""
+    rig, cost = adjust(trial.evidence, trial.rig, EXACT, ROBUST_SCALES[-1:])
+    return dataclasses.replace(trial, rig=rig, cost=cost)
+
+
+def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
+    """Rms of errors (c, k), by degrees of freedom where there are any: points and cameras were
+    fitted to them.
+    """
+    views, shown = len(errors), weights.max(0) > SEEN
+    numbers = 2 * (weights > SEEN).sum()
+    left = max(numbers - 3 * shown.sum() - 6 * views + 7, numbers / 4)
+    # as many far outliers as a detector has count no more than near ones
+    return float(np.sqrt(np.sum((weights > SEEN) * np.minimum(errors, FAR) ** 2) / left))
+
+
+def _angle(rig: Rig) -> float:
+    """Degrees between the two photos that see the person from the most different sides."""
+    towards = _directions(rig)
+    return float(np.rad2deg(np.arccos(np.clip(towards @ towards.T, -1, 1))).max())
+
+
+def _directions(rig: Rig) -> Float[np.ndarray, "c 3"]:
+    """From the person towards the cameras, unit vectors."""
+    places = rig.places / np.linalg.norm(rig.places, axis=1, keepdims=True)
+    return -np.einsum("cba,cb->ca", rig.rotations, places)
+
+
+# Evidence
+# --------------------------------------------------------------------------------------------------
+
+
+def _focal_lengths(
+    seen: PersonViews,
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Int[np.ndarray, " c"]]:
+    """Focal lengths (c,), stds of their logarithms, and kinds of cameras; photos without one are
+    like the others, or as usual.
+
+    Lengths of EXIF share one factor. Those of photos without share another, photos of one size
+    taken for those of one camera.
+    """
+    diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
+    known = np.isfinite(seen.focal)
+    usual = (
+        np.median((seen.focal / diagonals)[known]) if known.any() else USUAL_FOCAL / DIAGONAL_35MM
+    )
+    std = np.where(known, EXIF_STD, USUAL_STD)
+    cameras = [
+        () if own else tuple(sorted(size)) for own, size in zip(known, seen.sizes, strict=True)
+    ]
+    kinds = np.asarray([sorted(set(cameras)).index(own) for own in cameras])
+    return np.where(known, seen.focal, usual * diagonals), std, kinds
+
+
+def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
+    """Evidence with left and right of some views exchanged, and cameras to start from."""
+    focal, std, kinds = _focal_lengths(seen)
+    mirror = [seen.names.index(mirrored_name(name)) for name in seen.names]
+    order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
+    pick = lambda values: np.take_along_axis(
+        values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1
+    )
+    points, weights = pick(seen.points - np.asarray(seen.sizes)[:, None] / 2), pick(seen.visibility)
+    world = pick(seen.world)
+    for own, flipped in zip(world, mirrored, strict=True):
+        if (
+            flipped and handedness(own, seen.names) < 0
+        ):  # the detector saw the body turned round as well
+            own[:, 2] *= -1
+    K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
+    hips = np.asarray([name in ("left_hip", "right_hip") for name in seen.names])
+    middle = np.where((weights * hips).all(1, where=hips, keepdims=True), weights * hips, weights)
+    world = in_camera_axes(world, points, middle, K)
+    world = np.asarray(
+        [x - (w[:, None] * x).sum(0) / w.sum() for x, w in zip(world, weights, strict=True)]
+    )
+    radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
+    world *= (np.median(radii) / radii)[:, None, None]
+    shape, rotations = align_views(world, weights)
+    size = lambda p, w: float(np.ptp(np.quantile(p[w > 0], OUTER, axis=0), axis=0).max())
+    noise = np.asarray([size(p, w) * NOISE for p, w in zip(points, weights, strict=True)])
+    offsets = np.einsum("cab,kb->cka", rotations, shape)
+    places = np.stack(
+        [place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)]
+    )
+    evidence = Evidence(points, weights, noise, world, focal, std, kinds, _bones(seen.names))
+    return evidence, Rig(shape, rotations, places, focal)
+
+
+def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
+    rows = []
+    for a, b in BONES:
+        ends = [[f"{side}_{a}", f"{side}_{b}"] for side in ("left", "right")]
+        if all(name in names for side in ends for name in side):
+            rows.append([[names.index(name) for name in side] for side in ends])
+    return np.asarray(rows, int).reshape(-1, 2, 2)
+
+
+# The body
+# --------------------------------------------------------------------------------------------------
+
+
+def middle_of(
+    points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str
+) -> Float[np.ndarray, "3"]:
+    """The middle of the left and the right of a part."""
+    return np.mean([points[names.index(f"{side}_{part}")] for side in ("left", "right")], axis=0)
+
+
+def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
+    ends = [
+        (f"{side}_{toe}", f"{side}_heel")
+        for toe in ("foot_index", "big_toe")
+        for side in ("left", "right")
+    ]
+    found = [
+        points[names.index(a)] - points[names.index(b)]
+        for a, b in ends
+        if a in names and b in names
+    ]
+    if {"nose", "left_ear", "right_ear"} <= set(names):
+        found.append(points[names.index("nose")] - middle_of(points, names, "ear"))
+    return np.sum(found, axis=0) if found else np.zeros(3)
+
+
+def across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
+    """From the right side of the trunk to the left one."""
+    side = lambda part: points[names.index(f"left_{part}")] - points[names.index(f"right_{part}")]
+    return side("shoulder") + side("hip")
+
+
+def handedness(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> float:
+    """Positive if the left side is to the left of somebody who looks to the front."""
+    up = middle_of(points, names, "shoulder") - middle_of(points, names, "hip")
+    return float(np.linalg.det(np.stack([across(points, names), up, _front(points, names)])))

@@ -1,0 +1,653 @@
+"""Cameras, shape and poses refined against silhouettes and keypoints: kept only if the score is
+better.
+
+As in iterated closest points, each iteration matches the rendered silhouette with the mask's and
+solves a few steps of damped least squares. `StateStd` is a Gaussian prior around the start: without
+it cameras and people could move together.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage
+
+from humangs_jax.body.joints import BODY_NAMES
+from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
+from humangs_jax.body.model import (
+    EXACT,
+    BodyModel,
+    BodyPose,
+    SurfacePoints,
+    pose_body,
+    pose_features,
+    pose_points,
+    shape_body,
+    without_expression,
+)
+from humangs_jax.capture.fitting.report import (
+    Change,
+    FitReport,
+    ViewReport,
+    how_far,
+    limit_violations,
+)
+from humangs_jax.capture.fitting.residuals import silhouettes
+from humangs_jax.capture.fitting.residuals.keypoints import (
+    NEAR,
+    Observations,
+    body_errors,
+    found_noise,
+    keypoint_residuals,
+    scaled_observations,
+)
+from humangs_jax.capture.fitting.state import (
+    NORMAL_MAD,
+    FitState,
+    Origin,
+    StateStd,
+    betas_of,
+    camera_origin,
+    cameras_of,
+    clothing_thickness,
+    pose_of,
+    segments,
+    solve,
+    zero_state,
+)
+from humangs_jax.capture.fitting.triangulation import reprojection_errors
+from humangs_jax.capture.keypoints.keypoints import Keypoints
+from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.geometry.camera import Camera
+
+LEAST_NOISE = 0.7
+"""Pixels: silhouettes of masks are no better."""
+LM_UNKNOWNS = 400
+"""With more unknowns L-BFGS replaces least squares, whose Jacobian grows with rows times columns.
+"""
+PATIENCE = 6
+"""Steps of L-BFGS for one of least squares."""
+STEPS, LONGEST_SIDE = 4, 512
+"""Of the solver in a round; pixels to which larger photos are shrunk."""
+REACH = (0.08, 0.015)
+"""How far points look in the first and the last round, shares of the person's height in the image.
+"""
+KEYPOINT_SCALE = 5.0
+"""Robust scale of keypoints, standard deviations."""
+BARE = 5.0
+"""Clothes have no negative thickness: it counts this much more than a positive one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CaptureRefineConfig:
+    """Static settings of a refinement.
+
+    std: how far off the start is expected to be. coefficients: of the shape, where the capture has
+    fewer. fixed_cameras: only shape and poses move. iterations: number of matchings. points: of a
+    silhouette. independent: number of independent equations that all points of a view count for.
+    robust_scales: multiples of the reach, outwards and inwards of the mask. keypoints_worse: a
+    result whose keypoints' error is more than this multiple of the start's is not kept; a fit to
+    them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
+    by_joint: (word, factor) of joints whose names hold the word: multiples of `std.body_pose`.
+    """
+
+    std: StateStd = dataclasses.field(default_factory=StateStd)
+    coefficients: int = 10
+    fixed_cameras: bool = False
+    iterations: int = 10
+    points: int = 300
+    independent: float = 30.0
+    robust_scales: tuple[float, float] = (1.0, 0.5)
+    keypoints_worse: float = 1.3
+    by_joint: tuple[tuple[str, float], ...] = ()
+
+
+FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
+"""Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its
+keypoints hold the joints where clothes would pull them away."""
+FROM_PERSON = dataclasses.replace(FITTED, focal=0.05, camera_rotation=2.0, camera_center=0.08)
+"""The same with cameras that were found from the person."""
+SKIN, TIGHT = 0.001, 0.015
+"""Metres, for `StateStd.clothing`: masks of somebody without clothes, and in tight ones."""
+
+
+def usual_config(
+    fitted: bool,
+    *,
+    fixed_cameras: bool = False,
+    bare: bool = False,
+    tight: bool = False,
+    calibrated: bool = True,
+) -> CaptureRefineConfig:
+    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given.
+    bare: the body is to fill the masks. tight: the person wears tight clothes. calibrated: False
+    for cameras that were found from the person.
+    """
+    start = FITTED if calibrated else FROM_PERSON
+    std = start if fitted else StateStd()
+    config = CaptureRefineConfig(
+        fixed_cameras=fixed_cameras,
+        independent=100.0 if fitted else CaptureRefineConfig.independent,
+    )
+    if (
+        bare or tight or not calibrated
+    ):  # the masks are believed; cameras were fitted to these very keypoints
+        config = dataclasses.replace(config, keypoints_worse=math.inf)
+    if tight:
+        std = dataclasses.replace(std, clothing=TIGHT, betas=2.0, body_pose=10.0)
+    if bare:
+        std, config = (
+            dataclasses.replace(std, clothing=SKIN),
+            dataclasses.replace(config, robust_scales=(1.0, 1.0)),
+        )
+    return dataclasses.replace(config, std=std)
+
+
+def cameras_are_unseen(capture: Capture) -> bool:
+    """Whether nothing tells how cameras should move: they were found from the person, and each
+    photo shows a pose of its own.
+    """
+    return not capture.calibrated and capture.frame_count >= capture.view_count
+
+
+# The state of a capture
+# ----------------------------------------------------------------------------------------------
+
+
+def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfig) -> Origin:
+    """The origin of a refinement. cameras: of the views, for images of any size."""
+    body = capture.body
+    named = [j for j, name in enumerate(body.joint_names) if name in BODY_NAMES]
+    joints = tuple(j for j in named or range(len(body.parents)) if body.parents[j] >= 0)
+    wanted = max(
+        len(capture.betas),
+        min(config.coefficients, without_expression(body).shape_directions.shape[-1]),
+    )
+    return Origin(
+        betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
+        pose=capture.poses,
+        body_pose_std=_body_pose_std([body.joint_names[j] for j in joints], config),
+        cameras=camera_origin(cameras, capture.frames),
+        segment=jnp.asarray(segments(body.parents, joints)),
+        joints=joints,
+        std=config.std,
+    )
+
+
+def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[Array, "a 3"]:
+    """Standard deviations of the free joints' rotations, radians."""
+    factors = [
+        next((factor for word, factor in config.by_joint if word in name), 1.0) for name in names
+    ]
+    std = np.radians(config.std.body_pose) * np.asarray(factors)
+    return jnp.asarray(np.repeat(std[:, None], 3, axis=1), jnp.float32)
+
+
+def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
+    """Zeros for what a refinement moves."""
+    state = zero_state(origin)
+    return replace(state, cameras=None) if config.fixed_cameras else state
+
+
+def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
+    """A capture with cameras, shape and poses of a state, whatever the size of the origin's images;
+    its displacement belonged to the shape before, and is left out.
+    """
+    own = replace(origin, cameras=replace(origin.views, K=capture.cameras.K))
+    (K, cam_from_world), betas, poses = _moved(own, state)
+    cameras = replace(capture.cameras, K=K, cam_from_world=cam_from_world)
+    return dataclasses.replace(
+        capture, cameras=cameras, betas=np.asarray(betas), poses=poses, displacement=None
+    )
+
+
+@jax.jit
+def _moved(
+    origin: Origin, state: FitState
+) -> tuple[tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]], Float[Array, " s"], BodyPose]:
+    return cameras_of(origin, state), betas_of(origin, state), pose_of(origin, state)
+
+
+# Equations
+# --------------------------------------------------------------------------------------------------
+
+
+@pytree_dataclass
+class Evidence:
+    """What v views show. points: of the body's silhouette, and matches: their equations, batches of
+    v. noise: () pixels; scales: (2,) robust scales, pixels, outwards and inwards. keypoints: a
+    batch of v, each with one view (c = 1), or None.
+    """
+
+    points: SurfacePoints
+    matches: silhouettes.Matches
+    noise: Float[Array, ""]
+    scales: Float[Array, "2"]
+    keypoints: Observations | None
+
+
+def evidence_residuals(
+    model: LandmarkModel, origin: Origin, state: FitState, evidence: Evidence, independent: float
+) -> dict[str, Float[Array, "..."]]:
+    """Residuals of the views, in standard deviations, by kind: silhouettes (v, e) and keypoints (v,
+    1, k, 2).
+    """
+    K, cam_from_world = cameras_of(origin, state)
+    betas, poses, frame = betas_of(origin, state), pose_of(origin, state), origin.views.frame
+    transforms, joints = jax.vmap(lambda pose: pose_joints(model, betas, pose))(poses)
+    features = jax.vmap(pose_features)(poses.rotations)
+
+    def silhouette(points, matches, frame, K, matrix):
+        posed = pose_points(points, betas, features[frame], transforms[frame])
+        seen = jnp.matmul(posed, matrix[:3, :3].T, precision=EXACT) + matrix[:3, 3]
+        focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
+        clothes = clothing_thickness(origin, state, points.weights) * focal.mean() / depth[:, 0]
+        pixels, scales = (
+            seen[:, :2] / depth * focal + K[:2, 2],
+            (evidence.scales[0], evidence.scales[1]),
+        )
+        return silhouettes.silhouette_residuals(
+            matches, pixels, clothes, evidence.noise, scales, independent
+        )
+
+    parts = {
+        "silhouettes": jax.vmap(silhouette)(
+            evidence.points, evidence.matches, frame, K, cam_from_world
+        )
+    }
+    if evidence.keypoints is not None:
+
+        def landmarks(features, transforms, joints):
+            return landmarks_from(
+                model, joints, pose_points(model.points, betas, features, transforms)
+            )
+
+        seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
+        points = jax.vmap(landmarks)(features, transforms, joints)[frame]
+        compare = lambda own, points: keypoint_residuals(model, own, points, KEYPOINT_SCALE)
+        parts["keypoints"] = jax.vmap(compare)(seen, points)
+    return parts
+
+
+def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
+    """Thicknesses of clothes as their prior counts them."""
+    return jnp.where(clothing < 0, BARE * clothing, clothing)
+
+
+def _as_motion(values: Float[Array, "m ..."], memory: Float[Array, " n"]) -> Float[Array, "m ..."]:
+    """Numbers of m frames, independent and of unit variance where each of the frames has the
+    correlation `memory` (m - 1,) with the one before.
+    """
+    r = memory.reshape(-1, *[1] * (values.ndim - 1))
+    return jnp.concatenate([values[:1], (values[1:] - r * values[:-1]) / jnp.sqrt(1 - r * r)])
+
+
+@functools.partial(jax.jit, static_argnames="independent")
+def solve_round(
+    model: LandmarkModel,
+    origin: Origin,
+    evidence: Evidence,
+    state: FitState,
+    independent: float,
+    memory: Float[Array, " n"] | None = None,
+) -> FitState:
+    """The state after some steps with fixed matches. memory: (m - 1,) correlations of m poses, see
+    `refine_capture`.
+    """
+
+    def residuals(y):
+        counted = replace(y, clothing=_counted(y.clothing))
+        if memory is not None:
+            names = ("global_orient", "transl", "body_pose")
+            motion = {name: _as_motion(getattr(y, name), memory) for name in names}
+            counted = replace(counted, **motion)
+        return evidence_residuals(model, origin, y, evidence, independent), counted
+
+    many = sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS
+    return solve(
+        residuals, state, PATIENCE * STEPS if many else STEPS, method="lbfgs" if many else "lm"
+    )[0]
+
+
+# Iterations
+# --------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Score:
+    """ious: (v,) of silhouettes, NaN without a mask. iou: their mean; None without any mask.
+    keypoints: median error, pixels; None without. loss: 1 - iou plus the keypoints' error as a
+    share of the person's height.
+    """
+
+    ious: Float[np.ndarray, " v"]
+    iou: float | None
+    keypoints: float | None
+    loss: float
+
+
+class Scene:
+    """What stays the same over the iterations: masks at the size that is looked at, keypoints, and
+    the origin.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        keypoints: Keypoints | None,
+        config: CaptureRefineConfig,
+        memory: Float[np.ndarray, " n"] | None = None,
+    ) -> None:
+        self.capture, self.config = capture, config
+        self.memory = None if memory is None else jnp.asarray(memory, jnp.float32)
+        small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
+        looked_at = capture if small else capture.resized(LONGEST_SIDE)
+        empty = np.zeros(looked_at.images.shape[:3], np.float32)
+        self.cameras, self.masks = (
+            looked_at.cameras,
+            empty if looked_at.masks is None else looked_at.masks,
+        )
+        self.faces = np.asarray(capture.body.faces)
+        self.edges = silhouettes.body_edges(self.faces)
+        self.unknown = looked_at.unknown
+        self.hidden = _with_rim(looked_at.unknown, len(self.masks))
+        self.boundaries = [
+            silhouettes.mask_boundary(mask, config.points, hidden)
+            for mask, hidden in zip(self.masks, self.hidden, strict=True)
+        ]
+        kind = None if keypoints is None else keypoints.set
+        known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
+        self.model = landmark_model(capture.body, *known)
+        self.scale = self.cameras.width / capture.cameras.width
+        seen_by = lambda cameras: (
+            None if keypoints is None else scaled_observations(cameras, keypoints, capture.cameras)
+        )
+        self.keypoints, self.observations = seen_by(capture.cameras), seen_by(self.cameras)
+        self.height = _person_height(self.masks, self.observations)
+        self.origin = capture_origin(capture, self.cameras, config)
+
+    def run(self) -> tuple[FitState, float]:
+        """The state after all iterations, and the largest move of the last round, in expected
+        standard deviations.
+        """
+        config, state, move = self.config, start_state(self.origin, self.config), 0.0
+        first, last = REACH
+        for turn in range(config.iterations):
+            evidence = self.look(
+                state,
+                self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)),
+            )
+            before = state
+            state = solve_round(
+                self.model, self.origin, evidence, state, config.independent, self.memory
+            )
+            moves = jax.tree.map(
+                lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before
+            )
+            move = max(jax.tree.leaves(moves))
+        return state, move
+
+    def look(self, state: FitState, reach: float) -> Evidence:
+        """What the views show, matched within `reach` pixels of the body in this state."""
+        count = self.config.points
+        moved = moved_capture(self.capture, self.origin, state)
+        boundaries = [
+            silhouettes.body_boundary(view, self.faces, self.edges, count)
+            for view in self.body_views(moved)
+        ]
+        views = zip(boundaries, self.masks, self.boundaries, self.hidden, strict=True)
+        matches = [
+            silhouettes.match(boundary, mask, other, reach, count, hidden)
+            for boundary, mask, other, hidden in views
+        ]
+        return Evidence(
+            points=silhouettes.boundary_points(
+                self.capture.body, boundaries, count, len(self.origin.betas)
+            ),
+            matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
+            noise=jnp.asarray(_noise(boundaries, matches), jnp.float32),
+            scales=reach * jnp.asarray(self.config.robust_scales, jnp.float32),
+            keypoints=self._keypoints(moved),
+        )
+
+    def _keypoints(self, capture: Capture) -> Observations | None:
+        """The keypoints, with the noise that a body finds: a detector's own bias is no evidence
+        against the masks.
+        """
+        if self.keypoints is None or self.observations is None:
+            return None
+        errors = jnp.asarray(self._errors(capture, self.keypoints) * self.scale, jnp.float32)
+        return replace(self.observations, noise=found_noise(errors, self.observations.noise))
+
+    def _errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
+        """Errors of the keypoints in pixels of the photos; NaN where there is none."""
+        seen = replace(
+            seen,
+            K=capture.cameras.K[:, None],
+            cam_from_world=capture.cameras.cam_from_world[:, None],
+        )
+        betas = jnp.asarray(capture.betas)
+        errors = body_errors(
+            self.model, betas, capture.poses, seen, capture.frames, reprojection_errors
+        )
+        known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
+        return np.where(known, errors, np.nan)[:, 0]
+
+    def body_views(self, capture: Capture) -> list[silhouettes.BodyView]:
+        """The body of a capture of these photos in every view."""
+        cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
+        vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
+        faces = capture.body.faces
+        return [
+            silhouettes.view_body(vertices[int(frame)], faces, cameras[i])
+            for i, frame in enumerate(capture.frames)
+        ]
+
+    def score(self, capture: Capture) -> Score:
+        """How well the body of a capture of these photos agrees with masks and keypoints."""
+        known = [None] * len(self.masks) if self.unknown is None else list(~self.unknown)
+        pairs = zip(self.body_views(capture), self.masks, known, strict=True)
+        ious = np.asarray([overlap(view.covered, mask, seen) for view, mask, seen in pairs])
+        iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
+        loss = 0.0 if iou is None else 1 - iou
+        if (
+            self.keypoints is not None
+            and np.isfinite(errors := self._errors(capture, self.keypoints)).any()
+        ):
+            keypoints = float(np.nanmedian(errors))
+            loss += keypoints * self.scale / self.height
+        return Score(ious, iou, keypoints, loss)
+
+
+HIDDEN_RIM = 3
+"""Pixels around what is unknown where the edge of a mask is that of whoever stands in front."""
+
+
+def _with_rim(
+    unknown: Bool[np.ndarray, "v h w"] | None, views: int
+) -> list[Bool[np.ndarray, "h w"] | None]:
+    """What is unknown of each view and its rim; None for a view without any."""
+    if unknown is None:
+        return [None] * views
+    return [
+        ndimage.binary_dilation(each, iterations=HIDDEN_RIM) if each.any() else None
+        for each in unknown
+    ]
+
+
+def overlap(
+    covered: Bool[np.ndarray, "h w"],
+    mask: Float[np.ndarray, "h w"],
+    known: Bool[np.ndarray, "h w"] | None = None,
+) -> float:
+    """Intersection over union of a body and a mask where that is known (default: everywhere);
+    NaN if the mask is empty.
+    """
+    person = mask > 0.5
+    if known is not None:
+        covered = covered & known
+    return (
+        float((covered & person).sum() / (covered | person).sum()) if person.any() else float("nan")
+    )
+
+
+@jax.jit
+def posed_vertices(
+    body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose
+) -> Float[jax.Array, "m n 3"]:
+    """Vertices of a person in a batch of m poses, metres."""
+    rest = shape_body(body, betas)
+    return jax.lax.map(lambda pose: pose_body(body, rest, pose).vertices, poses)
+
+
+def _noise(
+    boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
+) -> float:
+    """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a
+    body that is not yet there.
+    """
+    off = [
+        np.asarray(silhouettes.distances(m, jnp.asarray(boundary.positions, jnp.float32)))[
+            np.asarray(m.weights) > 0
+        ]
+        for boundary, m in zip(boundaries, matches, strict=True)
+        if len(boundary.positions)
+    ]
+    off = np.concatenate([np.zeros(0), *off])
+    return max(NORMAL_MAD * float(np.median(np.abs(off))), LEAST_NOISE) if len(off) else 1.0
+
+
+def _person_height(
+    masks: Sequence[Float[np.ndarray, "h w"]] | Float[np.ndarray, "v h w"],
+    observations: Observations | None,
+) -> float:
+    """Height of the person in the image, pixels: median over the views of the extent of masks, or
+    else of keypoints.
+    """
+    sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
+    if not sizes and observations is not None:
+        pairs = zip(
+            np.asarray(observations.points)[:, 0],
+            np.asarray(observations.confidences)[:, 0] > 0,
+            strict=True,
+        )
+        sizes = [np.ptp(points[seen], axis=0).max() for points, seen in pairs if seen.any()]
+    return float(np.median(sizes)) if sizes else float("nan")
+
+
+LEAST_GAIN, LEAST_GAIN_OF_MASKS = 0.02, 0.2
+"""Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of
+clothes are fitted a little better by wrong bodies: for four people who started at the truth, by up
+to 0.15; keypoints show that.
+"""
+LEAST_DIFFERENCE = 0.005
+"""Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding
+of pixels.
+"""
+LEAST_IOU = 0.6
+"""Bodies in clothes overlap masks by more than this; less means that the start was too far off."""
+
+DEFAULT_CONFIG = CaptureRefineConfig()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RefinedCapture:
+    """capture: the better one of start and result; the very start if `report.kept` is False."""
+
+    capture: Capture
+    report: FitReport
+
+
+def refine_capture(
+    capture: Capture,
+    *,
+    keypoints: Keypoints | None = None,
+    config: CaptureRefineConfig = DEFAULT_CONFIG,
+    memory: Float[np.ndarray, " n"] | None = None,
+) -> RefinedCapture:
+    """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
+
+    Arguments: keypoints: of the capture's views. config: after a fit to these keypoints, see
+    `usual_config`. memory: (m - 1,) correlations in [0, 1) of each of the m poses with the one
+    before, as in a video; None: each stands for itself. Views whose mask is empty take no part.
+    Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if
+    the keypoints are of another number of views.
+    """
+    if keypoints is not None and len(keypoints.points) != capture.view_count:
+        raise ValueError(
+            f"keypoints: of {len(keypoints.points)} views, but the capture has {capture.view_count}"
+        )
+    masked = capture.masks is not None and (np.asarray(capture.masks) > 0.5).any()
+    if not masked and (keypoints is None or not (keypoints.confidences > 0).any()):
+        raise CaptureError(
+            "capture",
+            "masks",
+            "none shows anybody, and there are no keypoints: refinement needs one or the other",
+        )
+    scene = Scene(capture, keypoints, config, memory)
+    state, move = scene.run()
+    tried = moved_capture(capture, scene.origin, state)
+    before, found = scene.score(capture), scene.score(tried)
+    kept = _better(found, before, config.keypoints_worse)
+    best, score = (tried, found) if kept else (capture, before)
+    kinds = {"silhouettes": before.iou, "keypoints": before.keypoints}
+    kinds = " and ".join(name for name, value in kinds.items() if value is not None)
+    verdict = "kept" if kept else "no sufficient improvement, the start is kept"
+    note = (
+        f"{kinds}: loss {before.loss:.4f} -> {found.loss:.4f}, {verdict} (last move {move:.2g}"
+        " expected std)"
+    )
+    return RefinedCapture(best, _report(capture, best, before, score, note))
+
+
+def _better(found: Score, before: Score, most_worse: float) -> bool:
+    known = found.keypoints is not None and before.keypoints is not None
+    least = LEAST_GAIN if known else LEAST_GAIN_OF_MASKS
+    worse = known and found.keypoints > most_worse * before.keypoints
+    return not worse and before.loss - found.loss > max(least * before.loss, LEAST_DIFFERENCE)
+
+
+def _report(start: Capture, best: Capture, before: Score, after: Score, note: str) -> FitReport:
+    kept = best is not start
+    names = {"silhouette_iou": "iou", "keypoint_error_px": "keypoints", "loss": "loss"}
+    pairs = {name: (getattr(before, key), getattr(after, key)) for name, key in names.items()}
+    errors = {name: Change(b, a) for name, (a, b) in pairs.items() if b is not None}
+    ious = zip(
+        start.names, start.frames.tolist(), before.ious.tolist(), after.ious.tolist(), strict=True
+    )
+    moved = how_far(start, best) if kept else {}
+    notes = [note, f"kept: {'refined' if kept else 'start'}"]
+    if kept:
+        notes.append(
+            "moved: focal length x {focal_factor:.4f}, cameras {camera_degrees:.2f} degrees and"
+            " {camera_cm:.1f} cm, joints {joint_degrees:.2f} degrees, person {transl_cm:.1f} cm"
+            " (means)".format(**moved)
+        )
+        if start.displacement is not None:
+            notes.append(
+                "the displacement of body.npz is left out: it was made for the shape before"
+            )
+    apart = after.iou is not None and after.iou < LEAST_IOU
+    return FitReport(
+        fitted="refinement",
+        kept=kept,
+        errors=errors,
+        views=tuple(
+            ViewReport(name, frame, iou_before=a, iou_after=b) for name, frame, a, b in ious
+        ),
+        moved=moved,
+        violations=limit_violations(best.body.joint_names, best.poses),
+        notes=tuple(notes),
+        warnings=(
+            ("body and masks do not agree: the start was too far off; `humangs check` shows why",)
+            if apart
+            else ()
+        ),
+    )

@@ -1,0 +1,298 @@
+"""One report for every fit: what was fitted, errors by evidence, limits, uncertainty and warnings.
+
+`str(report)` is what the command line prints, `report.to_json()` what is stored beside the result.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import FINGERS
+from humangs_jax.body.model import BodyPose
+from humangs_jax.capture.fitting.state import pose_prior
+from humangs_jax.capture.fitting.swaps import Swap
+from humangs_jax.core.array_types import Float
+from humangs_jax.core.progress import text_table
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.capture_checks import few
+
+ROWS = 24
+"""Views in the printed table; of more, those that fit worst."""
+NAMED = 5
+"""Items that are listed by name; the others are counted."""
+LABELS = {
+    "keypoint_error_px": ("keypoints, median error", "{:.2f} px"),
+    "silhouette_iou": ("silhouette IoU", "{:.3f}"),
+    "loss": ("loss", "{:.4f}"),
+    "scan_outside_median_mm": ("scan outside of the skin, median", "{:.1f} mm"),
+    "scan_outside_5_mm": ("scan outside of the skin, 5 % below", "{:.1f} mm"),
+    "scan_outside_95_mm": ("scan outside of the skin, 95 % below", "{:.1f} mm"),
+    "scan_near_body": ("share of the scan near the body", "{:.0%}"),
+}
+"""How errors are printed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """An error of the result, and of the start where there was one."""
+
+    after: float
+    before: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewReport:
+    """One view. keypoints: that were compared. median, high: their median error and 90th
+    percentile, pixels (NaN: none).
+    outliers: share. iou_before, iou_after: of silhouettes, NaN without a mask, None if masks are
+    not part of the fit.
+    """
+
+    name: str
+    frame: int
+    keypoints: int = 0
+    median: float = float("nan")
+    high: float = float("nan")
+    outliers: float = 0.0
+    iou_before: float | None = None
+    iou_after: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Violation:
+    """A joint that exceeds its limit about an axis of the T-pose."""
+
+    frame: int
+    joint: str
+    axis: str
+    degrees: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FitReport:
+    """What came of a fit.
+
+    kept: False if the start was better and stays. start: of a fit to a scan, where it came from:
+    "landmarks" or "search".
+    errors: by name, see `LABELS`. moved: how far parameters moved, by name. violations: of joint
+    limits. swaps: what seems exchanged. undetermined: joints, or groups of joints, that the views
+    do not determine.
+    notes: further results. warnings: what points to a mistake.
+    """
+
+    fitted: Literal["keypoints", "refinement", "scan"]
+    kept: bool = True
+    start: str = ""
+    errors: dict[str, Change] = dataclasses.field(default_factory=dict)
+    views: tuple[ViewReport, ...] = ()
+    moved: dict[str, float] = dataclasses.field(default_factory=dict)
+    violations: tuple[Violation, ...] = ()
+    swaps: tuple[Swap, ...] = ()
+    undetermined: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no warning."""
+        return not self.warnings
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; numbers that are not finite are None."""
+        return _plain(dataclasses.asdict(self))
+
+    def __str__(self) -> str:
+        """A table of views, then errors, notes and warnings."""
+        lines = _view_rows(self.views) if self.views else []
+        for key, change in self.errors.items():
+            label, form = LABELS[key]
+            start = "" if change.before is None else f"{form.format(change.before)} -> "
+            lines.append(f"{label}: {start}{form.format(change.after)}")
+        lines += self.notes
+        if self.undetermined:
+            lines.append(
+                f"not determined by the views, taken from the prior: {', '.join(self.undetermined)}"
+            )
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(own) for key, own in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(own) for own in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _view_rows(views: Sequence[ViewReport]) -> list[str]:
+    error = lambda view: np.nan_to_num(
+        view.median if view.iou_after is None else 1 - view.iou_after, nan=np.inf
+    )
+    worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
+    masks = views[0].iou_after is not None
+    rows = [
+        (
+            ["view", "IoU before", "after"]
+            if masks
+            else ["view", "keypoints", "median error", "90 % below", "outliers"]
+        )
+    ]
+    for view in (views[i] for i in sorted(worst)):
+        if not masks:
+            errors = (
+                [f"{view.median:.1f} px", f"{view.high:.1f} px"] if view.keypoints else ["-", "-"]
+            )
+            rows.append([view.name, str(view.keypoints), *errors, f"{view.outliers:.0%}"])
+        elif np.isfinite(view.iou_before):
+            rows.append([view.name, f"{view.iou_before:.3f}", f"{view.iou_after:.3f}"])
+        else:
+            rows.append([view.name, "no mask"])
+    lines = text_table(rows)
+    return (
+        lines if len(views) <= ROWS else [*lines, f"...  {len(views) - ROWS} more that fit better"]
+    )
+
+
+# What points to a mistake
+# --------------------------------------------------------------------------------------------
+
+MANY_OUTLIERS = 0.3
+"""Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw
+something else.
+"""
+OFF = 4.0
+"""Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows
+another pose or camera.
+"""
+SLIGHTLY_BEYOND, FAR_BEYOND = np.rad2deg(0.05), 10.0
+"""Degrees beyond a joint's limit that are no violation, and from which there is a warning: limits
+are rough.
+"""
+UNSURE, UNDECIDED = 0.03, 0.1
+"""A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is
+determined: a mean over axes, of which knees and fingers have one that turns."""
+
+_FINGERS = {
+    side: [f"{side}_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)]
+    for side in ("left", "right")
+}
+GROUPS = {
+    "left hand": _FINGERS["left"],
+    "right hand": _FINGERS["right"],
+    "eyes": ["left_eye", "right_eye"],
+    "feet": ["left_foot", "right_foot"],
+    "spine": ["spine1", "spine2", "spine3"],
+    "collars": ["left_collar", "right_collar"],
+}
+"""Joints that are named together if all of them are undetermined."""
+
+
+def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
+    """Violations of joint limits in a batch of poses, by frame."""
+    prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
+    beyond = np.rad2deg(np.maximum(prior.lower - rotations, rotations - prior.upper))
+    found = np.argwhere(beyond > SLIGHTLY_BEYOND)
+    return tuple(
+        Violation(int(m), joint_names[j], "xyz"[axis], float(beyond[m, j, axis]))
+        for m, j, axis in found
+    )
+
+
+def undetermined_joints(
+    joint_names: tuple[str, ...],
+    joint_std: Float[np.ndarray, "m j"],
+    determined: Float[np.ndarray, "m j"],
+) -> tuple[str, ...]:
+    """Joints that the views do not determine in m frames; fingers and other groups as one.
+
+    Arguments: joint_std: metres. determined: shares.
+    """
+    unknown = (joint_std > UNSURE) | (determined < UNDECIDED)
+    counts = {
+        name: count
+        for name, count in zip(joint_names, unknown.sum(0).tolist(), strict=True)
+        if count
+    }
+    found = []
+    for group, members in GROUPS.items():
+        if all(name in counts for name in members):
+            found.append((group, max(counts.pop(name) for name in members)))
+    found += counts.items()
+    total = len(unknown)
+    return tuple(
+        name if count == total else f"{name} (in {count} of {total} frames)"
+        for name, count in found
+    )
+
+
+def keypoint_warnings(
+    views: Sequence[ViewReport],
+    expected: Float[np.ndarray, " m"],
+    violations: Sequence[Violation],
+    swaps: Sequence[Swap],
+) -> tuple[str, ...]:
+    """What points to a mistake. expected: noise of the keypoints of each frame, pixels."""
+    found = [str(swap) for swap in swaps[:NAMED]]
+    if len(swaps) > NAMED:
+        found.append(f"{len(swaps) - NAMED} more views or pairs of views seem exchanged")
+    blind = [view for view in views if not view.keypoints]
+    off = [view for view in views if view.keypoints and view.median > OFF * expected[view.frame]]
+    wild = [view for view in views if view not in off and view.outliers > MANY_OUTLIERS]
+    if blind:
+        found.append(f"no keypoints in {_names(blind)}")
+    if off:
+        found.append(
+            f"body and keypoints disagree in {_names(off)}: median error"
+            f" {_span(off, 'median', '{:.0f}')} px"
+        )
+    if wild:
+        found.append(
+            f"many keypoints are outliers in {_names(wild)}: {_span(wild, 'outliers', '{:.0%}')}"
+        )
+    far: dict[tuple[str, str], list[Violation]] = {}
+    for each in violations:
+        if each.degrees > FAR_BEYOND:
+            far.setdefault((each.joint, each.axis), []).append(each)
+    for (joint, axis), of in far.items():
+        worst = max(each.degrees for each in of)
+        frames = few([str(each.frame) for each in of], NAMED)
+        found.append(
+            f"{joint} is {worst:.0f} degrees beyond its limit about {axis}, in frame {frames}"
+        )
+    return tuple(found)
+
+
+def _names(views: Sequence[ViewReport]) -> str:
+    return f"view {few([view.name for view in views], NAMED)}"
+
+
+def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
+    """The least and the greatest value of a field, or the one value if they are equal."""
+    ends = [form.format(of(getattr(view, field) for view in views)) for of in (min, max)]
+    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+
+
+def how_far(start: Capture, refined: Capture) -> dict[str, float]:
+    """How far two captures of one person differ, means: focal_factor; camera_degrees, camera_cm;
+    joint_degrees of the joints' rotations, transl_cm of the root.
+    """
+    a, b = start.cameras, refined.cameras
+    turns = lambda cameras: Rotation.from_matrix(
+        np.asarray(cameras.cam_from_world[:, :3, :3], float)
+    )
+    joints = lambda capture: Rotation.from_rotvec(
+        np.asarray(capture.poses.rotations, float).reshape(-1, 3)
+    )
+    degrees = lambda first, second: float(np.degrees((first.inv() * second).magnitude().mean()))
+    length = lambda x: float(np.linalg.norm(np.asarray(x), axis=-1).mean())
+    return {
+        "focal_factor": float(np.mean(np.asarray(b.K[:, 0, 0] / a.K[:, 0, 0]))),
+        "camera_degrees": degrees(turns(a), turns(b)),
+        "camera_cm": 100 * length(b.center - a.center),
+        "joint_degrees": degrees(joints(start), joints(refined)),
+        "transl_cm": 100 * length(refined.poses.translation - start.poses.translation),
+    }

@@ -1,0 +1,329 @@
+"""Keypoints as evidence: observations of fixed shapes, so that frames and people can be vmapped,
+and their residuals.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.landmarks import LandmarkModel, kind_of, pose_landmarks
+from humangs_jax.body.model import BodyPose
+from humangs_jax.capture.fitting.state import (
+    FitState,
+    Origin,
+    PosePrior,
+    betas_of,
+    limit_residuals,
+    pose_of,
+    robust,
+)
+from humangs_jax.capture.keypoints.keypoints import Keypoints
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.photos import Photos
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.mesh import smallest_turns
+from humangs_jax.geometry.transform import EXACT
+
+AnyArray = Float[Array, "m c ..."] | Float[np.ndarray, "m c ..."]
+NEAR = 0.05
+"""Metres: depths are clamped to at least this."""
+NOISE, LEAST_NOISE = 0.005, 0.3
+"""Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and a
+lower bound, pixels.
+"""
+OUTER = (0.03, 0.97)
+"""Quantiles of the coordinates between which a person's size is measured, so that outliers do not
+count.
+"""
+NOISE_RANGE = (0.5, 8.0)
+"""Bounds of the noise that a fit finds, multiples of the expected noise."""
+PLACE_STD = 0.02
+"""Metres: how far from where they are thought to be detectors see landmarks."""
+OPTICAL_AXIS = np.asarray([0.0, 0.0, 1.0])
+WORLD_STD = 0.15
+"""Of a detector's 3D landmarks, over the root mean square of their distances from their middle."""
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a vector whose two components have a std of 1."""
+
+
+@pytree_dataclass
+class Observations(Batchable):
+    """Keypoints of one frame in c views; a missing view has confidence 0.
+
+    points: (c, k, 2) pixels, centres at +0.5. confidences: (c, k) in [0, 1]; 0: not seen. K: (c, 3,
+    3) pixels.
+    cam_from_world: (c, 4, 4), metres. noise: () std of the detections, pixels. world: (c, k, 3)
+    where the detector sees the landmarks in space, in the camera's axes, up to a translation and a
+    scale.
+    """
+
+    points: Float[Array, "c k 2"]
+    confidences: Float[Array, "c k"]
+    K: Float[Array, "c 3 3"]
+    cam_from_world: Float[Array, "c 4 4"]
+    noise: Float[Array, ""]
+    world: Float[Array, "c k 3"] | None = None
+
+
+def make_observations(
+    points: AnyArray,
+    confidences: AnyArray,
+    K: AnyArray,
+    cam_from_world: AnyArray,
+    world: AnyArray | None = None,
+) -> Observations:
+    """A batch of m frames from arrays (m, c, ...), with the noise that is expected of them."""
+    noise = expected_noise(np.asarray(points), np.asarray(confidences))
+    given = (points, confidences, K, cam_from_world, noise, *(() if world is None else (world,)))
+    return jax.vmap(Observations)(*(jnp.asarray(x, jnp.float32) for x in given))
+
+
+def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
+    """Keypoints of photos in pixels of resized cameras: a batch of views, each with one view (c =
+    1), and the noise of all.
+    """
+    scale = np.asarray(
+        [cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype
+    )
+    points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
+    arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
+    noise = expected_noise(points[None], keypoints.confidences[None])
+    return replace(
+        make_observations(*(x[:, None] for x in arrays)),
+        noise=jnp.asarray(np.repeat(noise, len(points))),
+    )
+
+
+def group_by_frame(
+    photos: Photos | Capture, keypoints: Keypoints
+) -> tuple[Observations, Int[np.ndarray, "m c"]]:
+    """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where
+    there is none.
+    """
+    frames, count = np.asarray(photos.frames), photos.frame_count
+    members = [np.flatnonzero(frames == frame) for frame in range(count)]
+    views = np.full((count, max(len(own) for own in members)), -1)
+    for row, own in zip(views, members, strict=True):
+        row[: len(own)] = own
+    confidences = np.where(views[..., None] < 0, 0.0, keypoints.confidences[views])
+    points = np.where(confidences[..., None] > 0, keypoints.points[views], 0.0)
+    cameras = photos.cameras
+    world = None
+    if (
+        keypoints.world is not None and views.shape[1] == 1
+    ):  # several views say more than any of them alone
+        hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
+        middle = np.where(
+            (confidences * hips).any(-1, keepdims=True), confidences * hips, confidences
+        )
+        world = in_camera_axes(keypoints.world[views], points, middle, np.asarray(cameras.K)[views])
+    return make_observations(
+        points, confidences, cameras.K[views], cameras.cam_from_world[views], world
+    ), views
+
+
+def in_camera_axes(
+    world: Float[np.ndarray, "*b k 3"],
+    points: Float[np.ndarray, "*b k 2"],
+    weights: Float[np.ndarray, "*b k"],
+    K: Float[np.ndarray, "*b 3 3"],
+) -> Float[np.ndarray, "*b k 3"]:
+    """Landmarks whose z axis is the ray to the mean of the weighted points, in the axes of the
+    camera.
+    """
+    total = weights.sum(-1, keepdims=True)
+    middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
+    focal, center = np.diagonal(K, axis1=-2, axis2=-1)[..., :2], K[..., :2, 2]
+    rays = np.concatenate(
+        [np.where(total > 0, (middle - center) / focal, 0), np.ones_like(total)], axis=-1
+    )
+    turns = smallest_turns(OPTICAL_AXIS, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    return np.einsum("...ab,...kb->...ka", turns, world)
+
+
+def expected_noise(
+    points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
+) -> Float[np.ndarray, " m"]:
+    """Pixels, from the size of the person in the views of a frame; 1 where nothing is seen."""
+
+    def of_frame(points, seen):
+        sizes = [
+            np.ptp(np.quantile(p[s], OUTER, axis=0), axis=0).max()
+            for p, s in zip(points, seen, strict=True)
+            if s.any()
+        ]
+        return max(NOISE * float(np.median(sizes)), LEAST_NOISE) if sizes else 1.0
+
+    return np.asarray(
+        [of_frame(p, seen) for p, seen in zip(points, confidences > 0, strict=True)], np.float32
+    )
+
+
+def found_noise(lengths: Array, expected: Array) -> Array:
+    """Pixels, from the median of errors, which outliers hardly change; NaN is none, and without any
+    it is as expected.
+    """
+    median = jnp.nanmedian(lengths)
+    found = jnp.where(jnp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
+    return jnp.clip(found, NOISE_RANGE[0] * expected, NOISE_RANGE[1] * expected)
+
+
+def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:
+    """Points of the world in the coordinates of every camera."""
+    rotation, translation = (
+        observations.cam_from_world[:, :3, :3],
+        observations.cam_from_world[:, :3, 3],
+    )
+    return jnp.einsum("cab,kb->cka", rotation, points, precision=EXACT) + translation[:, None]
+
+
+def focal_lengths(observations: Observations) -> Float[Array, "c 1 2"]:
+    """fx and fy of every view, pixels."""
+    return jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
+
+
+def keypoint_errors(
+    observations: Observations, landmarks: Float[Array, "k 3"]
+) -> Float[Array, "c k 2"]:
+    """Projected landmarks minus detections, pixels."""
+    seen = in_cameras(observations, landmarks)
+    pixels = seen[..., :2] / jnp.maximum(seen[..., 2:], NEAR) * focal_lengths(observations)
+    return pixels + observations.K[:, None, :2, 2] - observations.points
+
+
+@functools.partial(jax.jit, static_argnames="errors")
+def body_errors(
+    model: LandmarkModel,
+    betas: Float[Array, " s"],
+    poses: BodyPose,
+    seen: Observations,
+    frames: Int[Array | np.ndarray, " n"],
+    errors: Callable[
+        [Observations, Float[Array, "k 3"]], Float[Array, "c k ..."]
+    ] = keypoint_errors,
+) -> Float[Array, "n c k ..."]:
+    """`errors` of a person in the poses `frames` of a batch, for a batch of n observations."""
+    landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
+    return jax.vmap(errors)(seen, landmarks[frames])
+
+
+TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
+"""Landmarks that hardly depend on the pose."""
+LIMBS = 0.02
+"""Weight of the others: they count where the trunk is not seen."""
+
+
+def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
+    """(k,) 1 for landmarks of the trunk, `LIMBS` for others."""
+    return np.asarray([1.0 if kind_of(name) in TRUNK else LIMBS for name in names], np.float32)
+
+
+def keypoint_residuals(
+    model: LandmarkModel,
+    observations: Observations,
+    landmarks: Float[Array, "k 3"],
+    scale: Float[Array, ""] | float,
+) -> Float[Array, "c k 2"]:
+    """Errors of keypoints in standard deviations; scale: robust scale, in standard deviations."""
+    errors = (
+        keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
+    )
+    return _roots(observations.confidences * np.asarray(model.known, np.float32))[
+        ..., None
+    ] * robust(errors, scale)
+
+
+def _roots(weights: Float[Array, "c k"]) -> Float[Array, "c k"]:
+    """Square roots, differentiable where they are 0."""
+    return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)
+
+
+def world_residuals(
+    model: LandmarkModel,
+    observations: Observations,
+    landmarks: Float[Array, "k 3"],
+    scale: Float[Array, ""] | float,
+) -> Float[Array, "c k"]:
+    """Depths of landmarks against those that the detector sees, of a person of the same size, in
+    standard deviations.
+    """
+    weights = observations.confidences * np.asarray(model.known, np.float32)
+    centered = lambda x: (
+        x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
+    )
+    size = lambda x: jnp.sqrt(
+        jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total + NEAR**2
+    )[:, None]
+    total = jnp.maximum(jnp.sum(weights, axis=1), 1e-6)
+    ours, theirs = centered(in_cameras(observations, landmarks)), centered(observations.world)
+    errors = ours[..., 2] / size(ours) - theirs[..., 2] / size(theirs)
+    return _roots(weights) * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
+
+
+@pytree_dataclass
+class Targets:
+    """Triangulated landmarks: points (k, 3) metres; known: (k,) their weights; pixel: () metres per
+    pixel there.
+    """
+
+    points: Float[Array, "k 3"]
+    known: Float[Array, " k"] | Bool[Array, " k"]
+    pixel: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class KeypointProblem:
+    """What stays the same in a fit to keypoints."""
+
+    model: LandmarkModel
+    prior: PosePrior
+    origin: Origin
+
+    @property
+    def known(self) -> Float[np.ndarray, " k"]:
+        """(k,) 1 for landmarks that the body has."""
+        return np.asarray(self.model.known, np.float32)
+
+    def model_of(self, state: FitState) -> LandmarkModel:
+        """The landmarks, where the state has their places."""
+        return self.model if state.places is None else self.model.moved(PLACE_STD * state.places)
+
+    def landmarks_and_joints(
+        self, state: FitState
+    ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
+        """Landmarks and joints of a state, metres."""
+        return pose_landmarks(
+            self.model_of(state), betas_of(self.origin, state), pose_of(self.origin, state)
+        )
+
+
+def frame_residuals(
+    problem: KeypointProblem,
+    observations: Observations,
+    state: FitState,
+    scale: Float[Array, ""] | float,
+    targets: Targets | None = None,
+) -> dict[str, Float[Array, "..."]]:
+    """All residuals of one frame, by kind; half their square sum is the negative log posterior."""
+    betas, pose = betas_of(problem.origin, state), pose_of(problem.origin, state)
+    landmarks, _ = pose_landmarks(problem.model_of(state), betas, pose)
+    found = {
+        "keypoints": keypoint_residuals(problem.model, observations, landmarks, scale),
+        "pose": state.body_pose,
+        "limits": limit_residuals(problem.prior, problem.origin.joints, pose.rotations),
+        "shape": state.betas,
+    }
+    if observations.world is not None:
+        found["world"] = world_residuals(problem.model, observations, landmarks, scale)
+    if targets is not None:
+        known = (targets.known * problem.known)[:, None]
+        found["points"] = known * robust(
+            (landmarks - targets.points) / (targets.pixel * observations.noise), scale
+        )
+    return found

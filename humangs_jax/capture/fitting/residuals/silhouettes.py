@@ -1,0 +1,368 @@
+"""Silhouettes as evidence: that of a posed body against that of a mask.
+
+A body's silhouette consists of mesh edges between a face that looks at the camera and one that
+looks away (Sander et al. 2000, "Silhouette clipping"), as far as the image shows no body outside of
+them: known functions of the pose. A mask's is where its coverage crosses one half. Both are found
+on the host and held fixed while a solver moves the body.
+
+As in edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's silhouette looks
+along its normal for the nearest end of the mask, and each point of the mask's for the nearest point
+of the body's that faces the same way. Both give an equation n . x = n . q: x, a point of the body
+in the image, may slide along the mask's silhouette. People wear clothes and hair: distances
+outwards count in full, and distances inwards count less and less the larger they are.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel, SurfacePoints, surface_points
+from humangs_jax.capture.fitting.state import robust
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.geometry import transform
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.mesh import mesh_edges, unit
+from humangs_jax.network.maps import sample_bilinear
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
+
+PROBE = 1.5
+"""Pixels outside of a silhouette at which there must be no body."""
+NEAREST_EDGE = 0.05
+"""Metres: edges of faces nearer to the camera than this, or behind it, are no silhouette."""
+BORDER = 1.0
+"""Pixels from the image border within which nothing is a silhouette: the image ends there, not the
+person.
+"""
+SPECK = 0.03
+"""Contours shorter than this share of a mask's longest are noise."""
+SMOOTHING = 1.5
+"""Pixels: standard deviation of the blur whose gradient is a mask's normal."""
+
+
+class MeshEdges(NamedTuple):
+    """Edges of a triangle mesh. ends: (e, 2) vertices. faces: (e, 2) on both sides, -1: none."""
+
+    ends: Int[np.ndarray, "e 2"]
+    faces: Int[np.ndarray, "e 2"]
+
+
+class BodyView(NamedTuple):
+    """A posed body as a camera sees it. pixels: (n, 2) and depths: (n,) of its vertices. normals:
+    (n, 2) of the surface at the vertices as unit directions in the image. covered: (h, w).
+    """
+
+    pixels: Float[np.ndarray, "n 2"]
+    depths: Float[np.ndarray, " n"]
+    normals: Float[np.ndarray, "n 2"]
+    covered: Bool[np.ndarray, "h w"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Boundary:
+    """Points of a silhouette, evenly spread over it. positions: (p, 2) pixels. normals: (p, 2)
+    unit, outwards.
+
+    ends: (p, 2), shares: (p,): for a body, the vertices of each point's edge and its position
+    between them in [0, 1]. A silhouette may be empty.
+    """
+
+    positions: Float[np.ndarray, "p 2"]
+    normals: Float[np.ndarray, "p 2"]
+    ends: Int[np.ndarray, "p 2"] | None = None
+    shares: Float[np.ndarray, " p"] | None = None
+
+
+def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
+    """All edges of a mesh; of more than two faces that share an edge, two are kept."""
+    ends, sides = mesh_edges(faces)
+    edge, owner = sides.ravel(), np.repeat(np.arange(len(faces)), 3)
+    beside = np.full((len(ends), 2), -1)
+    beside[edge, 0] = owner  # the last of an edge's faces; then the first
+    beside[edge[::-1], 1] = owner[::-1]
+    beside[beside[:, 0] == beside[:, 1], 1] = -1
+    return MeshEdges(ends, beside)
+
+
+def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
+    """Project and rasterize a posed body."""
+    return BodyView(*map(np.asarray, _look(vertices, faces, camera)))
+
+
+@jax.jit
+def _look(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera
+) -> tuple[Array, Array, Array, Array]:
+    rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
+    seen = transform.apply(camera.cam_from_world, vertices)
+    depths = seen[:, 2]
+    pixels = (
+        seen[:, :2] / jnp.where(depths > NEAREST_EDGE, depths, 1.0)[:, None] * focal
+        + camera.K[:2, 2]
+    )
+    # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
+    normals = (
+        jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)[:, :2]
+        / focal
+    )
+    normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    return pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0
+
+
+def body_boundary(
+    view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int
+) -> Boundary:
+    """`count` points of the body's silhouette, or none if the image shows none."""
+    corners = view.pixels[faces]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    towards = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
+    before = (view.depths > NEAREST_EDGE)[faces].all(axis=1)
+    first, second = mesh.faces.T
+    turns = (towards[first] != towards[second]) | (second < 0)
+    chosen = np.flatnonzero(turns & before[first] & (before[second] | (second < 0)))
+    ends = mesh.ends[chosen]
+    normals = unit(view.normals[ends].sum(axis=1))
+    middles = view.pixels[ends].mean(axis=1)
+    outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(
+        middles, view.covered.shape
+    )
+    ends, normals = ends[outside], normals[outside]
+    lengths = np.linalg.norm(view.pixels[ends[:, 1]] - view.pixels[ends[:, 0]], axis=1)
+    edge, shares = _spread(lengths, count)
+    ends, shares = ends[edge], shares.astype(np.float32)
+    positions = (
+        view.pixels[ends[:, 0]] * (1 - shares[:, None]) + view.pixels[ends[:, 1]] * shares[:, None]
+    )
+    return Boundary(positions, normals[edge], ends, shares)
+
+
+def mask_boundary(
+    mask: Float[np.ndarray, "h w"], count: int, hidden: Bool[np.ndarray, "h w"] | None = None
+) -> Boundary:
+    """`count` points where coverage crosses one half, or none. The image border is no silhouette,
+    nor is that of who hides the person.
+    """
+    from skimage.filters import gaussian
+    from skimage.measure import find_contours
+
+    contours = [
+        contour[:, ::-1] + 0.5 for contour in find_contours(mask, 0.5)
+    ]  # rows, columns of centres -> pixels
+    steps = [np.linalg.norm(np.diff(contour, axis=0), axis=1) for contour in contours]
+    longest = max((step.sum() for step in steps), default=0.0)
+    kept = [i for i, step in enumerate(steps) if step.sum() >= SPECK * longest]
+    none = np.zeros((0, 2))
+    starts = np.concatenate([none, *(contours[i][:-1] for i in kept)])
+    ends = np.concatenate([none, *(contours[i][1:] for i in kept)])
+    lengths = (
+        np.linalg.norm(ends - starts, axis=1)
+        * inside_image(starts, mask.shape)
+        * inside_image(ends, mask.shape)
+    )
+    if hidden is not None:
+        lengths = lengths * ~_covered(hidden, starts)
+    segment, shares = _spread(lengths, count)
+    positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
+    down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
+    column, row = np.floor(positions).astype(int).T
+    return Boundary(
+        positions.astype(np.float32),
+        unit(-np.stack([right[row, column], down[row, column]], axis=-1)),
+    )
+
+
+def inside_image(
+    positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]
+) -> Bool[np.ndarray, "*p"]:
+    """Which positions are further than `BORDER` inside of an image of (height, width)."""
+    size = np.asarray([shape[1], shape[0]])
+    return np.all((positions > BORDER) & (positions < size - BORDER), axis=-1)
+
+
+def _covered(
+    covered: Bool[np.ndarray, "h w"], positions: Float[np.ndarray, "p 2"]
+) -> Bool[np.ndarray, " p"]:
+    column, row = np.floor(positions).astype(int).T
+    height, width = covered.shape
+    return covered[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+
+
+def _spread(
+    lengths: Float[np.ndarray, " l"], count: int
+) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Points evenly along pieces of a line: (count,) the piece of each and its position there in
+    [0, 1]; none without length.
+    """
+    ends = np.cumsum(lengths)
+    if len(ends) == 0 or ends[-1] <= 0:
+        return np.zeros(0, int), np.zeros(0)
+    places = (np.arange(count) + 0.5) / count * ends[-1]
+    piece = np.searchsorted(ends, places)
+    return piece, 1 - (ends[piece] - places) / lengths[piece]
+
+
+LOOKS = 129
+"""Samples along a normal: half a pixel apart in the first round, less later."""
+FACING = 0.5
+"""Least cosine between the normals of two points that belong together (60 degrees)."""
+
+
+@pytree_dataclass
+class Matches:
+    """Equations of one view: points[i] of the body's silhouette shall lie on the line normals[i] .
+    x = offsets[i].
+
+    points: (e,) indices. normals: (e, 2) unit, outwards. offsets: (e,) pixels. weights: (e,) 0: no
+    equation.
+    """
+
+    points: Int[Array, " e"]
+    normals: Float[Array, "e 2"]
+    offsets: Float[Array, " e"]
+    weights: Float[Array, " e"]
+
+
+def match(
+    body: Boundary,
+    mask: Float[np.ndarray, "h w"],
+    boundary: Boundary,
+    reach: float,
+    count: int,
+    hidden: Bool[np.ndarray, "h w"] | None = None,
+) -> Matches:
+    """At most 2 `count` equations of a mask and its boundary, padded with weight 0. reach: pixels,
+    how far points look.
+    hidden: where the mask says nothing, since somebody may be in front.
+    """
+    pairs = zip(
+        _ends_of_mask(body, mask, reach, hidden), _nearest(body, boundary, reach), strict=True
+    )
+    rows = [np.concatenate(pair) for pair in pairs]
+    points, normals, offsets = (padded(x, 2 * count) for x in rows)
+    weights = np.arange(2 * count) < len(rows[0])
+    to = lambda x: jnp.asarray(x, jnp.float32)
+    return Matches(jnp.asarray(points, jnp.int32), to(normals), to(offsets), to(weights))
+
+
+Pairs = tuple[Int[np.ndarray, " e"], Float[np.ndarray, "e 2"], Float[np.ndarray, " e"]]
+"""Points of the body's silhouette, and the normals and offsets of their lines."""
+
+
+def _ends_of_mask(
+    body: Boundary,
+    mask: Float[np.ndarray, "h w"],
+    reach: float,
+    hidden: Bool[np.ndarray, "h w"] | None,
+) -> Pairs:
+    """For points of the body, along their normals: where the mask goes from inside to outside."""
+    steps = np.linspace(-reach, reach, LOOKS)
+    places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
+    covered = np.asarray(_coverage(jnp.asarray(mask), jnp.asarray(places, jnp.float32)))
+    seen = inside_image(places, mask.shape)
+    if hidden is not None:
+        seen &= ~_covered(hidden, places.reshape(-1, 2)).reshape(seen.shape)
+    ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
+    nearest = np.argmin(np.where(ends, np.abs(steps[:-1]), np.inf), axis=1)
+    rows = np.arange(len(nearest))
+    inner, outer = covered[rows, nearest], covered[rows, nearest + 1]
+    found = ends[rows, nearest]
+    along = steps[nearest] + (steps[1] - steps[0]) * (inner - 0.5) / np.where(
+        found, inner - outer, 1.0
+    )
+    offsets = np.sum(body.normals * body.positions, axis=-1) + along
+    return np.flatnonzero(found), body.normals[found], offsets[found]
+
+
+@jax.jit
+def _coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[Array, "p l"]:
+    return sample_bilinear(mask[..., None], places - 0.5)[..., 0]
+
+
+def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
+    """For points of the mask: the nearest of the body that faces the same way."""
+    if not len(body.positions) or not len(mask.positions):
+        return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
+    distances = np.linalg.norm(mask.positions[:, None] - body.positions, axis=-1)
+    distances = np.where(mask.normals @ body.normals.T > FACING, distances, np.inf)
+    nearest = np.argmin(distances, axis=1)
+    found = distances[np.arange(len(nearest)), nearest] < reach
+    return (
+        nearest[found],
+        mask.normals[found],
+        np.sum(mask.normals * mask.positions, axis=-1)[found],
+    )
+
+
+def distances(matches: Matches, pixels: Float[Array, "p 2"]) -> Float[Array, " e"]:
+    """How far points of the body are outside of their lines, pixels; negative inside."""
+    along = matches.normals * pixels[matches.points]
+    return along[:, 0] + along[:, 1] - matches.offsets  # not `jnp.sum`: see `scan.scan_residuals`
+
+
+def silhouette_residuals(
+    matches: Matches,
+    pixels: Float[Array, "p 2"],
+    clothes: Float[Array, " p"],
+    noise: Float[Array, ""],
+    scales: tuple[Float[Array, ""], Float[Array, ""]],
+    independent: float,
+) -> Float[Array, " e"]:
+    """Distances of silhouettes in standard deviations.
+
+    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of a
+    silhouette, pixels. scales: robust scales outwards and inwards, pixels. independent: number of
+    independent equations that all of a view count for, because neighbours on a silhouette err
+    together.
+    """
+    off = distances(matches, pixels) + clothes[matches.points]
+    scale = jnp.where(off > 0, *scales)
+    share = independent / jnp.maximum(jnp.sum(matches.weights), 1.0)
+    bounded = jax.vmap(robust)((off / noise)[:, None], scale / noise)[:, 0]
+    return jnp.sqrt(matches.weights * jnp.minimum(share, 1.0)) * bounded
+
+
+# Points of silhouettes on the body
+# --------------------------------------------------------------------------------------
+
+
+def boundary_points(
+    body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int
+) -> SurfacePoints:
+    """The points of v silhouettes as functions of shape and pose, (v, count, ...), padded with
+    points that no equation uses.
+    """
+    ends, shares = (
+        np.stack([padded(getattr(each, name), count) for each in boundaries])
+        for name in ("ends", "shares")
+    )
+    return _between(body, ends, shares, coefficients)
+
+
+def padded(rows: np.ndarray, count: int) -> np.ndarray:
+    """The rows, and rows of zeros up to `count`."""
+    return np.pad(rows, ((0, count - len(rows)),) + ((0, 0),) * (rows.ndim - 1))
+
+
+@functools.partial(jax.jit, static_argnames="coefficients")
+def _between(
+    body: BodyModel,
+    ends: Int[Array | np.ndarray, "v p 2"],
+    shares: Float[Array | np.ndarray, "v p"],
+    coefficients: int,
+) -> SurfacePoints:
+    points = surface_points(body)
+    points = replace(points, directions=points.directions[..., :coefficients])
+
+    def one(ends, shares):
+        def of(values):
+            share = shares.reshape(-1, *(1,) * (values.ndim - 1))
+            return (1 - share) * values[ends[:, 0]] + share * values[ends[:, 1]]
+
+        return jax.tree.map(of, points)
+
+    return jax.vmap(one)(ends, shares)

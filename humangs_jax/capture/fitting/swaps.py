@@ -1,0 +1,380 @@
+"""Bookkeeping errors that keypoints reveal: exchanged sides, or exchanged cameras.
+
+Views of one frame that are right agree: the rays of a landmark meet. Exchanges that people and
+detectors make are undone on trial; while the views then agree clearly better, the clearest is kept.
+Cameras are reported in this order, then sides by view:
+
+    sides     left and right of the keypoints of one view; needs two views, of which either may be
+              the wrong one
+    cameras   of two views, which is the same as their photos; needs three views
+    hands     left and right keypoints of the hands alone, in one view
+
+Left and right exchanged in all views agree as well: that is not found.
+
+A view agrees with a landmark by how near its keypoint is to the best of the points that pairs of
+views propose (`triangulation.triangulate_robustly`), so that outliers count little.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.capture.fitting.residuals.keypoints import Observations
+from humangs_jax.capture.fitting.state import camera_numbers
+from humangs_jax.capture.fitting.triangulation import agreement, triangulate_robustly
+from humangs_jax.capture.keypoints.keypoints import Keypoints, KeypointSet
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import replace
+
+LEAST_GAIN, CHANCE = 0.1, 0.8
+"""Agreement of n keypoints has to grow by LEAST_GAIN + CHANCE / sqrt(n) of what is attainable. By
+chance, without an exchange, 17 keypoints with 20 % of outliers and three times the expected noise
+gain up to 0.26; 67 keypoints gain nothing.
+"""
+MANY = 5
+"""With this many views or more the right ones outvote an exchange: only exchanges that look better
+at once are tried.
+"""
+ALIKE = 0.9
+"""Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras
+several are equivalent.
+"""
+HANDS_SHARE = 0.3
+"""Hands are exchanged if their roots are nearer to the other wrists than this share of the distance
+from their own.
+"""
+SAME_CAMERA = 1e-3
+"""Share of the focal length, and metres, by which a camera that stands still may differ between
+frames.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Swap:
+    """One exchange that explains a disagreement; `str()` is a sentence about it.
+
+    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a
+    and b"). frames: for cameras, in how many; the views are those of the first.
+    """
+
+    kind: Literal["sides", "cameras", "hands"]
+    views: tuple[str, ...]
+    instead: tuple[str, ...] = ()
+    frames: int = 1
+
+    def __str__(self) -> str:
+        if self.kind == "hands":
+            return (
+                f"view {self.views[0]}: the keypoints of the hands seem exchanged: each lies at the"
+                " other wrist"
+            )
+        if self.kind == "cameras":
+            frames = f", as in {self.frames} frames" if self.frames > 1 else ""
+            other = f" (or those of {' or '.join(self.instead)} instead)" if self.instead else ""
+            return (
+                f"the cameras (or the photos) of views {' and '.join(self.views)} seem"
+                f" exchanged{other}{frames}"
+            )
+        other = f" (or in {' and '.join(self.instead)} instead)" if self.instead else ""
+        return f"view {self.views[0]}: left and right of the keypoints seem exchanged{other}"
+
+
+def find_swaps(
+    observations: Observations,
+    kind: KeypointSet,
+    views: Int[np.ndarray, "m c"],
+    names: tuple[str, ...],
+) -> tuple[Swap, ...]:
+    """Exchanged cameras, the clearest first, and then sides by view. Frames need two views for
+    sides and three for cameras.
+
+    Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none,
+    see `group_by_frame`.
+    """
+    mirror, cameras = np.asarray(kind.mirror), _camera_numbers(observations, views)
+    order, exchanges = given(*views.shape), []
+    while True:
+        search = _Search(observations, mirror, cameras, order)
+        flips, tried = search.flips(), search.exchanges()
+        best = max(tried, key=lambda each: each.gain, default=None)
+        if best is not None and best.gain >= sum(flips[m].gain for m in best.frames if m in flips):
+            exchanges.append(_cameras(best, tried, views, names))
+            order = order.exchanged(best.frames, best.a, best.b)
+        elif flips:
+            frames, slots = (
+                np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("frames", "a")
+            )
+            order = order.exchanged(frames, slots, None)
+        else:
+            return (*exchanges, *_sides(observations, views, order, names))
+
+
+def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
+    """Views in which the hands' keypoints are at each other's wrists, as hand detectors on
+    exchanged crops leave them.
+    """
+    wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
+    if not set(wanted) <= set(keypoints.set.names):
+        return ()
+    rows = [keypoints.set.names.index(name) for name in wanted]
+    hands, wrists = np.split(keypoints.points[:, rows], 2, axis=1)
+    own, other = (np.linalg.norm(hands - at, axis=-1).sum(1) for at in (wrists, wrists[:, ::-1]))
+    exchanged = (keypoints.confidences[:, rows] > 0).all(1) & (other < HANDS_SHARE * own)
+    return tuple(Swap("hands", (names[view],)) for view in np.flatnonzero(exchanged))
+
+
+# How well views agree
+# --------------------------------------------------------------------------------------------------
+
+
+class Order(NamedTuple):
+    """Which keypoints the c cameras of m frames get.
+
+    source: (m, c) camera that they come from. mirrored: (m, c) by source, whether left and right
+    are exchanged.
+    """
+
+    source: Int[np.ndarray, "m c"]
+    mirrored: Bool[np.ndarray, "m c"]
+
+    def exchanged(
+        self,
+        frames: Int[np.ndarray, " e"],
+        a: Int[np.ndarray, " e"],
+        b: Int[np.ndarray, " e"] | None,
+    ) -> "Order":
+        """The order with the keypoints of cameras a and b exchanged in some frames, or without b
+        left and right of camera a's.
+        """
+        source, mirrored = self.source.copy(), self.mirrored.copy()
+        if b is None:
+            mirrored[frames, source[frames, a]] ^= True
+        else:
+            source[frames, a], source[frames, b] = self.source[frames, b], self.source[frames, a]
+        return Order(source, mirrored)
+
+
+def given(frames: int, views: int) -> Order:
+    """Every camera has its own keypoints."""
+    return Order(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
+
+
+def arranged(
+    observations: Observations, mirror: Int[np.ndarray, " k"], order: Order
+) -> Observations:
+    """The keypoints of m frames in an order. mirror: index of each keypoint's mirror image."""
+    rows = np.arange(len(order.source))[:, None]
+    columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
+    pick = lambda values: jnp.asarray(
+        np.asarray(values)[rows[..., None], order.source[..., None], columns]
+    )
+    # where left and right are exchanged the detector may have seen the body turned round: its
+    # depths say nothing then
+    world = None if observations.world is None or order.mirrored.any() else pick(observations.world)
+    return replace(
+        observations,
+        points=pick(observations.points),
+        confidences=pick(observations.confidences),
+        world=world,
+    )
+
+
+class Agreement(NamedTuple):
+    """How well c views agree with the points that they agree on best: confidences summed over
+    keypoints, less for larger errors.
+
+    own: (c,) with the keypoints as they are. crossed: (c, c) if the first view had the second's
+    keypoints, and mirrored: (c,) with left and right exchanged, both without new triangulation.
+    """
+
+    own: Float[Array, " c"]
+    crossed: Float[Array, "c c"]
+    mirrored: Float[Array, " c"]
+
+
+@jax.jit
+def _agreements(
+    observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]
+) -> Agreement:
+    """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror
+    image.
+    """
+
+    def of_frame(seen):
+        points, counts, weights = triangulate_robustly(seen)
+
+        def near(keypoints, confidences):
+            """Agreement (c,) of all views if each had these keypoints (k, 2)."""
+            everywhere = lambda own, of: jnp.broadcast_to(own, of.shape)
+            alike = replace(
+                seen,
+                points=everywhere(keypoints, seen.points),
+                confidences=everywhere(confidences, seen.confidences),
+            )
+            return jnp.sum((counts >= 2) * agreement(alike, points), axis=-1)
+
+        crossed = jax.vmap(near, out_axes=1)(seen.points, seen.confidences)
+        mirrored = jnp.diagonal(
+            jax.vmap(near, out_axes=1)(seen.points[:, mirror], seen.confidences[:, mirror])
+        )
+        return Agreement(jnp.sum(weights, axis=-1), crossed, mirrored)
+
+    return jax.lax.map(of_frame, observations)
+
+
+# Trials
+# --------------------------------------------------------------------------------------------------
+
+
+class _Trial(NamedTuple):
+    """An exchange in some frames, of cameras a and b, or of the sides of camera a if b is None.
+    gain: agreement that it adds.
+    """
+
+    gain: float
+    frames: Int[np.ndarray, " e"]
+    a: Int[np.ndarray, " e"]
+    b: Int[np.ndarray, " e"] | None
+
+
+class _Search:
+    """Keypoints in an order, how well the views agree, and what exchanges would add.
+
+    cameras: (m, c) equal numbers for one camera that stands still, -1: no view. total: (m,)
+    agreement. views: (m, c) with keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
+    """
+
+    def __init__(
+        self,
+        observations: Observations,
+        mirror: Int[np.ndarray, " k"],
+        cameras: Int[np.ndarray, "m c"],
+        order: Order,
+    ) -> None:
+        self.observations, self.mirror, self.cameras, self.order = (
+            observations,
+            mirror,
+            cameras,
+            order,
+        )
+        seen = arranged(observations, mirror, order)
+        found = jax.tree.map(np.asarray, _agreements(seen, mirror))
+        self.confidences = np.asarray(seen.confidences)
+        self.total, self.views = found.own.sum(-1), (self.confidences > 0).any(-1)
+        count, own = self.views.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
+        self.sides = self.views & (count > 1) & ((count < MANY) | (found.mirrored > own))
+        self.several = self.views & (count > 2)
+        better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
+        self.pairs = (
+            self.several[:, :, None] & self.several[:, None] & ((count < MANY)[..., None] | better)
+        )
+
+    def gains(
+        self,
+        frames: Int[np.ndarray, " e"],
+        a: Int[np.ndarray, " e"],
+        b: Int[np.ndarray, " e"] | None = None,
+    ) -> Float[np.ndarray, " e"]:
+        """(e,) agreement that an exchange adds in each of its frames."""
+        order = self.order.exchanged(frames, a, b)
+        own = _agreements(arranged(self.observations, self.mirror, order), self.mirror).own
+        return (np.asarray(own).sum(-1) - self.total)[frames]
+
+    def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
+        """Whether an exchange of the keypoints `of` gains enough: attainable is that all agree that
+        another view sees.
+        """
+        seen = (self.confidences > 0) & of
+        shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
+        slots = [slot for slot in (trial.a, trial.b) if slot is not None]
+        total = lambda values: float(sum(values[trial.frames, slot].sum() for slot in slots))
+        most, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
+        return trial.gain / max(most, 1e-6) > LEAST_GAIN + CHANCE / max(count, 1) ** 0.5
+
+    def flips(self) -> dict[int, _Trial]:
+        """The view of each frame whose sides are exchanged most clearly, by frame."""
+        found: dict[int, _Trial] = {}
+        sided = self.mirror != np.arange(len(self.mirror))
+        for slot in np.flatnonzero(self.sides.any(0)):
+            frames = np.flatnonzero(self.sides[:, slot])
+            gains = self.gains(frames, np.full(len(frames), slot))
+            for frame, gain in zip(frames.tolist(), gains.tolist(), strict=True):
+                trial = _Trial(gain, np.asarray([frame]), np.asarray([slot]), None)
+                if self.is_clear(trial, sided) and (frame not in found or gain > found[frame].gain):
+                    found[frame] = trial
+        return found
+
+    def exchanges(self) -> list[_Trial]:
+        """Exchanges of two cameras in all of their frames together, and in each alone."""
+        cameras = lambda frame, a, b: tuple(sorted(self.cameras[frame, [a, b]].tolist()))
+        suspected = {cameras(*at) for at in np.argwhere(self.pairs)}
+        tried: dict[tuple[int, ...], list[_Trial]] = {}
+        for a, b in itertools.combinations(range(self.views.shape[1]), 2):
+            frames = np.flatnonzero(self.several[:, a] & self.several[:, b])
+            frames = np.asarray(
+                [frame for frame in frames if cameras(frame, a, b) in suspected], int
+            )
+            if len(frames):
+                slots = [np.full(len(frames), slot) for slot in (a, b)]
+                for row, gain in enumerate(self.gains(frames, *slots).tolist()):
+                    one = _Trial(gain, frames[[row]], *(slot[[row]] for slot in slots))
+                    tried.setdefault(cameras(frames[row], a, b), []).append(one)
+        together = [_together(trials) for trials in tried.values()]
+        alone = [trial for trials in tried.values() if len(trials) > 1 for trial in trials]
+        every = np.ones(len(self.mirror), bool)
+        return [trial for trial in (*together, *alone) if self.is_clear(trial, every)]
+
+
+def _together(trials: Sequence[_Trial]) -> _Trial:
+    """Exchanges of two cameras in several frames as one."""
+    frames, a, b = (
+        np.concatenate([getattr(trial, key) for trial in trials]) for key in ("frames", "a", "b")
+    )
+    return _Trial(sum(trial.gain for trial in trials), frames, a, b)
+
+
+def _cameras(
+    best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]
+) -> Swap:
+    """The swap of the best exchange, and the others of the same frames that gain as much."""
+    name = lambda trial: tuple(
+        names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]])
+    )
+    alike = [each for each in tried if each is not best and each.gain > ALIKE * best.gain]
+    others = [
+        " and ".join(name(each)) for each in alike if np.array_equal(each.frames, best.frames)
+    ]
+    return Swap("cameras", name(best), tuple(others), len(best.frames))
+
+
+def _sides(
+    observations: Observations, views: Int[np.ndarray, "m c"], order: Order, names: Sequence[str]
+) -> list[Swap]:
+    """A swap for each view whose sides are exchanged; if these are half of the views, it may be the
+    other half.
+    """
+    found = []
+    seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)
+    for own, mirrored, exists in zip(views, order.mirrored, seen, strict=True):
+        others = own[exists & ~mirrored]
+        instead = tuple(names[v] for v in others) if len(others) == mirrored.sum() else ()
+        found += [Swap("sides", (names[v],), instead) for v in own[mirrored]]
+    return found
+
+
+def _camera_numbers(
+    observations: Observations, views: Int[np.ndarray, "m c"]
+) -> Int[np.ndarray, "m c"]:
+    """(m, c) equal for views of one camera that stands still; -1 where there is no view."""
+    there = np.nonzero(views >= 0)
+    matrices = (
+        np.asarray(x, np.float64)[there] for x in (observations.K, observations.cam_from_world)
+    )
+    numbers = np.full(views.shape, -1)
+    numbers[there] = camera_numbers(*matrices, SAME_CAMERA)
+    return numbers

@@ -1,0 +1,522 @@
+"""Points in space from several views, similarities between points, and which people in several
+views are the same person.
+
+A pixel is a ray. The point with the least weighted sum of squared distances to the rays solves 3 x
+3 equations. Weights of focal length over distance turn metres into pixels (Hartley and Zisserman,
+Multiple View Geometry, 12.2). Robustly: from the pair of views that most views agree with.
+Similarities are in float64 on the host.
+
+Landmarks of one person triangulate: seen from other cameras they fall on that person's landmarks,
+within a few hundredths of the person's size. Those of two people do not, nor do those of a person
+whose left and right one view takes for each other. Every pair of people in two views proposes
+points, as they are and with the sides of the second exchanged; the others join where they agree.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from humangs_jax.capture.fitting.residuals.keypoints import Observations, focal_lengths, in_cameras
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.numerics import safe_normalize
+from humangs_jax.geometry.transform import EXACT
+
+RIDGE = 1e-6
+"""Share of the weights that pulls towards the cameras: parallel rays leave the distance open."""
+REWEIGHTED = 3
+"""Iterations that weight the rays by the distance of the last point."""
+PAIRS_AT_ONCE = 16
+"""Pairs of views whose proposals are compared with all views at once: memory does not grow with the
+number of pairs.
+"""
+MARGIN = 6.0
+"""A view agrees with a point within this many standard deviations of the noise."""
+
+
+def triangulate(
+    observations: Observations, weights: Float[Array, "c k"] | None = None
+) -> tuple[Float[Array, "k 3"], Float[Array, " k"]]:
+    """Least squares over all views: points (k, 3) in metres and how many views see each (k,).
+
+    Arguments: weights: of the views of each point; default: the confidences.
+    """
+    weights = observations.confidences if weights is None else weights
+    origins, directions = _rays(observations)
+    focal = observations.K[:, 0, 0]
+    points = _nearest(origins, directions, weights)
+    for _ in range(REWEIGHTED):
+        distance = jnp.sum(directions * (points - origins[:, None]), axis=-1)
+        points = _nearest(
+            origins,
+            directions,
+            weights * jnp.square(focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1)),
+        )
+    return points, jnp.sum(weights > 0, axis=0).astype(jnp.float32)
+
+
+def triangulate_robustly(
+    observations: Observations,
+) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
+    """Points (k, 3), how many views agree with each (k,), and those views' weights (c, k).
+
+    Every pair of views proposes a point; the proposal that the views agree with most is improved
+    from those views alone. A point that fewer than two views agree with has weights of 0.
+    """
+    views = observations.points.shape[0]
+    if views < 2:
+        k = observations.points.shape[1]
+        return jnp.zeros((k, 3)), jnp.zeros(k), jnp.zeros_like(observations.confidences)
+    pairs = np.stack(np.triu_indices(views, 1), axis=1)
+    chosen = np.zeros((len(pairs), views, 1), np.float32)
+    chosen[np.arange(len(pairs))[:, None], pairs] = 1
+
+    def propose(pair):
+        points = triangulate(observations, observations.confidences * pair)[0]
+        return points, jnp.sum(agreement(observations, points), axis=0)
+
+    # of all pairs only their points are kept: with 48 views there are 1128 pairs, each with an
+    # agreement of every view
+    proposals, agreed = jax.lax.map(propose, jnp.asarray(chosen), batch_size=PAIRS_AT_ONCE)
+    best = jnp.argmax(agreed, axis=0)
+    weights = agreement(
+        observations, jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0]
+    )
+    weights = jnp.where(jnp.sum(weights > 0, axis=0) >= 2, weights, 0.0)
+    points, count = triangulate(observations, weights)
+    return points, count, weights
+
+
+def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
+    """How well the views agree with points: their confidences, less for larger errors, 0 beyond the
+    margin.
+    """
+    errors = reprojection_errors(observations, points)
+    return observations.confidences * jnp.maximum(
+        1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0
+    )
+
+
+def reprojection_errors(
+    observations: Observations, points: Float[Array, "k 3"]
+) -> Float[Array, "c k"]:
+    """Distance in pixels between points as the views would show them and the detections; huge
+    behind a camera.
+    """
+    seen = in_cameras(observations, points)
+    depth = seen[..., 2]
+    before = depth > 0.01
+    pixels = seen[..., :2] / jnp.where(before, depth, 1.0)[..., None] * focal_lengths(observations)
+    pixels += observations.K[:, None, :2, 2]
+    return jnp.where(before, jnp.linalg.norm(pixels - observations.points, axis=-1), 1e6)
+
+
+def _rays(observations: Observations) -> tuple[Float[Array, "c 3"], Float[Array, "c k 3"]]:
+    rotation, translation = (
+        observations.cam_from_world[:, :3, :3],
+        observations.cam_from_world[:, :3, 3],
+    )
+    xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
+    local = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+    directions = safe_normalize(
+        jnp.einsum("cba,ckb->cka", rotation, local, precision=EXACT), jnp.asarray([0.0, 0.0, 1.0])
+    )
+    return -jnp.einsum("cba,cb->ca", rotation, translation, precision=EXACT), directions
+
+
+def _nearest(
+    origins: Float[Array, "c 3"], directions: Float[Array, "c k 3"], weights: Float[Array, "c k"]
+) -> Float[Array, "k 3"]:
+    center = jnp.mean(origins, axis=0)  # against rounding far from the world's origin
+    across = jnp.eye(3) - directions[..., :, None] * directions[..., None, :]
+    scale = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-12)
+    matrix = jnp.einsum("ck,ckab->kab", scale, across, precision=EXACT) + RIDGE * jnp.eye(3)
+    vector = jnp.einsum("ck,ckab,cb->ka", scale, across, origins - center, precision=EXACT)
+    return jnp.linalg.solve(matrix, vector[..., None])[..., 0] + center
+
+
+# Similarities
+# --------------------------------------------------------------------------------------------------
+
+ITERATIONS = 10
+"""They reweight the points by their distances."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale rotation x + translation. rotation: (3, 3), proper. translation: (3,)."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    def __call__(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
+        return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
+
+    def after(self, first: "Similarity") -> "Similarity":
+        """The composition: first `first`, then this one."""
+        return Similarity(
+            self.scale * first.scale,
+            self.rotation @ first.rotation,
+            self(np.asarray(first.translation, np.float64)),
+        )
+
+    def inverse(self) -> "Similarity":
+        back = self.rotation.T
+        return Similarity(1 / self.scale, back, -(back @ self.translation) / self.scale)
+
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
+
+def align_points(
+    source: Float[np.ndarray, "k 3"],
+    target: Float[np.ndarray, "k 3"],
+    weights: Float[np.ndarray, " k"],
+) -> Similarity:
+    """The similarity from source to target whose weighted square distances are least (Umeyama 1991,
+    eq. 40 to 43).
+
+    Raises: ValueError if fewer than three points have a weight, or they lie on a line.
+    """
+    share = weights / max(weights.sum(), 1e-30)
+    mean_source, mean_target = share @ source, share @ target
+    x, y = source - mean_source, target - mean_target
+    extent = np.linalg.svd(np.sqrt(share)[:, None] * x, compute_uv=False)
+    if (weights > 0).sum() < 3 or extent[1] < 1e-6 * extent[0]:
+        raise ValueError("expected at least three points that are not on one line")
+    u, values, vt = np.linalg.svd(y.T @ (share[:, None] * x))
+    signs = np.asarray([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * signs) @ vt
+    scale = float((values * signs).sum() / (share @ (x * x).sum(axis=1)))
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def align_robustly(
+    source: Float[np.ndarray, "k 3"],
+    target: Float[np.ndarray, "k 3"],
+    weights: Float[np.ndarray, " k"],
+    std: float,
+) -> Similarity:
+    """The same with Cauchy weights: points farther off than `std`, in units of the target, count
+    less.
+
+    Raises: see `align_points`.
+    """
+    found = align_points(source, target, weights)
+    for _ in range(ITERATIONS):
+        away = np.linalg.norm(found(source) - target, axis=1) / std
+        found = align_points(source, target, weights / (1 + away * away))
+    return found
+
+
+# Who is who
+# --------------------------------------------------------------------------------------------------
+
+AGREE = 0.06
+"""Median distance of landmarks from the triangulated points, a share of the person's size in the
+photo, up to which a view shows the same person. Cameras that are off by a degree make 0.02 of it.
+"""
+CLEARLY, RATHER = 0.5, 0.8
+"""Sides are exchanged if the distance is then less than this share of what it is without; the
+second where it does not agree without."""
+FARTHEST = 1.0
+"""Metres between a person's places in two frames that follow each other, where several views show
+where they are.
+"""
+SHORTER, FAR = 0.3, 3.0
+"""Of the longest way: how much shorter the ways of people between two frames have to be than if two
+of them were exchanged; and from where on all ways count as equally long."""
+NEAR = 0.5
+"""A share of a person's size in the photo: how far they go in the photo of one camera from one
+frame to the next.
+"""
+RESIZED = 1.5
+"""The most by which a person's size in the photo of one camera changes from one frame to the next,
+a factor.
+"""
+STILL_DEGREES, STILL_METRES = 10.0, 0.3
+"""A view that has turned and moved by no more than this since the last frame is one camera's."""
+SEEN, FEWEST = 0.3, 6
+"""Least visibility of a landmark that counts, and least number of those that two views share."""
+
+
+class Seen(NamedTuple):
+    """People of a view. K: (3, 3). cam_from_world: (4, 4).
+
+    people: each (k, 3) pixels and visibility.
+    """
+
+    K: Float[np.ndarray, "3 3"]
+    cam_from_world: Float[np.ndarray, "4 4"]
+    people: tuple[Float[np.ndarray, "k 3"], ...]
+
+
+Key = tuple[int, int]
+"""A view, and a person in it."""
+
+
+class Match(NamedTuple):
+    """One person. members: for each view the index of its person, None where it has none. mirrored:
+    for each view whether left and right are exchanged. error: median distance of the landmarks from
+    the triangulated points over the person's size; infinite for a person of one view. center: the
+    median of the points, metres; NaN for a person of one view.
+    """
+
+    members: tuple[int | None, ...]
+    mirrored: tuple[bool, ...]
+    error: float
+    center: Float[np.ndarray, "3"]
+
+
+def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
+    """The people of some views of one moment, those seen by most views first; those whom no other
+    view shows come last.
+
+    Arguments: mirror: for each landmark the index of its mirror image.
+    """
+    flipped_order = np.asarray(mirror)
+    left = {(v, p) for v, view in enumerate(views) for p in range(len(view.people))}
+    groups = []
+    for (v, p), (w, q) in itertools.combinations(sorted(left), 2):
+        if v == w:
+            continue
+        first, second = views[v].people[p], views[w].people[q]
+        trials = []
+        for row in (second, second[flipped_order]):
+            points, known = _triangulated(views, {v: first, w: row})
+            error = max(_error(views[i], each, points, known) for i, each in ((v, first), (w, row)))
+            trials.append((error, points, known))
+        flipped = _is_exchanged(trials[0][0], trials[1][0])
+        if trials[flipped][0] < AGREE:
+            groups.append(
+                _gathered(views, flipped_order, {(v, p): False, (w, q): flipped}, *trials[flipped])
+            )
+    matches = []
+    # the group that most views agree with, and of these the one that agrees best
+    for group, error in sorted(groups, key=lambda each: (-len(each[0]), each[1])):
+        if all(key in left for key in group):
+            left -= set(group)
+            matches.append(_match(views, flipped_order, group, error))
+    return matches + [
+        _match(views, flipped_order, {key: False}, float("inf")) for key in sorted(left)
+    ]
+
+
+def _gathered(
+    views: Sequence[Seen],
+    mirror: Int[np.ndarray, " k"],
+    pair: dict[Key, bool],
+    error: float,
+    points: Float[np.ndarray, "k 3"],
+    known: Bool[np.ndarray, " k"],
+) -> tuple[dict[Key, bool], float]:
+    """A pair, {(view, person): exchanged}, with the people of the other views who agree with its
+    points; and the error.
+    """
+    group, errors = dict(pair), [error]
+    for v in set(range(len(views))) - {v for v, _ in pair}:
+        trials = []
+        for p, row in enumerate(views[v].people):
+            plain, exchanged = (
+                _error(views[v], each, points, known) for each in (row, row[mirror])
+            )
+            flipped = _is_exchanged(plain, exchanged)
+            trials.append((exchanged if flipped else plain, (v, p), flipped))
+        best = min(trials, default=None)
+        if best is not None and best[0] < AGREE:
+            error, key, flipped = best
+            group[key] = flipped
+            errors.append(error)
+    return group, float(np.mean(errors))
+
+
+def _is_exchanged(plain: float, exchanged: float) -> bool:
+    """From two errors. Of a small or thin person left and right hardly differ: then nothing is
+    exchanged.
+    """
+    return exchanged < (CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain))
+
+
+def _match(
+    views: Sequence[Seen], mirror: Int[np.ndarray, " k"], group: dict[Key, bool], error: float
+) -> Match:
+    members: list[int | None] = [None] * len(views)
+    mirrored = [False] * len(views)
+    for (v, p), flipped in group.items():
+        members[v], mirrored[v] = p, flipped
+    rows = {
+        v: views[v].people[p][mirror] if flipped else views[v].people[p]
+        for (v, p), flipped in group.items()
+    }
+    center = np.full(3, np.nan)
+    if len(rows) > 1:
+        points, known = _triangulated(views, rows)
+        center = np.median(points[known], axis=0) if known.any() else center
+    if 2 * sum(mirrored) > len(group):  # the exchanged ones are the fewer
+        mirrored = [
+            member is not None and not flipped
+            for member, flipped in zip(members, mirrored, strict=True)
+        ]
+    return Match(tuple(members), tuple(mirrored), error, center)
+
+
+def _triangulated(
+    views: Sequence[Seen], rows: dict[int, Float[np.ndarray, "k 3"]]
+) -> tuple[Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
+    """Points by linear least squares, and which of them all views see."""
+    known = np.logical_and.reduce([row[:, 2] >= SEEN for row in rows.values()])
+    equations = []
+    for v, row in rows.items():
+        xy = (row[:, :2] - views[v].K[:2, 2]) / np.diag(views[v].K)[:2]
+        camera = views[v].cam_from_world[:3]
+        equations += [xy[:, i, None] * camera[2] - camera[i] for i in range(2)]
+    vectors = np.linalg.svd(np.stack(equations, axis=1))[2][:, -1]
+    scale = np.where(np.abs(vectors[:, 3]) > 1e-12, vectors[:, 3], np.nan)
+    points = vectors[:, :3] / scale[:, None]
+    return points, known & np.isfinite(points).all(-1)
+
+
+def _error(
+    view: Seen,
+    row: Float[np.ndarray, "k 3"],
+    points: Float[np.ndarray, "k 3"],
+    known: Bool[np.ndarray, " k"],
+) -> float:
+    """Median distance of landmarks from points over the size of the person; infinite behind the
+    camera or with few in common.
+    """
+    seen = known & (row[:, 2] >= SEEN)
+    if seen.sum() < FEWEST:
+        return float("inf")
+    local = points[seen] @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    if np.median(local[:, 2]) <= 0:
+        return float("inf")
+    pixels = local @ view.K.T
+    distances = np.linalg.norm(
+        pixels[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan) - row[seen, :2], axis=-1
+    )
+    size = np.ptp(row[row[:, 2] >= SEEN, :2], axis=0).max()
+    return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
+
+
+def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]) -> bool:
+    """Tells whether two views see enough of the same landmarks to say that they show two people."""
+    return int(((first[:, 2] >= SEEN) & (second[:, 2] >= SEEN)).sum()) >= FEWEST
+
+
+def in_order_of_time(
+    frames: Sequence[list[Match]], shown: Sequence[Sequence[Seen]] | None = None
+) -> list[list[Match | None]]:
+    """The matches of frames that follow each other, so that the i-th of each is one person.
+
+    The ways of all together are the shortest, in space and, of those whom space does not tell, in
+    the photos of one camera. Where others are nearly as short, nobody is linked.
+
+    Arguments: shown: the views of each frame; None: people are followed in space alone.
+    Returns: for each frame a match for each person, None where the frame does not have the person.
+    Whoever is linked to nobody is added at the end: that may be one of the others all the same.
+    """
+    people: list[list[Match | None]] = []
+    for f, matches in enumerate(frames):
+        last = [max(g for g in range(f) if person[g] is not None) for person in people]
+        centers = [_last_center(person) for person in people]
+        ways = np.asarray(
+            [[np.linalg.norm(match.center - center) for match in matches] for center in centers]
+        )
+        chosen = dict(_plainly_shortest(ways.reshape(len(people), len(matches)), FARTHEST))
+        if shown is not None:
+            free = [j for j in range(len(people)) if j not in chosen]
+            left = [i for i in range(len(matches)) if i not in chosen.values()]
+            costs = np.full((len(free), len(left)), np.inf)
+            for (row, j), (column, i) in itertools.product(enumerate(free), enumerate(left)):
+                before = people[j][last[j]]
+                assert before is not None
+                costs[row, column] = _moved_in_photos(shown[last[j]], before, shown[f], matches[i])
+            chosen |= {free[row]: left[column] for row, column in _plainly_shortest(costs, NEAR)}
+        for j, person in enumerate(people):
+            person.append(matches[chosen[j]] if j in chosen else None)
+        new = [match for i, match in enumerate(matches) if i not in chosen.values()]
+        people += [[*[None] * f, match] for match in new]
+    return [[person[f] for person in people] for f in range(len(frames))]
+
+
+def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
+    """Where several views last saw a person; NaN if they never did."""
+    centers = [
+        match.center for match in person if match is not None and np.isfinite(match.center).all()
+    ]
+    return centers[-1] if centers else np.full(3, np.nan)
+
+
+def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tuple[int, int]]:
+    """People and their matches: those with the shortest ways of all together, where any others are
+    plainly longer.
+    """
+    ways = np.fmin(
+        ways, FAR * longest
+    )  # longer ones, and those that are not known, are all as unlikely
+    pairs = list(zip(*(each.tolist() for each in linear_sum_assignment(ways)), strict=True))
+    chosen = []
+    for j, i in pairs:
+        longer = [ways[j, k] + ways[m, i] - ways[j, i] - ways[m, k] for m, k in pairs if m != j]
+        # whoever has no match now, or is nobody's match, could have this one
+        longer += [
+            ways[m, i] - ways[j, i] for m in range(len(ways)) if m not in {m for m, _ in pairs}
+        ]
+        longer += [
+            ways[j, k] - ways[j, i] for k in range(ways.shape[1]) if k not in {k for _, k in pairs}
+        ]
+        if ways[j, i] < longest and min(longer, default=np.inf) >= SHORTER * longest:
+            chosen.append((j, i))
+    return chosen
+
+
+def _moved_in_photos(
+    before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match
+) -> float:
+    """How far one person would have gone in the photos of all cameras that show both, at the most,
+    a share of the size.
+
+    Infinite if no camera does, or if the size in a photo changed too much.
+    """
+    moved = []
+    for v, w in itertools.product(range(len(before)), range(len(now))):
+        p, q = first.members[v], second.members[w]
+        if p is None or q is None or not _stands_still(before[v], now[w]):
+            continue
+        (place, size), (other, other_size) = (
+            _box(row) for row in (before[v].people[p], now[w].people[q])
+        )
+        resized = max(size, other_size) > RESIZED * min(size, other_size)
+        moved.append(
+            float("inf")
+            if resized
+            else float(np.linalg.norm(other - place)) / max(size, other_size, 1e-9)
+        )
+    return max(moved, default=float("inf"))
+
+
+def _stands_still(before: Seen, now: Seen) -> bool:
+    """Tells whether two views are one camera that hardly moved."""
+    first, second = before.cam_from_world[:3], now.cam_from_world[:3]
+    turn = first[:, :3] @ second[:, :3].T
+    degrees = np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    way = first[:, :3].T @ first[:, 3] - second[:, :3].T @ second[:, 3]
+    return bool(degrees <= STILL_DEGREES and np.linalg.norm(way) <= STILL_METRES)
+
+
+def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
+    """The middle of the landmarks that are seen, pixels, and the longer side of the box around
+    them.
+    """
+    seen = row[row[:, 2] >= SEEN, :2]
+    seen = seen if len(seen) else row[:, :2]
+    return np.median(seen, axis=0), float(np.ptp(seen, axis=0).max())

@@ -1,0 +1,535 @@
+"""Files of keypoints: ours, OpenPose's, EasyMocap's, COCO's (AlphaPose's, COCO-WholeBody's) and
+MMPose's.
+
+In ours alone the centre of the first pixel is at (0.5, 0.5). The keypoints of one person, by
+`save_keypoints`: an npz of points (v, k, 2), confidences (v, k), the set's name, and the names of
+the v views. The people in photos, by `humangs detect`:
+
+    {"format": "humangs-people", "version": 1, "set": "mediapipe33", "images": [
+        {"image": "front.jpg", "width": 1920, "height": 1080, "people": [
+            {"presence": 0.99, "pixels": [[x, y], ...], "visibility": [...], "world": [[x, y, z],
+            ...]}, null]}]}
+
+world: metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
+person of average size. The i-th of every image is one and the same person; null: not in it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.capture.keypoints.keypoints import (
+    KEYPOINT_SETS,
+    MEDIAPIPE_33,
+    OPENPOSE_60,
+    OPENPOSE_67,
+    SETS_BY_COUNT,
+    DetectedImage,
+    Detections,
+    Keypoints,
+    KeypointSet,
+    Source,
+    detections_of,
+    triples,
+)
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    checked_json,
+    expect,
+    file_numbers,
+    members,
+)
+from humangs_jax.data.formats import SourceFormat
+from humangs_jax.io.arrays import ArrayFile, write_npz
+from humangs_jax.io.reading import check_limit, limits, shown, write_json
+
+FORMAT, VERSION = "humangs-people", 1
+DECIMALS = 4
+"""Of numbers in the file: a ten-thousandth of a pixel, a tenth of a millimetre."""
+
+
+def recognizes_own(source: Source) -> bool:
+    """Whether a file is one of ours; npz archives are taken for one."""
+    return source.path.suffix.lower() == ".npz" or _is_people_file(source.json)
+
+
+def read_own(source: Source, format: SourceFormat) -> Detections:
+    """The keypoints of one person, or all people, with confidence 0 where they are not in the
+    image. Raises: CaptureError.
+    """
+    if source.path.suffix.lower() == ".npz":
+        return _saved(source.path)
+    kind, images = read_people(source.path, source.json)
+    nobody = np.zeros((len(kind.names), 6))
+    columns = lambda each: nobody if each is None else np.column_stack([each.points, each.world])
+    found = (tuple(map(columns, image.people)) for image in images)
+    seen = tuple(
+        DetectedImage(i.image, source.path, p, i.size) for i, p in zip(images, found, strict=True)
+    )
+    return Detections(
+        kind if any(any(image.people) for image in images) else None, seen, offset=0.0
+    )
+
+
+def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
+    """Write our own format (.npz). names: of the views, as in the capture. `read_keypoints` reads
+    exactly these back.
+
+    Raises: ValueError if the path does not end in .npz, or there is not one name per view.
+    """
+    if len(names) != len(keypoints.points):
+        raise ValueError(
+            f"names: expected one for each of {len(keypoints.points)} views, got {len(names)}"
+        )
+    arrays = {
+        "points": np.asarray(keypoints.points, np.float32),
+        "confidences": np.asarray(keypoints.confidences, np.float32),
+        "set": keypoints.set.name,
+        "names": np.asarray(list(names), np.str_),
+    }
+    if Path(path).suffix != ".npz":
+        raise ValueError(f"{path}: expected a name ending in .npz")
+    write_npz(path, arrays)
+
+
+def _saved(file: Path) -> Detections:
+    values = ArrayFile.open(file, CaptureError)
+    name, views = (values.array(key) for key in ("set", "names"))
+    kind = _set_of(str(name), file)
+    check_limit("people", views.size, "people")
+    shape = len(views.reshape(-1)), len(kind.names)
+    points = file_numbers(values.array("points"), file, "points", (*shape, 2), nulls=True)
+    confidences = file_numbers(values.array("confidences"), file, "confidences", shape, nulls=True)
+    people = np.concatenate([points, confidences[..., None]], axis=-1)
+    rows = zip(views.reshape(-1).tolist(), people, strict=True)
+    return Detections(
+        kind, tuple(DetectedImage(str(view), file, (person,)) for view, person in rows), offset=0.0
+    )
+
+
+def _set_of(name: str, file: Path) -> KeypointSet:
+    if name not in KEYPOINT_SETS:
+        raise CaptureError(file, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
+    return KEYPOINT_SETS[name]
+
+
+# People in photos
+# --------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SeenPerson:
+    """A person in an image. points: (k, 3) pixels and visibility. world: (k, 3) metres.
+
+    presence: in [0, 1].
+    """
+
+    points: Float[np.ndarray, "k 3"]
+    world: Float[np.ndarray, "k 3"]
+    presence: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImagePeople:
+    """An image, its (width, height) in pixels, and its people, None for those who are not in it."""
+
+    image: str
+    size: tuple[int, int]
+    people: tuple[SeenPerson | None, ...]
+
+
+def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
+    """Write the file, whole or not at all."""
+    described = []
+    for image in images:
+        people = [None if person is None else _described(person) for person in image.people]
+        described.append(
+            {
+                "image": image.image,
+                "width": image.size[0],
+                "height": image.size[1],
+                "people": people,
+            }
+        )
+    write_json(
+        path,
+        {"format": FORMAT, "version": VERSION, "set": MEDIAPIPE_33.name, "images": described},
+        indent=None,
+    )
+
+
+def _described(person: SeenPerson) -> dict[str, Any]:
+    rounded = lambda values: np.round(values, DECIMALS).tolist()
+    return {
+        "presence": round(person.presence, DECIMALS),
+        "pixels": rounded(person.points[:, :2]),
+        "visibility": rounded(person.points[:, 2]),
+        "world": rounded(person.world),
+    }
+
+
+def read_people(path: Path, content: Any = None) -> tuple[KeypointSet, tuple[ImagePeople, ...]]:
+    """The set and the images of a file. content: its JSON value, if it is known.
+
+    Raises: CaptureError naming file and field.
+    """
+    content = checked_json(path) if content is None else content
+    if not _is_people_file(content):
+        raise CaptureError(path, "format", f"expected {FORMAT!r}")
+    version, name, images = members(content, path, version=int, set=str, images=list)
+    if version != VERSION:
+        raise CaptureError(path, "version", f"expected {VERSION}, got {version!r}")
+    kind = _set_of(name, path)
+    return kind, tuple(
+        _image(each, len(kind.names), path, f"images[{i}]") for i, each in enumerate(images)
+    )
+
+
+def _is_people_file(content: Any) -> bool:
+    return isinstance(content, dict) and content.get("format") == FORMAT
+
+
+def _image(image: Any, count: int, path: Path, field: str) -> ImagePeople:
+    name, width, height, people = members(
+        image, path, field, image=str, width=int, height=int, people=list
+    )
+    found = (
+        _own_person(each, count, path, f"{field}.people[{i}]") for i, each in enumerate(people)
+    )
+    return ImagePeople(name, (width, height), tuple(found))
+
+
+def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson | None:
+    if person is None:
+        return None
+    shapes = {"pixels": (count, 2), "visibility": (count,), "world": (count, 3)}
+    values = members(person, path, field, **dict.fromkeys(shapes, list), presence=float)
+    pixels, visibility, world = (
+        file_numbers(value, path, f"{field}.{key}", shape, nulls=True)
+        for value, (key, shape) in zip(values, shapes.items(), strict=False)
+    )
+    return SeenPerson(np.column_stack([pixels, visibility]), world, float(values[-1]))
+
+
+# OpenPose's --write_json
+# -----------------------------------------------------------------------------------------------
+
+SUFFIX = "_keypoints"
+"""What OpenPose adds to the name of the image."""
+HANDS_OF_OPENPOSE = {"hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
+"""The face, if it is there, is not read."""
+BODY, BODY_POINTS = "pose_keypoints_2d", (25, 18)
+"""Of the body: the models BODY_25 and BODY_25B, and COCO."""
+OTHER_MODELS = {15: "MPI", 135: "BODY_135", 20: "an animal of ControlNet"}
+"""What has other numbers of points."""
+
+
+def recognizes_openpose(source: Source) -> bool:
+    """Whether a file is a JSON object with people, or a list of such."""
+    frames = source.json if isinstance(source.json, list) else [source.json]
+    return bool(frames) and all(isinstance(frame, dict) and "people" in frame for frame in frames)
+
+
+def read_openpose(source: Source, format: SourceFormat) -> Detections:
+    """The people of one image, or of the frames of a video, which programs with nodes write as a
+    list. Raises: CaptureError.
+    """
+    listed, frames = isinstance(source.json, list), source.json
+    frames = frames if listed else [frames]
+    own = not any("canvas_width" in frame for frame in frames) and any(
+        "version" in frame for frame in frames
+    )
+    images = []
+    for i, frame in enumerate(frames):
+        field = f"[{i}]." if listed else ""
+        (entries,) = members(frame, source.path, field.rstrip("."), people=list)
+        people = tuple(
+            _openpose_person(each, source.path, f"{field}people[{j}]", own)
+            for j, each in enumerate(entries)
+        )
+        people = people if any(person.any() for person in people) else ()
+        name: str | int = source.name.removesuffix(SUFFIX)
+        if len(frames) > 1:
+            name = i if source.alone else f"{name}/{i}"
+        images.append(DetectedImage(name, source.path, people, _canvas(frame, source.path)))
+    found = detections_of(images, OPENPOSE_67, OPENPOSE_60)
+    return dataclasses.replace(found, tool="OpenPose" if own else "")
+
+
+def _canvas(frame: dict[str, Any], file: Path) -> tuple[int, int] | None:
+    """Width and height of the image that the points are of, where the file says so."""
+    width, height = frame.get("canvas_width"), frame.get("canvas_height")
+    return (
+        None
+        if width is None or height is None
+        else _stated_size({"width": width, "height": height}, file)
+    )
+
+
+def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np.ndarray, "k 3"]:
+    """own: OpenPose has written it."""
+    if expect(person, dict, file, field).get(BODY) is None:
+        person = person | {BODY: []}
+    (body,) = members(person, file, field, **{BODY: list})
+    count, rest = divmod(len(body), 3)
+    if not rest and count in SETS_BY_COUNT:
+        return triples(body, file, f"{field}.{BODY}")
+    if rest or (count and count not in BODY_POINTS):
+        model = f" of {OTHER_MODELS[count]}" if not rest and count in OTHER_MODELS else ""
+        found = f"{len(body)} numbers" if rest else f"{count} points{model}"
+        known = ", ".join(map(str, sorted((*BODY_POINTS, *SETS_BY_COUNT))))
+        hint = " (OpenPose: --model_pose BODY_25)" if own else ""
+        raise CaptureError(
+            file,
+            f"{field}.{BODY}",
+            f"expected {known} points of x, y, confidence, got {found}{hint}",
+        )
+    return _parts(person, {BODY: count or BODY_POINTS[0], **HANDS_OF_OPENPOSE}, file, field)
+
+
+def _parts(
+    person: dict[str, Any], counts: dict[str, int], file: Path, field: str
+) -> Float[np.ndarray, "k 3"]:
+    """The points of the parts of a person; those that were not detected are left out, null, or
+    empty lists.
+    """
+    points = [
+        np.zeros((count, 3))
+        if person.get(key) in (None, [])
+        else triples(person[key], file, f"{field}.{key}", count)
+        for key, count in counts.items()
+    ]
+    return np.concatenate(points)
+
+
+# EasyMocap's annots
+# --------------------------------------------------------------------------------------------------
+
+EASYMOCAP_HANDS = ("handl2d", "handr2d")
+MOST_PEOPLE = 64
+"""People are in the order of their IDs; beyond this many an ID is no count."""
+
+
+def recognizes_easymocap(source: Source) -> bool:
+    """Whether a file is a JSON object with annots."""
+    return isinstance(source.json, dict) and isinstance(source.json.get("annots"), list)
+
+
+def read_easymocap(source: Source, format: SourceFormat) -> Detections:
+    """The people of one image: person I is the one with that personID, where these are small
+    numbers. Raises: CaptureError.
+    """
+    content, file, people = source.json, source.path, {}
+    for i, entry in enumerate(content["annots"]):
+        field = f"annots[{i}]"
+        members(entry, file, field, keypoints=list)
+        points = lambda key, count, field=field, entry=entry: file_numbers(
+            entry[key], file, f"{field}.{key}", (count, 3), nulls=True
+        )
+        person = points("keypoints", None) if entry["keypoints"] else np.zeros((0, 3))
+        if len(person) == 25:  # BODY_25, perhaps with hands
+            hands = [
+                points(key, 21) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS
+            ]
+            person = np.concatenate([person, *hands])
+        number = entry.get("personID", i)
+        people[
+            number
+            if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people
+            else len(people)
+        ] = person
+    first = next(iter(people.values()), np.zeros((0, 3)))
+    found = tuple(people.get(i, np.zeros_like(first)) for i in range(max(people, default=-1) + 1))
+    name, size = content.get("filename"), (content.get("width"), content.get("height"))
+    known = all(type(side) is int and side > 0 for side in size)
+    image = DetectedImage(
+        name if isinstance(name, str) and name else source.name,
+        file,
+        found,
+        size if known else None,
+    )
+    return detections_of([image], OPENPOSE_67)
+
+
+# COCO
+# --------------------------------------------------------------------------------------------------
+
+COCO_PARTS = {
+    "keypoints": 17,
+    "foot_kpts": 6,
+    "face_kpts": 68,
+    "lefthand_kpts": 21,
+    "righthand_kpts": 21,
+}
+"""COCO-WholeBody's, in the order of its 133 points."""
+HIDDEN_CONFIDENCE = 0.5
+"""For points that an annotator guessed behind something else."""
+LARGEST_VISIBILITY = 2
+
+
+def recognizes_coco(source: Source) -> bool:
+    """Whether a file has annotations, or a list of results that name their image."""
+    if isinstance(source.json, dict):
+        return "annotations" in source.json
+    entries = source.json if isinstance(source.json, list) else []
+    return any(
+        isinstance(entry, dict) and entry.keys() & {"image_id", "file_name"} for entry in entries
+    )
+
+
+def read_coco(source: Source, format: SourceFormat) -> Detections:
+    """The images of a file, those of results in the order in which they first appear.
+
+    Raises: CaptureError.
+    """
+    of_kind = _annotated_images if isinstance(source.json, dict) else _result_images
+    return detections_of(of_kind(source.json, source.path))
+
+
+def _result_images(entries: list[Any], file: Path) -> list[DetectedImage]:
+    whole = _whole_body(entries)
+    people: dict[str | int, list[Float[np.ndarray, "k 3"]]] = {}
+    for i, entry in enumerate(entries):
+        key = "file_name" if "file_name" in expect(entry, dict, file, f"[{i}]") else "image_id"
+        image = _image_label(entry.get(key), file, f"[{i}].{key}")
+        people.setdefault(image, []).append(_coco_person(entry, file, f"[{i}]", whole))
+    return [DetectedImage(image, file, tuple(each)) for image, each in people.items()]
+
+
+def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage]:
+    """Crowds, and annotations without keypoints, are ignored."""
+    described, annotations = members(content, file, images=list, annotations=list)
+    images: dict[str | int, tuple[dict[str, Any], list[Float[np.ndarray, "k 3"]]]] = {}
+    for i, image in enumerate(described):
+        expect(image, dict, file, f"images[{i}]")
+        images[_image_label(image.get("id"), file, f"images[{i}].id")] = (image, [])
+    whole = _whole_body(annotations)
+    for i, entry in enumerate(annotations):
+        field = f"annotations[{i}]"
+        if expect(entry, dict, file, field).get("iscrowd") or "keypoints" not in entry:
+            continue
+        image = _image_label(entry.get("image_id"), file, f"{field}.image_id")
+        if image not in images:
+            raise CaptureError(
+                file,
+                f"{field}.image_id",
+                f"expected the id of one of the images, got {shown(image)}",
+            )
+        images[image][1].append(
+            _by_visibility(_coco_person(entry, file, field, whole), file, field)
+        )
+    name = lambda image, key: _image_label(image.get("file_name", key), file, f"image {key}")
+    found = images.items()
+    return [
+        DetectedImage(name(i, key), file, tuple(people), _stated_size(i, file))
+        for key, (i, people) in found
+    ]
+
+
+def _image_label(value: Any, file: Path, field: str) -> str | int:
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise CaptureError(
+            file, field, f"expected the name or number of an image, got {shown(value)}"
+        )
+    return value
+
+
+def _whole_body(entries: list[Any]) -> bool:
+    """Whether some person has a part of COCO-WholeBody; those who lack it have its points with
+    confidence 0.
+    """
+    return any(
+        isinstance(entry, dict) and len(COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
+    )
+
+
+def _coco_person(
+    entry: dict[str, Any], file: Path, field: str, whole: bool
+) -> Float[np.ndarray, "k 3"]:
+    (keypoints,) = members(entry, file, field, keypoints=list)
+    return (
+        _parts(entry, COCO_PARTS, file, field)
+        if whole
+        else triples(keypoints, file, f"{field}.keypoints")
+    )
+
+
+def _by_visibility(
+    person: Float[np.ndarray, "k 3"], file: Path, field: str
+) -> Float[np.ndarray, "k 3"]:
+    """Confidences from visibilities.
+
+    Fractions occur in COCO-WholeBody, where any value above 0 means reliable.
+    """
+    visibility = person[:, 2]
+    if not np.isnan(visibility).all() and (
+        np.nanmin(visibility) < 0 or np.nanmax(visibility) > LARGEST_VISIBILITY
+    ):
+        raise CaptureError(
+            file, field, f"expected visibilities 0, 1 or 2, got {np.nanmax(np.abs(visibility)):g}"
+        )
+    confidence = np.where(visibility == 1, HIDDEN_CONFIDENCE, np.where(visibility > 0, 1.0, 0.0))
+    return np.column_stack([person[:, :2], np.where(np.isnan(visibility), np.nan, confidence)])
+
+
+def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
+    """Width and height that the file states; 0 means unknown."""
+    width, height = size = image.get("width"), image.get("height")
+    if not width or not height:
+        return None
+    if not all(isinstance(side, int | float) and 1 <= side <= limits().side for side in size):
+        raise CaptureError(
+            file, "images", f"expected width and height in pixels, got {width!r} and {height!r}"
+        )
+    return int(width), int(height)
+
+
+# MMPose's inferencer and demo scripts
+# ----------------------------------------------------------------------------------
+
+PREFIX = "results_"
+"""What the demo scripts put before the name of the image."""
+
+
+def recognizes_mmpose(source: Source) -> bool:
+    """Whether a file has a list of instances or frames; an empty list may be anybody's."""
+    entries = _entries(source)
+    if not isinstance(entries, list):
+        return False
+    return not entries or any(
+        isinstance(each, dict) and each.keys() & {"keypoint_scores", "frame_id"} for each in entries
+    )
+
+
+def read_mmpose(source: Source, format: SourceFormat) -> Detections:
+    """The image of a file, or the frames of a video. Raises: CaptureError."""
+    name, file, entries = source.name.removeprefix(PREFIX), source.path, _entries(source)
+    if not any(isinstance(entry, dict) and "frame_id" in entry for entry in entries):
+        return detections_of([DetectedImage(name, file, _people(entries, file, "instances"))])
+    images = []
+    for i, entry in enumerate(entries):
+        frame, instances = members(entry, file, f"[{i}]", frame_id=int, instances=list)
+        label = frame if source.alone else f"{name}/{frame}"
+        images.append(DetectedImage(label, file, _people(instances, file, f"[{i}].instances")))
+    return detections_of(images)
+
+
+def _entries(source: Source) -> Any:
+    return source.json.get("instance_info") if isinstance(source.json, dict) else source.json
+
+
+def _people(instances: list[Any], file: Path, field: str) -> tuple[Float[np.ndarray, "k 3"], ...]:
+    return tuple(
+        _mmpose_person(instance, file, f"{field}[{i}]") for i, instance in enumerate(instances)
+    )
+
+
+def _mmpose_person(instance: Any, file: Path, field: str) -> Float[np.ndarray, "k 3"]:
+    points, scores = members(instance, file, field, keypoints=list, keypoint_scores=list)
+    points = file_numbers(points, file, f"{field}.keypoints", (None, 2), nulls=True)
+    scores = file_numbers(scores, file, f"{field}.keypoint_scores", (len(points),), nulls=True)
+    return np.column_stack([points, scores])

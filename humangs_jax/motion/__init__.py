@@ -1,0 +1,251 @@
+"""Motions: one body pose per frame, read from the files that people have. `load_motion` is the one
+door.
+
+In memory (`body.motion.Motion`): SMPL-X's 55 joints, axis-angle in radians, metres, y up. Readers
+(`data.formats.MOTIONS` is their table): `arrays`, by key; `clips`, skeletons of other programs,
+which `skeleton` brings to our joints. `rules`: what all of them and the page know, as tables.
+"""
+
+import logging
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.motion import Motion, turned_upright
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.registry import alternatives
+from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
+from humangs_jax.data.formats import MOTIONS, MotionFormat
+from humangs_jax.geometry.axes import UPRIGHT, standing_axis
+from humangs_jax.io.arrays import write_npz
+from humangs_jax.io.reading import FileError, check_limit, open_file, reading
+from humangs_jax.motion import rules, skeleton
+from humangs_jax.motion.face_tracks import FaceTrack, checked_track
+
+__all__ = ["Motion", "MotionError", "load_motion", "save_motion"]
+
+
+logger = logging.getLogger(__name__)
+WALK = "walk.npz"
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif")
+_OF_A_VIDEO = (
+    ", a video: GVHMR, WHAM or TRAM find the motion of the person in it, and their files are read"
+    " (docs/motions.md)"
+)
+OTHERS = {
+    **dict.fromkeys(VIDEOS, _OF_A_VIDEO),
+    ".fbx": ": open it in Blender and export a .bvh or .glb",
+    ".c3d": (
+        ", markers without a skeleton: solve them with the program that recorded them, and export a"
+        " .bvh"
+    ),
+}
+"""What else is said of files that are not read, by suffix."""
+SLOWEST = 0.01
+"""Frames per second: one in more than a minute and a half is no motion."""
+
+
+class MotionError(FileError):
+    """Something is wrong with a motion file; the message is one line: file, key, and what was
+    expected.
+    """
+
+
+class Reading(NamedTuple):
+    """What `load_motion` was asked, as readers need it; see there."""
+
+    fps: float | None = None
+    person: int | None = None
+    clip: str | None = None
+
+
+class Poses(NamedTuple):
+    """What a reader finds: rotations (m, 55, 3), translations (m, 3) and rate, in the world of the
+    file, of which `up` is up.
+
+    fixed: whatever the poses look like; also: other axes that are up in some files of the format,
+    see `rules.up_axis`.
+    frames: (m,) numbers of the frames, whose gaps are filled; None: consecutive. said: lines for
+    the user about the file.
+    face: what the file says of the face.
+    """
+
+    rotations: Float[np.ndarray, "m j 3"]
+    translations: Float[np.ndarray, "m 3"]
+    fps: float
+    up: str = "y"
+    fixed: bool = False
+    also: tuple[str, ...] = ()
+    frames: np.ndarray | None = None
+    said: str = ""
+    face: FaceTrack | None = None
+
+
+@checked_arguments
+def load_motion(
+    path: str | Path | None = None,
+    *,
+    up: str = "auto",
+    fps: float | int | None = None,
+    person: int | None = None,
+    clip: str | int | None = None,
+    rest_joints: Float[Array, "j 3"] | Float[np.ndarray, "j 3"] | None = None,
+) -> Motion:
+    """Read a motion; suffix and content decide the format (docs/motions.md).
+
+    Args:
+        path: None for the shipped walk; else a file or a folder of one of `data.formats.MOTIONS`.
+        up: axis of the file's world that points up ("y", "-y", "z" and so on); the motion is turned
+            so that y does. "auto": the format's own, or another one along which people stand on a
+            floor, which is logged as a warning (`rules.up_axis`).
+        fps: frames per second in place of those in the file.
+        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres:
+            skeletons of other programs are brought to it, and a motion of another number of joints
+            is refused. None: the shipped body.
+        person: the number of the person, in a file of several.
+        clip: of the animations of a GLB file, its name or number. None: the first.
+
+    Returns:
+        Rotations, translations and frames per second.
+
+    Raises:
+        MotionError: one line naming file and key.
+
+    Examples:
+        >>> motion = hg.load_motion("dance.bvh", rest_joints=avatar.rest_joints)
+    """
+    if up not in ("auto", *UPRIGHT):
+        raise ValueError(f"up: expected auto, {', '.join(UPRIGHT)}, got {up!r}")
+    if path is None:
+        with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
+            return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise MotionError(
+            path, "fps", f"expected a positive number of frames per second, got {fps}"
+        )
+    with reading(path, "motion", MotionError):
+        options = Reading(
+            None if fps is None else float(fps), person, None if clip is None else str(clip)
+        )
+        return _load(Path(path), up, options, rest_joints)
+
+
+def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array | None) -> Motion:
+    read = _reader(path)
+    body = lambda: (
+        skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
+    )
+    with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
+        found = read(path, options)
+        if isinstance(found, skeleton.Clip):
+            rate = skeleton.whole_rate(found.fps)
+            rotations, translations, said = skeleton.retargeted(found, body(), up)
+        else:
+            rate = found.fps
+            axis, said = _up_of(found, body) if up == "auto" else (up, "")
+            rotations, translations = turned_upright(found.rotations, found.translations, axis)
+    if rest_joints is not None and rotations.shape[1] != len(rest_joints):
+        raise MotionError(
+            path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}"
+        )
+    with np.errstate(over="ignore"):  # what is no float32 is infinite from here on
+        rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
+    if not np.isfinite(rotations).all():
+        raise MotionError(path, "", "expected rotations and a skeleton of finite size")
+    if (largest := np.abs(rotations).max()) > LARGEST_TURN:
+        raise MotionError(
+            path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}"
+        )
+    if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
+        limit = f"at most {LARGEST_DISTANCE:g} from the origin"
+        raise MotionError(path, "", f"expected metres, {limit}, got {farthest:g}")
+    check_limit("frames", len(rotations), "frames")
+    rate = rate if options.fps is None else options.fps
+    check_limit("rate", rate, "frames per second")
+    if rate < SLOWEST:
+        raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
+    names, faces = ((), None) if found.face is None else checked_track(found.face, len(rotations))
+    motion = Motion(
+        jnp.asarray(rotations),
+        jnp.asarray(translations),
+        rate,
+        None if faces is None else jnp.asarray(faces),
+        names,
+    )
+    if isinstance(found, Poses) and found.frames is not None:
+        motion, filled = _without_gaps(motion, found.frames, path)
+        said = "; ".join(filter(None, (said, filled)))
+    if said := "; ".join(filter(None, (found.said, said))):
+        logger.warning("%s: %s", path, said)
+    return motion
+
+
+def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motion, str]:
+    """The motion with the frames in which nobody was seen, between those before and after, and what
+    is to be said.
+    """
+    steps = np.diff(np.asarray(frames, float))
+    if not len(steps):
+        return motion, ""
+    if not (np.isfinite(steps).all() and (steps > 0).all()):
+        raise MotionError(path, "frames", "expected increasing numbers of frames")
+    step = float(steps.min())
+    count = float(steps.sum()) / step + 1
+    if count <= len(frames) + 0.5 or (steps % step > 1e-6).any():
+        return motion, ""
+    check_limit("frames", count, "frames")
+    every = np.arange(round(count))
+    motion = motion._at(np.interp(every, np.cumsum([0, *steps]) / step, np.arange(len(frames))))
+    return motion, f"nobody in {len(every) - len(frames)} of {len(every)} frames: filled in between"
+
+
+def _reader(path: Path) -> MotionFormat:
+    """The format of a file, of its suffix or, of archives of arrays, of its content.
+
+    Raises: MotionError.
+    """
+    if not path.exists():
+        raise MotionError(path, "", "no such file")
+    found = MOTIONS.recognized(path)
+    if found is None and path.is_file() and not MOTIONS.of(path):
+        with open_file(path) as file:
+            found = MOTIONS["humangs"] if file.read(2) == b"PK" else None
+    if found is None:
+        got = path.suffix or "no suffix"
+        hint = OTHERS.get(path.suffix.lower(), "")
+        raise MotionError(
+            path,
+            "",
+            f"no motion: expected a file {alternatives(MOTIONS.suffixes)}, got {got}{hint}",
+        )
+    return found
+
+
+def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
+    rotations, translations, usual = poses.rotations, poses.translations, poses.up
+    stands = None if poses.fixed else standing_axis(rotations[:, 0])
+    if (
+        stands in (None, usual) or len(joints := body()) != rotations.shape[1]
+    ):  # another number is refused later
+        return usual, ""
+    chosen = rules.sampled_frames(len(rotations))
+    points = rules.joint_places(joints, rotations[chosen], translations[chosen])
+    return rules.up_axis(points, stands, usual, poses.fps, poses.also)
+
+
+def save_motion(path: str | Path, motion: Motion) -> None:
+    """Write our own format, compressed; the file appears whole or not at all."""
+    arrays: dict[str, Any] = {
+        "rotations": motion.rotations,
+        "translations": motion.translations,
+        "fps": motion.fps,
+    }
+    if motion.expressions is not None:
+        arrays["expressions"] = motion.expressions
+        arrays["expression_names"] = np.asarray(motion.expression_names)
+    write_npz(path, arrays)

@@ -1,0 +1,470 @@
+"""Motions in files of arrays: the keys decide the format (`data.formats`), whose rows say what is
+under them.
+
+SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole
+hands; 22 (66) are the body. Rotations are axis-angles or matrices (three times as many numbers).
+What a file does not have (fingers, eyes) is 0.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.formats import PLACES, ArrayKeys
+from humangs_jax.geometry.mesh import smallest_turns, unit
+from humangs_jax.io.arrays import ArrayFile
+from humangs_jax.io.reading import Refused
+from humangs_jax.io.restricted_pickle import as_array
+from humangs_jax.io.tensors import read_values
+from humangs_jax.motion import MotionError, Poses, Reading, skeleton
+from humangs_jax.motion.face_tracks import FaceTrack, checked_track
+from humangs_jax.motion.people import SHOWN, Person, are_rotations, format_of, read_people
+from humangs_jax.motion.rules import (
+    COLUMNS,
+    HAND_NUMBERS,
+    MILLIMETRES,
+    NO_PLACES,
+    NO_RATE,
+    PELVIS,
+    joint_places,
+)
+from humangs_jax.motion.skeleton import Clip
+from humangs_jax.motion.vectors import frames_first
+
+HEAD = JOINT_NAMES.index("head")
+Rotations = Float[np.ndarray, "m n 3"]
+"""Axis-angles of the frames."""
+NO_RATE_AT_ALL = (
+    "missing: how many frames are a second? expected --motion-fps (in Python fps=), or this key"
+)
+SOMA_JOINTS = 77
+"""Of Kimodo's skeleton that is not SMPL-X's."""
+NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
+
+
+def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
+    """The poses of one person. Raises: MotionError, naming the key."""
+    person = _chosen(path, read_people(path), options.person)
+    form = format_of(person.values)
+    assert form is not None
+    if form.six:
+        person = person._replace(
+            values=frames_first(person.values, form.poses["all"], form.moves[0])
+        )
+    file = _MotionFile(path, person, options.fps)
+    if form.kind == "points":
+        return clip_of_points(file, file.rate(form))
+    rotations = (
+        file.numbers(form.poses["all"], (None, None, 3))
+        if form.kind == "ours"
+        else _posed(file, form)
+    )
+    moves = _placed(file, form, rotations)
+    face = _face(file, form, len(rotations))
+    frames = (
+        person.frames
+        if person.frames is not None and len(person.frames) == len(rotations)
+        else None
+    )
+    return Poses(
+        rotations,
+        moves,
+        file.rate(form),
+        form.up,
+        form.fixed,
+        form.also,
+        frames,
+        "; ".join(file.said),
+        face,
+    )
+
+
+EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
+"""Keys of SMPL-X's expressions, the first that is there; ours have names."""
+
+
+def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
+    """The expressions of a person; those of other programs that fit no frames are left out, which
+    is said.
+
+    Raises: MotionError for a file of ours.
+    """
+    ours = form.kind == "ours"
+    key = "expressions" if ours else file.first(EXPRESSIONS)
+    if key not in file.values:
+        return None
+    values = np.atleast_1d(file.numbers(key, None))
+    if values.ndim == 1 and not ours:  # one face for all frames
+        values = np.broadcast_to(values, (count, len(values)))
+    if values.shape[:1] == (count,) and not ours:
+        values = values.reshape(count, -1)
+    if ours:
+        named = [str(name) for name in np.ravel(file.values.get("expression_names", ()))]
+        names = tuple(named)
+    else:
+        names = tuple(f"expression_{i}" for i in range(values.shape[-1]))
+    track = FaceTrack(names, values)
+    try:
+        checked_track(track, count)
+    except Refused as error:
+        if ours:
+            raise
+        file.said.append(f"{key} is left out: {error}")
+        return None
+    return track
+
+
+def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
+    names = [person.name for person in people]
+    if number is None and len(people) == 1:
+        return people[0]
+    if number is not None:
+        if str(number) in names:
+            return people[names.index(str(number))]
+        if 0 <= number < len(people) and not any(name.isdigit() for name in names):
+            return people[number]
+    counted = ", ".join(
+        f"{person.name or 0} ({_frames(person)} frames)" for person in people[:SHOWN]
+    )
+    counted += ", ..." if len(people) > SHOWN else ""
+    if number is not None:
+        raise MotionError(path, f"person {number}", f"no such person: expected one of {counted}")
+    raise MotionError(
+        path,
+        "",
+        f"{len(people)} people: {counted}: expected the option or argument person, the number"
+        " of one",
+    )
+
+
+def _frames(person: Person) -> int:
+    form = format_of(person.values)
+    return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys) if form else 0
+
+
+# Rotations
+# --------------------------------------------------------------------------------------------------
+
+
+def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
+    rotations: Rotations | None = None
+    for place, key in form.poses.items():
+        if rotations is not None and key not in file.values:
+            continue
+        values = file.numbers(key, None)
+        if rotations is None:
+            single = values.ndim == 1 or (
+                place == "root" and values.shape == (3, 3) and are_rotations(values)
+            )
+            rotations = np.zeros((1 if single else len(values), len(JOINT_NAMES), 3))
+        count = len(rotations)
+        flat = (
+            values.reshape(count, -1)
+            if count == 1 or len(np.atleast_1d(values)) == count
+            else np.zeros((count, 0))
+        )
+        part = (
+            _all(file, form, key, values, flat)
+            if place == "all"
+            else _part(file, place, key, values, flat)
+        )
+        if (
+            form.pivot == "origin" and place == "all"
+        ):  # the root's own rotation, before that about the origin
+            part = part.copy()
+            part[:, 0] = (
+                Rotation.from_rotvec(rotations[:, 0]) * Rotation.from_rotvec(part[:, 0])
+            ).as_rotvec()
+        first = PLACES[place][0]
+        rotations[:, first : first + part.shape[1]] = part
+    assert rotations is not None
+    return rotations
+
+
+def _part(
+    file: "_MotionFile",
+    place: str,
+    key: str,
+    values: np.ndarray,
+    flat: Float[np.ndarray, "m columns"],
+) -> Rotations:
+    most, (count, width) = PLACES[place][1], flat.shape
+    of_smpl = place in ("limbs", "body")
+    for joints in (most, most + 2) if of_smpl else (most,):
+        if width in (3 * joints, 9 * joints):
+            return _axis_angles(file, key, flat, joints)[:, :most]
+    if 3 * most == HAND_NUMBERS and 0 < width < HAND_NUMBERS:
+        file.said.append(f"{key}: {NO_HANDS.format(width)}")
+        return np.zeros((count, most, 3))
+    shapes = f"({count}, {3 * most})" + (
+        f", or ({count}, {3 * most + 6}) of SMPL" if of_smpl else ""
+    )
+    raise MotionError(file.path, key, f"expected shape {shapes}, got {values.shape}")
+
+
+def _all(
+    file: "_MotionFile",
+    form: ArrayKeys,
+    key: str,
+    values: np.ndarray,
+    flat: Float[np.ndarray, "m columns"],
+) -> Rotations:
+    """Of a pose under one key: what is behind the body of SMPL is left out, of SMPL-H it is the
+    fingers.
+    """
+    count, width = flat.shape
+    if form.pivot == "head" and width == 3 * 53:  # root, body, hands and jaw
+        pose = flat.reshape(count, 53, 3)
+        return np.concatenate(
+            [pose[:, :22], pose[:, 52:], np.zeros_like(pose[:, :2]), pose[:, 22:52]], axis=1
+        )
+    if form.pivot == "origin" and width == 69:  # without the root
+        return np.pad(flat, ((0, 0), (3, 0))).reshape(count, -1, 3)[:, :22]
+    if form.pivot == "origin" and width in (78, 87):  # with coefficients of hands
+        file.said.append(NO_HANDS.format(6))
+        return np.concatenate([flat[:, :66], flat[:, 78:]], axis=1).reshape(count, -1, 3)
+    if width in (75, *COLUMNS, *(3 * number for number in COLUMNS)):
+        joints = width // 3 if width in (75, *COLUMNS) else width // 9
+        pose = _axis_angles(file, key, flat, joints)
+        if joints < 52:  # the last two of 24 are whole hands, the last three of 25 jaw and eyes
+            return pose if joints == 25 else pose[:, :22]
+        face = pose[:, 22:25] if joints == len(JOINT_NAMES) else np.zeros((count, 3, 3))
+        return np.concatenate([pose[:, :22], face, pose[:, -30:]], axis=1)
+    words = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
+    joints = f", {width // 3} joints" if width % 3 == 0 else ""
+    if values.shape[1:] == (SOMA_JOINTS, 3, 3):
+        joints = f", {SOMA_JOINTS} joints of SOMA: write a .bvh of them"
+    raise MotionError(
+        file.path, key, f"expected {words} numbers a frame, got shape {values.shape}{joints}"
+    )
+
+
+def _axis_angles(
+    file: "_MotionFile", key: str, flat: Float[np.ndarray, "m columns"], joints: int
+) -> Rotations:
+    if flat.shape[1] == 3 * joints:
+        return flat.reshape(len(flat), joints, 3)
+    matrices = flat.reshape(-1, 3, 3)
+    if not are_rotations(matrices):
+        raise MotionError(
+            file.path,
+            key,
+            f"expected rotation matrices, got others than rotations in shape {flat.shape}",
+        )
+    return Rotation.from_matrix(matrices).as_rotvec().reshape(len(flat), joints, 3)
+
+
+# Positions
+# --------------------------------------------------------------------------------------------------
+
+
+def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float[np.ndarray, "m 3"]:
+    """(m, 3) translations; turns roots where cameras or the format's convention ask for it."""
+    count, key = len(rotations), file.first(form.moves)
+    if key not in file.values and form.stays and key not in file.pickled:
+        file.said.append(NO_PLACES.format(", ".join(form.moves[:3])))
+        return np.zeros((count, 3))
+    moves = file.numbers(key, None)
+    if (
+        moves.size == 4 * count and moves.shape[0] == count
+    ):  # a weak perspective: scales, then metres beside the axis
+        file.said.append(f"{key} does not tell how far away people are: they stay at one distance")
+        moves = np.concatenate([moves.reshape(count, 4)[:, 2:], np.zeros((count, 1))], axis=1)
+    if moves.size != 3 * count or moves.shape[-1] != 3 or (count > 1 and len(moves) != count):
+        raise MotionError(file.path, key, f"expected shape ({count}, 3), got {moves.shape}")
+    moves = moves.reshape(count, 3)
+    if form.scaling is not None:
+        scale = (
+            float(file.numbers(form.scaling, None).reshape(-1)[0])
+            if form.scaling in file.values
+            else MILLIMETRES
+        )
+        if not scale > 0:
+            raise MotionError(file.path, form.scaling, f"expected a positive number, got {scale}")
+        moves = moves / scale
+    if form.pivot == "origin":
+        return (
+            moves
+            + Rotation.from_rotvec(file.numbers(form.poses["root"], None).reshape(count, 3)).apply(
+                PELVIS
+            )
+            - PELVIS
+        )
+    if form.pivot == "joint":
+        moves = moves - PELVIS
+    if form.pivot == "head":
+        joints = skeleton.shipped_joints()
+        moves = moves - joint_places(joints, rotations, np.zeros((count, 3)))[:, HEAD]
+    camera = _cameras(file, count)
+    if camera is None:
+        return moves
+    turns, places = camera
+    rotations[:, 0] = (
+        Rotation.from_matrix(turns) * Rotation.from_rotvec(rotations[:, 0])
+    ).as_rotvec()
+    return np.einsum("mab,mb->ma", turns, moves + PELVIS) + places - PELVIS
+
+
+def _cameras(
+    file: "_MotionFile", count: int
+) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]] | None:
+    """Rotations and places of the cameras in the world for each frame, where files tell; None: they
+    do not.
+    """
+    if "cam2world" in file.values:
+        matrices = file.numbers(
+            "cam2world", (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)
+        ).reshape(-1, 4, 4)
+        turns, places = matrices[:, :3, :3], matrices[:, :3, 3]
+    elif "pred_rotmat" in file.values:
+        folders = (file.path, *file.path.parents[:2])
+        beside = next(
+            (each / "camera.npy" for each in folders if (each / "camera.npy").is_file()), None
+        )
+        if beside is None:
+            file.said.append("no camera.npy beside it: people move as the camera sees them")
+            return None
+        camera = ArrayFile(beside, read_values(beside), error=MotionError)
+        own = file.numbers(file.first(("frame", "frames")), (count,)).astype(int)
+        kind = "world" if "world_cam_R" in camera else "pred"
+        turns, places = (
+            camera.numbers(f"{kind}_cam_R", (None, 3, 3)),
+            camera.numbers(f"{kind}_cam_T", (None, 3)),
+        )
+        if own.min() < 0 or own.max() >= min(len(turns), len(places)):
+            raise MotionError(
+                beside,
+                f"{kind}_cam_R",
+                f"expected one for each of {own.max() + 1} frames, got {len(turns)}",
+            )
+        turns, places = turns[own], places[own]
+    else:
+        return None
+    if not are_rotations(turns):
+        raise MotionError(file.path, "", "expected rotation matrices of cameras")
+    return turns, places
+
+
+class _MotionFile(ArrayFile):
+    """The values of a person, and what is to be said."""
+
+    def __init__(self, path: Path, person: Person, fps: float | None):
+        super().__init__(path, person.values, person.pickled, MotionError)
+        self.fps = fps
+        self.said: list[str] = []
+
+    def first(self, keys: tuple[str, ...]) -> str:
+        """The first key that the file has; the first of all if it has none."""
+        return next((key for key in keys if key in self.values), keys[0])
+
+    def rate(self, form: ArrayKeys) -> float:
+        """Frames per second: those asked for, or under the first of the keys that is there."""
+        if self.fps is not None:
+            return self.fps
+        key = self.first(form.rates) if form.rates else ""
+        if key in self.values:
+            rate = float(self.numbers(key, None).reshape(-1)[0])
+            if not (rate > 0 and np.isfinite(1 / rate)):
+                raise MotionError(
+                    self.path, key, f"expected a positive number of frames per second, got {rate}"
+                )
+            return rate
+        if form.fps is None:
+            raise MotionError(self.path, key, NO_RATE_AT_ALL)
+        if not form.fixed:
+            self.said.append(
+                f"{NO_RATE.format(form.fps)}, which --motion-fps (in Python fps=) changes"
+            )
+        return form.fps
+
+
+# Points in space: SAM 3D Body
+# ------------------------------------------------------------------------------------------
+
+RIG = {
+    1: ("pelvis", -1),
+    2: ("left_hip", 1),
+    3: ("left_knee", 2),
+    4: ("left_ankle", 3),
+    8: ("left_foot", 4),
+    18: ("right_hip", 1),
+    19: ("right_knee", 18),
+    20: ("right_ankle", 19),
+    24: ("right_foot", 20),
+    34: ("spine0", 1),
+    35: ("spine1", 34),
+    36: ("spine2", 35),
+    37: ("spine3", 36),
+    110: ("neck", 37),
+    113: ("head", 110),
+    74: ("left_collar", 37),
+    75: ("left_shoulder", 74),
+    76: ("left_elbow", 75),
+    78: ("left_wrist", 76),
+    38: ("right_collar", 37),
+    39: ("right_shoulder", 38),
+    40: ("right_elbow", 39),
+    42: ("right_wrist", 40),
+}
+"""Of the rig's 127: name and the joint above."""
+RIG_JOINTS = 127
+RIG_Y_UP = np.array([1.0, -1.0, -1.0])
+
+
+def clip_of_points(file: Any, fps: float) -> Clip:
+    """The skeleton in motion of an `ArrayFile`. Raises: the file's error, naming the key."""
+    points = _of_frames(file, "pred_joint_coords", (RIG_JOINTS, 3))[:, list(RIG)]
+    if "pred_cam_t" in file.values:
+        points = points + _of_frames(file, "pred_cam_t", (3,), len(points))[:, None]
+    else:
+        file.said.append("the file has no pred_cam_t: people stay in place")
+    index = {joint: i for i, joint in enumerate(RIG)}
+    parents = tuple(index.get(parent, -1) for _, parent in RIG.values())
+    places = points * RIG_Y_UP
+    if "pred_global_rots" in file.values:
+        turns = _of_frames(file, "pred_global_rots", (RIG_JOINTS, 3, 3), len(points))[:, list(RIG)]
+    else:
+        turns = _carried(places, parents)
+    rest = np.zeros(places.shape[1:])
+    for i, p in enumerate(parents):
+        if p >= 0:
+            rest[i] = rest[p] + np.einsum(
+                "mba,mb->ma", turns[:, p], places[:, i] - places[:, p]
+            ).mean(axis=0)
+    names = tuple(name for name, _ in RIG.values())
+    return Clip(names, parents, rest, turns, places, fps, "y", "; ".join(file.said))
+
+
+def _of_frames(
+    file: Any, key: str, shape: tuple[int, ...], count: int | None = None
+) -> Float[np.ndarray, "m ..."]:
+    values = file.numbers(key, None)
+    values = values.reshape(1, *shape) if values.size == np.prod(shape) else values
+    if values.shape[1:] != shape and values.shape[2:] == shape and values.shape[1] == 1:
+        values = values[:, 0]
+    return (
+        values
+        if values.shape == (count or len(values), *shape)
+        else file.numbers(key, (count, *shape))
+    )
+
+
+def _carried(
+    places: Float[np.ndarray, "m s 3"], parents: tuple[int, ...]
+) -> Float[np.ndarray, "m s 3 3"]:
+    """Rotations of bones from the first frame on, where a file has none: the smallest turns down
+    the tree.
+    """
+    turns = np.tile(np.eye(3), (*places.shape[:2], 1, 1))
+    for i, p in enumerate(parents):
+        if p >= 0:
+            first = unit(places[0, i] - places[0, p])
+            turns[:, p] = (
+                smallest_turns(turns[:, p] @ first, unit(places[:, i] - places[:, p])) @ turns[:, p]
+            )
+            turns[:, i] = turns[:, p]
+    return turns

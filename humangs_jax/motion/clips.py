@@ -1,0 +1,365 @@
+"""Skeletons in motion of other programs: BVH files, and the animations of GLB files.
+
+BVH (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html): a tree of joints with
+offsets and channels, then one line of numbers per frame. Rotations are degrees about the axes of
+the channels, in their order: R = R_first R_second R_third. Position channels replace the offset. In
+the rest pose all rotations are 0. A joint's name may have spaces: it ends with its line or before a
+brace.
+
+GLB (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations): one of its animations,
+on the joints of its skin. The rest pose is the one in which the skin was bound to the mesh (inverse
+bind matrices), without a skin that of the nodes. Splines are taken at their keys and interpolated
+linearly.
+"""
+
+import re
+from collections.abc import Container, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import DEFAULT_FPS
+from humangs_jax.core.array_types import Float
+from humangs_jax.io.mesh import parse_glb, read_accessor
+from humangs_jax.io.nodes import (
+    PATHS,
+    Nodes,
+    Tracks,
+    check_finite,
+    node_parents,
+    with_ancestors,
+    world_matrices,
+)
+from humangs_jax.io.reading import (
+    Refused,
+    check_limit,
+    check_unpacked,
+    read_bytes,
+    read_text,
+)
+from humangs_jax.motion import Poses, Reading
+from humangs_jax.motion.face_files import animated_face, face_alone
+from humangs_jax.motion.skeleton import Clip, bytes_of_clip
+
+CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
+_WORD = re.compile(r"(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+")
+_MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
+
+
+def read_bvh(path: Path, options: object = None) -> Clip:
+    """The skeleton of a file in motion.
+
+    Raises: OSError; Refused or FileError, which say what was expected.
+    """
+    text = read_text(path)
+    if text.split(maxsplit=1)[:1] != ["HIERARCHY"]:
+        raise Refused("not a BVH file: expected HIERARCHY first")
+    found = _MOTION.search(text)
+    names, parents, offsets, channels = _tree(text[: found.start() if found else len(text)])
+    if found is None:
+        raise Refused(
+            "cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints"
+        )
+    count, seconds = _number(found[1]), _number(found[2])
+    if not (count >= 1 and count == int(count) and seconds > 0 and np.isfinite(1 / seconds)):
+        raise Refused(
+            f"expected at least one frame and a positive Frame Time, got {found[1]} and {found[2]}"
+        )
+    width = sum(len(each) for each in channels)
+    numbers = _numbers(text[found.end() :])
+    if width == 0 or len(numbers) != count * width:
+        raise Refused(
+            f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers: cut"
+            " short?"
+        )
+    check_unpacked(len(text), bytes_of_clip(int(count), len(names)))
+    turns, places = _posed(parents, offsets, channels, numbers.reshape(int(count), width))
+    return Clip(names, parents, _chained(parents, offsets), turns, places, 1 / seconds)
+
+
+def _tree(
+    text: str,
+) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "s 3"], list[list[str]]]:
+    found = _WORD.finditer(text, len("HIERARCHY") + text.index("HIERARCHY"))
+    words = ((match[1] or match[0], match[2]) for match in found)  # and the name that follows
+    number = lambda: _number(next(words)[0])
+    names, parents, offsets, channels = [], [], [], []
+    open_joints, waiting = [], None  # of the braces that are open; None for the end of a limb
+    try:
+        for word, name in words:
+            here = open_joints[-1] if open_joints else None
+            if name is not None:
+                waiting = (word, " ".join(name.split()))
+            elif word == "{" and waiting is not None:
+                if waiting[0] == "End":
+                    open_joints.append(None)
+                else:
+                    open_joints.append(len(names))
+                    names.append(waiting[1])
+                    parents.append(-1 if here is None else here)
+                    offsets.append(np.zeros(3))
+                    channels.append([])
+                    check_limit("joints", len(names), "joints")
+                waiting = None
+            elif word == "}" and open_joints:
+                open_joints.pop()
+            elif word == "OFFSET" and open_joints:
+                offset = np.asarray([number() for _ in range(3)])
+                if here is not None:
+                    offsets[here] = offset
+            elif word == "CHANNELS" and here is not None:
+                amount = number()
+                channels[here] = [
+                    next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))
+                ]
+                if amount != len(channels[here]) or any(
+                    name not in CHANNELS for name in channels[here]
+                ):
+                    raise Refused(
+                        f"joint {names[here]}: expected up to 6 channels such as Xrotation"
+                    )
+            else:
+                raise Refused(f"unknown word {word}")
+    except StopIteration:
+        raise Refused("cut short") from None
+    if open_joints or waiting is not None or not names:
+        raise Refused(
+            "cut short: a brace of the joints is open" if names else "cut short: no joints"
+        )
+    if parents.count(-1) != 1:
+        raise Refused(f"expected one ROOT, got {parents.count(-1)}")
+    return tuple(names), tuple(parents), np.stack(offsets), channels
+
+
+def _number(word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        raise Refused(f"expected a number, got {word}") from None
+    if not np.isfinite(value):
+        raise Refused(f"expected finite numbers, got {word}")
+    return value
+
+
+def _numbers(text: str) -> Float[np.ndarray, " n"]:
+    try:
+        values = np.fromstring(text, np.float64, sep=" ")
+    except ValueError as error:
+        raise Refused(f"frames: expected numbers: {error}") from None
+    if not np.isfinite(values).all():
+        raise Refused(
+            f"frames: expected finite numbers, got {values[np.argmin(np.isfinite(values))]}"
+        )
+    return values
+
+
+def _chained(
+    parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]
+) -> Float[np.ndarray, "s 3"]:
+    places = np.zeros_like(offsets)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            places[joint] = places[parent] + offsets[joint]
+    return places
+
+
+def _posed(
+    parents: tuple[int, ...],
+    offsets: Float[np.ndarray, "s 3"],
+    channels: list[list[str]],
+    numbers: Float[np.ndarray, "m n"],
+) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
+    frames = len(numbers)
+    turns, places = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
+    at = 0
+    for joint, parent in enumerate(parents):
+        names, columns = channels[joint], numbers[:, at : at + len(channels[joint])]
+        at += len(names)
+        move = np.tile(offsets[joint], (frames, 1))
+        turning = [i for i, name in enumerate(names) if name.endswith("rotation")]
+        for i in set(range(len(names))) - set(turning):
+            move[:, "xyz".index(names[i][0])] = columns[:, i]
+        turn = np.tile(np.eye(3), (frames, 1, 1))
+        for i in turning:
+            turn = (
+                turn @ Rotation.from_euler(names[i][0], columns[:, [i]], degrees=True).as_matrix()
+            )
+        turns[:, joint] = turn if parent < 0 else turns[:, parent] @ turn
+        places[:, joint] = (
+            move
+            if parent < 0
+            else places[:, parent] + np.einsum("mab,mb->ma", turns[:, parent], move)
+        )
+    return turns, places
+
+
+# GLB
+# --------------------------------------------------------------------------------------------------
+
+
+def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
+    """The skeleton of a GLB file in motion, with its face; the face alone of one that turns
+    nothing.
+
+    Raises: OSError; Refused and what damaged numbers raise.
+    """
+    data = read_bytes(path, "mesh_bytes")
+    content, binary = parse_glb(data, "text_bytes")
+    nodes, animations = content.get("nodes", []), content.get("animations", [])
+    if not animations:
+        raise Refused("a GLB file without an animation: expected a skeleton in motion")
+    animation, said = _chosen(animations, options.clip if options else None)
+    alone = face_alone(content, binary, animation, said)
+    if alone is not None:
+        return alone
+    parents = node_parents(nodes)
+    joints, binding = _joints(content, binary, nodes)
+    order = with_ancestors(joints, parents)
+    check_limit("joints", len(order), "joints")
+    tracks = _tracks(content, binary, animation, set(order))
+    times, fps = _times(tracks)
+    check_unpacked(len(data), 3 * bytes_of_clip(len(times), len(order)))
+    posed = world_matrices(nodes, parents, order, tracks, times)
+    rest = world_matrices(nodes, parents, order, {}, np.zeros(1))
+    index = {joint: i for i, joint in enumerate(joints)}
+    bind = np.stack([binding.get(joint, rest[joint][0]) for joint in joints])
+    matrices = np.stack([posed[joint] for joint in joints], axis=1)
+    turns = _rotations(matrices) @ np.swapaxes(_rotations(bind), -1, -2)
+    bones = _humanoid(content)
+    names = tuple(bones.get(joint, str(nodes[joint].get("name", ""))) for joint in joints)
+    above = tuple(index.get(_next_joint(parents, joint, index), -1) for joint in joints)
+    face, of_face = animated_face(content, binary, animation, times)
+    said = "; ".join(filter(None, (said, of_face)))
+    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", said, face)
+
+
+SHOWN = 12
+"""Names of animations in a line."""
+
+
+def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
+    """The animation of a name or number, the first if none is asked for, and what is to be said.
+
+    Raises: Refused.
+    """
+    names = [str(each.get("name", i)) for i, each in enumerate(animations)]
+    listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+    if clip is None:
+        said = (
+            f"{len(names)} animations ({listed}): the first is taken; the option or argument clip"
+            " takes another"
+        )
+        return animations[0], said if len(names) > 1 else ""
+    plain = [name.casefold() for name in names]
+    if clip.casefold() in plain:
+        return animations[plain.index(clip.casefold())], ""
+    if clip.isdecimal() and int(clip) < len(names):
+        return animations[int(clip)], ""
+    raise Refused(f"clip {clip}: expected one of {listed}")
+
+
+def _humanoid(content: dict[str, Any]) -> dict[int, str]:
+    """Names of the bones by node, of files that say them (VRM and its animations): nodes may be
+    called anything.
+    """
+    extensions = content.get("extensions")
+    for each in extensions.values() if isinstance(extensions, dict) else ():
+        bones = each.get("humanoid", {}).get("humanBones", {}) if isinstance(each, dict) else {}
+        if isinstance(bones, list):  # of VRM 0
+            bones = {str(bone.get("bone")): bone for bone in bones if isinstance(bone, dict)}
+        named = {
+            bone["node"]: name
+            for name, bone in bones.items()
+            if isinstance(bone, dict) and type(bone.get("node")) is int
+        }
+        if named:
+            return named
+    return {}
+
+
+def _joints(
+    content: dict[str, Any], binary: bytes, nodes: Nodes
+) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
+    """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far
+    as the file tells.
+    """
+    skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
+    if not skins:
+        return list(range(len(nodes))), {}
+    skin = max(skins, key=lambda each: len(each["joints"]))
+    joints = skin["joints"]
+    if any(type(joint) is not int or not 0 <= joint < len(nodes) for joint in joints):
+        raise Refused("skins: a joint that is no node")
+    joints = list(dict.fromkeys(joints))
+    if "inverseBindMatrices" not in skin or len(joints) != len(skin["joints"]):
+        return joints, {}
+    inverse = (
+        read_accessor(content, binary, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    )
+    check_finite(inverse, "inverseBindMatrices")
+    return joints, dict(zip(joints, np.linalg.inv(inverse), strict=True))
+
+
+def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> int:
+    joint = parents[joint]
+    while joint != -1 and joint not in joints:
+        joint = parents[joint]
+    return joint
+
+
+def _tracks(
+    content: dict[str, Any], binary: bytes, animation: dict[str, Any], wanted: Container[int]
+) -> Tracks:
+    tracks: dict[tuple[int, str], Any] = {}
+    for channel in animation["channels"]:
+        node, path = channel["target"].get("node"), channel["target"]["path"]
+        if node not in wanted or path not in PATHS:
+            continue
+        if (node, path) in tracks:
+            raise Refused(f"animation: two tracks for the {path} of node {node}")
+        sampler = animation["samplers"][channel["sampler"]]
+        times = read_accessor(content, binary, sampler["input"])[:, 0]
+        values = read_accessor(content, binary, sampler["output"])
+        if sampler.get("interpolation") == "CUBICSPLINE":
+            values = values.reshape(-1, 3, values.shape[1])[:, 1]  # between the tangents
+        check_finite(values, path)
+        if (
+            not len(times)
+            or values.shape != (len(times), PATHS[path])
+            or not (np.diff(times) > 0).all()
+        ):
+            raise Refused(f"animation: expected one {path} for each of increasing times")
+        check_finite(times, "times")
+        tracks[node, path] = times, values, sampler.get("interpolation") == "STEP"
+    if not any(path == "rotation" for _, path in tracks):
+        raise Refused("an animation that turns no joint: expected a skeleton in motion")
+    return tracks
+
+
+def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
+    """Times of the frames in seconds, as close as those of the densest track, and their rate."""
+    first, last = (
+        pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1))
+    )
+    dense = max((times for times, _, _ in tracks.values()), key=len)
+    if len(dense) < 2 or not last > first:
+        return np.asarray([first]), DEFAULT_FPS
+    fps = (len(dense) - 1) / float(dense[-1] - dense[0])
+    count = round((last - first) * fps) + 1
+    if count > 4 * len(dense):
+        raise Refused("animation: tracks of very different lengths")
+    return first + np.arange(count) / fps, fps
+
+
+def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3 3"]:
+    """The rotations in matrices of rotation and scale. Raises: Refused where there is none."""
+    linear = matrices[..., :3, :3]
+    lengths = np.linalg.norm(linear, axis=-2, keepdims=True)
+    if not (lengths > 0).all() or not (np.linalg.det(linear) > 0).all():
+        raise Refused(
+            "a joint that is mirrored or without size: expected rotations, positions and scales"
+        )
+    flat = (linear / lengths).reshape(-1, 3, 3)
+    return Rotation.from_matrix(flat).as_matrix().reshape(linear.shape)

@@ -1,0 +1,359 @@
+"""Files of faces: tables of ARKit's shapes (Live Link Face), scores of MediaPipe, expressions in
+animations of GLB and VRMA.
+
+Tables and scores have no body: the person stands with the arms down, and the head turns where the
+file says how.
+
+A table (.csv) has a line of names, then a line of numbers for each frame. Columns may be in any
+order; names are compared without case ("EyeBlinkLeft", "eyeBlinkLeft", "eyeBlink_L"). `HeadYaw`,
+`HeadPitch`, `HeadRoll` are radians. `Timecode` is HH:MM:SS:FF, with or without parts of a frame.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import DEFAULT_FPS, JOINT_NAMES
+from humangs_jax.core.array_types import Float
+from humangs_jax.io.mesh import read_accessor
+from humangs_jax.io.reading import (
+    Refused,
+    check_limit,
+    check_unpacked,
+    read_json,
+    read_text,
+    reading,
+    shown,
+)
+from humangs_jax.motion import MotionError, Poses, Reading
+from humangs_jax.motion.face_tracks import (
+    ARKIT,
+    FaceTrack,
+    arkit_name,
+    as_arkit,
+    checked_track,
+    clipped,
+)
+from humangs_jax.motion.rules import NO_RATE
+
+ARMS_DOWN = 1.15
+"""Radians by which the arms of a person hang down who has a face and no motion."""
+FEWEST = 5
+"""Shapes of ARKit that make a table or an object one of faces."""
+HEAD_TURNS = ("headpitch", "headyaw", "headroll")
+"""Names of columns: rotations about x, y, z, radians."""
+RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
+"""Frames per second of timecodes, whose last number stays below."""
+LIVE_LINK_FPS = 60.0
+"""Of timecodes that are too short to tell."""
+MOST_COLUMNS = 1000
+DEEPEST = 5
+"""Objects and lists within each other, down to the scores of a frame."""
+
+
+# Tables
+# --------------------------------------------------------------------------------------------------
+
+
+def read_table(path: Path, options: Reading) -> Poses:
+    """A face in a table. Raises: MotionError or Refused, naming the column or the line."""
+    rows = csv.reader(io.StringIO(read_text(path)))
+    try:
+        lines = [row for row in rows if any(word.strip() for word in row)]
+    except csv.Error as error:
+        raise Refused(f"line {rows.line_num}: {error}") from None
+    names = [name.strip() for name in lines[0]] if lines else []
+    shapes = {arkit_name(name): i for i, name in reversed(list(enumerate(names)))}
+    shapes.pop(None, None)
+    if len(shapes) < FEWEST or len(names) > MOST_COLUMNS:
+        raise Refused(
+            "expected a line with names of ARKit's shapes such as EyeBlinkLeft, got"
+            f" {', '.join(names[:4]) or 'nothing'}"
+        )
+    lines = [row for row in lines[1:] if [word.strip() for word in row] != names]
+    if not lines:
+        raise Refused("expected a line of numbers for each frame, got none")
+    check_limit("frames", len(lines), "frames")
+    plain = {re.sub(r"[^a-z]", "", name.lower()): i for i, name in enumerate(names)}
+    column = lambda i: np.asarray(
+        [_number(row, i, names[i], line) for line, row in enumerate(lines)]
+    )
+    values = np.zeros((len(lines), len(ARKIT)))
+    for name, i in shapes.items():
+        values[:, ARKIT.index(str(name))] = column(i)
+    turns = [column(plain[name]) if name in plain else 0.0 for name in HEAD_TURNS]
+    head = np.stack([np.broadcast_to(turn, len(lines)) for turn in turns], axis=1)
+    codes = [row[plain["timecode"]] for row in lines] if "timecode" in plain else []
+    fps, frames, said = _times(codes, options.fps)
+    return _standing(
+        values, Rotation.from_euler("YXZ", head[:, [1, 0, 2]]).as_rotvec(), fps, frames, said
+    )
+
+
+def _number(row: Sequence[str], index: int, name: str, line: int) -> float:
+    word = row[index].strip() if index < len(row) else ""
+    try:
+        return float(word)
+    except ValueError:
+        raise Refused(f"line {line + 2}: {name}: expected a number, got {shown(word)}") from None
+
+
+def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray | None, str]:
+    """Frames per second, the numbers of the frames (None: consecutive), and what is to be said."""
+    parts = [re.fullmatch(r"\s*(\d+):(\d+):(\d+)[:;.](\d+(?:\.\d+)?)\s*", code) for code in codes]
+    if not parts or any(part is None for part in parts):
+        said = NO_RATE.format(DEFAULT_FPS) + ", which --motion-fps (in Python fps=) changes"
+        return (DEFAULT_FPS, None, said) if asked is None else (asked, None, "")
+    clock = np.asarray([[float(x) for x in part.groups()] for part in parts if part is not None])
+    seconds, within = clock[:, :3] @ (3600.0, 60.0, 1.0), clock[:, 3]
+    long_enough = np.ptp(seconds) >= 2
+    fitting = [rate for rate in RATES if rate > np.floor(within.max())]
+    rate = fitting[0] if long_enough and fitting else LIVE_LINK_FPS
+    numbers = np.rint(seconds * rate + within)
+    steps = np.diff(numbers)
+    if not len(steps) or not (steps > 0).all():
+        return rate if asked is None else asked, None, ""
+    return rate / float(steps.min()) if asked is None else asked, numbers, ""
+
+
+def _standing(
+    values: Float[np.ndarray, "m e"],
+    head: Float[np.ndarray, "m 3"],
+    fps: float,
+    frames: np.ndarray | None = None,
+    said: str = "",
+) -> Poses:
+    """A person with this face who stands with the arms down. head: rotations, axis-angle."""
+    track = FaceTrack(ARKIT, clipped(values))
+    checked_track(track, len(values))
+    if not np.isfinite(head).all():
+        raise Refused("head: expected finite numbers")
+    rotations = np.zeros((len(values), len(JOINT_NAMES), 3))
+    rotations[:, JOINT_NAMES.index("left_shoulder"), 2] = -ARMS_DOWN
+    rotations[:, JOINT_NAMES.index("right_shoulder"), 2] = ARMS_DOWN
+    rotations[:, JOINT_NAMES.index("head")] = head
+    return Poses(
+        rotations, np.zeros((len(values), 3)), fps, fixed=True, frames=frames, said=said, face=track
+    )
+
+
+# Scores of MediaPipe
+# --------------------------------------------------------------------------------------------------
+
+
+def has_scores(path: Path) -> bool:
+    """Whether a JSON file is one of scores. Raises: FileError if it is no JSON."""
+    return _frames_of(read_json(path)) is not None
+
+
+def read_scores(path: Path, options: Reading) -> Poses:
+    """A face in scores. Raises: MotionError, naming what is wrong."""
+    with reading(path, "scores of a face", MotionError):
+        content = read_json(path)
+        frames = _frames_of(content)
+        if frames is None:
+            raise Refused("expected a list of frames with scores of ARKit's shapes")
+        check_limit("frames", len(frames), "frames")
+        seen = [i for i, frame in enumerate(frames) if frame]
+        known = np.zeros((len(seen), len(ARKIT)))
+        for row, i in enumerate(seen):
+            for name, score in frames[i].items():
+                known[row, ARKIT.index(name)] = score
+        every = np.arange(
+            seen[0], seen[-1] + 1
+        )  # frames in which nobody was seen lie between the others
+        values = np.stack([np.interp(every, seen, column) for column in known.T], axis=1)
+        fps, said = options.fps, ""
+        given = content.get("fps") if isinstance(content, dict) else None
+        if fps is None and isinstance(given, int | float) and 0 < given < 1e6:
+            fps = float(given)
+        if fps is None:
+            fps, said = DEFAULT_FPS, NO_RATE.format(DEFAULT_FPS)
+        return _standing(values, np.zeros((len(values), 3)), fps, None, said)
+
+
+def _frames_of(content: Any) -> list[dict[str, float]] | None:
+    """The scores of each frame, empty where nobody was seen; None if there are none in the
+    content.
+    """
+    if isinstance(content, dict):
+        lists = [value for value in content.values() if isinstance(value, list)]
+        found = [frames for value in lists if (frames := _frames_of(value)) is not None]
+        return found[0] if found else None
+    if not isinstance(content, list):
+        return None
+    frames = [_scores_of(each, 0) for each in content]
+    return frames if any(frames) else None
+
+
+def _scores_of(frame: Any, depth: int) -> dict[str, float]:
+    """Scores by ARKit's names in one frame: an object of them, or a list of categories, however
+    deep.
+    """
+    if depth > DEEPEST:
+        return {}
+    if isinstance(frame, dict):
+        named = {arkit_name(str(name)): value for name, value in frame.items()}
+        named.pop(None, None)
+        if len(named) >= FEWEST:
+            return {str(name): _score(name, value) for name, value in named.items()}
+        inner = list(frame.values())
+    elif isinstance(frame, list):
+        categories = [each for each in frame if isinstance(each, dict) and "score" in each]
+        named = {arkit_name(_category(each)): each["score"] for each in categories}
+        named.pop(None, None)
+        if len(named) >= FEWEST:
+            return {str(name): _score(name, value) for name, value in named.items()}
+        inner = frame
+    else:
+        return {}
+    for each in inner[:MOST_COLUMNS]:
+        if found := _scores_of(each, depth + 1):
+            return found
+    return {}
+
+
+def _category(entry: Mapping[str, Any]) -> str:
+    keys = ("categoryName", "category_name", "displayName", "display_name", "name")
+    return next((str(entry[key]) for key in keys if entry.get(key)), "")
+
+
+def _score(name: object, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise Refused(f"{name}: expected a number, got {shown(value)}")
+    return float(value)
+
+
+# Animations
+# --------------------------------------------------------------------------------------------------
+
+
+def animated_face(
+    content: dict[str, Any],
+    binary: bytes,
+    animation: Mapping[str, Any],
+    times: Float[np.ndarray, " m"],
+) -> tuple[FaceTrack | None, str]:
+    """The expressions in an animation of a GLB or VRMA file at some seconds, as ARKit's shapes;
+    and what is to be said.
+    """
+    tracks = _expression_tracks(content, binary, animation) or _weight_tracks(
+        content, binary, animation
+    )
+    if not tracks:
+        return None, ""
+    names = tuple(tracks)
+    check_unpacked(len(binary), 8 * len(times) * len(names))
+    values = np.stack(
+        [np.interp(times, keys, weights) for keys, weights in tracks.values()], axis=1
+    )
+    if not np.isfinite(values).all():
+        raise Refused("animation: expected finite weights of shapes")
+    track, unknown = as_arkit(FaceTrack(names, values))
+    if not unknown:
+        return track, ""
+    listed = ", ".join(unknown[:6]) + (", ..." if len(unknown) > 6 else "")
+    return track, f"{len(unknown)} shapes are none of ARKit's and left out ({listed})"
+
+
+Weights = dict[str, tuple[np.ndarray, np.ndarray]]
+"""By the name of a shape: seconds, increasing, and the weight at each."""
+
+
+def _keys_of(
+    content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], channel: Mapping[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds (k,) and values (k, c) of a channel.
+
+    Raises: Refused unless there is a row for each of increasing times.
+    """
+    sampler = animation["samplers"][channel["sampler"]]
+    times = read_accessor(content, binary, sampler["input"])[:, 0]
+    values = read_accessor(content, binary, sampler["output"])
+    if not len(times) or not (np.diff(times) > 0).all() or values.size % len(times):
+        raise Refused("animation: expected one row of weights for each of increasing times")
+    if sampler.get("interpolation") == "CUBICSPLINE":
+        if values.size % (3 * len(times)):
+            raise Refused("animation: expected tangents beside each row of weights")
+        values = values.reshape(len(times), 3, -1)[:, 1]  # between the tangents
+    return times, values.reshape(len(times), -1)
+
+
+def _expression_tracks(
+    content: dict[str, Any], binary: bytes, animation: Mapping[str, Any]
+) -> Weights:
+    """Of a VRMA file: the weight of an expression is how far its node is moved along x."""
+    extension = (content.get("extensions") or {}).get("VRMC_vrm_animation", {})
+    expressions = extension.get("expressions", {}) if isinstance(extension, dict) else {}
+    nodes = {
+        entry["node"]: str(name)
+        for group in ("preset", "custom")
+        for name, entry in (expressions.get(group) or {}).items()
+        if isinstance(entry, dict) and type(entry.get("node")) is int
+    }
+    if len(nodes) > MOST_COLUMNS:
+        raise Refused(f"{len(nodes)} expressions: expected at most {MOST_COLUMNS}")
+    tracks = {}
+    for channel in animation["channels"]:
+        name = nodes.get(channel["target"].get("node"))
+        if name is None or name in tracks:
+            continue
+        if channel["target"]["path"] == "translation":
+            times, values = _keys_of(content, binary, animation, channel)
+            tracks[name] = times, values[:, 0]
+    return tracks
+
+
+def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[str, Any]) -> Weights:
+    """Of a GLB file: the weights of the targets of a mesh, by their names; of the mesh with most
+    names that are ARKit's.
+    """
+    found: list[Weights] = []
+    channels = [each for each in animation["channels"] if each["target"]["path"] == "weights"]
+    if len(channels) > MOST_COLUMNS:
+        raise Refused(f"{len(channels)} meshes with weights: expected at most {MOST_COLUMNS}")
+    for channel in channels:
+        node = content["nodes"][channel["target"]["node"]]
+        mesh = content["meshes"][node["mesh"]]
+        times, values = _keys_of(content, binary, animation, channel)
+        names = _target_names(mesh, values.shape[1])
+        found.append({name: (times, values[:, i]) for i, name in enumerate(names)})
+    known = lambda tracks: sum(arkit_name(name) is not None for name in tracks)
+    return max(found, key=known, default={})
+
+
+def _target_names(mesh: Mapping[str, Any], count: int) -> list[str]:
+    """Names of the targets of a mesh; numbers where it has none."""
+    places = [mesh, *mesh.get("primitives", [])]
+    for place in places:
+        names = (place.get("extras") or {}).get("targetNames")
+        if isinstance(names, list) and len(names) == count:
+            return [str(name) for name in names]
+    return [str(i) for i in range(count)]
+
+
+def face_alone(
+    content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], said: str
+) -> Poses | None:
+    """The motion of an animation that turns nothing and moves a face; None if it does not."""
+    if any(channel["target"]["path"] == "rotation" for channel in animation["channels"]):
+        return None
+    inputs = [
+        read_accessor(content, binary, animation["samplers"][channel["sampler"]]["input"])[:, 0]
+        for channel in animation["channels"]
+    ]
+    dense = max(inputs, key=len, default=np.zeros(0))
+    if not len(dense) or not np.isfinite(dense).all() or not (np.diff(dense) > 0).all():
+        return None
+    fps = (len(dense) - 1) / float(dense[-1] - dense[0]) if len(dense) > 1 else DEFAULT_FPS
+    track, unknown = animated_face(content, binary, animation, dense)
+    if track is None:
+        return None
+    said = "; ".join(filter(None, (said, unknown)))
+    return _standing(track.values, np.zeros((len(dense), 3)), fps, None, said)

@@ -1,0 +1,319 @@
+"""Which joint of a file's skeleton is which of ours: by names that are known, else by the tree.
+
+By the tree: two limbs of like bones below a joint are legs, two others above it are arms; what
+hangs between the arms ends in the head. A knee or elbow is where the two longest consecutive bones
+of a limb meet. Names or places tell left from right.
+"""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.geometry.mesh import unit
+from humangs_jax.io.reading import Refused
+from humangs_jax.motion.rules import (
+    ENDS,
+    EXPECTED_NAMES,
+    FEW,
+    LIKE,
+    MIDDLE,
+    NEEDED,
+    NOISE,
+    SIDED,
+    SIDES,
+    UNDER,
+)
+
+SHOWN = 12
+Places = Float[np.ndarray, "s 3"]
+Pair = tuple[list[int], list[int]]
+
+
+def matched(
+    names: Sequence[str], parents: Sequence[int], rest: Places, posed: Places
+) -> dict[str, int]:
+    """Index of the file's joint for each of ours that it has. rest, posed: places in the rest pose
+    and in the first frame.
+
+    Raises: Refused if neither names nor the tree tell where those are that are needed.
+    """
+    plain = _plain(names)
+    source = _named(plain)
+    if hips := [source[name] for name in ("left_hip", "right_hip") if name in source][1:]:
+        _place_pelvis(source, parents, (source["left_hip"], *hips))
+    if any(name not in source for name in NEEDED) or not _descends(source, parents):
+        lengths = np.asarray(
+            [0.0 if p < 0 else np.linalg.norm(rest[i] - rest[p]) for i, p in enumerate(parents)]
+        )
+        limbs = _limbs(plain, parents, lengths, posed)
+        if limbs is None:
+            missing = [name for name in NEEDED if name not in source]
+            what = (
+                f"no joint for {', '.join(missing)}"
+                if missing
+                else "joints that do not hang below each other"
+            )
+            found = ", ".join(names[:SHOWN])
+            raise Refused(f"{what}: {EXPECTED_NAMES}, got {found}")
+        body = {
+            f"{side}_{name}"
+            for side in SIDES
+            for name in ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
+        }
+        source = {
+            name: i for name, i in source.items() if name not in body | {"pelvis", "neck", "head"}
+        } | limbs
+    _match_toes(source, parents, rest)
+    _match_head(source, plain, parents)
+    _match_spine(source, parents)
+    return source
+
+
+# Names
+# --------------------------------------------------------------------------------------------------
+
+
+def _plain(names: Sequence[str]) -> list[str]:
+    """Lower-case letters and digits, without the prefixes that all or many names share:
+    "Model:Bip01_L_Thigh" is "lthigh".
+    """
+    words = [re.findall(r"[a-z0-9]+", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
+    words = [[word for word in each if word not in NOISE] for each in words]
+    plain = [re.sub(r"^mixamorig\d*", "", "".join(each)) for each in words]
+    filled = [name for name in plain if name]
+    start = next(
+        (i for i, letters in enumerate(zip(*filled, strict=False)) if len(set(letters)) > 1), 0
+    )
+    return [name[start if len(filled) >= FEW else 0 :] for name in plain]
+
+
+def _named(plain: Sequence[str]) -> dict[str, int]:
+    source: dict[str, int] = {}
+
+    def find(ours: str, theirs: Sequence[str]) -> None:
+        taken = set(source.values())
+        for name in theirs:
+            if name in plain and (index := plain.index(name)) not in taken:
+                source[ours] = index
+                return
+
+    for ours, theirs in MIDDLE.items():
+        find(ours, theirs)
+    for ours, theirs in SIDED.items():
+        for side in SIDES:
+            find(
+                f"{side}_{ours}",
+                [form for x in theirs for form in (side + x, side[0] + x, x + side[0], x + side)],
+            )
+    return source
+
+
+def _ancestors(parents: Sequence[int], joint: int) -> list[int]:
+    """The joint and those above it, from below."""
+    found = []
+    while joint >= 0 and len(found) <= len(parents):
+        found.append(joint)
+        joint = parents[joint]
+    return found
+
+
+def _place_pelvis(source: dict[str, int], parents: Sequence[int], hips: Sequence[int]) -> None:
+    """Where both hips hang, unless the joint of that name is above them."""
+    above = [_ancestors(parents, hip)[1:] for hip in hips]
+    common = [joint for joint in above[0] if joint in above[1]]
+    if common and source.get("pelvis") not in common:
+        source["pelvis"] = common[0]
+
+
+def _descends(source: dict[str, int], parents: Sequence[int]) -> bool:
+    """Whether limbs hang below each other."""
+    pairs = [(f"{side}_{a}", f"{side}_{b}") for a, b in UNDER for side in SIDES]
+    return all(
+        source[a] in _ancestors(parents, source[b])[1:]
+        for a, b in pairs
+        if a in source and b in source
+    )
+
+
+# The tree
+# --------------------------------------------------------------------------------------------------
+
+
+def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]:
+    path = [joint]
+    while children[path[-1]]:
+        path.append(max(children[path[-1]], key=lambda child: reach[child]))
+    return path
+
+
+def _limbs(
+    plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: Places
+) -> dict[str, int] | None:
+    """The joints of arms, legs, pelvis and head by the tree; None where it is not one of a
+    person.
+    """
+    children: list[list[int]] = [[] for _ in parents]
+    for i, p in enumerate(parents):
+        if p >= 0:
+            children[p].append(i)
+    reach = lengths.copy()
+    for i in reversed(range(len(parents))):
+        reach[i] += max((reach[child] for child in children[i]), default=0.0)
+
+    def pair_below(joint: int) -> Pair | None:
+        """The two longest limbs of like bones that hang on a joint, as their joints that bend."""
+        limbs = [
+            limb
+            for child in children[joint]
+            if (limb := _bends(_path(child, children, reach), lengths))
+        ]
+        bones = lambda limb: lengths[limb[1:3]]
+        pairs = [
+            (a, b)
+            for i, a in enumerate(limbs)
+            for b in limbs[:i]
+            if np.abs(bones(a) - bones(b)).max() <= LIKE * max(bones(a).max(), bones(b).max())
+        ]
+        return max(
+            pairs, key=lambda pair: bones(pair[0]).sum() + bones(pair[1]).sum(), default=None
+        )
+
+    above = [_ancestors(parents, joint) for joint in range(len(parents))]
+    found = [
+        (joint, pair) for joint in range(len(parents)) if (pair := pair_below(joint)) is not None
+    ]
+    for pelvis, legs in found:
+        feet = {leg[0] for leg in legs}
+        inside = [
+            each
+            for each in found
+            if pelvis in above[each[0]][1:] and not feet.intersection(above[each[0]])
+        ]
+        if inside:
+            chest, arms = max(inside, key=lambda each: lengths[[*each[1][0][1:3]]].sum())
+            return _sided(plain, parents, posed, pelvis, legs, chest, arms)
+    return None
+
+
+def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
+    """Of the joints of a limb: where its two longest bones in a row begin, meet and end, and the
+    next.
+    """
+    bones = lengths[path[1:]]
+    if len(bones) < 2:
+        return None
+    first = int(np.argmax(np.minimum(bones[1:], bones[:-1])))
+    return (
+        [path[first], path[first + 1], path[first + 2], *path[first + 3 : first + 4]]
+        if bones[first] > 0
+        else None
+    )
+
+
+def _sided(
+    plain: Sequence[str],
+    parents: Sequence[int],
+    posed: Places,
+    pelvis: int,
+    legs: Pair,
+    chest: int,
+    arms: Pair,
+) -> dict[str, int]:
+    up = unit(posed[chest] - posed[pelvis])
+    toes = [posed[leg[3]] - posed[leg[2]] for leg in legs if len(leg) > 3]
+    forward = np.sum(toes, axis=0) if toes else np.array([0.0, 0, 1])
+    left = np.cross(up, forward)
+    source = {"pelvis": pelvis}
+    for limbs, names in (
+        (legs, ("hip", "knee", "ankle", "foot")),
+        (arms, ("shoulder", "elbow", "wrist")),
+    ):
+        sides = [_side(plain, limb) for limb in limbs]
+        if sorted(sides) != sorted(SIDES):
+            across = [float(posed[limb[0]] @ left) for limb in limbs]
+            sides = ["left", "right"] if across[0] > across[1] else ["right", "left"]
+        for side, limb in zip(sides, limbs, strict=True):
+            source |= {f"{side}_{name}": joint for name, joint in zip(names, limb, strict=False)}
+            above = parents[limb[0]]
+            if limbs is arms and above != chest:
+                source[f"{side}_collar"] = above
+    return source
+
+
+def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
+    """Left or right, if all names of a limb begin or end so."""
+    for side in SIDES:
+        if all(
+            plain[j].startswith((side, side[0])) or plain[j].endswith((side, side[0]))
+            for j in limb[:3]
+        ):
+            return side
+    return ""
+
+
+# What follows from limbs
+# --------------------------------------------------------------------------------------------------
+
+
+def _match_toes(source: dict[str, int], parents: Sequence[int], rest: Places) -> None:
+    for side in SIDES:
+        ankle = source[f"{side}_ankle"]
+        below = [
+            i
+            for i, p in enumerate(parents)
+            if p == ankle and np.linalg.norm(rest[i] - rest[ankle]) > 0
+        ]
+        if f"{side}_foot" not in source and below:
+            source[f"{side}_foot"] = max(
+                below, key=lambda i: float(np.linalg.norm(rest[i] - rest[ankle]))
+            )
+
+
+def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[int]) -> None:
+    """What hangs between the arms: the first joint is the neck, the last the head, but for ends of
+    bones.
+    """
+    if "neck" in source or "head" in source:
+        return
+    arms = [_ancestors(parents, source[f"{side}_shoulder"])[1:] for side in SIDES]
+    chest = next((joint for joint in arms[0] if joint in arms[1]), -1)
+    below = [i for i, p in enumerate(parents) if p == chest and not any(i in arm for arm in arms)]
+    below = [i for i in below if i not in source.values()]
+    chains = []
+    for i in below:
+        chain = [i]
+        while len(children := [j for j, p in enumerate(parents) if p == chain[-1]]) == 1:
+            chain.append(children[0])
+        while len(chain) > 1 and plain[chain[-1]].endswith(ENDS):
+            chain.pop()
+        chains.append(chain)
+    if chains:
+        chain = max(chains, key=len)
+        source |= {"neck": chain[0]} | ({"head": chain[-1]} if len(chain) > 1 else {})
+
+
+def _match_spine(source: dict[str, int], parents: Sequence[int]) -> None:
+    """Spines have one to five joints, called differently everywhere: ours are the first, middle and
+    last of the file's.
+    """
+    chain = []
+    at = (
+        parents[source["neck"]]
+        if "neck" in source
+        else parents[source["head"]]
+        if "head" in source
+        else -1
+    )
+    while at >= 0 and at != source.get("pelvis"):
+        chain.insert(0, at)
+        at = parents[at]
+    last = len(chain) - 1
+    if at >= 0:
+        ours = {
+            "spine3": last,
+            "spine1": 0 if last > 0 else -1,
+            "spine2": last // 2 if last > 1 else -1,
+        }
+        source.update({name: chain[i] for name, i in ours.items() if i >= 0})

@@ -1,0 +1,341 @@
+"""The people in a file or a folder of a motion, and what it says of each: arrays by name.
+
+Estimators put people into dicts by their number, into a list for each frame, along a first axis,
+into files of their own, or into one file a frame; and what they found of a person into dicts by
+coordinates. Of these those of the world are taken first.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from humangs_jax.data.formats import MOTIONS, ArrayKeys
+from humangs_jax.io.arrays import ArrayFile, read_npy
+from humangs_jax.io.reading import Refused, check_limit, open_file, read_json, visible
+from humangs_jax.io.restricted_pickle import as_array, objects
+from humangs_jax.io.tensors import read_values
+from humangs_jax.motion import MotionError
+from humangs_jax.motion.rules import ORTHONORMAL
+from humangs_jax.motion.vectors import hint_for, values_of
+
+INSIDE = (
+    "smpl_params_global",
+    "smplx_world",
+    "smpl_params_incam",
+    "smplx_cam",
+    "pred_smpl_params",
+    "smpl_params",
+    "smpl",
+)
+"""Keys of what was found of a person, the best first."""
+LISTS = ("people", "persons", "annots", "results")
+"""Keys of all people."""
+IDS = ("id", "smpl_id", "track_id", "personID", "person_id")
+"""Keys of the number of a person."""
+FRAMES = ("frame_ids", "frames", "frame", "frame_id")
+"""Keys of the frames in which a person was seen."""
+FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
+"""Where the files of a folder may lie."""
+OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
+"""Suffixes of files of one person each; others are of one frame each."""
+OTHER_FILES = {
+    "this is an avatar: expected a motion to play with it": {"header", "skinning_weights", "means"},
+    "these are keypoints, which `humangs fit` makes poses of": {"points", "confidences", "set"},
+}
+"""What other files of ours are, by keys that they have."""
+DEEPEST, SHOWN = 6, 12
+NEARLY_ORTHONORMAL = 0.1
+"""3 x 3 matrices this close to rotations are those of one person, not vectors of three people;
+`ORTHONORMAL` is checked later.
+"""
+
+
+class Person(NamedTuple):
+    """A person of a file. name: as the file has it. frames: in which the person was seen, None for
+    all.
+    """
+
+    name: str
+    values: Mapping[str, Any]
+    frames: np.ndarray | None = None
+    pickled: tuple[str, ...] = ()
+
+
+def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
+    """The first format whose keys are all there."""
+    rows = (each.arrays for each in MOTIONS.values() if each.arrays is not None)
+    return next((row for row in rows if all(key in values for key in row.keys)), None)
+
+
+def read_people(path: Path) -> list[Person]:
+    """The people of a file or a folder.
+
+    Raises: FileError; Refused if it has nothing of any format.
+    """
+    files, alone = (
+        _files(path) if path.is_dir() else [path],
+        not path.is_dir() and path.suffix.lower() != ".json",
+    )
+    check_limit("frames", len(files), "files")
+    if not alone and files[0].suffix.lower() not in OF_ONE:
+        people = _stacked(_frames(files))
+    else:
+        people = []
+        for file in files:
+            content, pickled = _content(file)
+            found = _people(content, pickled)
+            if alone and not found:
+                raise Refused(expected(content if isinstance(content, dict) else {}))
+            name = (_numbers(file) or [file.stem])[-1]
+            people += (
+                [each._replace(name=name) for each in found]
+                if len(found) == 1 and not alone
+                else found
+            )
+    if not people:
+        raise Refused(expected({}))
+    return people
+
+
+def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
+    """What is in a file, and which of it is pickled objects."""
+    if file.suffix.lower() == ".json":
+        return read_json(file), ()
+    with open_file(file) as opened:
+        start = opened.read(6)
+    array = read_npy(file) if start == np.lib.format.MAGIC_PREFIX else None
+    if array is not None:
+        return values_of(array), ()
+    archive = start.startswith(b"PK")
+    if (archive or file.suffix.lower() == ".npz") and file.suffix.lower() not in (".pt", ".pth"):
+        found = ArrayFile.open(file, MotionError)
+        return found.values, found.pickled
+    return read_values(file), ()
+
+
+def _files(folder: Path) -> list[Path]:
+    natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
+    for place in (folder / name for name in FOLDERS):
+        for suffix in (".json", ".npz", *OF_ONE):
+            files = [
+                file for file in visible(place.glob("*" + suffix)) if file.name != "camera.npy"
+            ]
+            if files:
+                return sorted(files, key=natural)
+    raise Refused("no .json, .npz or other file of a motion in this folder")
+
+
+def _numbers(file: Path) -> list[str]:
+    return re.findall(r"\d+", file.stem)
+
+
+# People in values
+# --------------------------------------------------------------------------------------------------
+
+
+def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
+    frames = _listed_frames(content)
+    if frames is not None:
+        return _stacked([(f"frame {i}", each) for i, each in enumerate(frames)])
+    return [
+        person._replace(frames=_frames_of(person.values), pickled=pickled)
+        for person in _found(content, "", 0)
+    ]
+
+
+def _found(content: Any, name: str, depth: int) -> list[Person]:
+    content = objects(content)
+    if depth > DEEPEST:
+        return []
+    if isinstance(content, list | tuple):
+        found = [
+            p for i, each in enumerate(content) for p in _found(each, _id_of(each, i), depth + 1)
+        ]
+    elif not isinstance(content, dict):
+        return []
+    elif (form := format_of(content)) is not None:
+        return _split(content, form, name)
+    elif (
+        key := next((key for key in INSIDE if isinstance(content.get(key), dict)), None)
+    ) is not None:
+        beside = {other: value for other, value in content.items() if other not in INSIDE}
+        return _found(beside | content[key], name, depth + 1)
+    elif (
+        key := next(
+            (key for key in LISTS if isinstance(objects(content.get(key)), dict | list)), None
+        )
+    ) is not None:
+        return _found(content[key], name, depth + 1)
+    else:
+        found = [p for key, each in content.items() for p in _found(each, str(key), depth + 1)]
+    check_limit("people", len(found), "people")
+    return found
+
+
+def _id_of(content: Any, number: int) -> str:
+    key = next((key for key in IDS if isinstance(content, dict) and key in content), None)
+    return str(number) if key is None else _word(content[key])
+
+
+def _word(value: Any) -> str:
+    number = np.asarray(as_array(value)).reshape(-1)
+    return f"{number[0]:g}" if number.size == 1 and number.dtype.kind in "iuf" else str(value)[:40]
+
+
+def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person]:
+    """People along the first axis of the arrays of their roots, if they have one more than those of
+    one person.
+    """
+    place, key = next(iter(form.poses.items()))
+    if place not in ("root", "all") or form.kind != "poses" or key not in values:
+        return [Person(name, values)]
+    shape = np.shape(as_array(values[key])) if not isinstance(values[key], list) else ()
+    turns = shape[1:] == (3, 3) and _off_rotations(as_array(values[key])) < NEARLY_ORTHONORMAL
+    several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not turns
+    several = several or (form.pivot == "head" and len(shape) == 3)
+    if not several:
+        return [Person(name, values)]
+    ids = next(
+        (np.ravel(as_array(values[key])) for key in IDS if key in values), np.arange(shape[0])
+    )
+    arrays = {
+        key: as_array(values[key]) for key in (*form.poses.values(), *form.moves) if key in values
+    }
+    ids = ids if len(ids) == shape[0] else np.arange(shape[0])
+    rest = {key: value for key, value in values.items() if key not in arrays}
+    of = lambda array, i: array[i] if place == "root" else array[i : i + 1]
+    own = lambda i: {key: of(array, i) for key, array in arrays.items() if len(array) == len(ids)}
+    return [Person(str(number), rest | own(i)) for i, number in enumerate(ids.tolist())]
+
+
+def are_rotations(array: np.ndarray) -> bool:
+    """Whether the last two axes of an array are those of rotation matrices."""
+    return (
+        array.shape[-2:] == (3, 3)
+        and _off_rotations(array) < ORTHONORMAL
+        and bool((np.linalg.det(array) > 0).all())
+    )
+
+
+def _off_rotations(array: np.ndarray) -> float:
+    """How far R R^T of matrices is from 1, at most; infinite if they are no numbers."""
+    if array.dtype.kind not in "fiu":
+        return np.inf
+    return float(np.abs(array @ np.swapaxes(array, -1, -2) - np.eye(3)).max(initial=0))
+
+
+def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
+    key = next((key for key in FRAMES if key in values), None)
+    try:
+        return None if key is None else np.ravel(as_array(values[key]))
+    except ValueError:
+        return None
+
+
+# Frames with people
+# --------------------------------------------------------------------------------------------------
+
+
+def _listed_frames(content: Any) -> list[list[Person]] | None:
+    """The people of each frame in a list of lists, or in PHALP's dict by image; None for anything
+    else.
+    """
+    content = objects(content)
+    if (
+        isinstance(content, list)
+        and content
+        and all(isinstance(objects(each), list) for each in content)
+    ):
+        return [_found(each, "", 1) for each in content]
+    images = list(content.values()) if isinstance(content, dict) else []
+    if not images or not all(
+        isinstance(each, dict) and isinstance(objects(each.get("smpl")), list) for each in images
+    ):
+        return None
+    return [_tracked(each) for each in images]
+
+
+def _tracked(image: Mapping[str, Any]) -> list[Person]:
+    """The people that PHALP follows in an image: lists, an entry for each track."""
+    lists = {key: objects(image.get(key)) for key in ("smpl", "tid", "camera")}
+    tracks, cameras = lists["tid"], lists["camera"]
+    people = []
+    for i, values in enumerate(lists["smpl"]):
+        if isinstance(values, dict):
+            name = _word(tracks[i]) if isinstance(tracks, list) and i < len(tracks) else str(i)
+            camera = (
+                {"camera": cameras[i]} if isinstance(cameras, list) and i < len(cameras) else {}
+            )
+            people.append(Person(name, values | camera))
+    return people
+
+
+def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
+    """The people of each frame.
+
+    A file whose name ends in two numbers, of which the first changes, is of a frame and a person.
+    """
+    numbers = [_numbers(file) for file in files]
+    apart = all(len(each) > 1 for each in numbers) and len({each[-2] for each in numbers}) > 1
+    frames: dict[str, tuple[str, list[Person]]] = {}
+    for file, number in zip(files, numbers, strict=True):
+        content = _content(file)[0]
+        if not isinstance(content, dict | list):
+            raise MotionError(file, "", f"expected a JSON object, got {type(content).__name__}")
+        people = _found(content, "", 0)
+        if apart:
+            people = [person._replace(name=number[-1]) for person in people]
+        frames.setdefault(number[-2] if apart else str(file), (file.name, []))[1].extend(people)
+        if not people and isinstance(content, dict) and len(files) == 1:
+            raise Refused(expected(content))
+    return list(frames.values())
+
+
+def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
+    """People of many frames, from those of each, which have a name."""
+    people: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
+    for i, (_, found) in enumerate(frames):
+        for person in found:
+            people.setdefault(person.name, []).append((i, person.values))
+    stacked = []
+    for name, seen in people.items():
+        begin, first = seen[0]
+        form = format_of(first)
+        assert form is not None
+        keys = [
+            key for key in (*form.poses.values(), *form.moves, *form.rates, *MORE) if key in first
+        ]
+        for i, values in seen:
+            if missing := set(keys) - set(values):
+                raise Refused(
+                    f"{frames[i][0]}: {min(missing)}: missing, but {frames[begin][0]} has it"
+                )
+        values = {key: [objects(values[key]) for _, values in seen] for key in keys}
+        values = {
+            k: [x if isinstance(x, list | int | float) else as_array(x) for x in each]
+            for k, each in values.items()
+        }
+        stacked.append(Person(name, values, np.asarray([i for i, _ in seen])))
+    return stacked
+
+
+MORE = ("cam2world", "pred_global_rots")
+"""Keys of what is there for each frame, besides poses and positions."""
+
+
+def expected(values: Mapping[Any, Any]) -> str:
+    """What is said of a file of no format."""
+    for what, needed in OTHER_FILES.items():
+        if needed <= values.keys():
+            return f"no motion: {what}"
+    first_keys = dict.fromkeys(
+        row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None
+    )
+    first = ", ".join(
+        key for key in first_keys if not key.startswith("(")
+    )  # that of a single array
+    keys = ", ".join(sorted(map(str, values))[:SHOWN]) or "none"
+    return f"no motion: expected one of the keys {first}, got {keys}{hint_for(values)}"

@@ -1,0 +1,352 @@
+"""Skeletons of other programs in motion, brought to our joints: BVH and glTF.
+
+Bones point where the file's bones point. Every joint of ours has a rotation A_j from our rest frame
+to the file's. It turns our bone into the file's bone of the rest pose, and is the smallest such
+turn after that of the parent. With D_j(t) the rotation of the file's joint j from its rest pose to
+frame t, in the world, ours is
+
+    G_j(t) = C_j(t) D_j(t) A_j,    R_j = G_parent(j)^T G_j.
+
+C_j(t) is the smallest turn that makes the bone point where the file's points in the frame: none as
+long as the file's child hangs on the joint itself, but files have joints in between that turn on
+their own. The pelvis has a line, that of the hips, and the trunk for the turn about it: some files
+turn the pelvis's joint by any rotation and the joints that carry hips and spine back.
+
+Twists about a bone are therefore relative to the file's rest pose. Where nobody can stand like that
+(in LaFAN's files all offsets lie along one axis, the legs folded onto the spine), the smallest turn
+says nothing about twists. A_j is then turned about the bone so that the twist of R_j is 0 on
+average over the frames.
+
+Steps become as much longer as the legs are. Feet stay where the file's are: the pelvis moves up or
+down so that the lower foot is as high above the floor as in the file, whatever the shares of
+thighs, shins and hips in the legs. The page does the same (viewer/page/motion_files.js).
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from importlib import resources
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.library import read_body
+from humangs_jax.core.array_types import Float
+from humangs_jax.geometry.axes import CLEARLY_UP, nearest_axis, upright_matrix
+from humangs_jax.geometry.mesh import smallest_turns, unit
+from humangs_jax.io.reading import Refused
+from humangs_jax.motion import rules
+from humangs_jax.motion.face_tracks import FaceTrack
+from humangs_jax.motion.matching import matched
+from humangs_jax.motion.rules import sampled_frames, up_axis
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """A skeleton in motion, in the units and the world of its file.
+
+    names: of its s joints. parents: -1 for roots; parents come first. rest: (s, 3) places in the
+    rest pose. turns: (m, s, 3, 3) rotation of each joint from the rest pose to the frame, in the
+    world. places: (m, s, 3). fps: frames per second. up: the axis that the format says is up; None:
+    found from the rest pose. said: lines for the user about the file. face: what the file says of
+    the face.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    rest: Float[np.ndarray, "s 3"]
+    turns: Float[np.ndarray, "m s 3 3"]
+    places: Float[np.ndarray, "m s 3"]
+    fps: float
+    up: str | None = None
+    said: str = ""
+    face: FaceTrack | None = None
+
+
+def bytes_of_clip(frames: int, joints: int) -> int:
+    """Memory that a clip takes."""
+    return 96 * frames * joints
+
+
+def whole_rate(fps: float) -> float:
+    """Frames per second, a whole number where they are one up to the rounding of the file: BVH has
+    0.0083333 for 120.
+    """
+    return float(round(fps)) if abs(fps - round(fps)) < rules.RATE_ROUNDING * fps else fps
+
+
+@functools.cache
+def shipped_joints() -> Float[np.ndarray, "j 3"]:
+    """Joints of the shipped body in T-pose, mean shape, metres."""
+    with resources.as_file(resources.files("humangs_jax") / "assets" / "makehuman.npz") as file:
+        body = read_body(file)
+    return np.asarray(body.joint_regressor, np.float64) @ np.asarray(body.template, np.float64)
+
+
+def retargeted(
+    clip: Clip, joints: Float[np.ndarray, "j 3"], up: str = "auto"
+) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], str]:
+    """Rotations (axis-angle) and translations of a body of SMPL-X's joints that moves as the clip,
+    and what to say about up.
+
+    Arguments: joints: of the body in T-pose, metres. up: as in `load_motion`.
+    Raises: Refused if joints of the clip that are needed have no name we know, or the body is no
+    body of SMPL-X's joints.
+    """
+    if joints.shape != (len(JOINT_NAMES), 3):
+        raise Refused(
+            f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has"
+            f" {len(joints)}"
+        )
+    source = matched(clip.names, clip.parents, clip.rest, clip.places[0])
+    standing, said = _stands(clip, source), ""
+    scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.places[0], source), 1e-9)
+    if up == "auto":
+        up, said = (clip.up, "") if clip.up else _up_of(clip, source, scale, standing)
+    turn = upright_matrix(up)
+    turns, places = turn @ clip.turns, clip.places @ turn.T
+    world = _body_turns(clip, source, joints, turns, places, by_motion=not standing)
+    rotations = np.stack(
+        [
+            _rotation(own if p < 0 else _transposed(world[p]) @ own)
+            for p, own in zip(PARENTS, world, strict=True)
+        ],
+        axis=1,
+    )
+    moves = scale * places[:, source["pelvis"]]
+    soles = _soles(clip, source, joints) if standing else None
+    moves[:, 1] += _steps(scale * places[..., 1], source, soles) - _steps_of_body(
+        world, joints, moves, source
+    )
+    return rotations, moves - joints[0], said
+
+
+Source = Mapping[str, int]
+"""Our names of joints -> indices of the file's."""
+
+
+def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[str, str]:
+    """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people
+    stand does.
+    """
+    usual = nearest_axis(_spine(clip, source))[0] if standing else "y"
+    trunk = clip.places[:, source[_top(source)]] - clip.places[:, source["pelvis"]]
+    axis, cosine = nearest_axis(unit(trunk).mean(axis=0))
+    chosen = sampled_frames(len(clip.places))
+    points = scale * clip.places[chosen][:, sorted(source.values())]
+    return up_axis(points, axis if cosine >= CLEARLY_UP else None, usual, clip.fps)
+
+
+_INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
+
+
+# Rest poses
+# --------------------------------------------------------------------------------------------------
+
+
+def _top(source: Source) -> str:
+    return next(name for name in rules.TOPS if name in source)
+
+
+def _spine(clip: Clip, source: Source) -> Float[np.ndarray, "3"]:
+    return unit(clip.rest[source[_top(source)]] - clip.rest[source["pelvis"]])
+
+
+def _stands(clip: Clip, source: Source) -> bool:
+    legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in rules.SIDES)
+    return float(unit(legs) @ _spine(clip, source)) < rules.STANDING
+
+
+def _body_turns(
+    clip: Clip,
+    source: Source,
+    joints: Float[np.ndarray, "j 3"],
+    turns: Float[np.ndarray, "m s 3 3"],
+    places: Float[np.ndarray, "m s 3"],
+    by_motion: bool,
+) -> list[Float[np.ndarray, "m 3 3"]]:
+    """G_j (m, 3, 3) of our joints in the world."""
+    frames_of, world = [], []
+    for j, (name, parent) in enumerate(zip(JOINT_NAMES, PARENTS, strict=True)):
+        align = _pelvis_frame(clip, source, joints) if parent < 0 else frames_of[parent]
+        child = next((other for other in rules.NEXT.get(name, ()) if other in source), None)
+        if parent < 0:
+            world.append(_pelvis_turns(clip, source, turns, places) @ align)
+        elif name not in source:
+            world.append(world[parent])
+        elif child is None:
+            if by_motion and name.endswith(
+                "_ankle"
+            ):  # no toes tell where the foot points: as in T-pose on average
+                align = _mean(_transposed(world[parent]) @ turns[:, source[name]]).T
+            world.append(turns[:, source[name]] @ align)
+        else:
+            bone = unit(joints[_INDEX[child]] - joints[j])
+            align = (
+                smallest_turns(
+                    align @ bone, unit(clip.rest[source[child]] - clip.rest[source[name]])
+                )
+                @ align
+            )
+            if by_motion:
+                align = align @ _untwist(
+                    _transposed(world[parent]) @ turns[:, source[name]] @ align, bone
+                )
+            own = turns[:, source[name]] @ align
+            world.append(
+                smallest_turns(own @ bone, unit(places[:, source[child]] - places[:, source[name]]))
+                @ own
+            )
+        frames_of.append(align)
+    return world
+
+
+def _pelvis_turns(
+    clip: Clip,
+    source: Source,
+    turns: Float[np.ndarray, "m s 3 3"],
+    places: Float[np.ndarray, "m s 3"],
+) -> Float[np.ndarray, "m 3 3"]:
+    """(m, 3, 3) from the rest pose to the frames: of the joint, or of those that carry the hips if
+    these agree better with the trunk, turned so that the line of the hips is the file's.
+    """
+    pelvis, left, right = (source[name] for name in ("pelvis", "left_hip", "right_hip"))
+    rest_line, line = clip.rest[left] - clip.rest[right], places[:, left] - places[:, right]
+
+    def meeting(candidate):
+        return smallest_turns(unit(candidate @ rest_line), unit(line)) @ candidate
+
+    def tilts(candidate, top):
+        """(m,) angle about the line of the hips from the rest pose's direction of a joint above to
+        the frame's.
+        """
+        axis = unit(line)
+        across = lambda v: v - np.sum(v * axis, axis=-1, keepdims=True) * axis
+        a = across(candidate @ (clip.rest[top] - clip.rest[pelvis]))
+        b = across(places[:, top] - places[:, pelvis])
+        return np.arctan2(np.sum(np.cross(a, b) * axis, axis=-1), np.sum(a * b, axis=-1))
+
+    own, top = meeting(turns[:, pelvis]), source[_top(source)]
+    carriers = {clip.parents[left], clip.parents[right]}
+    if min(carriers) >= 0 and carriers != {pelvis}:
+        a, b = (
+            Rotation.from_matrix(turns[:, joint])
+            for joint in (clip.parents[left], clip.parents[right])
+        )
+        other = meeting((a * Rotation.from_rotvec(0.5 * (a.inv() * b).as_rotvec())).as_matrix())
+        own_tilt, tilt = (np.abs(tilts(x, top)).mean() for x in (own, other))
+        return other if tilt < own_tilt - rules.BETTER_TILT else own
+    spine = [top]
+    while clip.parents[spine[0]] not in (-1, pelvis):
+        spine.insert(0, clip.parents[spine[0]])
+    apart = 0.01 * np.linalg.norm(clip.rest[top] - clip.rest[pelvis])
+    lowest = next(
+        (j for j in spine if np.linalg.norm(clip.rest[j] - clip.rest[pelvis]) > apart), top
+    )
+    tilt = tilts(own, lowest)
+    if np.abs(tilt).mean() <= rules.LARGEST_BEND:
+        return own
+    return Rotation.from_rotvec(tilt[:, None] * unit(line)).as_matrix() @ own
+
+
+def _pelvis_frame(
+    clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, "3 3"]:
+    theirs = clip.rest[source["left_hip"]] - clip.rest[source["right_hip"]]
+    top = joints[_INDEX[_top(source)]] - joints[0]
+    ours = _frame(joints[_INDEX["left_hip"]] - joints[_INDEX["right_hip"]], top)
+    return _frame(theirs, _spine(clip, source)) @ ours.T
+
+
+def _frame(right: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    x = unit(right)
+    z = unit(np.cross(x, up))
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _mean(turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "3 3"]:
+    quaternions = Rotation.from_matrix(turns).as_quat()
+    signs = np.where(quaternions @ quaternions[0] < 0, -1.0, 1.0)
+    return Rotation.from_quat(signs @ quaternions).as_matrix()
+
+
+def _untwist(
+    turns: Float[np.ndarray, "m 3 3"], bone: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation about a bone that takes the mean twist about it out of rotations (m, 3, 3).
+
+    The twist of a quaternion (w, v) about b is 2 arg(w + i v.b); the square has no sign and weighs
+    those less that swing far.
+    """
+    q = Rotation.from_matrix(turns).as_quat()
+    twist = np.angle(np.sum((q[:, 3] + 1j * (q[:, :3] @ bone)) ** 2))
+    return Rotation.from_rotvec(-twist * bone).as_matrix()
+
+
+# Steps and the floor
+# --------------------------------------------------------------------------------------------------
+
+
+def _leg_length(places: Float[np.ndarray, "s 3"], index: Source) -> float:
+    bones = (("left_hip", "left_knee"), ("left_knee", "left_ankle"))
+    return sum(float(np.linalg.norm(places[index[b]] - places[index[a]])) for a, b in bones)
+
+
+def _feet(source: Source) -> list[list[str]]:
+    """Our names of the joints that may touch the floor: of both sides by kind."""
+    return [found for kind in rules.FEET if (found := [name for name in kind if name in source])]
+
+
+def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
+    """How high the joints of the file's feet are above the lowest of them in a rest pose that
+    stands, in our metres.
+    """
+    axis, _ = nearest_axis(_spine(clip, source))
+    scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.rest, source), 1e-9)
+    heights = scale * clip.rest @ upright_matrix(axis)[1]
+    found = {name: heights[source[name]] for kind in _feet(source) for name in kind}
+    return {name: height - min(found.values()) for name, height in found.items()}
+
+
+def _steps(
+    heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, float] | None
+) -> Float[np.ndarray, " m"]:
+    """(m,) how high the feet are above the floor, which is where they are lowest.
+
+    soles: of each joint of the feet, how high it is when the foot stands; None: each kind as high
+    as in its lowest frame.
+    """
+    if soles is None:
+        lowest = [
+            (kind, heights[:, [source[name] for name in kind]].min()) for kind in _feet(source)
+        ]
+        soles = {name: low for kind, low in lowest for name in kind}
+    feet = np.min([heights[:, source[name]] - sole for name, sole in soles.items()], axis=0)
+    return feet - feet.min()
+
+
+def _steps_of_body(
+    world: Sequence[Float[np.ndarray, "m 3 3"]],
+    joints: Float[np.ndarray, "j 3"],
+    moves: Float[np.ndarray, "m 3"],
+    source: Source,
+) -> Float[np.ndarray, " m"]:
+    places = {0: moves}
+
+    def place(j):
+        if j not in places:
+            p = PARENTS[j]
+            places[j] = place(p) + world[p] @ (joints[j] - joints[p])
+        return places[j]
+
+    feet = [_INDEX[name] for kind in _feet(source) for name in kind]
+    return np.min([place(j)[:, 1] - (joints[j, 1] - joints[feet, 1].min()) for j in feet], axis=0)
+
+
+def _transposed(matrices: Float[np.ndarray, "*b i j"]) -> Float[np.ndarray, "*b j i"]:
+    return np.swapaxes(matrices, -1, -2)
+
+
+def _rotation(matrices: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
+    return Rotation.from_matrix(matrices).as_rotvec()

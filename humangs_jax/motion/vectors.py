@@ -1,0 +1,108 @@
+"""Motions in a single array, by the number of its columns; and rotations of six numbers, in the
+order in which MDM writes them.
+
+A row of Motion-X has 322 numbers (https://github.com/IDEA-Research/Motion-X): root 3, body 63,
+hands 90, jaw 3, expression 50, shape of the face 100, translation 3, shape 10. Six numbers are the
+first two rows of a rotation matrix, before they are made orthonormal (Zhou et al., arXiv
+1812.07035).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.io.reading import Refused
+from humangs_jax.io.restricted_pickle import as_array
+from humangs_jax.motion.rules import COLUMNS
+
+MOTION_X = "(m,322)"
+"""The key under which an array of Motion-X is read."""
+POSES = "(m,165/156/72/66)"
+"""The key under which an array of poses is read."""
+_PARTS = {
+    "root_orient": (0, 3),
+    "pose_body": (3, 66),
+    "pose_hand": (66, 156),
+    "pose_jaw": (156, 159),
+    "trans": (309, 312),
+}
+COLUMNS_OF_MOTION_X = 322
+_RENDER = (
+    "make rotations of them, as MDM's `python -m visualize.render_mesh` does (*_smpl_params.npy)"
+)
+FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
+"""Columns of vectors of features, and of which data set they are."""
+JOINTS = {22: "HumanML3D's new_joints", 21: "KIT-ML's new_joints"}
+"""Joints in space, and of which data set they are."""
+RESULTS = {"motion", "text", "lengths"}
+"""Keys of the joints in space that MDM samples."""
+
+
+def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
+    """The values by key that an array stands for. Raises: Refused, saying what the array is."""
+    shape = array.shape
+    columns = shape[-1] if shape else 0
+    if array.ndim == 2 and columns == COLUMNS_OF_MOTION_X:
+        parts = {key: array[:, first:end] for key, (first, end) in _PARTS.items()}
+        return {MOTION_X: array, **parts}
+    if array.ndim == 2 and columns in COLUMNS:
+        return {POSES: array}
+    if array.ndim == 4 and shape[2:] == (3, 3):
+        return {POSES: array}
+    if array.ndim == 2 and columns in FEATURES:
+        raise Refused(
+            f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints"
+            f" and {_RENDER}"
+        )
+    if array.ndim == 3 and columns == 3:
+        whose = f" ({JOINTS[shape[1]]})" if shape[1] in JOINTS else ""
+        wanted = "expected a row of axis-angles a frame"
+        raise Refused(
+            f"{shape[1]} joints in space{whose}, or axis-angles in three axes: {wanted}; {_RENDER}"
+        )
+    known = ", ".join(map(str, (COLUMNS_OF_MOTION_X, *COLUMNS)))
+    raise Refused(
+        f"an array of shape {shape}: expected (frames, columns) with {known} columns, or a dict of"
+        " arrays by name"
+    )
+
+
+def hint_for(values: Mapping[Any, Any]) -> str:
+    """What else is said of values that are no motion; "" for nothing."""
+    return (
+        f"; these are joints in space that MDM sampled: {_RENDER}"
+        if values.keys() >= RESULTS
+        else ""
+    )
+
+
+def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[str, Any]:
+    """Values with matrices (m, j, 3, 3) and positions (m, 3), of six numbers a joint with the
+    frames last, or first.
+
+    Raises: Refused for other shapes, naming the key.
+    """
+    six = np.asarray(as_array(values[rotations]))
+    last = six.ndim == 3 and six.shape[1] == 6
+    if not last and (six.ndim != 3 or six.shape[2] != 6):
+        raise Refused(f"{rotations}: expected shape (24, 6, frames), got {six.shape}")
+    if six.dtype.kind not in "fiu":
+        raise Refused(f"{rotations}: expected real numbers, got {six.dtype}")
+    six = six.transpose(2, 0, 1) if last else six
+    changed: dict[str, Any] = {rotations: matrices_of(six)}
+    if moves in values:
+        places = np.asarray(as_array(values[moves]))
+        changed[moves] = places.T if last else places
+    return {**values, **changed}
+
+
+def matrices_of(six: Float[np.ndarray, "*b 6"]) -> Float[np.ndarray, "*b 3 3"]:
+    """Rotation matrices of their first two rows; not finite where these are zero or parallel."""
+    a, b = np.asarray(six[..., :3], np.float64), np.asarray(six[..., 3:], np.float64)
+    with np.errstate(all="ignore"):
+        first = a / np.linalg.norm(a, axis=-1, keepdims=True)
+        across = b - (first * b).sum(axis=-1, keepdims=True) * first
+        second = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    return np.stack([first, second, np.cross(first, second)], axis=-2)

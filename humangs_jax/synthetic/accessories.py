@@ -1,0 +1,385 @@
+"""What is worn on top and on the feet: hoods, scarves, hats, glasses, bags, necklaces, shoes.
+
+Swept tubes, sheets, boxes and silhouettes that follow one joint or the nearest skin.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.synthetic import hair, surfaces, tailoring
+from humangs_jax.synthetic.anatomy import (
+    FLOOR,
+    HEAD,
+    LEFT_ANKLE,
+    LEFT_EYE,
+    NECK,
+    RIGHT_EYE,
+    Anatomy,
+    Vector,
+)
+from humangs_jax.synthetic.fabrics import Fabric, Material, Spots, band, color, mix
+from humangs_jax.synthetic.outfits import Garment
+from humangs_jax.synthetic.surfaces import (
+    Faces,
+    Field,
+    Points,
+    Surface,
+    circle,
+    grid_faces,
+    join,
+    ripples,
+    sweep,
+    unit,
+)
+
+RING, COLUMNS = 40, 32
+"""Points of a ring around neck or head; of a ring of a shoe."""
+AZIMUTH = circle(RING)
+SIDEWAYS, UP, FORWARD = np.eye(3)
+
+
+def build(
+    rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float
+) -> list[tuple[Surface, Material]]:
+    """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk,
+    metres.
+    """
+    kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
+    hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
+    if kind in ("glasses", "sunglasses"):
+        return glasses(anatomy, garment)
+    if kind == "necklace":
+        metal = color(0.12, 0.5, 0.75) if fabric.rng(2).random() < 0.5 else color(0.6, 0.04, 0.72)
+        return [(necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
+    if kind in ("cap", "brim_hat"):
+        shell = hat(0.016, 0.0, crown=0.008) if kind == "cap" else hat(0.017, 0.0, crown=0.05)
+        albedo = functools.partial(_panelled if kind == "cap" else _ribboned, fabric)
+        return [(join([shell, hat_edge(rng, anatomy, garment)]), Material(albedo, wrinkles=0.05))]
+    if kind == "scarf":
+        surface = scarf(rng, anatomy, sizes["thickness"], sizes["tails"], ease)
+    elif kind == "beanie":
+        surface = hat(rng.uniform(0.014, 0.019), 0.04, crown=rng.uniform(0, 0.03))
+    else:  # a headscarf
+        opening, ends = _face_opening(0.312, 0.98, 0.078), rng.uniform(0.08, 0.13)
+        surface = hair.falling_tube(rng, anatomy, 0.022, 0.06, opening, wave=0.005, ends=ends)
+    return [(surface, Material(fabric.colors, wrinkles=0.3))]
+
+
+def _painted(dye: Vector, sheen: float) -> Material:
+    return Material(
+        lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)), sheen=sheen
+    )
+
+
+def _panelled(fabric: Fabric, s: Spots) -> Points:
+    angle, colors = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colors(s)
+    seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
+    return mix(colors, colors * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
+
+
+def _ribboned(fabric: Fabric, s: Spots) -> Points:
+    above = hair.above_line(s.template, hair.CAP_LINE)
+    on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
+    return mix(fabric.colors(s), fabric.other, band(above, 0.002, 0.026, 0.002) * on_crown)
+
+
+Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
+"""`RING` rest points from front over left, and outward directions."""
+
+
+def neck_ring(anatomy: Anatomy, lift: float) -> Ring:
+    """Around the neck at a lift above the crew neckline."""
+    return _ring(
+        anatomy,
+        np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02,
+        -0.005,
+    )
+
+
+def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> Ring:
+    """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed
+    line.
+    """
+    x, _, z = anatomy.skin.template[near].T
+    points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
+    apart = np.abs((azimuths[None] - AZIMUTH[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    weights = np.exp(-((apart / 0.16) ** 2)) + 1e-9
+    ring = weights @ points / weights.sum(1, keepdims=True)
+    outwards = ring - ring.mean(0)
+    outwards[:, 1] = 0
+    return ring, unit(outwards)
+
+
+def _followed(
+    anatomy: Anatomy,
+    path: Float[np.ndarray, "m 3"],
+    across: Float[np.ndarray, "*_m 3"],
+    widths: Float[np.ndarray, "m 2"] | float,
+    columns: int,
+    closed: bool = True,
+) -> Surface:
+    """A swept tube that moves with the skin nearest to it; its template coordinates are its own,
+    around its middle.
+    """
+    (x, y, _), (vertices, faces) = (
+        anatomy.skin.template.T,
+        sweep(path, across, widths, columns, closed),
+    )
+    candidates = np.flatnonzero((np.abs(x) < 0.2) & (y > -0.35) & (y < 0.2))
+    weights = tailoring.smooth_weights(
+        tailoring.nearest_weights(anatomy, vertices, candidates), faces, 6
+    )
+    around_middle = vertices - [0, anatomy.joints[NECK, 1] - 0.19, 0]
+    return Surface(vertices, faces, weights).painted(around_middle, around_middle, 0.12)
+
+
+def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
+    """A hood: over the head, or lying in folds around the neck and on the upper back."""
+    if up:
+        return hair.falling_tube(
+            rng, anatomy, 0.034, 0.1, _face_opening(0.31, 1.05, 0.096), wave=0.004, ends=0.1
+        )
+    ring, outwards = neck_ring(anatomy, -0.012)
+    behind = 0.5 - 0.5 * np.cos(AZIMUTH)  # 0 in front, 1 at the nape
+    thick = 0.010 + 0.020 * behind + 0.016 * behind**4
+    tall = 0.016 + 0.012 * behind + 0.030 * behind**4
+    path = ring + outwards * (0.4 * thick + 0.022)[:, None]
+    path[:, 1] += 0.012 - 0.030 * behind**4 + 0.004 * ripples(rng, 3 * ring, 0.3)
+    rolls = np.stack([tall, thick], -1) * (1 + 0.1 * ripples(rng, 4 * ring, 0.2))[:, None]
+    return _followed(anatomy, path, UP + 0.5 * outwards * behind[:, None] ** 3, rolls, 12)
+
+
+def _face_opening(
+    middle: float, half_width: float, half_height: float
+) -> Callable[[Field, Field], Field]:
+    """Azimuths and heights -> positive outside of an oval around the face."""
+    return lambda sides, height: (
+        ((sides / half_width) ** 2 + ((height - middle) / half_height) ** 2 - 1) * 0.05
+    )
+
+
+def scarf(
+    rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: float, ease: float
+) -> Surface:
+    """Two turns around the neck; tails: metres that its ends hang down in front, 0 for none."""
+    parts = []
+    for turn, lift in enumerate((-0.004, 0.022)):
+        ring, outwards = neck_ring(anatomy, lift)
+        lumps = 1 + 0.16 * ripples(rng, 3 * ring + turn, 0.25)
+        path = ring + outwards * (0.75 * thickness + min(ease, 0.015))
+        path[:, 1] += 0.014 + 0.006 * np.sin(AZIMUTH + turn * 2.1)
+        widths = np.stack([1.15 * thickness * lumps, 0.85 * thickness / lumps], -1)
+        parts.append(_followed(anatomy, path, UP, widths, 12))
+    if tails > 0:
+        ring, _ = neck_ring(anatomy, -0.004)
+        for side, length in ((1, tails), (-1, tails * rng.uniform(0.6, 1.0))):
+            parts.append(_tail(rng, anatomy, ring[0], side, length, thickness, ease))
+    return join(parts)
+
+
+def _tail(
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    start: Vector,
+    side: int,
+    length: float,
+    thickness: float,
+    ease: float,
+) -> Surface:
+    rows = max(5, int(length / 0.03))
+    y = np.linspace(start[1] + 0.01, start[1] - length, rows)
+    x = side * (0.028 + 0.012 * np.linspace(0, 1, rows)) + 0.006 * np.sin(np.linspace(0, 3, rows))
+    boundary = surfaces.blurred(surfaces.hanging(anatomy.trunk, 0.2), 2)
+    z = boundary.radius(y, np.arctan2(x, np.full(rows, 0.12))) + ease + 0.016
+    z = np.maximum(z, start[2] + 0.7 * thickness + np.linspace(0, 0.01, rows))
+    widths = np.tile([0.045 + 0.3 * thickness, 0.010], (rows, 1))
+    widths[0] *= 0.5
+    widths[-1, 1] = 0.002
+    return _followed(anatomy, np.stack([x, y, z], -1), SIDEWAYS, widths, 10, closed=False)
+
+
+def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points) -> Surface:
+    return surfaces.rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(
+        template, template, 0.09
+    )
+
+
+def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
+    """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat
+    outwards.
+    """
+    template, size, closed = (
+        anatomy.skin.template,
+        garment.sizes["brim"],
+        garment.kind == "brim_hat",
+    )
+    no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
+    ring, out = _ring(
+        anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2]
+    )
+    if closed:
+        start, widths = ring + out * 0.012, size * (1 + 0.12 * np.cos(AZIMUTH))
+        droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
+    else:
+        backwards, across = garment.sizes["backwards"] > 0, np.linspace(-1, 1, 15)
+        chosen = ((RING // 2 if backwards else 0) + np.arange(-7, 8)) % RING
+        start = ring[chosen] + out[chosen] * 0.011
+        out = unit(np.tile(-FORWARD if backwards else FORWARD, (15, 1)) + 0.25 * out[chosen])
+        widths = (0.030 + size * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
+        droop = 0.010 + 0.016 * across**2
+    start[:, 1] += 0.004
+    steps = np.linspace(0, 1, 5)[:, None]
+    sheet = start[None] + (steps * widths[None])[..., None] * out[None]
+    sheet[..., 1] -= steps**2 * droop[None]
+    vertices, faces = sheet.reshape(-1, 3), grid_faces(len(steps), len(start), closed=closed)
+    template = vertices - anatomy.joints[HEAD]
+    template[:, 1] = np.repeat(0.4 + 0.05 * steps, len(start))
+    return surfaces.turn_in_hems(_on_head(anatomy, vertices, faces, template), 0.004)
+
+
+def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]]:
+    """Two rims, a bridge and temples to the ears; dark lenses for the sun."""
+    size, squareness, wire = (garment.sizes[name] for name in ("size", "squareness", "wire"))
+    dark = garment.kind == "sunglasses"
+    eyes = anatomy.joints[[LEFT_EYE, RIGHT_EYE]]
+    middle, apart = eyes.mean(0), np.abs(eyes[0, 0])
+    template, vertices = anatomy.skin.template, anatomy.skin.vertices
+    x, y, z = template.T
+    brow = (np.abs(x) < 0.055) & (np.abs(vertices[:, 1] - middle[1]) < 0.022) & (z > 0.05)
+    front = np.quantile(vertices[brow, 2], 0.97) + 0.003
+    ear = (np.abs(x) > 0.068) & (np.abs(y - 0.343) < 0.012) & (np.abs(z - 0.005) < 0.02)
+    half, tall = min(0.0255 * size, apart * 0.93), 0.0195 * size
+    c, s = np.cos(circle(28)), np.sin(circle(28))
+    radius = (np.abs(c) ** squareness + np.abs(s) ** squareness) ** (-1 / squareness)
+    parts, lenses = [], []
+    for side in (1, -1):
+        x, y = side * apart * 1.06 + half * radius * c, middle[1] - 0.004 + tall * radius * s
+        path = np.stack([x, y, front - 9.0 * np.abs(x) ** 2.0 * 0.6], -1)
+        parts.append(sweep(path, FORWARD, wire, 6, closed=True))
+        hinge = np.asarray(
+            [
+                side * (apart * 1.06 + half),
+                middle[1] + 0.006,
+                front - 9.0 * (apart + half) ** 2 * 0.6,
+            ]
+        )
+        on_ear = vertices[ear & (template[:, 0] * side > 0)]
+        hook = (
+            np.median(on_ear, 0) + np.asarray([side * 0.004, 0.006, 0])
+            if len(on_ear)
+            else hinge - [0, 0, 0.09]
+        )
+        line = hinge + np.linspace(0, 1, 6)[:, None] * (hook - hinge)
+        parts.append(
+            sweep(
+                np.concatenate([line, [hook + np.asarray([0, -0.014, -0.014])]]), UP, 1.1 * wire, 6
+            )
+        )
+        if dark:
+            inner = np.concatenate([[path.mean(0) + np.asarray([0, 0, 0.002])], path])
+            fan = np.stack([np.zeros(28, int), 1 + np.arange(28), 1 + (np.arange(28) + 1) % 28], -1)
+            lenses.append((inner.astype(np.float32), fan.astype(np.int32)))
+    across, flat = np.linspace(-1, 1, 7), np.full(7, front + 0.002)
+    bridge = np.stack(
+        [(apart * 1.06 - half) * across, middle[1] + 0.004 + 0.003 * (1 - across**2), flat], -1
+    )
+    parts.append(sweep(bridge, UP, wire, 6))
+    glass = (lenses, _painted(color(0.08, 0.3, 0.06), 0.7))
+    made = [(parts, _painted(garment.fabric.base, 0.4)), *([glass] if dark else [])]
+    return [
+        (join([_on_head(anatomy, v, f, v - middle) for v, f in pieces]), material)
+        for pieces, material in made
+    ]
+
+
+def necklace(anatomy: Anatomy, length: float) -> Surface:
+    """A chain around the neck that hangs lower in front."""
+    ring, outwards = neck_ring(anatomy, 0.01)
+    front = np.clip(np.cos(AZIMUTH), 0, 1) ** 2
+    path = ring + outwards * 0.003
+    path[:, 1] -= length * front
+    path[:, 2] += 0.35 * length * front
+    return _followed(anatomy, path, UP, 0.0022, 6)
+
+
+def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
+    """A rounded box on the back, or a flat one at the hip, that moves as the skin near it does on
+    average.
+    """
+    x, y, z = anatomy.skin.template.T
+    size = garment.sizes["size"]
+    if garment.kind == "backpack":
+        near = (np.abs(x) < 0.1) & (y > -0.2) & (y < 0.08) & (z < -0.05)
+        half, turn = np.asarray([0.145, 0.21, 0.075]) * size, np.pi
+        height = float(tailoring.rest_height(anatomy, np.asarray([0.10]))[0]) - half[1]
+        behind = anatomy.trunk.radius(
+            height + np.linspace(-0.6, 0.8, 9) * half[1], np.full(9, np.pi)
+        ).max()
+        center = np.asarray([0, height, -behind - ease - half[2] - 0.004])
+    else:
+        side = garment.sizes["side"]
+        near = (x * side > 0.1) & (x * side < 0.24) & (np.abs(y + 0.22) < 0.05)
+        half, turn = np.asarray([0.15, 0.11, 0.05]) * size, side * 1.75
+        height = float(tailoring.rest_height(anatomy, np.asarray([-0.29]))[0]) - 0.75 * half[1]
+        around = anatomy.hips_and_legs.radius(
+            height + np.linspace(-0.3, 1, 7) * half[1], np.full(7, turn)
+        )
+        reach = around.mean() + ease + half[2] + 0.008
+        center = np.asarray([reach * np.sin(turn), height, reach * np.cos(turn)])
+    directions, faces = surfaces.ball(14, 24)
+    unit_box = directions / (np.sum(np.abs(directions) ** 4.0, -1, keepdims=True) ** (1 / 4.0))
+    points, c, s = unit_box * half, np.cos(turn), np.sin(turn)
+    vertices = (points @ np.asarray([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + center).astype(np.float32)
+    weights = np.repeat(anatomy.skin.weights[near].mean(0, keepdims=True), len(vertices), 0)
+    return Surface(vertices, faces, weights).painted(unit_box, points, 0.15)
+
+
+def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
+    """Both shoes. height: of the shaft above the floor; sole: its thickness; ease: metres between
+    foot and leather.
+    """
+    return join([_shoe(anatomy, side, height, sole, ease) for side in (0, 1)])
+
+
+def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) -> Surface:
+    x, y, _ = anatomy.skin.template.T
+    own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
+    points = anatomy.skin.vertices[own]
+    floor = points[:, 1].min()
+    shaft = (
+        np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1))
+        if height > 0.1
+        else [height]
+    )
+    low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
+    levels = floor + np.concatenate([low[low < height - 0.004], shaft])
+    # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices
+    thin, thick = (
+        surfaces.boundaries(points[:, 1], points[:, [0, 2]], levels, None, window)
+        for window in (0.012, 0.03)
+    )
+    shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
+    pairs = (thin.centers, thick.centers), (thin.radii, surfaces.blurred(thick, 2).radii)
+    shape = surfaces.Boundaries(levels, *(a + (b - a) * shin for a, b in pairs))
+    shape = surfaces.hanging(shape, 0.6)  # the sole is as wide as what is above it
+    below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
+    rows = [(floor + y, 0, extra) for y, extra in below] + [
+        (level, i + 1, 0.0) for i, level in enumerate(levels[1:])
+    ]
+    rings = []
+    for y, i, extra in rows:
+        radius = shape.radius(np.full(COLUMNS, levels[i]), circle(COLUMNS)) + ease + extra
+        radius = radius if rings else 0 * radius
+        rings.append(
+            surfaces.around(radius, circle(COLUMNS), np.full(COLUMNS, y), shape.centers[i])
+        )
+    vertices = np.concatenate(rings).astype(np.float32)
+    faces = np.ascontiguousarray(grid_faces(len(rows), COLUMNS, closed=True)[:, ::-1])
+    weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, own), faces, 3)
+    local = vertices - np.where([True, False, True], anatomy.joints[LEFT_ANKLE + side], floor)
+    return surfaces.turn_in_hems(
+        Surface(vertices, faces, weights).painted(local, local, 0.06), 0.01
+    )

@@ -1,0 +1,470 @@
+"""Dressed people as textured meshes, for renderers that know no materials, and as scans; and banks
+of them, ready for a device.
+
+Texels between charts repeat the nearest chart, so that bilinear lookups and smaller copies of the
+texture stay clean at seams. Folds that are painted into the normals become a second texture.
+Skinning is cut down to a few joints per vertex.
+
+A scan is such a mesh, lit, in a folder, like a scanner's: scan.obj with material.mtl and
+material_0.png, scan.glb, and scan.json with seed, shape and pose. Metres, y up, texture coordinates
+with v up; a vertex is written once per chart that it is in.
+
+A bank is made on the host once, all of one shape, and used by `on_the_fly_example`. It holds people
+of ONE range of seeds (see `subject.SPLITS`), so no key of a training bank makes a person of the
+test range. About 3 MB a person at 512 texels a side.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
+from humangs_jax.core.processes import in_processes
+from humangs_jax.core.progress import bar
+from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.data.body_and_masks import displacement, silhouette
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.camera import project
+from humangs_jax.io.arrays import check_array, check_indices, check_joints, read_npz, write_npz
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.reading import Refused, reading, write_json
+from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
+from humangs_jax.synthetic.anatomy import HEAD, joint_positions
+from humangs_jax.synthetic.poses import sample_rotations
+from humangs_jax.synthetic.subject import (
+    GENERATOR_VERSION,
+    PosedSubject,
+    SyntheticSubject,
+    light_points,
+    make_subject,
+    paint,
+    split_of,
+    spots_at,
+)
+from humangs_jax.synthetic.surfaces import vertex_normals
+from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
+
+# Baking
+# --------------------------------------------------------------------------------------------------
+
+
+JOINTS_PER_VERTEX = 6
+"""Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a
+millimetre in any pose.
+"""
+SLOPE_STEP, SLOPE_ZERO = 1 / 100, 128
+"""One step of the slope texture's bytes: slopes up to 1.27; byte of no slope."""
+FACE_DENSITY = 2.0
+"""Texels per metre of skin and eyes of the head, relative to everything else."""
+HEAD_JOINTS, SKIN_AND_EYES = (HEAD, 22, 23, 24), (0, 1)
+"""Head, jaw and eyes; the materials of a subject that `make_subject` puts first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BakedSubject:
+    """The textures of a person at rest.
+
+    atlas: texture coordinates. albedo: (t, t, 3) bytes, 255 is 1, row 0 on top (v = 1).
+    slopes: (t, t, 3) bytes, gradients of painted folds, `SLOPE_ZERO` + steps of `SLOPE_STEP`, axes
+    of `Spots.cloth`.
+    """
+
+    atlas: Atlas
+    albedo: UInt8[np.ndarray, "t t 3"]
+    slopes: UInt8[np.ndarray, "t t 3"]
+
+
+def bake_subject(
+    subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1
+) -> BakedSubject:
+    """The textures of a subject, texture_size texels a side, each the mean of samples x samples
+    points.
+
+    No chart of the atlas is across two materials; faces (of people) are in finer detail.
+    Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
+    """
+    surface, pieces = subject.surface, subject.face_materials
+    strongest = np.argmax(surface.weights[surface.faces[:, 0]], axis=1)
+    face = np.isin(strongest, HEAD_JOINTS) & np.isin(pieces, SKIN_AND_EYES)
+    density = np.where(face, FACE_DENSITY, 1.0).astype(np.float32)
+    atlas = unwrap(surface.vertices, surface.faces, 2 * pieces + face, texture_size, density)
+    ids, weights = texels(dataclasses.replace(atlas, size=texture_size * samples))
+    covered = ids >= 0
+    albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
+    values = np.zeros((*ids.shape, 7), np.float32)
+    values[covered] = np.concatenate(
+        [albedo, slopes, np.ones((len(albedo), 1), np.float32)], axis=1
+    )
+    sums = values.reshape(texture_size, samples, texture_size, samples, 7).sum((1, 3))
+    filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), sums[..., 6] > 0)
+    albedo, slopes = (
+        255 * np.clip(filled[..., :3], 0, 1),
+        np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127),
+    )
+    return BakedSubject(
+        atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8)
+    )
+
+
+def strongest_joints(
+    weights: Float[np.ndarray, "n j"], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` joints (n, k) of most weight of each vertex, strongest first, and their weights
+    (n, k) scaled to sum 1.
+    """
+    ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+    kept = np.take_along_axis(weights, ids, axis=1)
+    return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)
+
+
+SCAN, PARAMETERS = "scan", "scan.json"
+"""Names in a scan's folder: of the meshes (without ending), and what is known of the person."""
+
+
+def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 2048) -> None:
+    """Write a posed subject as a mesh whose texture carries its light, whole or not at all.
+
+    An existing folder is replaced.
+    """
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+    subject, baked = posed.subject, bake_subject(posed.subject, texture_size)
+    image = Image.fromarray(lit_texture(posed, baked))
+    materials = {
+        "obj": SimpleMaterial(image=image, diffuse=[255, 255, 255, 255]),
+        "glb": PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0),
+    }
+    known = {"betas": subject.betas, "rotations": posed.rotations, "translation": posed.translation}
+    known = {"seed": subject.seed, "lit": True} | {
+        name: value.tolist() for name, value in known.items()
+    }
+
+    def write(temporary: Path):
+        temporary.mkdir()
+        for kind, material in materials.items():
+            visual = TextureVisuals(uv=baked.atlas.uvs, material=material)
+            mesh = trimesh.Trimesh(
+                posed.vertices[baked.atlas.vertices],
+                baked.atlas.faces,
+                visual=visual,
+                process=False,
+            )
+            mesh.export(temporary / f"{SCAN}.{kind}")
+        write_json(temporary / PARAMETERS, known, indent=None)
+
+    replace_folder(folder, write, mark=PARAMETERS)
+
+
+def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "t t 3"]:
+    """(t, t, 3) the texture of a pose as its light makes it, seen from outside."""
+    ids, weights = texels(baked.atlas)
+    known = ids >= 0
+    albedo = baked.albedo[known].astype(np.float32) / 255
+    slopes = (baked.slopes[known].astype(np.float32) - SLOPE_ZERO) * SLOPE_STEP
+    colors = np.zeros((*ids.shape, 3), np.float32)
+    colors[known] = light_points(posed, ids[known], weights[known], albedo, slopes)
+    return np.round(255 * fill_gaps(colors, known)).astype(np.uint8)
+
+
+# Banks
+# --------------------------------------------------------------------------------------------------
+
+
+FORMAT, VERSION = "humangs-people", 2
+POSE_STREAM = 20
+"""Stream of a seed that draws the poses of the bank; others than the ones of written sets."""
+SILHOUETTES, SILHOUETTE_SIDE, SILHOUETTE_STREAM = 4, 960, 23
+"""Views that a body is displaced to, their pixels a side, and the stream of a seed that places
+their cameras.
+"""
+UV_STEPS = 65535
+"""Texture coordinates are stored in steps of one part of this."""
+PAD_VERTICES, PAD_FACES = 1024, 2048
+"""Meshes are padded to the largest of the bank, rounded up to a multiple of these."""
+MOST_MATERIALS = 32
+
+
+@pytree_dataclass
+class PeopleBank:
+    """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and
+    stacked.
+
+    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts: (p,) without
+    padding.
+    vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n,
+    k).
+    faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`,
+    v DOWN.
+    face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of
+    one number are dyed alike, dyeable (p, m): 1 where a piece is cloth that may have another color.
+    texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `BakedSubject`).
+    rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
+    displacements: (p, b, 3) of a body's vertices to the silhouettes of the dressed person
+    (`data.body_and_masks`), metres; b is 0 in a bank without.
+    Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds;
+    generator: `GENERATOR_VERSION`.
+    """
+
+    seeds: Int[Array, " p"]
+    betas: Float[Array, "p s"]
+    joints: Float[Array, "p j 3"]
+    vertex_counts: Int[Array, " p"]
+    vertices: Float[Array, "p n 3"]
+    normals: Float[Array, "p n 3"]
+    joint_ids: UInt8[Array, "p n k"]
+    joint_weights: Float[Array, "p n k"]
+    faces: UInt[Array, "p f 3"]
+    uvs: UInt[Array, "p f 3 2"]
+    face_pieces: UInt8[Array, "p f"]
+    sheen: Float[Array, "p m"]
+    groups: UInt8[Array, "p m"]
+    dyeable: Float[Array, "p m"]
+    texture: UInt8[Array, "p t t 6"]
+    rotations: Float[Array, "p q j 3"]
+    nearest: Int[Array, "p q"]
+    displacements: Float[Array, "p b 3"]
+    parents: tuple[int, ...] = static_field(default=())
+    mirrored_joints: tuple[int, ...] = static_field(default=())
+    split: str = static_field(default="")
+    generator: int = static_field(default=GENERATOR_VERSION)
+
+    @property
+    def people(self) -> int:
+        """How many people there are."""
+        return self.betas.shape[0]
+
+
+def build_bank(
+    seeds: list[int] | range,
+    body: BodyModel,
+    split: str,
+    *,
+    texture_size: int = 512,
+    pose_count: int = 16,
+    displaced: BodyModel | None = None,
+    processes: int = 1,
+    progress: bool = False,
+) -> PeopleBank:
+    """The people of some seeds, which must all lie in the range `split` of `subject.SPLITS`.
+
+    texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of
+    512.
+    displaced: the body to displace, one of `data.views.gaussian_body`; None: none.
+    processes: how many work at once; more than one use the CPU and load the shipped body
+    themselves.
+    Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the
+    package's own.
+    """
+    seeds = list(seeds)
+    if not seeds:
+        raise ValueError("no seeds")
+    _check_range(seeds, split)
+    make = functools.partial(
+        _person, texture_size=texture_size, pose_count=pose_count, displaced=displaced
+    )
+    if processes == 1:
+        made = ((i, make(seed, body)) for i, seed in enumerate(seeds))
+    else:
+        made = in_processes(
+            make, {i: (seed,) for i, seed in enumerate(seeds)}, processes, _shipped_body
+        )
+    people = dict(bar(made, total=len(seeds), desc="bank", shown=progress))
+    return _stacked([people[i] for i in range(len(seeds))], body, split)
+
+
+def save_bank(path: str | Path, bank: PeopleBank) -> None:
+    """Write one .npz, whole or not at all."""
+    fields = {name: np.asarray(getattr(bank, name)) for name in (*_ARRAYS, *_STATIC)}
+    write_npz(path, fields | {"format": np.asarray(FORMAT), "version": np.asarray(VERSION)})
+
+
+def load_bank(path: str | Path) -> PeopleBank:
+    """Read a bank. Raises: FileNotFoundError; FileError if it holds no bank."""
+    with reading(path, "bank of people"):
+        arrays, _ = read_npz(path)
+        if str(arrays.get("format")) != FORMAT:
+            raise ValueError(f"{path}: not a bank of people")
+        if (version := int(arrays["version"])) != VERSION:
+            raise ValueError(
+                f"{path}: a bank of version {version}; this program reads version {VERSION}"
+            )
+        if missing := {*_ARRAYS, *_STATIC} - set(arrays):
+            raise ValueError(f"{path}: a bank without {sorted(missing)}")
+        _check_arrays(arrays)
+        _check_range(arrays["seeds"].tolist(), str(arrays["split"]), f"{path}: ")
+        fields: dict[str, Any] = {name: jnp.asarray(arrays[name]) for name in _ARRAYS}
+        for name in ("parents", "mirrored_joints"):
+            fields[name] = tuple(arrays[name].tolist())
+        return PeopleBank(**fields, split=str(arrays["split"]), generator=int(arrays["generator"]))
+
+
+_STATIC = ("parents", "mirrored_joints", "split", "generator")
+_ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STATIC)
+
+
+def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
+    """Sizes that fit each other, real and finite numbers, indices that exist. Raises: Refused."""
+    sizes = {}
+    for name in _ARRAYS:
+        dimensions = PeopleBank.__annotations__[name].dim_str.split()
+        if arrays[name].ndim != len(dimensions):
+            raise Refused(
+                f"{name}: expected shape ({', '.join(dimensions)}), got {arrays[name].shape}"
+            )
+        for dimension, size in zip(dimensions, arrays[name].shape, strict=True):
+            if sizes.setdefault(dimension, int(dimension) if dimension.isdigit() else size) != size:
+                raise Refused(
+                    f"{name}: expected {dimension} = {sizes[dimension]}, got shape"
+                    f" {arrays[name].shape}"
+                )
+        check_array(name, arrays[name], arrays[name].shape)
+    bounds = {
+        "faces": sizes["n"],
+        "joint_ids": sizes["j"],
+        "nearest": sizes["q"],
+        "face_pieces": sizes["m"],
+    }
+    for name, bound in bounds.items():
+        check_indices(name, arrays[name], arrays[name].shape, bound)
+    check_joints(arrays["parents"].tolist(), [""] * sizes["j"])
+    check_indices("mirrored_joints", arrays["mirrored_joints"], (sizes["j"],), sizes["j"])
+
+
+def _check_range(seeds: Sequence[int], split: str, where: str = "") -> None:
+    for seed in seeds:
+        if split_of(seed) != split:
+            raise ValueError(
+                f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'"
+            )
+
+
+@functools.cache
+def _shipped_body() -> BodyModel:
+    return load_body()
+
+
+def _person(
+    seed: int,
+    body: BodyModel | None = None,
+    *,
+    texture_size: int,
+    pose_count: int,
+    displaced: BodyModel | None,
+) -> dict[str, np.ndarray]:
+    """One subject's share of the bank, unpadded: name -> array."""
+    subject = make_subject(seed, _shipped_body() if body is None else body)
+    baked = bake_subject(
+        subject, texture_size, 2 if texture_size <= 512 else 1
+    )  # fine patterns on coarse texels
+    surface, atlas, materials = subject.surface, baked.atlas, subject.materials
+    if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
+        raise ValueError(
+            f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many"
+        )
+    u, v = np.moveaxis(atlas.uvs[atlas.faces], -1, 0)
+    pad = lambda values, kind: np.pad(
+        np.asarray(values), (0, MOST_MATERIALS - len(materials))
+    ).astype(kind)
+    identities = [id(material) for material in materials]
+    generators = (np.random.default_rng([seed, POSE_STREAM, i]) for i in range(pose_count))
+    rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(
+        np.float32
+    )
+    places = np.stack([joint_positions(subject.build, r.astype(np.float64))[1] for r in rotations])
+    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(
+        -1
+    )  # of each pose from the others
+    joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
+    return {
+        "seeds": np.asarray(seed, np.int32),
+        "betas": subject.betas,
+        "joints": subject.build.joints.astype(np.float32),
+        "vertex_counts": np.asarray(len(surface.vertices), np.int32),
+        "vertices": surface.vertices.astype(np.float32),
+        "normals": vertex_normals(surface.vertices, surface.faces).astype(np.float16),
+        "joint_ids": joint_ids,
+        "joint_weights": joint_weights.astype(np.float16),
+        "faces": surface.faces.astype(np.uint16),
+        "uvs": np.round(UV_STEPS * np.stack([u, 1 - v], -1)).astype(np.uint16),
+        "face_pieces": subject.face_materials.astype(np.uint8),
+        "sheen": pad([material.sheen for material in materials], np.float32),
+        "groups": pad([identities.index(i) for i in identities], np.uint8),
+        "dyeable": pad([material.wrinkles > 0 for material in materials], np.float32),
+        "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
+        "rotations": rotations,
+        "nearest": np.argmin(away + 1e9 * np.eye(pose_count), axis=1).astype(np.int32),
+        "displacements": (
+            np.zeros((0, 3), np.float16)
+            if displaced is None
+            else to_silhouettes(subject, displaced, rotations[0])
+        ),
+    }
+
+
+def to_silhouettes(
+    subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, "b 3"]:
+    """The displacement of a body to what `SILHOUETTES` cameras around the dressed person see in a
+    pose, metres.
+    """
+    rng, nowhere = np.random.default_rng([subject.seed, SILHOUETTE_STREAM]), np.zeros(3, np.float32)
+    vertices = subject.posed_vertices(rotations, nowhere)
+    cameras = cameras_around(rng, vertices, spread_azimuths(rng, SILHOUETTES), SILHOUETTE_SIDE)
+    pixels = np.asarray(
+        jax.vmap(project, in_axes=(0, None))(cameras, jnp.asarray(vertices, jnp.float32))[0]
+    )
+    masks = np.stack(
+        [
+            silhouette(view, subject.surface.faces, (SILHOUETTE_SIDE, SILHOUETTE_SIDE))
+            for view in pixels
+        ]
+    )
+    frames, names = np.zeros(SILHOUETTES, int), tuple(map(str, range(SILHOUETTES)))
+    poses = jax.tree.map(lambda x: x[None], BodyPose(jnp.asarray(rotations), jnp.asarray(nowhere)))
+    images = np.broadcast_to(masks[..., None], (*masks.shape, 3))
+    return displacement(
+        body, Capture(images, masks, cameras, frames, body, subject.betas, poses, names)
+    ).astype(np.float16)
+
+
+def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: str) -> PeopleBank:
+    vertices = -(-max(len(p["vertices"]) for p in people) // PAD_VERTICES) * PAD_VERTICES
+    faces = -(-max(len(p["faces"]) for p in people) // PAD_FACES) * PAD_FACES
+
+    def padded(name, array):
+        if name in ("faces", "uvs", "face_pieces"):
+            return np.pad(array, [(0, faces - len(array))] + [(0, 0)] * (array.ndim - 1))
+        if name in ("vertices", "normals", "joint_ids", "joint_weights"):
+            return np.concatenate([array, np.repeat(array[:1], vertices - len(array), axis=0)])
+        return array
+
+    fields: dict[str, Any] = {
+        name: jnp.asarray(np.stack([padded(name, p[name]) for p in people])) for name in _ARRAYS
+    }
+    return PeopleBank(
+        **fields,
+        parents=body.parents,
+        mirrored_joints=mirrored_joints(body.joint_names),
+        split=split,
+    )
+
+
+def mirrored_joints(names: tuple[str, ...]) -> tuple[int, ...]:
+    """For each joint the one on the other side; joints in the middle are their own."""
+    other = {"left": "right", "right": "left"}
+    swapped = [
+        f"{other[n.split('_')[0]]}_{n.split('_', 1)[1]}" if n.split("_")[0] in other else n
+        for n in names
+    ]
+    return tuple(names.index(name) for name in swapped)

@@ -1,0 +1,452 @@
+"""Fabrics and materials: colors of points on a surface.
+
+A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT]. It is evaluated per
+pixel or texel, so it is crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed). What
+else is random about it is drawn anew from its seed whenever it is asked for colors. Periods of
+patterns are metres on the cloth; the finest is a few millimetres.
+"""
+
+import colorsys
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.synthetic.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, Vector, sewn_coordinates
+from humangs_jax.synthetic.surfaces import Field, Points, Ripples, choice, hashed, lattice
+
+SHOULDER_RIDGE = -0.02
+"""Template z of the line from neck to shoulder on which front and back are sewn together."""
+ALBEDO_LIMIT = 0.88
+"""Largest albedo: white clothes stay darker than the white background."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Spots:
+    """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3)
+    template coordinates.
+
+    Coordinates of sleeves and trouser legs are recomputed, so that they are sharp at seams, where
+    patterns meet.
+    """
+
+    cloth: Float[np.ndarray, "n 4"]
+    template: Points
+
+    def __post_init__(self):
+        object.__setattr__(self, "cloth", sewn_coordinates(self.cloth, self.template))
+
+    @property
+    def around(self) -> Field:
+        """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the
+        middle, back and front apart.
+        """
+        girth = self.cloth[:, 3]
+        turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
+        flat = (
+            np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1) * self._on_trunk
+        )  # 0 where the cloth hangs
+        x = self.cloth[:, 0]
+        across = np.where(self.template[:, 2] > SHOULDER_RIDGE, x, np.sign(x) * np.pi * girth - x)
+        return turned + flat * (across - turned)
+
+    @property
+    def along(self) -> Field:
+        """(n,) metres along the trunk or limb: height, but towards the shoulders the way up to
+        their ridge.
+        """
+        rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
+        return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - SHOULDER_RIDGE)
+
+    @property
+    def _on_trunk(self) -> Bool[np.ndarray, " n"]:
+        """(n,) whether this is cloth of a trunk, inside of the armholes."""
+        return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < SAME_GIRTH) & (
+            np.abs(self.template[:, 0]) <= ARMHOLE
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """albedo: Spots -> (n, 3). wrinkles: of the normals, strength; draped: they run down. sheen:
+    soft highlight in [0, 1].
+    """
+
+    albedo: Callable[[Spots], np.ndarray]
+    wrinkles: float = 0.0
+    sheen: float = 0.0
+    draped: bool = False
+
+
+def color(hue: float, saturation: float, value: float) -> Vector:
+    """(3,) linear-as-given RGB."""
+    return np.asarray(
+        colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32
+    )
+
+
+DYES = {
+    "neutral": (0.28, (0, 1), (0, 0.06), (0.1, 0.18, 0.32, 0.5, 0.7, 0.85)),
+    "muted": (0.28, (0, 1), (0.2, 0.5), (0.3, 0.8)),
+    "vivid": (0.22, (0, 1), (0.5, 0.85), (0.35, 0.8)),
+    "earth": (0.11, (0.05, 0.12), (0.3, 0.7), (0.2, 0.7)),
+    "navy": (0.11, (0.56, 0.66), (0.4, 0.8), (0.12, 0.45)),
+}
+"""Kinds of dyes: odds; hue, saturation and value, each a range or a choice of more than two
+numbers.
+"""
+
+
+def _color_of(rng: np.random.Generator, ranges: Iterable[Sequence[float | int]]) -> Vector:
+    return color(
+        *(
+            rng.uniform(values[0], values[1]) if len(values) == 2 else rng.choice(values)
+            for values in ranges
+        )
+    )
+
+
+def random_color(rng: np.random.Generator) -> Vector:
+    """A dye: neutral, muted, vivid, an earth color or navy."""
+    return _color_of(rng, DYES[rng.choice(list(DYES), p=[odds for odds, *_ in DYES.values()])][1:])
+
+
+def accent(rng: np.random.Generator, base: Vector) -> Vector:
+    """A second dye that stands out from the first."""
+    for _ in range(8):
+        other = random_color(rng)
+        if np.abs(other - base).sum() > 0.6:
+            return other
+    return np.where(base.mean() > 0.45, base * 0.3, 0.3 + 0.55 * base).astype(np.float32)
+
+
+def mix(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Field) -> Points:
+    """Colors, of points (n, 3) or one for all (3,): `a` where amount (n,) is 0, `b` where it is
+    1.
+    """
+    return a + (b - a) * amount[:, None]
+
+
+def band(
+    x: Field, low: float | int | Field, high: float | int | Field, soft: float = 0.0015
+) -> Field:
+    """1 between low and high (metres), with soft edges."""
+    return np.clip((x - low) / soft + 0.5, 0, 1) * np.clip((high - x) / soft + 0.5, 0, 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fabric:
+    """pattern: key of PATTERNS. base, other: (3,) dyes.
+
+    seed: of everything else about it (periods, prints, buttons).
+    """
+
+    pattern: str
+    base: Vector
+    other: Vector
+    seed: int
+
+    def rng(self, stream: int) -> np.random.Generator:
+        """Random numbers of the fabric's own; one stream for each feature."""
+        return np.random.default_rng([self.seed, stream])
+
+    def colors(self, s: Spots) -> Points:
+        """(n, 3) the colors of points."""
+        return PATTERNS[self.pattern][1](s, self.rng(0), self.base, self.other)
+
+
+LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
+USUAL = {
+    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)),
+    "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
+    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)),
+    "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
+}
+"""Hue, saturation and value of usual cloths."""
+CLOTHS = {
+    "jeans": ("denim", 0.85),
+    "denim_jacket": ("denim", 0.9),
+    "chinos": ("cotton", 0.6),
+    "cargo": ("cotton", 0.65),
+    "slim": ("suit", 0.5),
+    "blazer": ("suit", 0.6),
+    "coat": ("suit", 0.35),
+    "flats": ("leather", 0.75),
+    "boots": ("leather", 0.75),
+    "ankle_boots": ("leather", 0.75),
+    "belt": ("leather", 0.9),
+    "sandals": ("leather", 0.7),
+    "shoulder_bag": ("leather", 0.5),
+    "watch": ("leather", 0.6),
+    "glasses": ("leather", 0.6),
+    "sunglasses": ("leather", 0.85),
+    "track": ("suit", 0.5),
+    "leggings": ("suit", 0.6),
+    "wide": ("cotton", 0.4),
+}
+"""Usual cloth of a kind of garment, and how often it is of that color."""
+COLORS = (
+    (("shirt", "socks", "sneakers"), 0.45, ((0, 1), (0, 0.05), (0.72, 0.87))),
+    (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
+    (("sneakers", *LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
+)
+"""Kinds of garments, how often they are (if of no color so far) of these colors; otherwise any dye.
+"""
+PATTERN_RULES = (
+    (("jeans", "denim_jacket"), "denim", 1, ()),
+    (("cargo", "hooded_jacket", "shorts"), "camouflage", 0.25, ()),
+    (("puffer", "leggings", "backpack"), "plain", 0.7, ()),
+    (("cap", "brim_hat"), "plain", 1, ("camouflage", "melange", "checks", "herringbone")),
+    (("sneakers", *LEATHER_SHOES, "belt", "watch", "necklace", "glasses"), "plain", 1, ()),
+)
+"""Kinds of garments, the pattern that they get instead of a random one, how often, and patterns
+that they keep.
+"""
+
+
+def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
+    """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly
+    so.
+    """
+    plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
+    odds = (
+        plain_ones
+        if rng.random() < plainness
+        else {name: share for name, (share, _) in PATTERNS.items() if share}
+    )
+    pattern = choice(rng, odds)
+    base = _dye(rng, kind)
+    for kinds, usual, odds, kept in PATTERN_RULES:
+        if kind in kinds and pattern not in kept and (odds == 1 or rng.random() < odds):
+            pattern = usual
+    return Fabric(pattern, base, accent(rng, base), int(rng.integers(1 << 31)))
+
+
+def _dye(rng: np.random.Generator, kind: str) -> Vector:
+    """A usual color of a kind of garment, or any."""
+    cloth, odds = CLOTHS.get(kind, ("cotton", 0.0))
+    for kinds, share, ranges in (((kind,), odds, USUAL[cloth]), *COLORS):
+        if kind in kinds and rng.random() < share:
+            return _color_of(rng, ranges)
+    return random_color(rng)
+
+
+def _lines(x: Field, period: float, width: float, shift: float = 0.0) -> Field:
+    """(n,) 1 on lines of a width that are a period apart, metres; shift: in periods."""
+    return band((x / period + shift) % 1 * period, 0, width)
+
+
+def _grain(s: Spots, around: float, along: float, seed: int) -> Field:
+    """(n,) lattice noise in cells of around x along metres."""
+    return lattice(np.stack([s.around / around, s.along / along], -1), seed)
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(1 << 20))
+
+
+def plain(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
+    """One dye, slightly uneven."""
+    return base * (1 + 0.03 * Ripples(rng, 0.12)(s.cloth[:, :3]))[:, None]
+
+
+def stripes(
+    s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upright: bool = False
+) -> Points:
+    """Stripes around (or, upright, along) the limb."""
+    period, share = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09]), rng.uniform(0.25, 0.6)
+    return mix(base, other, _lines(s.around if upright else s.along, period, share * period))
+
+
+def checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Gingham, or tartan with thin lines of a third dye."""
+    period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
+    result = mix(
+        base,
+        other,
+        0.5 * (_lines(s.around, period, period / 2) + _lines(s.along, period, period / 2)),
+    )
+    lines = np.maximum(_lines(s.around, period, 0.004, 0.25), _lines(s.along, period, 0.004, 0.25))
+    return mix(result, third, 0.7 * lines) if tartan else result
+
+
+def dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Polka dots in a triangular grid."""
+    period, size = rng.choice([0.03, 0.045, 0.07]), rng.uniform(0.2, 0.34)
+    row = np.floor(s.along / period)
+    x = ((s.around / period + 0.5 * (row % 2)) % 1 - 0.5) * period
+    y = ((s.along / period) % 1 - 0.5) * period
+    return mix(base, other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
+
+
+def flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Scattered blossoms of five petals in two dyes."""
+    period, seed, third = rng.choice([0.05, 0.075]), _seed(rng), accent(rng, base)
+    plane = np.stack([s.around, s.along], -1) / period
+    cell = np.floor(plane).astype(np.int64)
+    jitter = np.stack([hashed(cell, seed), hashed(cell, seed + 1)], -1) * 0.4 + 0.3
+    d = (plane - cell - jitter) * period
+    r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
+    petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
+    dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
+    return mix(
+        mix(base, dye, petals),
+        np.asarray([0.85, 0.75, 0.3], np.float32),
+        band(r, -1, period * 0.07, 0.002),
+    )
+
+
+def mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Camouflage, batik, tie-dye: thresholded or soft noise."""
+    scale, seed = rng.choice([0.03, 0.06, 0.1]), _seed(rng)
+    width, third = 0.02 if rng.random() < 0.5 else 0.2, accent(rng, other)
+    p = s.cloth[:, :3] / scale
+    n = 0.65 * lattice(p, seed) + 0.35 * lattice(2.1 * p, seed + 1)
+    first = np.clip((n - 0.47) / width + 0.5, 0, 1)
+    second = np.clip((lattice(p * 1.2 + 7.7, seed + 2) - 0.62) / width + 0.5, 0, 1)
+    return mix(mix(base, other, first), third, 0.8 * second)
+
+
+def melange(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Knit: fine grain."""
+    seed, share = _seed(rng), rng.uniform(0.2, 0.5)
+    return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
+
+
+def denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
+    """Faded on the front of the thighs and at creases, grained along the thread."""
+    cloud, seed = Ripples(rng, 0.15), _seed(rng)
+    fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
+    front = (
+        np.clip(s.cloth[:, 2] / 0.08, 0, 1)
+        * np.exp(-(((s.along + 0.6) / 0.14) ** 2))
+        * (s.cloth[:, 3] < 0.14)
+    )
+    crease = np.clip(np.abs(_grain(s, 0.09, 0.022, seed + 1) - 0.5) * 8, 0, 1)
+    worn = np.exp(-(((s.along + 0.47) / 0.05) ** 2)) + 0.5 * np.exp(
+        -(((s.along + 0.78) / 0.06) ** 2)
+    )
+    bright = (
+        1
+        + 0.07 * cloud(s.cloth[:, :3])
+        + fade * front
+        + 0.14 * (_grain(s, 0.003, 0.016, seed) - 0.5)
+    )
+    result = base * (bright + 0.5 * fade * worn * (1 - crease))[:, None]
+    if not holes:
+        return result
+    at = ((s.along + 0.72) / 0.03) ** 2 + (s.around / 0.05) ** 2
+    frayed = band(at + 0.6 * _grain(s, 0.02, 0.004, seed + 2), -1, 0.8, 0.2)
+    return mix(
+        result, np.asarray([0.75, 0.74, 0.72], np.float32), 0.8 * frayed * (s.cloth[:, 2] > 0)
+    )
+
+
+CAMOUFLAGES = np.asarray(
+    [
+        [[0.24, 0.26, 0.14], [0.10, 0.12, 0.07], [0.33, 0.24, 0.15], [0.52, 0.47, 0.32]],
+        [[0.68, 0.58, 0.42], [0.52, 0.42, 0.29], [0.40, 0.32, 0.22], [0.78, 0.70, 0.56]],
+        [[0.45, 0.46, 0.47], [0.14, 0.14, 0.15], [0.28, 0.29, 0.30], [0.72, 0.73, 0.74]],
+        [[0.14, 0.20, 0.32], [0.06, 0.08, 0.14], [0.24, 0.33, 0.46], [0.45, 0.54, 0.62]],
+    ],
+    np.float32,
+)
+"""Four colors each: earth, sand, town, sea."""
+
+
+def camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector) -> Points:
+    """Torn blots of four colors, larger ones below smaller ones."""
+    dyes = CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
+    scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
+    p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
+    warp = np.stack([lattice(2.3 * p + k, seed + k) for k in range(3)], -1) - 0.5
+    result = np.broadcast_to(dyes[0], (len(p), 3))
+    for k, level in ((1, 0.56), (2, 0.6), (3, 0.66)):
+        blots = lattice((0.8 + 0.35 * k) * (p + 0.9 * warp) + 11.3 * k, seed + 10 * k)
+        result = mix(result, dyes[k], np.clip((blots - level) / 0.03 + 0.5, 0, 1))
+    return result
+
+
+def herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Zigzags of slanted threads."""
+    period, pitch, share = (
+        rng.choice([0.03, 0.045]),
+        rng.choice([0.008, 0.012]),
+        rng.uniform(0.35, 0.7),
+    )
+    side = np.abs((s.around / period) % 2 - 1) * period
+    return mix(base, base + share * (other - base), _lines(s.along + side, pitch, 0.5 * pitch))
+
+
+def argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Diamonds with thin lines across."""
+    period, third = rng.choice([0.06, 0.09]), accent(rng, other)
+    x, y = s.around / period, s.along / (1.6 * period)
+    u, v = (x + y) % 1, (x - y) % 1
+    diamond = band(u * period, 0, period / 2) * band(v * period, 0, period / 2)
+    lines = np.maximum(*(band(((w + 0.25) % 1) * period, 0, 0.003) for w in (u, v)))
+    return mix(mix(base, other, diamond), third, 0.8 * lines)
+
+
+def dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """One dye runs into another along the garment, or in rings around a middle (tie-dye)."""
+    rings, level, wide = rng.random() < 0.5, rng.uniform(-0.35, 0.0), rng.uniform(0.05, 0.25)
+    wobble, third = lattice(s.cloth[:, :3] / 0.05, _seed(rng)) - 0.5, accent(rng, other)
+    if not rings:
+        return mix(base, other, np.clip((s.along + 0.05 * wobble - level) / wide + 0.5, 0, 1))
+    r = np.sqrt(s.around**2 + (s.along + 0.1) ** 2) + 0.06 * wobble
+    twist = (r / 0.13 + np.arctan2(s.around, s.along + 0.1) / np.pi) % 1
+    return mix(
+        mix(base, other, np.clip(np.abs(twist - 0.5) * 4 - 0.5, 0, 1)),
+        third,
+        band(twist, 0.4, 0.6, 0.15),
+    )
+
+
+def tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """Woven in two threads of nearly one color."""
+    seed, share = _seed(rng), rng.uniform(0.08, 0.25)
+    return mix(
+        base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2
+    )
+
+
+def cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
+    """Plaits of thick yarn: light and dark, no second dye."""
+    period = rng.choice([0.05, 0.07])
+    x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
+    strand = np.sin(2 * np.pi * (y + 0.8 * np.abs(x))) * np.sign(x)
+    inside = band(np.abs(x) * period, -1, 0.3 * period)
+    ribs = np.cos(2 * np.pi * s.around / 0.008)
+    return base * (1 + 0.13 * strand * inside + 0.07 * ribs * (1 - inside))[:, None]
+
+
+def color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+    """A chest (or thigh) in another dye, with a line between."""
+    level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
+    return mix(
+        mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level)
+    )
+
+
+PATTERNS: dict[str, tuple[float, Callable]] = {
+    "plain": (0.05, plain),
+    "stripes": (0.2, stripes),
+    "upright": (0.08, functools.partial(stripes, upright=True)),
+    "checks": (0.17, checks),
+    "dots": (0.06, dots),
+    "flowers": (0.09, flowers),
+    "mottled": (0.05, mottled),
+    "camouflage": (0.05, camouflage),
+    "melange": (0.03, melange),
+    "blocks": (0.09, color_blocks),
+    "herringbone": (0.03, herringbone),
+    "argyle": (0.03, argyle),
+    "dip_dye": (0.04, dip_dye),
+    "cable_knit": (0.03, cable_knit),
+    "tweed": (0.0, tweed),
+    "denim": (0.0, denim),
+}
+"""Odds among fabrics that are not plain, and the pattern."""

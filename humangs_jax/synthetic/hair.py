@@ -1,0 +1,446 @@
+"""Haircuts and beards: how they are drawn, and their shells, tubes, buns and tails; also knitted
+caps.
+
+A hairline is a template height for each azimuth around the skull (0 in front, pi at the nape), the
+same on both sides.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.synthetic import surfaces
+from humangs_jax.synthetic.anatomy import (
+    HEAD,
+    LEFT_EYE,
+    NECK,
+    RIGHT_EYE,
+    SPINE3,
+    Anatomy,
+    Vector,
+    smoothstep,
+)
+from humangs_jax.synthetic.outfits import HEADWEAR, drawn, row
+from humangs_jax.synthetic.surfaces import (
+    Field,
+    Points,
+    Surface,
+    around,
+    blurred,
+    boundaries,
+    cut,
+    rigid,
+    ripples,
+    smooth,
+)
+from humangs_jax.synthetic.tailoring import finished, nearest_weights
+
+CUTS = {
+    "cropped": (0.22, 0.03, (0.005, 0.010)),
+    "short": (0.26, 0.10, (0.012, 0.022)),
+    "quiff": (0.10, 0.01, (0.010, 0.016)),
+    "curly": (0.08, 0.12, (0.024, 0.045)),
+    "afro": (0.05, 0.05, (0.045, 0.085)),
+    "buzz": (0.09, 0.01, 0.008),
+    "bald": (0.07, 0.004, 0.008),
+    "bob": (0.012, 0.17, (0.012, 0.024)),
+    "long": (0.025, 0.25, (0.010, 0.022)),
+    "ponytail": (0.02, 0.11, 0.008),
+    "bun": (0.03, 0.08, 0.008),
+    "braid": (0.01, 0.05, 0.008),
+}
+"""Odds for men and women, thickness (metres, or their range)."""
+NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
+"""Cuts that no headwear fits over."""
+LONG_CUTS = ("bob", "long")
+SHELLS = {
+    "curly": (0.3, 0.035, 0),
+    "afro": (0.1, 0.05, 0),
+    "quiff": (0.2, 0.05, 1),
+    "short": (0.22, 0.035, 1),
+}
+"""Of hair on the scalp: height of its bumps as a share of the thickness, their width in metres, 1
+if it is parted.
+"""
+TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
+"""Range of their lengths; distance of the knots, metres."""
+FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
+"""Odds of a fringe of longer hair."""
+BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full": 0.16}
+"""Odds for men."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Haircut:
+    """cut: one of CUTS. fringe: one of FRINGES. side: +1 or -1, of parting and braid. thickness in
+    metres.
+
+    bottom: template height where long hair ends. wave: height of its waves, metres. receding: shift
+    of the hairline upwards.
+    beard: one of BEARDS; beard_length in metres. grain: contrast of strands.
+    """
+
+    cut: str
+    fringe: str
+    side: float
+    thickness: float
+    bottom: float
+    wave: float
+    receding: float
+    beard: str
+    beard_length: float
+    grain: float
+
+
+def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set[str]) -> Haircut:
+    """A random cut that fits under the headwear; old men lose hair."""
+    headwear = bool(worn & set(HEADWEAR))
+    odds = {name: value[0 if male else 1] for name, value in CUTS.items()}
+    if male and years > 45:
+        odds["bald"] *= 3.0
+    cut = drawn(rng, odds | (dict.fromkeys(NOT_UNDER_HEADWEAR, 0) if headwear else {}))
+    thickness = row(rng, {name: value[2] for name, value in CUTS.items()}, cut)
+    thickness = min(thickness, 0.010) if headwear else thickness
+    bottom = rng.uniform(0.15, 0.2) if cut == "bob" else rng.uniform(-0.17, 0.1)
+    wave = rng.choice([rng.uniform(0.002, 0.004), rng.uniform(0.006, 0.014)], p=[0.55, 0.45])
+    receding = (
+        rng.uniform(-0.004, 0.012 + 0.012 * (years > 45)) if male else rng.uniform(-0.006, 0.004)
+    )
+    beard = drawn(rng, BEARDS) if male and years > 17 else "none"
+    long = 0.35 if rng.random() < 0.8 else 1.0
+    fringe, side = drawn(rng, FRINGES), float(rng.choice([-1, 1]))
+    beard_length, grain = (
+        rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016),
+        rng.uniform(0.5, 0.95),
+    )
+    return Haircut(
+        cut,
+        fringe,
+        side,
+        float(thickness),
+        bottom,
+        float(wave),
+        receding,
+        beard,
+        beard_length,
+        grain,
+    )
+
+
+SKULL = np.asarray([0.0, 0.345, 0.02])
+"""Middle of the skull in template coordinates."""
+CROWN, NECK_HEIGHT = 0.4356, 0.189
+
+SHORT_LINE = (
+    [0.0, 0.55, 0.95, 1.2, 1.36, 1.42, 1.86, 1.95, 2.3, 3.15],
+    [0.392, 0.388, 0.368, 0.325, 0.312, 0.353, 0.353, 0.275, 0.234, 0.226],
+)
+"""Azimuths and heights: forehead, temple, sideburn before the ear, above and behind the ear, nape.
+"""
+CAP_LINE = ([0.0, 0.8, 1.5, 2.2, 3.15], [0.375, 0.37, 0.345, 0.325, 0.315])
+TUBE_COLUMNS = 60
+
+FRINGE_LINES = {
+    "straight": (
+        [-3.15, -1.2, -1.12, -0.9, -0.5, 0.0, 0.5, 0.9, 1.12, 1.2, 3.15],
+        [-9.0, -9.0, 0.30, 0.362, 0.384, 0.388, 0.384, 0.362, 0.30, -9.0, -9.0],
+    ),
+    "parted": (
+        [-3.15, -1.16, -1.08, -0.85, -0.5, -0.1, 0.0, 0.1, 0.5, 0.85, 1.08, 1.16, 3.15],
+        [-9.0, -9.0, 0.30, 0.35, 0.388, 0.414, 0.419, 0.414, 0.388, 0.35, 0.30, -9.0, -9.0],
+    ),
+    "side": (
+        [-3.15, -1.2, -1.1, -0.8, -0.3, 0.25, 0.55, 0.75, 0.95, 1.1, 1.18, 3.15],
+        [-9.0, -9.0, 0.30, 0.352, 0.374, 0.402, 0.415, 0.405, 0.37, 0.30, -9.0, -9.0],
+    ),
+}
+"""Signed azimuths and heights above which longer hair covers the face: blunt, parted in the middle,
+combed to the right.
+"""
+
+
+def style(
+    rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0
+) -> list[Surface]:
+    """The surfaces of a haircut, beard included, over clothes that are `over` metres from the
+    skin.
+    """
+    kind, parts = haircut.cut, []
+    if kind in LONG_CUTS:
+        opening, wave = fringe(rng, haircut), haircut.wave
+        parts.append(
+            falling_tube(
+                rng, anatomy, haircut.thickness, haircut.bottom, opening, wave=wave, over=over
+            )
+        )
+    elif kind not in ("buzz", "bald"):
+        bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
+        quiff = rng.uniform(0.012, 0.026) if kind == "quiff" else 0.0
+        side, shift = haircut.side * parted, haircut.receding
+        parts.append(
+            scalp_shell(
+                rng, anatomy, haircut.thickness, bumps, size, shift=shift, quiff=quiff, side=side
+            )
+        )
+    if kind in TAILS:
+        length, knots = TAILS[kind]
+        parts.append(tail(rng, anatomy, rng.uniform(*length), knots))
+    if kind == "bun":
+        parts.append(bun(anatomy, rng.uniform(0.032, 0.05), rng.uniform(0.0, 1.1)))
+    if haircut.beard in ("moustache", "goatee", "full"):
+        parts.append(beard(rng, anatomy, haircut.beard_length, haircut.beard))
+    return parts
+
+
+Opening = Callable[[Field, Field], Field]
+"""Azimuths in (-pi, pi] and template heights -> positive where hair or cloth leaves the face free.
+"""
+
+
+def fringe(rng: np.random.Generator, haircut: Haircut) -> Opening:
+    """Metres above the ragged edge of hair around the face."""
+    angles, heights = (np.asarray(x) for x in FRINGE_LINES[haircut.fringe])
+    phase = rng.uniform(0, 6.28, 3)
+
+    def above(azimuths, height):
+        a = azimuths * haircut.side
+        waves = zip((0.0035, 0.0025, 0.003), (23, 41, 9), phase, strict=True)
+        return (
+            height
+            - np.interp(a, angles, heights)
+            - sum(size * np.sin(n * a + p) for size, n, p in waves)
+        )
+
+    return above
+
+
+def ears(template: Points) -> np.ndarray:
+    """(n,) whether a vertex is on the outer part of an ear."""
+    x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
+    return (x > 0.0765) & (y > 0.265) & (y < 0.36) & (z < 0.03)
+
+
+def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
+    """(n,) height above a hairline; strongly negative away from the head."""
+    azimuths = np.abs(
+        np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2])
+    )  # 0 in front, pi at the nape
+    above = template[:, 1] - np.interp(azimuths, *line) - shift
+    return np.where((template[:, 1] > 0.2) & (np.abs(template[:, 0]) < 0.12), above, -1.0)
+
+
+def scalp_shell(
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    thickness: float,
+    bumps: float,
+    size: float = 0.05,
+    hat: bool = False,
+    shift: float = 0.0,
+    crown: float = 0.0,
+    quiff: float = 0.0,
+    side: float | int = 0,
+) -> Surface:
+    """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the
+    hairline.
+
+    bumps: share of the thickness, `size` metres wide. crown, quiff: metres that the top and the
+    front rise above that.
+    side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge
+    that stands off.
+    """
+    template = anatomy.skin.template
+    above, rim = (
+        above_line(template, CAP_LINE if hat else SHORT_LINE, shift),
+        0.011 if hat else 0.0025,
+    )
+    if not hat:
+        above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
+    surface = cut(anatomy.skin.with_attributes(above=above), above)
+    normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 8))
+    full = smoothstep(-0.002, 0.022, surface.attributes["above"])
+    grown = thickness * full * (1 + bumps * ripples(rng, surface.template, size))
+    grown = np.maximum(grown, rim) + 0.3 * rim
+    base = smooth(surface.vertices, surface.faces, 3, keep_hems=True)
+    x, y, z = surface.template.T
+    top = smoothstep(0.385, 0.425, y)
+    if side:
+        parting = np.exp(-(((x - side * 0.035) / 0.009) ** 2)) * top * (z > -0.02)
+        grown = (
+            grown
+            * (1 - 0.55 * parting)
+            * (1 + 0.25 * top * np.clip(-side * (x - side * 0.035) / 0.06, -1, 1))
+        )
+    points = base + grown[:, None] * normals
+    raised = quiff * smoothstep(0.02, 0.085, z) * smoothstep(0.375, 0.41, y)
+    points = points + raised[:, None] * np.asarray([0.0, 0.95, 0.35])
+    points[:, 1] += crown * smoothstep(0.39, 0.42, y)
+    return finished(surface.moved(points), 2, 0.006)
+
+
+def falling_tube(
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    thickness: float,
+    bottom: float,
+    opening: Opening,
+    wave: float = 0.004,
+    ends: float | None = None,
+    over: float = 0.0,
+) -> Surface:
+    """Long hair, a hood or a headscarf: the skull's silhouette scaled up, then falling to the
+    height `bottom` at the back.
+
+    ends: height at which it ends in front; None: hair, which ends on the shoulders at the sides.
+    over: metres between skin and what is worn below it.
+    """
+    skin, template = anatomy.skin, anatomy.skin.template
+    to_rest, center = _skull(anatomy)
+    scale = 1 + thickness / 0.09
+    ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
+    head = (
+        (template[:, 1] > 0.24) & (np.abs(template[:, 0]) < 0.1) & ~ears & (template[:, 2] < 0.125)
+    )
+    levels = np.concatenate([np.arange(-0.3, 0.24, 0.02), np.linspace(0.24, CROWN - 0.0015, 24)])
+    spine = np.repeat(center[None, [0, 2]], len(levels), 0)
+    points = skin.vertices[head]
+    skull = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.012))
+    falling = surfaces.hanging(skull, 0.25)
+    trunk = (np.abs(template[:, 0]) < 0.12) & (template[:, 1] < 0.24) & (template[:, 1] > -0.35)
+    points = skin.vertices[trunk]
+    back = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
+
+    top = CROWN + (CROWN - SKULL[1]) * (scale - 1)
+    dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
+    rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
+    row_height, angle, faces = surfaces.tube(rows, surfaces.circle(TUBE_COLUMNS))
+    height = to_rest(row_height)
+    inner = center[1] + (height - center[1]) / scale
+    brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
+    vault = np.sqrt(
+        np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1)
+    )  # the dome above the brim
+    radius = scale * vault * falling.radius(np.minimum(inner, brim), angle)
+    on_back = back.radius(height, angle) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)
+    radius = np.maximum(radius, on_back * (row_height < 0.24))
+    waves = ripples(rng, around(3, angle, height * 4), 1.2)
+    radius = radius + smoothstep(0.0, 0.12, SKULL[1] - row_height) * wave * waves
+    vertices = around(radius, angle, height, center[[0, 2]]).astype(np.float32)
+    signed = (angle + np.pi) % (2 * np.pi) - np.pi
+    front = 0.15 if ends is None else ends
+    lowest = [front, front, max(bottom, front), bottom, bottom]
+    hem = np.interp(np.abs(signed), [0, 1.2, 1.75, 2.2, np.pi], lowest)
+    hem = hem + 0.012 * ripples(rng, around(5, angle, 0 * angle), 1.5)
+    flat = around(0.09, angle, row_height, SKULL[[0, 2]]).astype(np.float32)
+    surface = Surface(vertices, faces, _falling_weights(anatomy, vertices, row_height))
+    surface = surface.painted(flat, flat - np.asarray([0, 0, 0.02], np.float32), 0.09)
+    surface = cut(surface, np.minimum(opening(signed, row_height), row_height - hem))
+    return finished(
+        surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 2, 0.008
+    )
+
+
+def bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
+    """A ball of hair on the back of the head."""
+    direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
+    center = _skull(anatomy)[1] + direction * (0.095 + 0.55 * radius)
+    directions, faces = surfaces.ball(12, 20)
+    vertices = center + directions * (radius * np.asarray([1.0, 0.9, 0.85]))
+    return _painted(rigid(vertices, faces, HEAD, len(anatomy.joints)))
+
+
+def tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float) -> Surface:
+    """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres
+    apart.
+    """
+    start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[HEAD, 2] - 0.105])
+    rows, columns = 40 if knots else 16, 14
+    t = np.linspace(0, 1, rows)
+    sway = 0.012 * np.sin(3 * t + rng.uniform(0, 6)) * t
+    line = start + np.stack(
+        [sway, -length * t**1.3, -0.05 * np.sin(np.pi * np.minimum(t * 1.6, 1) / 1.3) - 0.01], -1
+    )
+    radius = np.interp(t, [0, 0.12, 0.4, 0.8, 1], [0.016, 0.026, 0.030, 0.020, 0.004])
+    if knots:
+        radius = 0.85 * radius * (1 + 0.22 * np.cos(2 * np.pi * length * t / knots))
+    vertices, faces = surfaces.sweep(line, np.asarray([1.0, 0.0, 0.0]), radius[:, None], columns)
+    weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
+    follow = smoothstep(0.1, 1.0, np.repeat(t, columns)) * 0.8
+    weights[:, HEAD], weights[:, SPINE3] = 1 - follow, follow
+    return _painted(Surface(vertices, faces, weights))
+
+
+def beard_field(template: Points, kind: str) -> Field:
+    """Positive where a beard grows: full, goatee or moustache."""
+    x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
+    lips = 1 - (x / 0.027) ** 2 - ((y - 0.262) / 0.0115) ** 2
+    cheek = 0.279 + 0.30 * np.maximum(x - 0.03, 0) - 0.1 * np.maximum(0.02 - x, 0)
+    field = np.minimum.reduce([cheek - y, y - 0.2, z - 0.012, -0.02 * lips])
+    if kind == "goatee":
+        field = np.minimum(field, 0.031 - x)
+    if kind == "moustache":
+        field = np.minimum.reduce([field, 0.034 - x, y - 0.2625 + 0.25 * np.maximum(x - 0.02, 0)])
+    return np.where((y > 0.19) & (x < 0.08) & (z > 0.0), field, -1.0)
+
+
+def beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
+    """A beard that thins out towards the cheeks."""
+    template = anatomy.skin.template
+    field = beard_field(template, kind)
+    ragged = np.where(field > -0.5, field + 0.002 * ripples(rng, template, 0.012), -1.0)
+    surface = cut(anatomy.skin.with_attributes(above=field), ragged)
+    normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 4))
+    full = smoothstep(0.0, 0.016, surface.attributes["above"])
+    chin = smoothstep(0.25, 0.225, surface.template[:, 1])
+    bumps = 1 + 0.25 * ripples(rng, surface.template, 0.02)
+    grown = thickness * full * (0.6 + 0.8 * chin) * bumps + 0.0010
+    return finished(surface.moved(surface.vertices + grown[:, None] * normals), 2, 0.002)
+
+
+def _painted(surface: Surface) -> Surface:
+    """Template and cloth coordinates of hair that does not come from the scalp: its own
+    position.
+    """
+    flat = surface.vertices - surface.vertices.mean(0)
+    return surface.painted(flat + SKULL, flat, 0.09)
+
+
+def eyeballs(anatomy: Anatomy) -> Surface:
+    """Two balls in the sockets; their `template` attribute is the unit direction from the ball's
+    middle.
+    """
+    parts, (directions, faces) = [], surfaces.ball(14, 22)
+    directions = directions.astype(np.float32)
+    for joint in (LEFT_EYE, RIGHT_EYE):
+        center = anatomy.joints[joint]
+        lids = np.sort(np.linalg.norm(anatomy.skin.vertices - center, axis=1))[:12]
+        eye = rigid(center + directions * lids.mean() * 0.985, faces, joint, len(anatomy.joints))
+        parts.append(eye.painted(directions, directions, 1.0))
+    return surfaces.join(parts)
+
+
+def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
+    """Template heights of head and neck -> rest heights of the person; the skull's middle (3,) at
+    rest.
+    """
+    neck = anatomy.joints[NECK, 1]
+    factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
+    to_rest = lambda y: neck + (y - NECK_HEIGHT) * factor
+    return to_rest, np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
+
+
+def _falling_weights(
+    anatomy: Anatomy, vertices: Points, template_y: Field
+) -> Float[np.ndarray, "n j"]:
+    """Weights of the head above the jaw, blending into those of the nearest skin further down."""
+    x, y, _ = anatomy.skin.template.T
+    near = np.flatnonzero((np.abs(x) < 0.15) & (y > -0.3) & (y < 0.26))[::2]
+    head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
+    head[:, HEAD] = 1
+    own = smoothstep(0.06, 0.25, template_y)[:, None]
+    lower = template_y < 0.26
+    trunk = head.copy()
+    trunk[lower] = nearest_weights(anatomy, vertices[lower], near)
+    return (head * own + trunk * (1 - own)).astype(np.float32)

@@ -1,0 +1,587 @@
+"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to
+learn from; its `Source`.
+
+A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two
+similar poses of the person's own), light and cameras. The same key gives the same bits on the same
+platform. Differences from `subject.render_view`: colors come from baked textures, normals are
+skinned, vertices follow a few joints each.
+
+    bank = load_bank("people.npz")
+    example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
+    batch = jax.vmap(on_the_fly_example, in_axes=(None, 0, None))(bank, keys, OnTheFlyConfig())
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from humangs_jax.body.model import joint_transforms
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
+from humangs_jax.core.configuration import Few, Share, Side, Slots, Spread, configuration, knob
+from humangs_jax.core.numerics import safe_divide
+from humangs_jax.core.processes import compiler_options
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.loading.examples import SUBJECT_STREAM, Example
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.mesh.rasterizer import Fragments, rasterize_mesh
+from humangs_jax.rendering.tiling import cumsum
+from humangs_jax.synthetic import surroundings
+from humangs_jax.synthetic.anatomy import MIRROR
+from humangs_jax.synthetic.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleBank
+from humangs_jax.synthetic.subject import APPEARANCES, SPLITS, SUPERSAMPLING, subject_key
+from humangs_jax.synthetic.surroundings import pick
+
+POSES, MIXING = 2, 0.5
+"""Of an example; largest share of the way to the nearest pose: the other half of the way is reached
+from that pose.
+"""
+DYED_SHARE, CLOSE_SHARE = 0.7, 0.2
+"""Of examples whose clothes get other colors; of close cameras among the targets."""
+DISPLACED, COUNTED = 1, 2
+"""They make the keys that decide whether the body is displaced and how many views there are from
+that of an example.
+"""
+Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
+"""Of views: numbers for cameras, azimuths, poses, shares of close cameras."""
+BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
+
+
+@configuration
+class OnTheFlyConfig:
+    """What an example shows."""
+
+    input_views: Few = 4
+    view_counts: tuple[Few, ...] = ()
+    """If given, how many of the `input_views` an example has, one of these at random. The last one
+    is repeated after them, so that one program serves all numbers (`SubjectViews.view_count`)."""
+    target_views: Few = 3
+    input_size: Side = 256
+    """Pixels a side."""
+    target_size: Side = 256
+    """Pixels a side."""
+    mixed_pose_share: Share = 0.3
+    """Of examples whose inputs show any of the `POSES` too, each, as targets do; otherwise all show
+    the first.
+    """
+    jitter: Spread = 0.7
+    """See `surroundings.azimuths_from`."""
+    scattered_share: Share = 0.2
+    """See `surroundings.azimuths_from`."""
+    mirrored_share: Share = 0.5
+    """Of examples."""
+    displaced_share: Share = 0.0
+    """Of examples: their body is displaced to the silhouettes of the clothes, and they are not
+    mirrored.
+    """
+    depths: bool = False
+    """Also of every view."""
+    views_at_once: Few = knob(
+        1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
+    )
+    """Views drawn side by side: 1 suits CPUs, all of them accelerators."""
+    pixels_per_step: Slots = knob(
+        1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
+    )
+    """Of the person, that are colored at a time: few for CPUs, whole images for accelerators."""
+
+    def __post_init__(self):
+        if max(self.view_counts, default=0) > self.input_views:
+            raise ValueError(
+                f"view_counts {self.view_counts}: expected at most input_views, {self.input_views}"
+            )
+
+
+ON_THE_FLY = OnTheFlyConfig()
+
+
+@pytree_dataclass
+class Scene:
+    """What all views of an example share: a person in several poses o, dyes and light.
+
+    person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3)
+    metres.
+    corners: (o, f, 15) of every face's corners normal, openness and share of the key light that
+    arrives.
+    dyes: (m, 3, 3) color matrix of every piece. lights.
+    """
+
+    person: Int[Array, ""]
+    rotations: Float[Array, "o j 3"]
+    translations: Float[Array, "o 3"]
+    vertices: Float[Array, "o n 3"]
+    corners: Float[Array, "o f 15"]
+    dyes: Float[Array, "m 3 3"]
+    lights: surroundings.Lights
+
+
+def on_the_fly_example(
+    bank: PeopleBank,
+    key: Key,
+    config: OnTheFlyConfig = ON_THE_FLY,
+    person: Int[Array, ""] | int | None = None,
+) -> Example:
+    """Views of a person of the bank: inputs and targets. person: its number in the bank; None: the
+    key chooses.
+
+    Raises: ValueError for a `displaced_share` of a bank that has none.
+    """
+    if config.displaced_share and not bank.displacements.shape[1]:
+        raise ValueError(
+            "displaced_share: the bank has no displacements: expected one of"
+            " build_bank(displaced=body)"
+        )
+    numbers = _draw_numbers(bank, key, config)
+    if person is not None:
+        numbers["person"] = (
+            jnp.asarray(person + 0.5) / bank.people
+        )  # which `pick` takes for this one
+    scene = scene_from(numbers, bank)
+    count = None
+    if config.view_counts:
+        number = jax.random.uniform(jax.random.fold_in(key, COUNTED))
+        count = jnp.asarray(config.view_counts, jnp.int32)[pick(number, len(config.view_counts))]
+    plans = _plans(numbers, config, count)
+    if config.input_size == config.target_size:  # one loop over all views: half of the compilation
+        both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
+        views = _views(bank, scene, both, config, config.input_size)
+        parts = [
+            _some(views, part)
+            for part in (slice(config.input_views), slice(config.input_views, None))
+        ]
+    else:
+        sizes = config.input_size, config.target_size
+        parts = [
+            _views(bank, scene, plan, config, size) for plan, size in zip(plans, sizes, strict=True)
+        ]
+    flipped = numbers["mirrored"] < config.mirrored_share
+    if config.displaced_share:
+        displaced = jax.random.uniform(jax.random.fold_in(key, DISPLACED)) < config.displaced_share
+        flipped &= ~displaced
+    choose = lambda a, b: jnp.where(flipped, a, b)
+    inputs, targets = (
+        jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts
+    )
+    if config.displaced_share:
+        moved = bank.displacements[scene.person].astype(inputs.images.dtype)
+        inputs = replace(inputs, displacement=jnp.where(displaced, moved, 0))
+    return Example(replace(inputs, view_count=count), targets)
+
+
+def _draw_numbers(
+    bank: PeopleBank, key: Key, config: OnTheFlyConfig
+) -> dict[str, Float[Array, "..."]]:
+    """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
+    shapes = {
+        "person": (),
+        "poses": (POSES, 2),
+        "lights": (surroundings.LIGHT_NUMBERS,),
+        "dyed": (),
+    }
+    shapes |= {"dyes": (4, bank.groups.shape[1]), "mirrored": (), "mixed": ()}
+    for name, count in (("input", config.input_views), ("target", config.target_views)):
+        shapes |= {f"{name}_azimuths": (2 + 2 * count,), f"{name}_poses": (count,)}
+        shapes |= {f"{name}_cameras": (count, surroundings.CAMERA_NUMBERS)}
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
+    parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
+    return {
+        name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)
+    }
+
+
+def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
+    """Who, in which poses, colors and light; numbers in [0, 1) by name."""
+    person = pick(numbers["person"], bank.people)
+    faces = bank.faces[person].astype(jnp.int32)
+    which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
+    poses, nearest = (
+        bank.rotations[person, which],
+        bank.rotations[person, bank.nearest[person, which]],
+    )
+    rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
+    dyes = surroundings.dyes_from(
+        numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person]
+    )
+    dyes = jnp.where(numbers["dyed"] < DYED_SHARE, dyes, jnp.eye(3))
+    lights = surroundings.lights_from(numbers["lights"])
+
+    def pose(rotations):
+        vertices, normals, translation = pose_person(bank, person, rotations)
+        openness, lit = surroundings.shaded_vertices(vertices, normals, lights.directions[0], faces)
+        values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
+        return vertices, translation, values[faces].reshape(faces.shape[0], 15)
+
+    vertices, translations, corners = lax.map(pose, rotations)
+    return Scene(person, rotations, translations, vertices, corners, dyes, lights)
+
+
+def pose_person(
+    bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
+    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the
+    translation (3,).
+    """
+    nowhere = jnp.zeros(3, rotations.dtype)
+    transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[
+        :, :3
+    ].reshape(-1, 12)
+    ids, weights = (
+        bank.joint_ids[person].astype(jnp.int32),
+        bank.joint_weights[person].astype(rotations.dtype),
+    )
+    weights = weights / weights.sum(-1, keepdims=True)  # they are stored in few bits
+    blended = jnp.asarray(
+        sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1]))
+    )
+    x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
+    nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
+    # written out: matrix products are of low precision on GPU and TPU
+    vertices = blended[:, 0::4] * x + blended[:, 1::4] * y + blended[:, 2::4] * z + blended[:, 3::4]
+    normals = blended[:, 0::4] * nx + blended[:, 1::4] * ny + blended[:, 2::4] * nz
+    translation = nowhere.at[1].set(-vertices[:, 1].min())
+    return (
+        vertices + translation,
+        normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9),
+        translation,
+    )
+
+
+def _plans(
+    numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None
+) -> tuple[Plan, Plan]:
+    """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares
+    of close cameras (v,).
+
+    count: of the inputs; after them the last one is repeated. None: all.
+    """
+    azimuths = surroundings.azimuths_from(
+        numbers["input_azimuths"], config.jitter, config.scattered_share, count
+    )
+    own, other = (pick(numbers[name], POSES) for name in ("input_poses", "target_poses"))
+    own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
+    anywhere = surroundings.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
+    close = jnp.full(config.target_views, CLOSE_SHARE)
+    inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
+    if count is not None:
+        inputs = jax.tree.map(
+            lambda x: x[jnp.minimum(jnp.arange(config.input_views), count - 1)], inputs
+        )
+    return inputs, (numbers["target_cameras"], anywhere, other, close)
+
+
+def _views(
+    bank: PeopleBank, scene: Scene, plan: Plan, config: OnTheFlyConfig, size: int
+) -> SubjectViews:
+    """Views of some of the scene's poses."""
+
+    def view(plan):
+        u, azimuth, pose, close_share = plan
+        camera = surroundings.camera_from(
+            u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size
+        )
+        return *draw_view(bank, scene, pose, camera, config), camera
+
+    poses = plan[2]
+    batch = None if config.views_at_once == 1 else min(config.views_at_once, len(poses))
+    images, masks, depths, found = lax.map(view, plan, batch_size=batch)
+    rotations, translations, betas = (
+        scene.rotations[poses],
+        scene.translations[poses],
+        bank.betas[scene.person],
+    )
+    depths = depths if config.depths else None
+    return SubjectViews(images, masks, found, rotations, translations, betas, depths=depths)
+
+
+def _some(views: SubjectViews, part: slice) -> SubjectViews:
+    """Views of a range; betas have no axis of views."""
+    return replace(jax.tree.map(lambda x: x[part], replace(views, betas=None)), betas=views.betas)
+
+
+def draw_view(
+    bank: PeopleBank,
+    scene: Scene,
+    pose: Int[Array, ""],
+    camera: Camera,
+    config: OnTheFlyConfig = ON_THE_FLY,
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
+    """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1], and
+    (h, w) mean z of what is covered, metres, 0 in the background.
+    """
+    fine = camera.resized(camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING)
+    vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
+    fragments = rasterize_mesh(vertices, faces, fine)
+    behind = surroundings.seen_from_behind(vertices, faces, camera.center)
+    colors = _light_pixels(
+        bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step
+    )
+    covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
+    z = _box_average(fragments.depth.reshape(-1, 1) * covered, camera)[..., 0]
+    coverage = _box_average(covered, camera)[..., 0]
+    return _box_average(colors, camera), coverage, safe_divide(z, coverage)
+
+
+def _box_average(samples: Float[Array, "samples c"], camera: Camera) -> Float[Array, "h w c"]:
+    """Means of s x s samples of each pixel; added one by one: XLA's CPU backend reduces two axes
+    slowly.
+    """
+    s = SUPERSAMPLING
+    samples = samples.reshape(camera.height, s, camera.width, s, -1)
+    return jnp.asarray(sum(samples[:, i, :, j] for i in range(s) for j in range(s))) / (s * s)
+
+
+def _light_pixels(
+    bank: PeopleBank,
+    scene: Scene,
+    corners: Float[Array, "f 15"],
+    behind: Bool[Array, " f"],
+    fragments: Fragments,
+    step: int,
+) -> Float[Array, "hw 3"]:
+    """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at
+    a time.
+    """
+    ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
+    covered = ids >= 0
+    count = ids.shape[0]
+    step = min(step, count)
+    place = jnp.where(covered, cumsum(covered.astype(jnp.int32)) - 1, count)
+    # the numbers of the covered pixels in order; steps may reach beyond their end, where "no pixel"
+    # is
+    listed = (
+        jnp.full(-(-count // step) * step, count, jnp.int32)
+        .at[place]
+        .set(jnp.arange(count), mode="drop")
+    )
+    total = jnp.sum(covered, dtype=jnp.int32)
+
+    def light(state):
+        start, colors = state
+        pixels = lax.dynamic_slice_in_dim(listed, start, step)
+        face, weight = (
+            jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0),
+            weights[pixels],
+        )
+        lit = _color_points(bank, scene, corners[face], face, weight, behind[face])
+        return start + step, colors.at[pixels].set(lit, mode="drop")
+
+    blank = jnp.full((count, 3), BACKGROUND, weights.dtype)
+    return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[
+        1
+    ]
+
+
+def _color_points(
+    bank: PeopleBank,
+    scene: Scene,
+    corners: Float[Array, "p 15"],
+    faces: Int[Array, " p"],
+    weights: Float[Array, "p 3"],
+    behind: Bool[Array, " p"],
+) -> Float[Array, "p 3"]:
+    """(p, 3) colors of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3);
+    inner sides (p,).
+    """
+    person = scene.person
+    wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
+    uv = bank.uvs[person, faces].astype(weights.dtype)
+    painted = _sample(
+        bank.texture, person, (wa * uv[:, 0] + wb * uv[:, 1] + wc * uv[:, 2]) / UV_STEPS
+    )
+    pieces = bank.face_pieces[person, faces].astype(jnp.int32)
+    dye = scene.dyes[pieces]
+    albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
+    slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
+    albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
+    return surroundings.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
+
+
+def _sample(
+    texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]
+) -> Float[Array, "p 6"]:
+    """(p, 6) texture of a person at (p, 2) places in [0, 1], v down, bilinear; bytes as floats."""
+    size = texture.shape[1]
+    at = jnp.clip(at * size - 0.5, 0, size - 1)
+    low = jnp.floor(at)
+    along = at - low
+    column, row = low[:, 0].astype(jnp.int32), low[:, 1].astype(jnp.int32)
+    right, below = jnp.minimum(column + 1, size - 1), jnp.minimum(row + 1, size - 1)
+    texel = lambda r, c: texture[person, r, c].astype(at.dtype)
+    x, y = along[:, :1], along[:, 1:]
+    upper = texel(row, column) * (1 - x) + texel(row, right) * x
+    lower = texel(below, column) * (1 - x) + texel(below, right) * x
+    return upper * (1 - y) + lower * y
+
+
+def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
+    """The views of a world with left and right exchanged; joints: each one's mirror image.
+
+    Batched cameras.
+    """
+    flip = jnp.asarray(MIRROR, views.images.dtype)
+    side = jnp.asarray([-1.0, 1.0, 1.0], views.images.dtype)
+    camera = views.cameras
+    K = camera.K.at[..., 0, 2].set(camera.width - camera.K[..., 0, 2])
+    signs = jnp.concatenate([side, jnp.ones(1, side.dtype)])
+    return replace(
+        views,
+        images=views.images[..., :, ::-1, :],
+        masks=views.masks[..., :, ::-1],
+        depths=None if views.depths is None else views.depths[..., :, ::-1],
+        cameras=replace(camera, K=K, cam_from_world=camera.cam_from_world * signs[:, None] * signs),
+        rotations=views.rotations[..., jnp.asarray(joints), :] * flip,
+        translations=views.translations * side,
+    )
+
+
+MakeExample = Callable[[Key, int], Example]
+"""(key, number of input views) -> Example; pure, usually jitted with the number static."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GeneratedSource:
+    """Examples that `make` computes from keys; all keys are of people of one split
+    (`subject.SPLITS`).
+
+    make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see
+    `ViewSampling`.
+    on_host: bring the arrays to the host, where they mix with those of files and are divided among
+    devices.
+    person_of: called as person_of(key, input_count), gives the seed of the person whom `make`
+    shows; None: that of the key.
+
+    Raises: ValueError if there is no such split.
+    """
+
+    make: MakeExample
+    split: str = "train"
+    input_counts: tuple[int, ...] = (4,)
+    on_host: bool = False
+    person_of: Callable[[Key, int], int] | None = None
+
+    def __post_init__(self):
+        if self.split not in SPLITS:
+            raise ValueError(f"no split {self.split!r}: expected one of {', '.join(SPLITS)}")
+
+    @property
+    def broken(self) -> Mapping[str, str]:
+        """Empty: there are no files."""
+        return {}
+
+    def __len__(self) -> int:
+        return len(SPLITS[self.split])
+
+    def drawn_key(self, seed: int, index: int) -> Key:
+        """The key of the index-th example of a run: a random subject of the split, in its index-th
+        appearance.
+        """
+        return subject_key(self._person(seed, index), index)
+
+    def _person(self, seed: int, index: int) -> int:
+        people = SPLITS[self.split]
+        return people[
+            int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(len(people)))
+        ]
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`."""
+        person = self._person(seed, index)
+        if self.person_of is not None:
+            person = self.person_of(self.drawn_key(seed, index), input_count)
+        return _described(person, index)
+
+    def example(self, seed: int, index: int, input_count: int) -> Example:
+        """See `Source`."""
+        example = self.make(self.drawn_key(seed, index), input_count)
+        return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
+
+
+def _described(person: int, appearance: int) -> str:
+    return f"synthetic person {person} in appearance {appearance}"
+
+
+@dataclasses.dataclass(frozen=True)
+class EachPerson:
+    """Each person of a bank once, in order: people to compare on. input_counts, on_host: see
+    `GeneratedSource`.
+    """
+
+    bank: PeopleBank
+    config: OnTheFlyConfig
+    input_counts: tuple[int, ...] = (4,)
+    on_host: bool = False
+
+    @property
+    def broken(self) -> Mapping[str, str]:
+        """Empty: there are no files."""
+        return {}
+
+    def __len__(self) -> int:
+        return self.bank.people
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`."""
+        return _described(int(self.bank.seeds[index % self.bank.people]), index)
+
+    def example(self, seed: int, index: int, input_count: int) -> Example:
+        """See `Source`. Who it is depends on the index alone, how they look on both."""
+        person = index % self.bank.people
+        appearance = int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(APPEARANCES))
+        key = subject_key(int(self.bank.seeds[person]), appearance)
+        config = dataclasses.replace(self.config, input_views=input_count)
+        example = jitted_example(self.bank, key, config=config, person=person)
+        return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
+
+
+def jitted_example(
+    bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: int | None = None
+) -> Example:
+    """`on_the_fly_example`, compiled once per configuration and shape of the bank; with
+    `CPU_COMPILER_OPTIONS` on a CPU.
+    """
+    return _compiled()(bank, key, config=config, person=person)
+
+
+@functools.cache
+def _compiled() -> Callable[..., Example]:
+    return jax.jit(
+        on_the_fly_example, static_argnames="config", compiler_options=compiler_options()
+    )
+
+
+def person_drawn(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> int:
+    """The seed of the person of a bank whom `on_the_fly_example` shows."""
+    number = _draw_numbers(bank, key, config)["person"]
+    return int(bank.seeds[pick(number, bank.people)])
+
+
+def on_the_fly_source(
+    bank: PeopleBank,
+    config: OnTheFlyConfig,
+    input_counts: tuple[int, ...] = (4,),
+    on_host: bool = False,
+    each_once: bool = False,
+) -> GeneratedSource | EachPerson:
+    """Examples of a bank for `Loader` and `Mixture`: random people of it, or each of them once, in
+    order.
+
+    input_counts replace `config.input_views`; each is compiled once. on_host: see
+    `GeneratedSource`.
+    """
+    if each_once:
+        return EachPerson(bank, config, input_counts, on_host)
+    drawn = lambda count: dataclasses.replace(config, input_views=count)
+    return GeneratedSource(
+        make=lambda key, count: jitted_example(bank, key, config=drawn(count)),
+        split=bank.split,
+        input_counts=input_counts,
+        on_host=on_host,
+        person_of=lambda key, count: person_drawn(bank, key, drawn(count)),
+    )

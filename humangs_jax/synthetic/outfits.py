@@ -1,0 +1,609 @@
+"""What people wear, as choices: kinds of garments, their lengths and widths, their fabrics. No
+geometry.
+
+Lengths are in template coordinates (see `anatomy`): heights y for hems, |x| for the ends of
+sleeves. The tables below hold specifications of random numbers, see `drawn`. All rows of a table
+are drawn, whichever is used: a new row changes what every seed makes, so raise
+`subject.GENERATOR_VERSION` with it.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.synthetic.anatomy import WRIST
+from humangs_jax.synthetic.fabrics import Fabric, sample_fabric
+from humangs_jax.synthetic.surfaces import choice
+
+TOPS = (
+    "tank",
+    "tee",
+    "longsleeve",
+    "polo",
+    "shirt",
+    "blouse",
+    "sweater",
+    "turtleneck",
+    "hoodie",
+    "jersey",
+)
+OUTER = ("jacket", "denim_jacket", "blazer", "cardigan", "vest", "puffer", "coat", "hooded_jacket")
+BOTTOMS = ("jeans", "chinos", "slim", "wide", "shorts", "cropped", "track", "leggings", "cargo")
+SKIRTS = ("short_skirt", "long_skirt", "pleated_skirt")
+DRESSES = ("short_dress", "long_dress", "shirt_dress")
+HEADWEAR = ("beanie", "cap", "brim_hat", "headscarf")
+SHOES = ("sneakers", "flats", "sandals", "ankle_boots", "boots")
+EXTRAS = (
+    "scarf",
+    "belt",
+    "tie",
+    "glasses",
+    "sunglasses",
+    "backpack",
+    "shoulder_bag",
+    "socks",
+    "necklace",
+    "watch",
+)
+KINDS = TOPS + OUTER + BOTTOMS + SKIRTS + DRESSES + HEADWEAR + SHOES + EXTRAS
+
+
+@dataclasses.dataclass(frozen=True)
+class Garment:
+    """One piece of clothing. kind: one of KINDS. fabric. sizes: what its builder needs. details:
+    features that it has.
+    """
+
+    kind: str
+    fabric: Fabric
+    sizes: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    details: frozenset[str] = frozenset()
+
+
+Odds = Mapping[str, float | int]
+
+
+@dataclasses.dataclass(frozen=True)
+class Style:
+    """Clothes that go together. men, women: odds of the style. tops, bottoms, coats, shoes: odds of
+    kinds of garments.
+
+    The rest are probabilities of something over the others, of a top tucked in, of a skirt, a
+    scarf, kinds of headwear and of no sunglasses.
+    """
+
+    men: float
+    women: float
+    tops: Odds
+    bottoms: Odds
+    shoes: Odds
+    coats: Odds = dataclasses.field(default_factory=lambda: {"hooded_jacket": 1, "jacket": 1})
+    outer: float = 0.06
+    tucked: float = 0.22
+    skirt: float = 0.12
+    scarf: float = 0.1
+    headwear: Odds = dataclasses.field(
+        default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05}
+    )
+    no_sunglasses: float = 0.96
+
+
+STYLES = {
+    "casual": Style(
+        0.36,
+        0.27,
+        {
+            "tee": 4,
+            "longsleeve": 2,
+            "shirt": 2.5,
+            "sweater": 2,
+            "hoodie": 2,
+            "polo": 1,
+            "turtleneck": 0.6,
+        },
+        {
+            "jeans": 5,
+            "chinos": 2,
+            "slim": 1.5,
+            "wide": 1,
+            "cropped": 0.6,
+            "cargo": 0.8,
+            "shorts": 0.6,
+        },
+        {"sneakers": 5, "ankle_boots": 1.5, "flats": 1.5, "boots": 0.4},
+        {
+            "jacket": 3,
+            "denim_jacket": 2,
+            "cardigan": 2,
+            "hooded_jacket": 1.5,
+            "vest": 0.7,
+            "blazer": 0.7,
+        },
+        outer=0.28,
+        skirt=0.22,
+    ),
+    "formal": Style(
+        0.16,
+        0.1,
+        {"shirt": 6, "blouse": 2, "turtleneck": 1, "sweater": 1},
+        {"chinos": 4, "slim": 2, "wide": 1.3, "jeans": 1},
+        {"flats": 6, "ankle_boots": 2},
+        {"blazer": 6, "coat": 1.5, "cardigan": 1, "vest": 1},
+        outer=0.6,
+        tucked=0.7,
+        skirt=0.4,
+        headwear={"brim_hat": 0.1},
+    ),
+    "sport": Style(
+        0.14,
+        0.1,
+        {"tee": 3, "tank": 2, "jersey": 2.5, "hoodie": 1.5, "longsleeve": 1},
+        {"track": 3, "shorts": 3, "leggings": 2},
+        {"sneakers": 1},
+        tucked=0.05,
+        scarf=0.03,
+        headwear={"cap": 0.35},
+    ),
+    "winter": Style(
+        0.16,
+        0.14,
+        {"sweater": 3, "turtleneck": 2, "longsleeve": 2, "shirt": 2, "hoodie": 1.5},
+        {"jeans": 4, "chinos": 2, "slim": 2, "wide": 0.7, "cargo": 0.7},
+        {"ankle_boots": 3, "boots": 2.5, "sneakers": 1.5},
+        {"coat": 4, "puffer": 3, "jacket": 1.5, "hooded_jacket": 1.5},
+        outer=0.9,
+        scarf=0.4,
+        headwear={"beanie": 0.4, "brim_hat": 0.06},
+    ),
+    "summer": Style(
+        0.12,
+        0.12,
+        {"tee": 4, "tank": 3, "shirt": 2, "polo": 1.5, "blouse": 1},
+        {"shorts": 5, "cropped": 1.5, "wide": 1, "jeans": 1.5},
+        {"sneakers": 3, "sandals": 3, "flats": 1.5},
+        skirt=0.35,
+        scarf=0.03,
+        headwear={"cap": 0.2, "brim_hat": 0.22},
+        no_sunglasses=0.85,
+    ),
+    "street": Style(
+        0.06,
+        0.04,
+        {"hoodie": 4, "tee": 4, "jersey": 2, "shirt": 1},
+        {"jeans": 3, "cargo": 3, "wide": 2, "track": 2, "shorts": 1},
+        {"sneakers": 5, "ankle_boots": 1},
+        {"jacket": 2, "denim_jacket": 2, "hooded_jacket": 2, "puffer": 1},
+        outer=0.5,
+        tucked=0.05,
+        headwear={"cap": 0.35, "beanie": 0.2},
+        no_sunglasses=0.85,
+    ),
+    "dressed": Style(
+        0.0,
+        0.25,
+        {},
+        {},
+        {"flats": 3, "sandals": 2, "boots": 1.2, "ankle_boots": 1.2, "sneakers": 1},
+        {"cardigan": 3, "blazer": 1.5, "coat": 1.5, "denim_jacket": 1.5},
+        outer=0.2,
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class OneOf:
+    """One of some specifications, all of which are drawn; odds: of each, None: equal."""
+
+    options: tuple
+    odds: tuple[float, ...] | None = None
+
+
+def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
+    """A random value: of (low, high) a uniform number, of a dict of odds a name, of `OneOf` an
+    option, of a name a given value.
+
+    Numbers stand for themselves.
+    """
+    if isinstance(specification, tuple):
+        return rng.uniform(*specification)
+    if isinstance(specification, Mapping):
+        return choice(rng, specification)
+    if isinstance(specification, OneOf):
+        return rng.choice(
+            [drawn(rng, option, **named) for option in specification.options], p=specification.odds
+        )
+    return named.get(specification, specification)
+
+
+def row(rng: np.random.Generator, table: Mapping[str, Any], kind: str, **named: float) -> Any:
+    """The value of a kind of garment in a table of specifications, or that of "other"; all rows are
+    drawn.
+    """
+    values = {name: drawn(rng, specification, **named) for name, specification in table.items()}
+    return values.get(kind, values.get("other"))
+
+
+SLEEVES = {
+    "tank": (0.122, 0.15),
+    "tee": "short",
+    "polo": (0.30, 0.38),
+    "jersey": OneOf(("short", (0.125, 0.15)), (0.7, 0.3)),
+    "shirt": OneOf(("long", (0.3, 0.4), (0.44, 0.55)), (0.62, 0.23, 0.15)),
+    "blouse": OneOf(("long", (0.25, 0.55))),
+    "other": OneOf(("long", (0.42, 0.6)), (0.78, 0.22)),
+}
+NECKS = {
+    "tee": {"crew": 6, "vee": 2.5, "scoop": 1.5},
+    "tank": "scoop",
+    "jersey": {"crew": 1, "vee": 1},
+    "shirt": "collar",
+    "polo": "collar",
+    "blouse": {"collar": 2, "vee": 2, "crew": 1},
+    "turtleneck": "high",
+    "hoodie": "crew",
+    "other": {"crew": 6, "vee": 2, "scoop": 0.6},
+}
+MENS_NECKS = NECKS | {"other": {"crew": 6, "vee": 2, "scoop": 0}}
+PLAIN_TOPS = {
+    "tee": 0.5,
+    "sweater": 0.4,
+    "turtleneck": 0.65,
+    "hoodie": 0.65,
+    "shirt": 0.35,
+    "tank": 0.55,
+}
+"""How often tops are in one dye; the others: 0.35."""
+TOP_DETAILS = (
+    ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5),
+    ("number", ("jersey",), 1),
+    ("zip", ("hoodie",), 0.4),
+    ("hood_up", ("hoodie",), 0.18),
+    ("ribbed", ("sweater", "turtleneck", "hoodie", "longsleeve"), 1),
+    ("pocket", ("shirt", "polo", "blouse"), 0.5),
+    ("open", ("shirt",), 0.2),
+)
+"""Feature, kinds that can have it, how often they do."""
+LEG_ENDS = {"shorts": (-0.77, -0.56), "cropped": (-1.1, -0.93), "other": (-1.172, -1.14)}
+LEG_WIDTHS = {
+    "wide": (0.025, 0.065),
+    "cargo": (0.015, 0.04),
+    "track": (0.004, 0.03),
+    "jeans": OneOf(((0.0, 0.01), (0.01, 0.035))),
+    "chinos": (0.004, 0.02),
+    "shorts": (0.002, 0.04),
+    "slim": 0.002,
+    "leggings": 0.0,
+    "other": (0.004, 0.025),
+}
+LEG_LOOSENESS = {"leggings": 0.0, "slim": 0.1, "wide": 0.9, "cargo": 0.9, "other": (0.2, 0.7)}
+COAT_OPEN = {"puffer": 0.4, "coat": 0.5, "cardigan": 0.85, "vest": 0.5}
+"""How often coats are open; the others: 0.75."""
+COAT_ENDS = {
+    "coat": (-0.9, -0.6),
+    "blazer": (-0.43, -0.38),
+    "denim_jacket": (-0.34, -0.28),
+    "puffer": (-0.42, -0.3),
+    "vest": (-0.34, -0.27),
+    "other": (-0.42, -0.31),
+}
+COAT_DETAILS = {
+    "jacket": {"collar", "pockets"},
+    "denim_jacket": {"collar", "pockets"},
+    "coat": {"pockets"},
+    "vest": {"pockets"},
+    "puffer": {"pockets"},
+    "hooded_jacket": {"hood"},
+    "blazer": {"lapels"},
+}
+SHAFTS = {
+    "sneakers": OneOf((0.09, (0.11, 0.14)), (0.8, 0.2)),
+    "flats": (0.068, 0.085),
+    "sandals": 0.07,
+    "ankle_boots": (0.13, 0.17),
+    "boots": (0.24, 0.40),
+}
+SOLES = {"sneakers": (0.02, 0.036), "flats": (0.008, 0.02), "other": (0.015, 0.035)}
+
+
+def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[Garment, ...]:
+    """Clothes that go together, innermost first; shoes and what is carried last."""
+    name = drawn(rng, {name: style.men if male else style.women for name, style in STYLES.items()})
+    style = STYLES[name]
+    outer = rng.random() < style.outer
+    worn = _dress(rng, outer) if name == "dressed" else _separates(rng, name, male, outer)
+    worn += _fastened(rng, name, male, worn)
+    if outer:
+        worn.append(_outer(rng, style, worn))
+    worn += _shoes(rng, style, male, worn)
+    worn += _extras(rng, style, male, years, worn)
+    return tuple(worn)
+
+
+def _made(
+    rng: np.random.Generator,
+    kind: str,
+    plainness: float,
+    details: Iterable[str] = (),
+    **sizes: float,
+) -> Garment:
+    """A garment in a random fabric."""
+    return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
+
+
+def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> list[Garment]:
+    style = STYLES[name]
+    kind = drawn(rng, style.tops)
+    kind = "shirt" if male and kind == "blouse" else kind
+    tucked = rng.random() < style.tucked and kind not in ("hoodie", "jersey")
+    waist = rng.uniform(-0.235, -0.212)
+    top = _top(rng, name, kind, male, waist, tucked, outer)
+    skirted = not male and rng.random() < style.skirt
+    lower = (
+        _skirt(rng, waist, tucked) if skirted else _trousers(rng, style, male, waist, tucked, top)
+    )
+    if "open" in top.details:
+        below = {
+            "sleeve": rng.uniform(0.14, 0.36),
+            "bottom": top.sizes["bottom"] + 0.012,
+            "loose": 0.0,
+            "depth": 0.05,
+        }
+        return [_made(rng, "tee", 0.7, {"crew"}, **below), lower, top]
+    return [top, lower]
+
+
+def _top(
+    rng: np.random.Generator,
+    style: str,
+    kind: str,
+    male: bool,
+    waist: float,
+    tucked: bool,
+    outer: bool,
+) -> Garment:
+    long, short = WRIST - rng.uniform(0.0, 0.035), rng.uniform(0.27, 0.40)
+    sleeve = row(rng, SLEEVES, kind, long=long, short=short)
+    details = {row(rng, MENS_NECKS if male else NECKS, kind)}
+    cropped = not male and not tucked and rng.random() < 0.08
+    bottom = (
+        waist - 0.03
+        if tucked
+        else rng.uniform(-0.22, -0.2)
+        if cropped
+        else rng.uniform(-0.385, -0.30)
+    )
+    wide = kind not in ("tank", "tee", "longsleeve", "turtleneck")
+    loose = rng.uniform(0.25, 1.0) if wide else rng.uniform(0.0, 1.0) ** 1.3
+    if kind == "hoodie":
+        loose = 0.5 + 0.5 * loose
+    elif style == "street":
+        loose = 0.4 + 0.6 * loose
+    for detail, kinds, odds in TOP_DETAILS:
+        possible = kind in kinds and not (detail == "open" and (tucked or outer))
+        if possible and (odds == 1 or rng.random() < odds) and not (detail == "hood_up" and outer):
+            details.add(detail)
+    if tucked:
+        details.add("tucked")
+    sleeve, loose = (
+        float(min(sleeve, WRIST - 0.01) if outer else sleeve),
+        min(loose, 0.2) if outer or tucked else loose,
+    )
+    plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
+    depth = rng.uniform(0.04, 0.095)
+    return _made(
+        rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth
+    )
+
+
+def _trousers(
+    rng: np.random.Generator, style: Style, male: bool, waist: float, tucked: bool, top: Garment
+) -> Garment:
+    kind = drawn(rng, style.bottoms)
+    if kind == "leggings" and male and rng.random() < 0.7:
+        kind = "shorts"
+    end = row(rng, LEG_ENDS | {"shorts": (-0.77, -0.62)} if male else LEG_ENDS, kind)
+    width, loose = row(rng, LEG_WIDTHS, kind), row(rng, LEG_LOOSENESS, kind)
+    upper = (
+        waist
+        if tucked or top.sizes["bottom"] > -0.25
+        else max(top.sizes["bottom"] + 0.06, waist - 0.2)
+    )
+    details = (
+        {"pockets"}
+        if kind not in ("track", "leggings")
+        else {"side_stripe"}
+        if rng.random() < 0.6
+        else set()
+    )
+    if rng.random() < 0.15 and kind in ("jeans", "chinos") and not male:
+        end = rng.uniform(-1.12, -1.05)
+    if kind == "jeans" and rng.random() < 0.25:
+        details.add("turn_up")
+    sizes = {
+        "top": upper,
+        "end": end,
+        "width": float(width),
+        "loose": loose,
+        "waist": waist,
+        "tucked": float(tucked),
+    }
+    return _made(rng, kind, 0.75, details, **sizes)
+
+
+def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
+    kind = drawn(rng, {"short_skirt": 3, "pleated_skirt": 1.5, "long_skirt": 2})
+    end = rng.uniform(-1.1, -0.84) if kind == "long_skirt" else rng.uniform(-0.76, -0.57)
+    flare = (
+        rng.uniform(0.0, 0.05)
+        if rng.random() < 0.35 and kind != "pleated_skirt"
+        else rng.uniform(0.05, 0.16)
+    )
+    sizes = {
+        "top": waist,
+        "end": end,
+        "flare": flare,
+        "waist": waist,
+        "tucked": float(tucked),
+        **_pleats(rng, kind),
+    }
+    return _made(rng, kind, 0.35, (), **sizes)
+
+
+def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
+    count, depth = (
+        ((14, 24), (0.008, 0.014)) if kind == "pleated_skirt" else ((4, 10), (0.004, 0.016))
+    )
+    return {"pleats": float(rng.integers(*count)), "depth": rng.uniform(*depth)}
+
+
+def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
+    kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
+    end = rng.uniform(-1.14, -0.85) if kind == "long_dress" else rng.uniform(-0.78, -0.56)
+    sleeve = float(
+        drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25)))
+    )
+    neck = "collar" if kind == "shirt_dress" else drawn(rng, {"crew": 1, "vee": 1.3, "scoop": 1.3})
+    sizes = {
+        "sleeve": sleeve,
+        "waist": rng.uniform(-0.235, -0.165),
+        "end": end,
+        "flare": rng.uniform(0.015, 0.17),
+    }
+    sizes |= {
+        "depth": rng.uniform(0.04, 0.1),
+        "loose": 0.1 if outer else rng.uniform(0.0, 0.4),
+        **_pleats(rng, kind),
+    }
+    return [_made(rng, kind, 0.3, [neck, "sash"] if rng.random() < 0.35 else [neck], **sizes)]
+
+
+def _outer(rng: np.random.Generator, style: Style, worn: Sequence[Garment]) -> Garment:
+    kind = drawn(rng, style.coats)
+    is_open = rng.random() < COAT_OPEN.get(kind, 0.75)
+    bottom = row(rng, COAT_ENDS, kind)
+    details = {"open" if is_open else "closed"} | COAT_DETAILS.get(kind, set())
+    if kind == "puffer" and rng.random() < 0.4:
+        details.add("hood")
+    if kind == "coat":
+        details.add(drawn(rng, {"lapels": 2, "hood": 0.6, "collar": 1}))
+        if not is_open and rng.random() < 0.4:
+            details.add("sash")
+    sizes = {"sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035), "bottom": bottom}
+    sizes |= {
+        "gap": rng.uniform(0.012, 0.05) if is_open else -1.0,
+        "spread": rng.uniform(0.05, 0.35),
+    }
+    sizes |= {"flare": rng.uniform(0.02, 0.1), "loose": rng.uniform(0.2, 1.0)}
+    if kind == "vest":
+        sizes["sleeve"] = rng.uniform(0.145, 0.165)
+    coat = _made(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72, details, **sizes)
+    suited = (
+        [g.fabric for g in worn if g.kind in ("chinos", "slim", "wide")] if kind == "blazer" else []
+    )
+    return dataclasses.replace(coat, fabric=suited[0]) if suited and rng.random() < 0.55 else coat
+
+
+def _shoes(
+    rng: np.random.Generator, style: Style, male: bool, worn: Sequence[Garment]
+) -> list[Garment]:
+    lower = next(g for g in worn if g.kind in BOTTOMS + SKIRTS + DRESSES)
+    kind = drawn(rng, style.shoes)
+    covered = lower.kind in BOTTOMS and lower.sizes["end"] < -1.0
+    narrow = not covered or (
+        lower.kind in ("slim", "leggings", "jeans") and lower.sizes["width"] <= 0.01
+    )
+    if kind == "boots" and (male or not narrow):
+        kind = "ankle_boots"
+    height, sole = row(rng, SHAFTS, kind), row(rng, SOLES, kind)
+    result = []
+    if kind in ("sneakers", "ankle_boots") and not covered and rng.random() < 0.75:
+        tall = drawn(rng, OneOf(((0.1, 0.17), (0.2, 0.4)), (0.75, 0.25)))
+        result.append(_made(rng, "socks", 0.7, height=max(float(tall), height + 0.02)))
+    return [
+        *result,
+        _made(rng, kind, 0.9, height=float(height), sole=float(sole), over=float(kind == "boots")),
+    ]
+
+
+def _fastened(
+    rng: np.random.Generator, style: str, male: bool, worn: Sequence[Garment]
+) -> list[Garment]:
+    """Belt and tie: worn below what is worn outside."""
+    result = []
+    trousers = next((g for g in worn if g.kind in BOTTOMS), None)
+    belted = (
+        trousers is not None
+        and trousers.sizes["tucked"]
+        and trousers.kind not in ("track", "leggings")
+    )
+    if belted and rng.random() < 0.7:
+        top = trousers.sizes["waist"] - 0.004
+        result.append(_made(rng, "belt", 1.0, top=top, width=rng.uniform(0.028, 0.042)))
+    collared = any(
+        "collar" in g.details and g.kind == "shirt" and "open" not in g.details for g in worn
+    )
+    if style == "formal" and male and collared and rng.random() < 0.55:
+        result.append(
+            _made(rng, "tie", 0.3, length=rng.uniform(0.3, 0.36), width=rng.uniform(0.018, 0.032))
+        )
+    return result
+
+
+def _extras(
+    rng: np.random.Generator, style: Style, male: bool, years: float, worn: Sequence[Garment]
+) -> list[Garment]:
+    kinds = {g.kind for g in worn}
+    hooded = any("hood_up" in g.details for g in worn)
+    result: list[Garment] = []
+
+    def put(kind, plainness, **sizes):
+        result.append(_made(rng, kind, plainness, **sizes))
+        kinds.add(kind)
+
+    if not hooded and rng.random() < style.scarf:
+        put(
+            "scarf",
+            0.35,
+            thickness=rng.uniform(0.022, 0.038),
+            tails=rng.choice([0.0, rng.uniform(0.15, 0.4)]),
+        )
+    left = rng.random()
+    for kind, odds in (style.headwear if male else {**style.headwear, "headscarf": 0.06}).items():
+        if left < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
+            put(
+                kind,
+                0.8,
+                brim=rng.uniform(0.045, 0.085),
+                backwards=float(kind == "cap" and rng.random() < 0.12),
+            )
+            break
+        left -= odds
+    eyes = rng.random()
+    if eyes < 0.2 + 0.15 * (years > 50):
+        put(
+            "glasses",
+            1.0,
+            size=rng.uniform(0.85, 1.2),
+            squareness=rng.uniform(2, 6),
+            wire=rng.uniform(0.0011, 0.0028),
+        )
+    elif eyes > style.no_sunglasses:
+        put(
+            "sunglasses",
+            1.0,
+            size=rng.uniform(1.0, 1.3),
+            squareness=rng.uniform(2, 5),
+            wire=rng.uniform(0.0015, 0.003),
+        )
+    carried = rng.random()
+    if carried < 0.09 and "headscarf" not in kinds:
+        put("backpack", 0.7, size=rng.uniform(0.8, 1.15))
+    elif carried < (0.19 if male else 0.27):
+        put("shoulder_bag", 0.8, size=rng.uniform(0.6, 1.1), side=rng.choice([-1.0, 1.0]))
+    if rng.random() < 0.15:
+        put("watch", 1.0, side=rng.choice([-1.0, 1.0]))
+    if not male and "scarf" not in kinds and rng.random() < 0.12 and "turtleneck" not in kinds:
+        put("necklace", 1.0, length=rng.uniform(0.0, 0.06))
+    return result

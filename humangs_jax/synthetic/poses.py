@@ -1,0 +1,475 @@
+"""A pose prior: plausible standing, striding, crouching and reaching people, within joint limits,
+their soles on the ground.
+
+Stances place the feet and the pelvis. An arm draws many candidates within its limits and keeps the
+one whose wrist comes nearest to a goal, among those whose forearm and hand stay out of the trunk,
+the head, the legs and the other arm. Hands blend a few gestures. `anatomy` has the joints, their
+limits and the conventions.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.synthetic import anatomy as kin
+from humangs_jax.synthetic.surfaces import choice
+
+TRIES = 20
+"""Stances tried until one is within the limits of the joints; after that the person stands upright.
+"""
+BOTH_ARMS, ATTEMPTS = 0.45, 3
+"""Share of people whose arms have the same goal; how many goals are tried for an arm that cannot
+keep clear of the body.
+"""
+CANDIDATES = 400
+HAND_LENGTH = 0.6
+"""From the wrist to the knuckles and a little beyond, in lengths of the forearm."""
+HEAD_RADIUS = 0.14
+MARGIN = 0.015
+"""Metres that forearm and hand keep away from the body."""
+
+
+Capsule = tuple[kin.Vector, kin.Vector, float]
+"""Two ends and a radius, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stance:
+    """Feet and pelvis before the person is turned. Lengths in legs, x to the left of the pelvis, z
+    in front of it.
+
+    feet: left, right. sink: how much lower the pelvis is than it could be, in legs. tilt: of the
+    pelvis forward. roll: of the pelvis, left side up. lean: how far forward the trunk bends to keep
+    the balance.
+    """
+
+    feet: kin.Feet
+    sink: float = 0.0
+    tilt: float = 0.0
+    roll: float = 0.0
+    lean: float = 0.0
+
+
+def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> Stance:
+    """Set legs and pelvis in `rotations`, keeping the pelvis's heading; returns the stance."""
+    heading, width = rotations[kin.PELVIS, 1], build.hip_width / build.leg
+    for _ in range(TRIES):
+        stance = STANCES[choice(rng, {name: odds for name, (odds, _) in STANCES.items()})][1](
+            rng, width
+        )
+        _, missed = take_stance(build, rotations, heading, stance)
+        if missed < 1e-6 and kin.excess(rotations, tuple(j for leg in kin.LEGS for j in leg)) < 0:
+            return stance
+    stance = _stand(rng, width)
+    take_stance(build, rotations, heading, stance)
+    return stance
+
+
+def take_stance(
+    build: kin.Build, rotations: kin.Rotations, heading: float, stance: Stance
+) -> tuple[kin.Vector, float]:
+    """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error
+    of the two feet, metres.
+    """
+    turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
+    rotations[kin.PELVIS] = kin.rotation_vector(turn)
+    feet = in_world(stance.feet, build.leg, heading)
+    pelvis = np.asarray(
+        [0.0, kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg, 0.0]
+    )
+    return pelvis, kin.place_feet(build, rotations, pelvis, feet)
+
+
+def in_world(feet: kin.Feet, leg: float, heading: float) -> kin.Feet:
+    """The feet of a stance (lengths in legs, unturned) in metres, turned by the heading."""
+    placed = []
+    for foot in feet:
+        x, _, z = kin.turned(y=heading) @ np.asarray([foot.x * leg, 0.0, foot.z * leg])
+        placed.append(kin.Foot(float(x), float(z), heading + foot.yaw, foot.pitch, foot.lift * leg))
+    return placed[0], placed[1]
+
+
+def _pair(
+    rng: np.random.Generator,
+    width: float,
+    *,
+    spread: tuple[float, float] = (0.0, 0.08),
+    apart: tuple[float, float] = (0.0, 0.06),
+    turn_out: tuple[float, float] = (-0.05, 0.35),
+) -> list[kin.Foot]:
+    """Two flat feet about as far apart as the hips."""
+    feet = []
+    for sign in (1, -1):
+        x = sign * (width + rng.uniform(*spread))
+        feet.append(
+            kin.Foot(
+                x, 0.08 + rng.choice([-1, 1]) * rng.uniform(*apart), sign * rng.uniform(*turn_out)
+            )
+        )
+    return feet
+
+
+def _stand(rng: np.random.Generator, width: float) -> Stance:
+    return Stance(tuple(_pair(rng, width)), sink=rng.uniform(0.0, 0.015), roll=rng.normal(0, 0.02))
+
+
+def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
+    feet, relaxed = _pair(rng, width), int(rng.integers(2))
+    sign = 1 if relaxed == 0 else -1
+    shift = rng.uniform(0.4, 1.0) * width * sign  # the standing foot comes below the pelvis
+    feet = [dataclasses.replace(foot, x=foot.x + shift) for foot in feet]
+    z = feet[relaxed].z + rng.uniform(0.0, 0.28)
+    pitch, yaw = (
+        rng.choice([0.0, rng.uniform(0.1, 0.5)]),
+        feet[relaxed].yaw + sign * rng.uniform(0, 0.3),
+    )
+    feet[relaxed] = dataclasses.replace(feet[relaxed], z=z, pitch=pitch, yaw=yaw)
+    return Stance(tuple(feet), sink=rng.uniform(0.0, 0.01), roll=-sign * rng.uniform(0.03, 0.12))
+
+
+def _stride(rng: np.random.Generator, width: float) -> Stance:
+    feet, front = (
+        _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2)),
+        int(rng.integers(2)),
+    )
+    length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
+    feet[front] = dataclasses.replace(
+        feet[front], z=0.08 + share * length, pitch=-rng.uniform(0, 0.3) * (length > 0.4)
+    )
+    rear = rng.uniform(0.3, 0.7) * min(1.0, length / 0.5)
+    feet[1 - front] = dataclasses.replace(
+        feet[1 - front], z=0.08 - (1 - share) * length, pitch=rear
+    )
+    return Stance(
+        tuple(feet),
+        sink=rng.uniform(0.0, 0.04),
+        tilt=rng.uniform(0, 0.08),
+        lean=rng.uniform(0, 0.1),
+    )
+
+
+def _wide(rng: np.random.Generator, width: float) -> Stance:
+    feet = _pair(rng, width, spread=(0.12, 0.35), turn_out=(0.05, 0.5))
+    return Stance(
+        tuple(feet), sink=rng.choice([0.0, rng.uniform(0, 0.15)]), roll=rng.normal(0, 0.03)
+    )
+
+
+def _squat(rng: np.random.Generator, width: float) -> Stance:
+    depth, feet = (
+        rng.uniform(0.08, 0.42),
+        _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6)),
+    )
+    heels = rng.uniform(0.2, 0.6) if depth > 0.3 else 0.0
+    feet = [dataclasses.replace(foot, pitch=heels, z=foot.z + 0.06) for foot in feet]
+    return Stance(tuple(feet), sink=depth, tilt=0.6 * depth, lean=1.4 * depth)
+
+
+def _lunge(rng: np.random.Generator, width: float) -> Stance:
+    feet, front = _pair(rng, width, turn_out=(-0.05, 0.2)), int(rng.integers(2))
+    feet[front] = dataclasses.replace(feet[front], z=rng.uniform(0.4, 0.7))
+    feet[1 - front] = dataclasses.replace(
+        feet[1 - front], z=-rng.uniform(0.4, 0.75), pitch=rng.uniform(0.55, 0.85)
+    )
+    return Stance(
+        tuple(feet),
+        sink=rng.uniform(0.05, 0.3),
+        tilt=rng.uniform(0, 0.15),
+        lean=rng.uniform(-0.1, 0.3),
+    )
+
+
+def _side_lunge(rng: np.random.Generator, width: float) -> Stance:
+    feet, bent = _pair(rng, width, spread=(0.2, 0.4), turn_out=(0.1, 0.5)), int(rng.integers(2))
+    sign = 1 if bent == 0 else -1
+    feet = [dataclasses.replace(foot, x=foot.x - sign * rng.uniform(0.1, 0.3)) for foot in feet]
+    return Stance(
+        tuple(feet),
+        sink=rng.uniform(0.02, 0.2),
+        tilt=rng.uniform(0.05, 0.2),
+        lean=rng.uniform(0, 0.3),
+    )
+
+
+def _one_leg(rng: np.random.Generator, width: float) -> Stance:
+    """One foot in the air: a raised knee, a kick, a foot behind."""
+    feet, raised = _pair(rng, width), int(rng.integers(2))
+    sign = 1 if raised == 0 else -1
+    feet = [dataclasses.replace(foot, x=foot.x + 0.6 * width * sign) for foot in feet]
+    x, z, lift, pitch = feet[raised].x, feet[raised].z, 0.0, 0.0
+    way = rng.choice(["knee", "kick", "behind", "aside"])
+    if way == "knee":
+        z, lift, pitch = z + rng.uniform(0.0, 0.3), rng.uniform(0.1, 0.5), rng.uniform(0.1, 0.6)
+    elif way == "kick":
+        z, lift, pitch = z + rng.uniform(0.4, 0.8), rng.uniform(0.1, 0.5), rng.uniform(-0.5, 0.2)
+    elif way == "behind":
+        z, lift, pitch = z - rng.uniform(0.3, 0.55), rng.uniform(0.1, 0.45), rng.uniform(0.5, 1.2)
+    else:
+        x, lift = x + sign * rng.uniform(0.2, 0.5), rng.uniform(0.05, 0.3)
+    feet[raised] = kin.Foot(x, z, feet[raised].yaw, pitch, lift)
+    sink, roll = rng.uniform(0.0, 0.05), sign * rng.uniform(0, 0.08)
+    return Stance(tuple(feet), sink=sink, roll=roll, lean=rng.uniform(-0.05, 0.1))
+
+
+def _tiptoe(rng: np.random.Generator, width: float) -> Stance:
+    pitch = rng.uniform(0.3, 0.8)
+    feet = [dataclasses.replace(foot, pitch=pitch) for foot in _pair(rng, width)]
+    return Stance(tuple(feet), sink=rng.uniform(0, 0.03))
+
+
+STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]] = {
+    "stand": (0.26, _stand),
+    "contrapposto": (0.2, _contrapposto),
+    "stride": (0.22, _stride),
+    "wide": (0.08, _wide),
+    "squat": (0.06, _squat),
+    "lunge": (0.05, _lunge),
+    "side lunge": (0.04, _side_lunge),
+    "one leg": (0.07, _one_leg),
+    "tiptoe": (0.02, _tiptoe),
+}
+"""Name -> probability, and a function of a generator and the distance of a hip from the middle in
+legs.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Goal:
+    """Target of a wrist. odds: of being drawn.
+
+    place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
+    raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the
+    front. flexed: of the elbow.
+    collar: how much the collar is raised.
+    """
+
+    odds: float
+    place: tuple[float, float, float]
+    raised: tuple[float, float] = (-1.45, -0.1)
+    forward: tuple[float, float] = (-0.5, 1.4)
+    flexed: tuple[float, float] = (0.05, 2.2)
+    collar: float = -0.08
+
+
+GOALS = {
+    "hang": Goal(0.36, (0.28, -1.0, 0.1), (-1.5, -1.05), (-0.25, 0.35), (0.05, 0.6)),
+    "away": Goal(0.14, (0.6, -0.85, 0.08), (-1.3, -0.7), flexed=(0.05, 0.6)),
+    "hip": Goal(0.09, (0.35, -0.82, 0.12)),
+    "front": Goal(0.09, (0.2, -0.3, 0.8)),
+    "low": Goal(0.06, (0.15, -0.75, 0.5)),
+    "chest": Goal(0.05, (-0.2, -0.4, 0.45)),
+    "wave": Goal(0.05, (0.55, 0.45, 0.25), (-1.45, 1.25), collar=0.15),
+    "side": Goal(0.04, (1.0, -0.1, 0.1), (-0.4, 0.4), collar=0.05),
+    "up": Goal(0.03, (0.25, 1.0, 0.1), (-0.5, 1.25), collar=0.3),
+    "reach": Goal(0.03, (0.15, 0.1, 0.95), (-0.6, 0.5), (0.6, 1.5), (0.05, 0.9), 0.02),
+    "back": Goal(0.02, (0.3, -0.85, -0.45), (-1.45, -0.7), (-0.9, 0.0), (0.05, 0.9)),
+    "face": Goal(0.02, (-0.2, 0.2, 0.5), (-1.3, 0.4), (0.0, 1.5), (1.2, 2.35), 0.05),
+    "diagonal": Goal(0.02, (0.75, 0.65, 0.1), (0.0, 1.1), (-0.2, 0.9), (0.05, 0.7), 0.2),
+}
+ARMS = (
+    (kin.LEFT_COLLAR, kin.LEFT_SHOULDER, kin.LEFT_ELBOW, kin.LEFT_WRIST),
+    (kin.RIGHT_COLLAR, kin.RIGHT_SHOULDER, kin.RIGHT_ELBOW, kin.RIGHT_WRIST),
+)
+
+
+def draw_goal(rng: np.random.Generator) -> str:
+    """The name of a goal."""
+    return choice(rng, {name: goal.odds for name, goal in GOALS.items()})
+
+
+def bend_arm(
+    rng: np.random.Generator,
+    build: kin.Build,
+    rotations: kin.Rotations,
+    goal: str,
+    side: int,
+    other_arm: bool = False,
+) -> float:
+    """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk,
+    head and legs must be set.
+
+    other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it
+    is not).
+    """
+    matrix, vector = kin.rotation_matrix, kin.rotation_vector
+    collar, shoulder, elbow, wrist = ARMS[side]
+    mirror, n, wanted = np.ones(3) if side == 0 else kin.MIRROR, CANDIDATES, GOALS[goal]
+    rotations[collar] = (
+        np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
+    )
+    down, forward, twist, flex, pronation = np.zeros((5, n, 3))
+    down[:, 2] = rng.uniform(*wanted.raised, n)
+    forward[:, 1] = -rng.uniform(*wanted.forward, n)
+    twist[:, 0] = rng.uniform(-1.0, 0.8, n)
+    flex[:, 1] = -rng.uniform(*wanted.flexed, n)
+    pronation[:, 0] = rng.uniform(-0.4, 0.5)
+    about_both = np.stack(
+        [forward[:, 1], down[:, 1], down[:, 2]], 1
+    )  # a hanging arm swings about the axis of both shoulders
+    swing = matrix(about_both) if goal == "hang" else matrix(forward) @ matrix(down)
+    upper = vector(swing @ matrix(twist)) * mirror
+    lower = vector(matrix(flex) @ matrix(pronation)) * mirror
+
+    world, positions = kin.joint_positions(build, rotations)
+    rest = build.joints
+    upper_world = world[collar] @ matrix(upper)
+    elbows = positions[shoulder] + upper_world @ (rest[elbow] - rest[shoulder])
+    wrists = elbows + upper_world @ matrix(lower) @ (rest[wrist] - rest[elbow])
+    reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
+    offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
+    target = positions[shoulder] + reach * world[kin.SPINE3] @ offset
+    capsules = _body_capsules(build, world, positions)
+    if other_arm:
+        capsules += _arm_capsules(build, positions, 1 - side)
+    clear = np.min(
+        [_clearance(build, capsules, points) for points in _along(elbows, wrists)], axis=0
+    )
+    beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
+    cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
+    best = int(np.argmin(cost))
+    rotations[shoulder], rotations[elbow] = upper[best], lower[best]
+    rotations[wrist] = rng.normal(0, 1, 3) * [0.08, 0.12, 0.2]
+    return float(clear[best])
+
+
+def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
+    """How far (metres) both forearms and hands are from the body and each other; negative if one is
+    inside.
+    """
+    world, positions = kin.joint_positions(build, rotations)
+    body, worst = _body_capsules(build, world, positions), np.inf
+    for side, (_, _, elbow, wrist) in enumerate(ARMS):
+        points = np.stack(_along(positions[elbow], positions[wrist]))
+        worst = min(
+            worst, _clearance(build, body + _arm_capsules(build, positions, 1 - side), points).min()
+        )
+    return float(worst)
+
+
+def _body_capsules(
+    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations
+) -> list[Capsule]:
+    """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
+    sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
+    top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
+    head = positions[kin.HEAD] + world[kin.HEAD] @ np.asarray([0, 0.09, 0.03])
+    capsules = [(head, head, HEAD_RADIUS)]
+    for s in (-1.0, 0.0, 1.0):
+        capsules.append(
+            (positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius)
+        )
+    for hip, knee, ankle, _ in kin.LEGS:
+        capsules.append((positions[hip], positions[knee], build.thigh_radius))
+        capsules.append((positions[knee], positions[ankle], build.shin_radius))
+    return capsules
+
+
+def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list[Capsule]:
+    """Upper arm, forearm and hand of one side."""
+    _, shoulder, elbow, wrist = (positions[joint] for joint in ARMS[side])
+    radius = build.arm_radius + 0.01
+    return [(shoulder, elbow, radius), (elbow, wrist + HAND_LENGTH * (wrist - elbow), radius)]
+
+
+def _clearance(
+    build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
+    distances = []
+    for a, b, radius in capsules:
+        axis = b - a
+        t = np.clip((points - a) @ axis / max(axis @ axis, 1e-9), 0, 1)
+        distances.append(np.linalg.norm(points - a - t[:, None] * axis, axis=1) - radius)
+    return np.min(distances, axis=0) - build.arm_radius
+
+
+def _along(
+    elbows: Float[np.ndarray, "*n 3"], wrists: Float[np.ndarray, "*n 3"]
+) -> list[Float[np.ndarray, "*n 3"]]:
+    """Points of the forearm and the hand that must not touch the body."""
+    tips = wrists + HAND_LENGTH * (wrists - elbows)
+    return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
+
+
+FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
+"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share
+of its spread.
+"""
+BONE_SHARE = (0.85, 1.0, 0.7)
+"""Share of a finger's curl at each knuckle, from the palm outwards."""
+
+
+GESTURES = {
+    "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
+    "flat": (0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
+    "spread": (0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3),
+    "fist": (0.12, (1.3, 1.35, 1.35, 1.35), 0.0, 1.0),
+    "point": (0.06, (0.02, 1.2, 1.3, 1.3), 0.0, 0.8),
+    "two": (0.03, (0.02, 0.02, 1.3, 1.3), 0.12, 0.9),
+    "thumb up": (0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4),
+    "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
+}
+"""Odds; curl of index, middle, ring and pinky, radians a knuckle; angle between fingers; how far
+the thumb lies across the palm, 0 beside it, 1 across."""
+
+
+def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:
+    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a
+    random gesture.
+    """
+    first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
+    goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
+    blends = (
+        (1 - t) * np.asarray(a) + t * np.asarray(b)
+        for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True)
+    )
+    _, curls, spread, thumb = blends
+    thumb = thumb + rng.normal(0, 0.08)
+    for finger, (place, splay) in enumerate(FINGERS):
+        curl = curls[place] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
+        for bone, share in enumerate(BONE_SHARE):
+            # fingers do not bend backwards, and spread at the palm only
+            bend = np.clip(curl * share * rng.uniform(0.9, 1.1), -0.1, kin.FINGER_LIMIT - 0.1)
+            aside = splay * spread if bone == 0 else 0.0
+            rotations[first + 3 * finger + bone] = np.asarray([0, -aside, -bend]) * mirror
+    rotations[first + 12] = np.asarray([0.25 * thumb, 0.45 * thumb, -0.35 * thumb]) * mirror
+    rotations[first + 13] = np.asarray([0.0, 0.35 * thumb, -0.1 * thumb]) * mirror
+    rotations[first + 14] = np.asarray([0.0, 0.5 * max(thumb, 0.0), 0.0]) * mirror
+
+
+def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotations:
+    """(j, 3) rotation vectors of a random plausible pose; the lowest points of planted feet are at
+    one height.
+    """
+    rotations = np.zeros((kin.JOINTS, 3))
+    rotations[kin.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
+    stance = sample_stance(rng, build, rotations)
+    bend_trunk(rng, rotations, stance.lean, stance.roll)
+    both, goal = rng.random() < BOTH_ARMS, draw_goal(rng)
+    for side in (0, 1):
+        wanted = goal if both or side == 0 else draw_goal(rng)
+        for _ in range(ATTEMPTS):
+            if bend_arm(rng, build, rotations, wanted, side, other_arm=side == 1) >= 0:
+                break
+            wanted = draw_goal(rng)
+        pose_hand(rng, rotations, side)
+    return kin.limited(rotations)
+
+
+def bend_trunk(
+    rng: np.random.Generator, rotations: kin.Rotations, lean: float, roll: float
+) -> None:
+    """Set spine, neck and head in `rotations`.
+
+    lean: how far the trunk bends forward, about. roll: of the pelvis, left side up, which the spine
+    evens out.
+    """
+    bowed = rng.random() < 0.08
+    lean = lean + rng.normal(0.03, 0.07) + (rng.uniform(0.2, 0.7) if bowed else 0.0)
+    side, turn = rng.normal(0, 0.06) - 0.8 * roll, rng.normal(0, 0.14)
+    for joint, share in ((kin.SPINE1, 0.3), (kin.SPINE2, 0.35), (kin.SPINE3, 0.35)):
+        rotations[joint] = np.asarray([lean, turn, side]) * share
+    look = rng.normal(0, 1, 3) * [0.12, 0.28, 0.07]
+    rotations[kin.NECK], rotations[kin.HEAD] = 0.45 * look - [0.4 * lean, 0, 0], 0.55 * look

@@ -1,0 +1,393 @@
+"""Smooth motions: walking along curves, turning on the spot, reaching for things. Soles on the
+ground stay where they are.
+
+Walks and turns are footprints along a path; feet roll from heel to toe on each and swing to the
+next, the pelvis goes along and as high as the legs let it, legs are solved for
+(`anatomy.place_feet`). Reaches keep both feet planted and move from pose to pose. World as
+everywhere: y up, metres, the ground at y = 0 where the soles are those of the bare body.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.synthetic import anatomy as kin
+from humangs_jax.synthetic.poses import (
+    ARMS,
+    STANCES,
+    Stance,
+    arm_clearance,
+    bend_arm,
+    bend_trunk,
+    draw_goal,
+    in_world,
+    pose_hand,
+)
+from humangs_jax.synthetic.surfaces import choice
+
+FPS, LONG_STEP = 30.0, 0.75
+"""Frames a second; a long step in lengths of a leg."""
+STANCE_SHARE, FLAT_FROM, FLAT_UNTIL = 0.62, 0.15, 0.55
+"""Share of a stride during which a foot is on the ground; shares of that between which the sole is
+flat.
+"""
+HEEL_STRIKE, TOE_OFF = 0.28, 0.85
+"""Pitch of the foot, radians, when it comes down on the heel and leaves from the toes, at a long
+stride.
+"""
+SMOOTHING, SPARE = 4, 0.995
+"""Frames to both sides over which the pelvis's height is smoothed; share of the legs' reach that it
+uses.
+"""
+TRIES = 12
+"""Goals tried for an arm until the way to one is clear."""
+
+
+Heading = Callable[[float | np.ndarray], float | np.ndarray]
+"""From the phase, in strides, to the angle about y."""
+Track = Callable[[float], kin.Vector]
+"""From the phase to the body's place on its path."""
+Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Bool[np.ndarray, "m 2"]]
+"""Rotations, positions of the pelvis, feet that are planted."""
+KeyPose = tuple[kin.Rotations, kin.Vector, float]
+"""Rotations, place of the pelvis on the ground plane, how much lower it is than it could be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequence:
+    """rotations: (m, j, 3) axis-angle. translations: (m, 3) metres.
+
+    planted: (m, 2) feet that are on the ground. kind, fps.
+    """
+
+    kind: str
+    rotations: Float[np.ndarray, "m j 3"]
+    translations: Float[np.ndarray, "m 3"]
+    planted: Bool[np.ndarray, "m 2"]
+    fps: float = FPS
+
+
+def sample_sequence(
+    rng: np.random.Generator, build: kin.Build, frames: int = 60, kind: str | None = None
+) -> Sequence:
+    """A motion of `frames` frames at 30 a second. kind: "walk", "turn" or "reach"; None draws one.
+
+    Raises: ValueError if there is no such kind, or no frame.
+    """
+    if frames < 1:
+        raise ValueError(f"frames: expected at least 1, got {frames}")
+    if kind is None:
+        kind = choice(rng, {name: odds for name, (odds, _) in KINDS.items()})
+    if kind not in KINDS:
+        raise ValueError(f"no kind of sequence {kind!r}: expected one of {', '.join(KINDS)}")
+    rotations, pelvis, planted = KINDS[kind][1](rng, build, frames)
+    return Sequence(kind, rotations, pelvis - build.joints[kin.PELVIS], planted)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gait:
+    """cadence: strides a second. step: metres forward per step. bend: radians turned per step.
+    width: metres of a foot from the line. lift: metres that a swinging foot is raised. turn_out: of
+    the feet. swing: of the arms, radians.
+    """
+
+    cadence: float
+    step: float
+    bend: float
+    width: float
+    lift: float
+    turn_out: float
+    swing: float
+
+
+def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
+    step, curved = rng.uniform(0.3, LONG_STEP) * build.leg, rng.random() < 0.6
+    cadence, bend = rng.uniform(0.75, 1.05), rng.normal(0, 0.16) if curved else 0.0
+    width, lift, turn_out = (
+        build.hip_width * rng.uniform(0.5, 0.9),
+        rng.uniform(0.04, 0.09),
+        rng.uniform(0.0, 0.18),
+    )
+    swing = rng.uniform(0.25, 0.5) * min(1.0, step / build.leg / 0.6)
+    return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
+
+
+def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
+    cadence, step = rng.uniform(0.6, 0.9), rng.uniform(-0.02, 0.06)
+    bend, width = (
+        rng.choice([-1, 1]) * rng.uniform(0.25, 0.5),
+        build.hip_width * rng.uniform(0.95, 1.3),
+    )
+    lift, turn_out, swing = rng.uniform(0.05, 0.09), rng.uniform(0.05, 0.2), rng.uniform(0.03, 0.15)
+    return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
+
+
+def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: Gait) -> Moves:
+    start = rng.uniform(0, 1)
+    begin_heading = (
+        rng.uniform(-np.pi, np.pi) if abs(gait.step) < 0.1 * build.leg else rng.uniform(-0.7, 0.7)
+    )
+    phase = start + gait.cadence * (np.arange(frames) / FPS)  # strides; two steps each
+    heading = lambda p: begin_heading + 2 * gait.bend * (p - start)
+    track = _path(heading, 2 * gait.step, start, phase[-1])
+    feet = [tuple(_foot_at(build, gait, heading, track, side, p) for side in (0, 1)) for p in phase]
+    planted = np.asarray([[(p + 0.5 * side) % 1 < STANCE_SHARE for side in (0, 1)] for p in phase])
+
+    rotations = np.zeros((frames, kin.JOINTS, 3))
+    sway = (
+        0.25 * gait.width * np.sin(2 * np.pi * (phase - 0.06))
+    )  # over the foot that stands: left at a quarter stride
+    lean = rng.normal(0.02, 0.02) + 0.12 * max(gait.step, 0) / build.leg
+    twist = 0.14 * gait.step / build.leg / 0.6
+    turns = np.empty((frames, 3, 3))
+    for i, p in enumerate(phase):
+        once = 2 * np.pi * p
+        roll = 0.05 * np.sin(once - 0.1) * min(1.0, gait.step / build.leg + 0.3)
+        turns[i] = kin.turned(y=heading(p) - twist * np.cos(once)) @ kin.turned(
+            x=0.4 * lean, z=roll
+        )
+        for joint, share in ((kin.SPINE1, 0.3), (kin.SPINE2, 0.4), (kin.SPINE3, 0.3)):
+            rotations[i, joint] = (
+                np.asarray([0.6 * lean, 2 * twist * np.cos(once - 0.2), -0.8 * roll]) * share
+            )
+        look = np.clip(1.2 * gait.bend, -0.5, 0.5)  # to where the path leads
+        rotations[i, [kin.NECK, kin.HEAD]] = [
+            -0.3 * lean,
+            0.5 * look - 0.5 * twist * np.cos(once - 0.2),
+            0,
+        ]
+    rotations[:, kin.PELVIS] = kin.rotation_vector(turns)
+    centers = np.stack([track(p) for p in phase])
+    centers += np.stack(
+        [kin.turned(y=heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)]
+    )
+    pelvis = _ride(build, turns, centers, feet)
+    for i in range(frames):
+        kin.place_feet(build, rotations[i], pelvis[i], feet[i])
+    _swing_arms(rng, build, rotations, phase, gait)
+    return rotations, pelvis, planted
+
+
+def _path(heading: Heading, stride: float, first: float, last: float) -> Track:
+    """A function from the phase to the body's position (3,) on its path: the integral of the
+    heading.
+    """
+    grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
+    direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
+    along = cumulative_trapezoid(direction, grid, axis=0, initial=0)
+    at = lambda p: np.asarray([np.interp(p, grid, along[:, k]) for k in range(3)])
+    origin = at(first)
+    return lambda p: stride * (at(p) - origin)
+
+
+def _foot_at(
+    build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, phase: float
+) -> kin.Foot:
+    """The foot of a side at a phase (strides); the left one comes down at whole phases, the right
+    one half a stride later.
+    """
+    number, share = divmod(phase + 0.5 * side, 1.0)
+    down = number - 0.5 * side
+    here, there = (_footprint(build, gait, heading, track, side, down + k) for k in (0, 1))
+    long = np.clip(gait.step / (LONG_STEP * build.leg), 0.15, 1.0)
+    strike, off = (
+        HEEL_STRIKE * long if gait.step > 0.2 * build.leg else 0.0,
+        TOE_OFF * (0.35 + 0.65 * long),
+    )
+    if share < STANCE_SHARE:
+        u = share / STANCE_SHARE
+        rise = np.clip((u - FLAT_UNTIL) / (1 - FLAT_UNTIL), 0.0, 1.0)  # from rest to full motion
+        late = off * (rise**2 * (3 - rise) / 2)
+        return dataclasses.replace(
+            here, pitch=float(-strike * (1 - _ease(u / FLAT_FROM)) if u < FLAT_FROM else late)
+        )
+    u = (share - STANCE_SHARE) / (1 - STANCE_SHARE)
+    s = _ease(u)
+    at = (
+        float(a + s * (b - a))
+        for a, b in ((here.x, there.x), (here.z, there.z), (here.yaw, there.yaw))
+    )
+    pitch = off * (1 - _ease(min(1.0, u / 0.6))) - strike * _ease(
+        (u - 0.4) / 0.6
+    )  # quickly, to clear the ground
+    return kin.Foot(*at, pitch=float(pitch), lift=float(gait.lift * np.sin(np.pi * s) ** 2))
+
+
+def _footprint(
+    build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, down: float
+) -> kin.Foot:
+    """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in
+    mid-stance.
+    """
+    middle = down + 0.5 * STANCE_SHARE
+    yaw, sign = float(heading(middle)), 1 - 2 * side
+    ahead = (
+        build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg
+    )  # of the ball, standing
+    x, _, z = track(middle) + kin.turned(y=yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
+    return kin.Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
+
+
+def _swing_arms(
+    rng: np.random.Generator,
+    build: kin.Build,
+    rotations: Float[np.ndarray, "m j 3"],
+    phase: Float[np.ndarray, " m"],
+    gait: Gait,
+) -> None:
+    """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of
+    the shoulders.
+    """
+    stood = rotations[0].copy()
+    stood[[joint for leg in kin.LEGS for joint in leg]] = 0
+    for side in (0, 1):
+        for _ in range(TRIES):
+            if bend_arm(rng, build, stood, "hang", side) > 0.01:
+                break
+        pose_hand(rng, stood, side)
+    for side, hand in (
+        (0, slice(kin.LEFT_HAND, kin.RIGHT_HAND)),
+        (1, slice(kin.RIGHT_HAND, kin.JOINTS)),
+    ):
+        collar, shoulder, elbow, wrist = ARMS[side]
+        sign = 1 - 2 * side
+        forward = -sign * np.cos(
+            2 * np.pi * (phase - 0.04)
+        )  # the left arm is back when the left heel comes down
+        base = kin.rotation_matrix(stood[shoulder])
+        for i, f in enumerate(forward):
+            rotations[i, shoulder] = kin.rotation_vector(kin.turned(x=-gait.swing * f) @ base)
+            rotations[i, elbow] = stood[elbow] + np.asarray(
+                [0, -sign * 0.35 * gait.swing * (1 + f), 0]
+            )
+            rotations[i, collar] = stood[collar] + np.asarray(
+                [0, -sign * 0.05 * f * min(1.0, gait.swing / 0.4), 0]
+            )
+        rotations[:, wrist], rotations[:, hand] = stood[wrist], stood[hand]
+
+
+def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
+    """From pose to pose on planted feet: the hands reach for targets, trunk and knees follow."""
+    name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
+    heading = rng.uniform(-0.7, 0.7)
+    stance = STANCES[name][1](rng, build.hip_width / build.leg)
+    feet = in_world(stance.feet, build.leg, heading)
+    keys, times = [_key_pose(rng, build, heading, stance, feet, None)], [0.0]
+    while times[-1] <= frames / FPS:
+        times.append(times[-1] + rng.uniform(0.7, 1.4))
+        keys.append(_key_pose(rng, build, heading, stance, feet, keys[-1]))
+    rotations, centers, sinks = (
+        np.zeros((frames, kin.JOINTS, 3)),
+        np.zeros((frames, 3)),
+        np.zeros(frames),
+    )
+    for i in range(frames):
+        k = int(np.searchsorted(times, i / FPS, side="right")) - 1
+        a, b = keys[k], keys[k + 1]
+        # three quarters of the time on the way, then a rest
+        s = _ease((i / FPS - times[k]) / (0.8 * (times[k + 1] - times[k])))
+        rotations[i] = kin.between(a[0], b[0], s)
+        centers[i], sinks[i] = (1 - s) * a[1] + s * b[1], (1 - s) * a[2] + s * b[2]
+    pelvis = _ride(
+        build, kin.rotation_matrix(rotations[:, kin.PELVIS]), centers, [feet] * frames, sinks
+    )
+    for i in range(frames):
+        kin.place_feet(build, rotations[i], pelvis[i], feet)
+    return rotations, pelvis, np.ones((frames, 2), bool)
+
+
+def _key_pose(
+    rng: np.random.Generator,
+    build: kin.Build,
+    heading: float,
+    stance: Stance,
+    feet: kin.Feet,
+    before: KeyPose | None,
+) -> KeyPose:
+    """(rotations, place of the pelvis on the ground plane, how much lower it is than it could
+    be).
+    """
+    rotations = np.zeros((kin.JOINTS, 3))
+    sink = stance.sink * build.leg + (
+        rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0
+    )
+    stooped = sink / build.leg
+    tilt, aside = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
+    turn = kin.turned(y=heading + aside) @ kin.turned(x=tilt, z=stance.roll)
+    rotations[kin.PELVIS] = kin.rotation_vector(turn)
+    back = (
+        kin.turned(y=heading)
+        @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)])
+        * build.leg
+    )
+    center = np.asarray(
+        [0.5 * (feet[0].x + feet[1].x) + back[0], 0.0, 0.5 * (feet[0].z + feet[1].z) + back[2]]
+    )
+    height = kin.highest_pelvis(build, turn, center[0], center[2], feet, SPARE) - sink
+    kin.place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
+    bend_trunk(rng, rotations, stance.lean + 1.2 * stooped, stance.roll)
+    for side in (0, 1):
+        best, best_clear = rotations, -np.inf
+        for _ in range(TRIES):
+            tried = rotations.copy()
+            goal = "hang" if rng.random() < 0.2 else draw_goal(rng)
+            bend_arm(rng, build, tried, goal, side, other_arm=side == 1)
+            clear = _clear_of(build, tried, side)
+            if before is not None:  # the way there counts as much as the place
+                way = (kin.between(before[0], tried, t) for t in (0.25, 0.5, 0.75))
+                clear = min(clear, *(_clear_of(build, pose, side) for pose in way))
+            if clear > best_clear:
+                best, best_clear = tried, clear
+            if clear > 0.0:
+                break
+        rotations = best
+        pose_hand(rng, rotations, side)
+    return rotations, center, sink
+
+
+def _clear_of(build: kin.Build, rotations: kin.Rotations, side: int) -> float:
+    """`arm_clearance`; while the left arm (side 0) is placed, the right one is held out of the
+    way.
+    """
+    if side == 0:
+        rotations = rotations.copy()
+        rotations[list(ARMS[1])] = 0
+    return arm_clearance(build, rotations)
+
+
+def _ride(
+    build: kin.Build,
+    turns: Float[np.ndarray, "m 3 3"],
+    centers: Float[np.ndarray, "m 3"],
+    feet: list[kin.Feet],
+    sinks: Float[np.ndarray, " m"] | None = None,
+) -> Float[np.ndarray, "m 3"]:
+    """Positions of the pelvis (m, 3) above the centers: smooth heights that the legs allow, minus
+    `sinks`.
+    """
+    heights = np.asarray([
+        kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
+        for turn, center, both in zip(turns, centers, feet, strict=True)
+    ])  # fmt: skip
+    views = np.lib.stride_tricks.sliding_window_view
+    window = lambda values: views(np.pad(values, SMOOTHING, mode="edge"), 2 * SMOOTHING + 1)
+    weights = np.hanning(2 * SMOOTHING + 3)[1:-1]
+    smooth = window(window(heights).min(-1)) @ (weights / weights.sum())
+    pelvis = centers.copy()
+    pelvis[:, 1] = smooth - (0.0 if sinks is None else sinks)
+    return pelvis
+
+
+def _ease(t: float) -> float:
+    """From 0 to 1 with rest at both ends (speed and acceleration)."""
+    t = np.clip(t, 0.0, 1.0)
+    return t**3 * (10 - 15 * t + 6 * t**2)
+
+
+KINDS: dict[str, tuple[float, Callable[[np.random.Generator, kin.Build, int], Moves]]] = {
+    "walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach),
+}  # fmt: skip
+"""Name -> probability, and a function of a generator, a build and a length."""

@@ -1,0 +1,89 @@
+"""Synthetic people as the examples of a training run. `training.sources` reaches this by name."""
+
+import dataclasses
+import logging
+import os
+from pathlib import Path
+
+import jax
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.loading import Source
+from humangs_jax.synthetic.bank import PeopleBank, build_bank, load_bank, save_bank
+from humangs_jax.synthetic.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
+from humangs_jax.synthetic.subject import SPLITS, seeds_of
+from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.sources import MakeSource
+
+logger = logging.getLogger(__name__)
+
+
+def people_of_run(people: int, out: Path, body: BodyModel) -> MakeSource:
+    """People of the training seeds, rendered for every step; their bank is kept in the run's
+    folder.
+    """
+    return on_the_fly_people(_bank(people, out, body))
+
+
+def people_of_split(
+    people: int, body: BodyModel, split: str, size: int, each_once: bool = False
+) -> MakeSource:
+    """The first people of a split, rendered for every step.
+
+    Arguments: size: of the images, pixels: textures are as fine as these need. each_once: see
+    `on_the_fly_people`.
+    """
+    texture = 128 if size <= 64 else 512 if size <= 256 else 1024
+    bank = build_bank(seeds_of(split, 0, people), body, split, texture_size=texture)
+    return on_the_fly_people(bank, each_once=each_once)
+
+
+def on_the_fly_people(
+    bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False
+) -> MakeSource:
+    """People of a bank, rendered for every step on the device that trains; sizes and views are
+    those of the run.
+
+    each_once: each person once, in order, as a validation wants them; otherwise they are drawn at
+    random.
+    """
+
+    def make(config: TrainConfig) -> Source:
+        views = config.views
+        if views.rule != "random":
+            logger.warning(
+                'views.rule "%s" is for written people; on-the-fly people are drawn by "random"',
+                views.rule,
+            )
+        drawn = dataclasses.replace(
+            settings,
+            target_views=views.target_count,
+            input_size=config.model.conventions.image_size,
+            target_size=config.target_size,
+            mixed_pose_share=views.mixed_pose_share,
+            jitter=views.jitter,
+            scattered_share=views.scattered_share,
+            depths=config.loss.depth > 0,
+        )
+        if jax.default_backend() != "cpu":  # whole images, all views at once
+            most = max(views.input_counts) + views.target_count
+            drawn = dataclasses.replace(drawn, views_at_once=most, pixels_per_step=1 << 30)
+        return on_the_fly_source(bank, drawn, views.input_counts, jax.device_count() > 1, each_once)
+
+    return make
+
+
+def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
+    """The bank in out/people.npz, which one process makes unless it is there."""
+    path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
+    if jax.process_index() == 0:
+        bank = load_bank(path) if path.is_file() else None
+        if bank is None or bank.seeds.tolist() != list(seeds):
+            out.mkdir(parents=True, exist_ok=True)
+            bank = build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True)
+            save_bank(path, bank)
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices("people")
+    return load_bank(path) if bank is None else bank

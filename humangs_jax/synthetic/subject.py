@@ -1,0 +1,496 @@
+"""A synthetic person from a seed: who it is (`describe`), and its mesh, materials, lights and build
+(`make_subject`).
+
+Also its views in a pose: rasterized at twice the size, shaded per pixel, box-averaged.
+
+A description is a few numbers and takes milliseconds; thousands can be counted without building any
+geometry.
+
+Seeds and keys are for training, validation, test and documentation; the ranges share no person. A
+seed names a person. Written people are made from the seed by numpy; people made on the fly from its
+keys, whose words are (appearance, seed), so that the person, and the split, can be read off every
+key.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel, shape_body
+from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.synthetic import complexion, hair, surroundings, wardrobe
+from humangs_jax.synthetic.anatomy import (
+    BODY,
+    LEFT_KNEE,
+    Anatomy,
+    Build,
+    Rotations,
+    Vector,
+    joint_positions,
+    measure,
+)
+from humangs_jax.synthetic.complexion import Complexion, sample_complexion
+from humangs_jax.synthetic.fabrics import Material, Spots
+from humangs_jax.synthetic.hair import Haircut, sample_haircut
+from humangs_jax.synthetic.outfits import Garment, sample_outfit
+from humangs_jax.synthetic.surfaces import (
+    Faces,
+    Field,
+    Folds,
+    Points,
+    Surface,
+    compact,
+    join,
+    vertex_normals,
+)
+from humangs_jax.synthetic.surroundings import Lights, sample_lights
+
+# Seeds
+# --------------------------------------------------------------------------------------------------
+
+
+GENERATOR_VERSION = 2
+"""Raised whenever the same seed makes another person, pose or image. Manifests record it; sets of
+different versions are not mixed in one folder."""
+
+TRAIN = range(0, 1_000_000)
+VALIDATION = range(1_000_000, 1_001_000)
+TEST = range(2_000_000, 2_001_000)
+"""Held out of training and of every choice made on the validation people."""
+DEMO = range(3_000_000, 3_001_000)
+"""People of the documentation and the tests."""
+FITTING = range(4_000_000, 4_001_000)
+"""People that fitting and refinement are tuned and measured on: no other result sees them."""
+TRADEOFF = range(5_000_000, 5_001_000)
+"""People that the presets of speed and accuracy are chosen on."""
+
+SPLITS = {
+    "train": TRAIN,
+    "validation": VALIDATION,
+    "test": TEST,
+    "demo": DEMO,
+    "fitting": FITTING,
+    "tradeoff": TRADEOFF,
+}
+
+KEY_KIND = "threefry2x32"
+"""Implementation of all keys of people: the words of such a key are its seed."""
+APPEARANCES = 2**32
+
+
+def split_of(seed: int) -> str:
+    """Name of the range that a seed lies in. Raises ValueError if it lies in none."""
+    for name, seeds in SPLITS.items():
+        if seed in seeds:
+            return name
+    ranges = ", ".join(f"{name} {seeds.start}..{seeds.stop - 1}" for name, seeds in SPLITS.items())
+    raise ValueError(f"seed {seed} lies in no range: {ranges}")
+
+
+def seeds_of(split: str, first: int, count: int) -> range:
+    """`count` seeds of a split from its `first`-th on.
+
+    Raises ValueError if they reach beyond the split.
+    """
+    people = SPLITS[split]
+    if first < 0 or count < 1 or first + count > len(people):
+        raise ValueError(
+            f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has"
+            f" {len(people)}"
+        )
+    return people[first : first + count]
+
+
+def subject_key(seed: int, appearance: int = 0) -> Key:
+    """The key of a person; further appearances (other clothes, pose, light) have further keys.
+
+    Raises: ValueError if the seed lies in no range of `SPLITS`.
+    """
+    split_of(seed)
+    words = np.asarray([appearance % APPEARANCES, seed], np.uint32)
+    return jax.random.wrap_key_data(jnp.asarray(words), impl=KEY_KIND)
+
+
+# People
+# --------------------------------------------------------------------------------------------------
+
+
+SHAPE_STD = 0.55
+"""Standard deviation of the shape coefficients without a rule of their own; values are clipped at
+twice that.
+"""
+HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
+"""Mean and standard deviation of the stature in metres of men (True) and women."""
+HEIGHT_RANGE, TALLEST_WOMAN = (1.42, 2.08), 1.95
+YEARS, YOUNG, OLD = (15.0, 85.0), 25.0, 90.0
+"""Range of ages; years at which the body's age coefficient is 0 and 1."""
+LENGTHS = ("height", "leg_length", "torso_length")
+"""Coefficients that share what is missing to the wanted stature."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Person:
+    """seed; betas: (s,) shape coefficients; male: dressed as a man; years; stature in metres,
+    without shoes.
+
+    complexion: colors of skin, hair, eyes. haircut: hair and beard. garments: clothes, shoes and
+    accessories, innermost first.
+    lights: what the person stands in.
+    """
+
+    seed: int
+    betas: Float[np.ndarray, " s"]
+    male: bool
+    years: float
+    stature: float
+    complexion: Complexion
+    haircut: Haircut
+    garments: tuple[Garment, ...]
+    lights: Lights
+
+
+def describe(seed: int, body: BodyModel) -> Person:
+    """The person of a seed, unbuilt."""
+    rng = np.random.default_rng([seed, 0])
+    male, years = (
+        bool(rng.random() < 0.5),
+        float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS)),
+    )
+    betas, stature = sample_shape(rng, body, male, years)
+    garments = sample_outfit(np.random.default_rng([seed, 11]), male, years)
+    complexion = sample_complexion(np.random.default_rng([seed, 12]), male, years)
+    haircut = sample_haircut(
+        np.random.default_rng([seed, 13]), male, years, {g.kind for g in garments}
+    )
+    lights = sample_lights(np.random.default_rng([seed, 14]))
+    return Person(seed, betas, male, years, stature, complexion, haircut, garments, lights)
+
+
+def sample_shape(
+    rng: np.random.Generator, body: BodyModel, male: bool, years: float
+) -> tuple[np.ndarray, float]:
+    """(s,) shape coefficients and the stature in metres that they give."""
+    at = {name: i for i, name in enumerate(body.shape_names)}
+    betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * SHAPE_STD
+    betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
+    betas[at["age"]] = (years - YOUNG) / (OLD - YOUNG) if years > YOUNG else 0.03 * (years - YOUNG)
+    heavier = 0.25 * np.clip((years - 20) / 30, 0, 1)
+    betas[at["weight"]] = np.clip(rng.normal(0.05 + heavier, 0.62), -1.0, 1.8)
+    betas[at["muscle"]] = np.clip(rng.normal(0.1 - 0.4 * (years > 60), 0.6), -1.0, 1.5)
+    mean, std = HEIGHTS[male]
+    youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
+    tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
+    wanted = np.clip(
+        mean - youth + std * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN
+    )
+    *_, stature, gains = _host_arrays(body)
+    lengths = [at[name] for name in LENGTHS]
+    betas[lengths] += (
+        (wanted - (stature + gains @ betas)) * gains[lengths] / (gains[lengths] @ gains[lengths])
+    )
+    return betas.astype(np.float32), float(wanted)
+
+
+@dataclasses.dataclass(frozen=True)
+class SyntheticSubject:
+    """A dressed person.
+
+    seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`,
+    `cloth`. face_materials: (f,) indices into materials. lights. build: what the pose prior knows.
+    person: what all of this was built from.
+    cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on
+    everything else.
+    """
+
+    seed: int
+    betas: Float[np.ndarray, " s"]
+    surface: Surface
+    face_materials: Int[np.ndarray, " f"]
+    materials: tuple[Material, ...]
+    lights: Lights
+    build: Build
+    cover: Field
+    person: Person
+
+    def posed_vertices(self, rotations: Rotations, translation: Vector) -> Points:
+        """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
+        # by the pose prior's own kinematics: no compilation, the same on every backend
+        world, positions = joint_positions(self.build, np.asarray(rotations, np.float64))
+        moved = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
+        transforms = np.concatenate([world, moved[..., None]], -1).astype(np.float32)
+        blended = (self.surface.weights @ transforms.reshape(-1, 12)).reshape(-1, 3, 4)
+        return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
+
+
+_shape = jax.jit(shape_body)
+
+
+def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> SyntheticSubject:
+    """The person of a seed. person: another description than that of the seed, such as one in other
+    clothes.
+
+    Raises: ValueError if the body is not the package's own: cuts and paint are given in its
+    coordinates.
+    """
+    if (body.name, len(body.template)) != BODY:
+        raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
+    person = describe(seed, body) if person is None else person
+    rest = _shape(body, jnp.asarray(person.betas))
+    template, faces, weights, *_ = _host_arrays(body)
+    vertices, joints = np.asarray(rest.vertices), np.asarray(rest.joints)
+    anatomy = measure(vertices, joints, template, faces, weights, body.parents)
+    outfit = wardrobe.dress_up(np.random.default_rng([seed, 20]), anatomy, person.garments)
+    hooded = any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments)
+    removed = outfit.removed
+    if person.haircut.cut in hair.LONG_CUTS or hooded:
+        removed = removed | hair.ears(template)
+    hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk, hooded)
+    skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
+    skin = compact(skin, ~removed[skin.faces].all(1))
+    skin_material = complexion.skin_material(
+        np.random.default_rng([seed, 22]), person.complexion, person.haircut
+    )
+    eyes = wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(person.complexion))
+    pieces = [wardrobe.Piece(skin, skin_material), eyes, *outfit.pieces, *hairs]
+    surface, materials = (
+        join([piece.surface for piece in pieces]),
+        tuple(piece.material for piece in pieces),
+    )
+    cover = np.pad(
+        skin.attributes["cover"],
+        (0, len(surface.vertices) - len(skin.vertices)),
+        constant_values=-1.0,
+    )
+    ids = np.repeat(
+        np.arange(len(pieces), dtype=np.int32), [len(piece.surface.faces) for piece in pieces]
+    )
+    build = _build(anatomy, surface)
+    return SyntheticSubject(
+        seed, person.betas, surface, ids, materials, person.lights, build, cover, person
+    )
+
+
+_HOST: dict[int, tuple] = {}
+
+
+def _host_arrays(
+    body: BodyModel,
+) -> tuple[
+    Points, Int[np.ndarray, "f 3"], Float[np.ndarray, "n j"], float, Float[np.ndarray, " s"]
+]:
+    """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds.
+
+    Kept for the body used last.
+    """
+    if id(body) not in _HOST:
+        template, faces, weights = (
+            np.asarray(a) for a in (body.template, body.faces, body.skinning_weights)
+        )
+        top, bottom = np.argmax(template[:, 1]), np.argmin(template[:, 1])
+        directions = np.asarray(body.shape_directions)
+        gains = (directions[top, 1] - directions[bottom, 1]).astype(float)
+        _HOST.clear()
+        _HOST[id(body)] = (
+            body,
+            template,
+            faces,
+            weights,
+            float(template[top, 1] - template[bottom, 1]),
+            gains,
+        )
+    return _HOST[id(body)][1:]
+
+
+def _hair(
+    rng: np.random.Generator, anatomy: Anatomy, person: Person, over: float, hooded: bool
+) -> list[wardrobe.Piece]:
+    """The pieces of hair; what a hat or hood covers is left out."""
+    material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
+    haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut
+    pieces = [
+        wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)
+    ]
+    hat = any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments)
+    if hat and pieces and not hooded:  # the scalp's; tails, buns and beards hang out
+        hidden = hair.above_line(pieces[0].surface.template, hair.CAP_LINE) > 0.008
+        pieces[0] = dataclasses.replace(pieces[0], hidden=hidden).visible()
+    return pieces
+
+
+def _build(anatomy: Anatomy, surface: Surface) -> Build:
+    """Radii of the dressed body for the pose prior."""
+    chest = anatomy.trunk.radii[(anatomy.trunk.levels > -0.35) & (anatomy.trunk.levels < 0.0)]
+    depth = float(np.median(0.5 * (chest[:, 0] + chest[:, chest.shape[1] // 2])))
+    thigh = float(
+        np.median(
+            anatomy.legs[0].radii[
+                (anatomy.legs[0].levels > -0.65) & (anatomy.legs[0].levels < -0.5)
+            ]
+        )
+    )
+    low = surface.vertices[(surface.vertices[:, 1] < -0.5) & (surface.vertices[:, 1] > -0.9)]
+    spread = (
+        float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2
+    )  # wide skirts keep the hands away
+    leg_line = float(np.abs(anatomy.joints[LEFT_KNEE, 0]))
+    radii = (
+        depth + 0.015,
+        max(thigh + 0.02, spread - leg_line),
+        max(0.07, spread - leg_line - 0.02),
+        0.035,
+    )
+    return Build(anatomy.joints.astype(np.float64), anatomy.parents, *radii)
+
+
+# Posed and rendered
+# --------------------------------------------------------------------------------------------------
+
+
+SUPERSAMPLING = 2
+VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
+"""Sizes of meshes are padded to multiples of these, and points are colored in steps of that length:
+few shapes are compiled.
+"""
+FOLD_SLOPE = 0.6
+"""Slope of painted creases on the most wrinkled cloth."""
+
+_shaded_vertices, _seen_from_behind = (
+    jax.jit(surroundings.shaded_vertices),
+    jax.jit(surroundings.seen_from_behind),
+)
+_light_points = jax.jit(surroundings.light_points)
+Image = Float[np.ndarray, "h w 3"]
+Map = Float[np.ndarray, "h w"]
+Ids = Int[np.ndarray, " m"]
+Values = Float[np.ndarray, "m 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedSubject:
+    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n,
+    3), openness (n,).
+
+    lit: (n,) share of the key light that arrives.
+    """
+
+    subject: SyntheticSubject
+    rotations: Rotations
+    translation: Vector
+    vertices: Points
+    normals: Points
+    openness: Field
+    lit: Field
+
+
+def pose_subject(
+    subject: SyntheticSubject, rotations: Rotations, translation: Vector
+) -> PosedSubject:
+    """Skin the mesh and gather what its shading needs."""
+    faces, count = subject.surface.faces, len(subject.surface.vertices)
+    vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
+    normals = vertex_normals(vertices, faces)
+    shades = _shaded_vertices(
+        padded(vertices, faces)[0], padded(normals, faces)[0], subject.lights.directions[0]
+    )
+    return PosedSubject(
+        subject, rotations, translation, vertices, normals, *(np.asarray(x)[:count] for x in shades)
+    )
+
+
+def padded(
+    vertices: Points, faces: Faces
+) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
+    """A mesh with repeated vertices and faces without area up to the next step of sizes."""
+    spare_vertices, spare_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
+    vertices = np.concatenate([vertices, np.repeat(vertices[:1], spare_vertices, axis=0)]).astype(
+        np.float32
+    )
+    return jnp.asarray(vertices), jnp.asarray(np.pad(faces, ((0, spare_faces), (0, 0))))
+
+
+def render_view(posed: PosedSubject, camera: Camera, background: float = 1.0) -> tuple[Image, Map]:
+    """(h, w, 3) image on the background and (h, w) coverage of one camera, both in [0, 1]."""
+    s, subject = SUPERSAMPLING, posed.subject
+    fine = camera.resized(camera.width * s, camera.height * s)
+    fragments = rasterize_mesh(*padded(posed.vertices, subject.surface.faces), fine)
+    ids = np.asarray(fragments.face_ids).reshape(-1)
+    seen = np.flatnonzero(ids >= 0)
+    weights = np.asarray(fragments.barycentrics).reshape(-1, 3)[seen]
+    albedo, slopes = paint(subject, ids[seen], spots_at(subject, ids[seen], weights))
+    samples = np.full((len(ids), 3), background, np.float32)
+    samples[seen] = light_points(posed, ids[seen], weights, albedo, slopes, camera.center)
+    shape = (camera.height, s, camera.width, s)
+    image = samples.reshape(*shape, 3).mean(axis=(1, 3))
+    mask = (ids >= 0).astype(np.float32).reshape(shape).mean(axis=(1, 3))
+    return np.clip(image, 0, 1), mask
+
+
+def light_points(
+    posed: PosedSubject,
+    face_ids: Ids,
+    weights: Values,
+    albedo: Values,
+    slopes: Values,
+    eye: Array | None = None,
+) -> Values:
+    """Colors (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the
+    weights of the corners.
+
+    eye: camera centre (3,), which decides whether the inner side of cloth is seen; None: everything
+    is seen from outside.
+    """
+    subject, faces = posed.subject, posed.subject.surface.faces
+    values = np.concatenate([posed.normals, posed.openness[:, None], posed.lit[:, None]], axis=1)
+    behind = np.zeros(len(faces), bool)
+    if eye is not None:
+        behind = np.asarray(_seen_from_behind(*padded(posed.vertices, faces), eye))
+    sheen = np.asarray([material.sheen for material in subject.materials], np.float32)[
+        subject.face_materials
+    ]
+    colors = [np.zeros((0, 3), np.float32)]
+    for start in range(0, len(face_ids), POINT_STEP):
+        part = slice(start, start + POINT_STEP)
+        ids = face_ids[part]
+        points = (
+            values[faces[ids]].reshape(-1, 15),
+            weights[part],
+            behind[ids],
+            albedo[part],
+            slopes[part],
+            sheen[ids],
+        )
+        full = (np.pad(x, [(0, POINT_STEP - len(ids))] + [(0, 0)] * (x.ndim - 1)) for x in points)
+        colors.append(np.asarray(_light_points(subject.lights, *full))[: len(ids)])
+    return np.concatenate(colors)
+
+
+def spots_at(subject: SyntheticSubject, face_ids: Ids, weights: Values) -> Spots:
+    """Points on faces, given by the weights of their corners, as materials see them."""
+    attributes = subject.surface.attributes
+    values = np.concatenate([attributes["cloth"], attributes["template"]], axis=1)
+    corners = subject.surface.faces[face_ids]
+    blended = sum(weights[:, i : i + 1] * values[corners[:, i]] for i in range(3))
+    return Spots(blended[:, :4], blended[:, 4:])
+
+
+def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Values, Values]:
+    """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted
+    folds.
+    """
+    material_ids = subject.face_materials[face_ids]
+    albedo, slope = (
+        np.empty((len(face_ids), 3), np.float32),
+        np.zeros((len(face_ids), 3), np.float32),
+    )
+    for k in np.unique(material_ids):
+        material, chosen = subject.materials[k], np.flatnonzero(material_ids == k)
+        own = Spots(spots.cloth[chosen], spots.template[chosen])
+        albedo[chosen] = material.albedo(own)
+        if material.wrinkles > 0:
+            folds = Folds(np.random.default_rng([subject.seed, 100 + k]), upright=material.draped)
+            slope[chosen] = FOLD_SLOPE * material.wrinkles * folds.slope(own.cloth[:, :3])
+    return np.clip(albedo, 0.01, None), slope

@@ -1,0 +1,516 @@
+"""What is around a person: cameras and light, for written people from a numpy generator, for those
+made on the fly on the device.
+
+Cameras like those of the published protocol: around the person, vertical field of view 60 degrees,
+near the horizon. Soft light: sky and ground, three wide lights, occlusion and soft shadows; a point
+has one color from wherever it is seen. Occlusion and the shadow of the key light are per vertex,
+from a voxel grid that holds the posed person.
+"""
+
+import functools
+import math
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.special import ndtri
+
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar, Vector3
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
+from humangs_jax.synthetic.anatomy import Vector
+from humangs_jax.synthetic.fabrics import ALBEDO_LIMIT
+from humangs_jax.synthetic.surfaces import Points, choice
+
+VERTICAL_FOV, ELEVATION = np.deg2rad(60.0), np.deg2rad(np.asarray([-5.0, 15.0]))
+DISTANCE_FACTOR, CLOSE_FACTOR = (1.8, 2.2), (0.8, 1.7)
+"""Distance in bounding radii: nearer than 1.7 the frame cuts heads and feet.
+
+Close views show parts of the person.
+"""
+CLOSE_SPREAD, CLEARANCE = 0.85, 0.3
+"""Close cameras look at points up to this share of the way from the middle of the person to its
+surface, and come no nearer to a point of it than this (metres)."""
+FRAME = 0.98
+"""Share of the half frame that the person may reach; a camera that is too near for it steps back.
+"""
+POINT_STEP = 4096
+"""Points are padded to a multiple of this: few shapes are compiled."""
+JITTER, CAMERA_NUMBERS = 0.3, 5
+UP = (0.0, 1.0, 0.0)
+Angles = Float[np.ndarray, " v"]
+Number = Float[Array, ""] | float
+Each = Float[Array | np.ndarray, "3 ..."]
+"""Of three lights or channels."""
+
+
+def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
+    """Middle of the bounding box (3,) and the largest distance from it."""
+    center = 0.5 * (vertices.min(0) + vertices.max(0))
+    return center, float(np.linalg.norm(vertices - center, axis=1).max())
+
+
+def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
+    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `JITTER` of
+    the spacing.
+    """
+    spacing = 2 * np.pi / count
+    return rng.uniform(0, spacing) + spacing * (
+        np.arange(count) + rng.uniform(-JITTER, JITTER, count)
+    )
+
+
+def cameras_around(
+    rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
+) -> Camera:
+    """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's
+    ranges.
+    """
+    center, radius = bounding_sphere(vertices)
+    distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
+    elevations = rng.uniform(*ELEVATION, len(azimuths))
+    points = np.pad(vertices - center, ((0, -len(vertices) % POINT_STEP), (0, 0)), mode="edge")
+    near = _nearest_distances(
+        jnp.asarray(points), *(jnp.asarray(x, jnp.float32) for x in (azimuths, elevations))
+    )
+    targets = np.broadcast_to(center, (len(azimuths), 3))
+    return _orbits(
+        image_size, targets, np.maximum(distances, np.asarray(near)), azimuths, elevations
+    )
+
+
+def close_cameras(
+    rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
+) -> Camera:
+    """A batch of cameras that see parts: `CLOSE_FACTOR` bounding radii away from points between
+    middle and surface.
+    """
+    center, radius = bounding_sphere(vertices)
+    count = len(azimuths)
+    towards = vertices[rng.integers(len(vertices), size=count)]
+    targets = center + rng.uniform(0, CLOSE_SPREAD, (count, 1)) * (towards - center)
+    distances = radius * rng.uniform(*CLOSE_FACTOR, count)
+    elevations = rng.uniform(*ELEVATION, count)
+    flat = np.cos(elevations)
+    directions = np.stack(
+        [flat * np.sin(azimuths), np.sin(elevations), flat * np.cos(azimuths)], -1
+    )
+    for i in range(count):
+        while (
+            np.linalg.norm(vertices - targets[i] - distances[i] * directions[i], axis=1).min()
+            < CLEARANCE
+        ):
+            distances[i] += 0.05 * radius
+    return _orbits(image_size, targets, distances, azimuths, elevations)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _orbits(
+    size: int,
+    targets: Float[Array, "v 3"],
+    distances: Float[Array, " v"],
+    azimuths: Float[Array, " v"],
+    elevations: Float[Array, " v"],
+) -> Camera:
+    """A batch of cameras that each look at a target of their own."""
+    K = intrinsics_from_fov(VERTICAL_FOV, size, size)
+    one = lambda target, distance, azimuth, elevation: orbit(
+        target, distance[None], azimuth[None], elevation[None], K, size, size
+    )[0]
+    return jax.vmap(one)(targets, distances, azimuths, elevations)
+
+
+def camera_from(
+    u: Array,
+    vertices: Float[Array, "n 3"],
+    count: Int[Array, ""] | int,
+    azimuth: Number,
+    close: Number,
+    size: int,
+) -> Camera:
+    """A square camera of `size` pixels that looks at a posed person from an azimuth.
+
+    u: (5,) in [0, 1). count: vertices that are no padding. close: probability of a close camera;
+    others see all of the person.
+    """
+    is_close, tilt, spread, outwards, place = u
+    low, high = vertices.min(0), vertices.max(0)
+    center = 0.5 * (low + high)
+    radius = jnp.sqrt(jnp.max(jnp.sum((vertices - center) ** 2, -1)))
+    near = is_close < close
+    elevation = _within(ELEVATION, tilt)
+    factor = jnp.where(near, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
+    towards_vertex = vertices[pick(place, count)] - center
+    target = center + jnp.where(near, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
+    along = _along_axes(vertices - target, azimuth, elevation)
+    ahead, above, aside = along
+    beside = CLEARANCE**2 - (
+        above * above + aside * aside
+    )  # a camera on its axis comes no nearer than that to a point
+    clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
+    distance = jnp.maximum(factor * radius, jnp.where(near, clear, _nearest_distance(*along)))
+    K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
+    eye = target + distance * _axes(azimuth, elevation)[0]
+    return look_at(eye, target, jnp.asarray(UP, vertices.dtype), K, size, size)
+
+
+def _nearest_distance(
+    ahead: Float[Array, " n"], above: Float[Array, " n"], aside: Float[Array, " n"]
+) -> Scalar:
+    """Least distance from the origin at which a camera that looks at it has all points in its
+    square frame.
+    """
+    return jnp.max(
+        jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead
+    )
+
+
+@jax.jit
+def _nearest_distances(
+    points: Float[Array, "n 3"], azimuths: Float[Array, " v"], elevations: Float[Array, " v"]
+) -> Float[Array, " v"]:
+    return jax.vmap(lambda a, e: _nearest_distance(*_along_axes(points, a, e)))(
+        azimuths, elevations
+    )
+
+
+def _within(limits: tuple[float, float] | Float[np.ndarray, "2"], share: Scalar) -> Scalar:
+    return limits[0] + (limits[1] - limits[0]) * share
+
+
+def _axes(azimuth: Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3]:
+    """Unit vectors towards a camera, up and right in its image."""
+    sa, ca, se, ce = jnp.sin(azimuth), jnp.cos(azimuth), jnp.sin(elevation), jnp.cos(elevation)
+    zero = jnp.zeros_like(sa)
+    return (
+        jnp.stack([ce * sa, se, ce * ca]),
+        jnp.stack([-se * sa, ce, -se * ca]),
+        jnp.stack([ca, zero, -sa]),
+    )
+
+
+def _along_axes(
+    points: Float[Array, "n 3"], azimuth: Number, elevation: Scalar
+) -> tuple[Float[Array, " n"], ...]:
+    """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and
+    TPU.
+    """
+    return tuple(jnp.sum(points * axis, -1) for axis in _axes(azimuth, elevation))
+
+
+def azimuths_from(
+    u: Float[Array, " numbers"],
+    jitter: float,
+    scattered_share: float,
+    count: Int[Array, ""] | None = None,
+) -> Float[Array, " v"]:
+    """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing;
+    or anywhere.
+
+    u: 2 + 2 v numbers in [0, 1). count: how many go around once; None: all.
+    """
+    v = len(u) // 2 - 1
+    scattered, start, offsets, places = u[0], u[1], u[2 : 2 + v], u[2 + v :]
+    spacing = 2 * np.pi / (v if count is None else count)
+    even = spacing * (jnp.arange(v) + jitter * (offsets - 0.5)) + 2 * np.pi * start
+    return jnp.where(scattered < scattered_share, 2 * np.pi * places, even)
+
+
+def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]:
+    """One of the numbers 0 .. count - 1 for each u in [0, 1)."""
+    return jnp.minimum((u * count).astype(jnp.int32), count - 1)
+
+
+# Light
+# --------------------------------------------------------------------------------------------------
+
+
+CELL, GRID, MARGIN = 0.025, (112, 104, 80), 6
+"""Edge of a voxel of the occupancy grid, metres; voxels along x, y and z, more than any pose takes
+(what lies outside casts no shadow); empty voxels around the person."""
+REACH, LIFT = (0.045, 0.11), 0.03
+"""Distances from the surface at which the grid is sampled for openness; height above it at which
+the way to the light begins.
+"""
+STRIDES = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
+"""Distances towards the key light at which the grid is sampled for shadows, metres."""
+SHADOW_DENSITY, DARKEST = 2.2, 0.4
+"""Extinction per unit of what the samples find, and the least share of the key light that arrives.
+"""
+SHOULDER, WHITEST = 0.72, 0.97
+"""Brightness from which highlights are compressed, and the one that they approach."""
+WRAP, GLOSS, INSIDE_SHADE = 0.25, 0.12, 0.45
+"""Cosine by which a wide light reaches beyond the terminator; strength of highlights on the
+glossiest material; brightness of the inner side of cloth."""
+LIGHT_NUMBERS = 28
+WARM = np.asarray([1.0, 0.0, -1.0])
+
+SCENES = {
+    "studio": (0.34, (-0.8, 0.8), (0.5, 1.0), (0.5, 0.75), (0.18, 0.34), (0.68, 0.82), 0.0, 0.68),
+    "overcast": (0.22, (-3.1, 3.1), (0.7, 1.2), (0.15, 0.4), (0.05, 0.2), (0.85, 1.02), -0.03, 0.6),
+    "sun": (0.2, (-3.1, 3.1), (0.45, 1.1), (0.85, 1.2), (0.08, 0.25), (0.56, 0.74), 0.10, 0.68),
+    "room": (0.16, (-2.0, 2.0), (0.8, 1.35), (0.4, 0.7), (0.1, 0.3), (0.6, 0.78), 0.12, 0.78),
+    "window": (0.08, (0.9, 1.9), (0.1, 0.5), (0.8, 1.1), (0.04, 0.15), (0.5, 0.66), -0.08, 0.8),
+}
+"""Kinds of light: odds; azimuth and elevation of the key light (radians), its strength, that of the
+fill, the sky's; how much warmer the key is than the sky; and the ground's brightness against the
+sky's."""
+_SCENES = np.asarray([np.hstack(row) for row in SCENES.values()], np.float32)
+
+
+Vectors = Float[Array, "*p 3"]
+Values = Float[Array, "*p"]
+
+
+@pytree_dataclass
+class Lights:
+    """directions: (k, 3) towards the lights, the key light first. strengths: (k, 3).
+
+    sky, ground: (3,) ambient from above and below. gain: (3,) exposure and white balance of the
+    camera.
+    """
+
+    directions: Float[Array, "k 3"]
+    strengths: Float[Array, "k 3"]
+    sky: Float[Array, "3"]
+    ground: Float[Array, "3"]
+    gain: Float[Array, "3"]
+
+
+def sample_lights(rng: np.random.Generator) -> Lights:
+    """A studio, an overcast or a sunny day, a lit room or a window; exposed and balanced by a
+    camera that errs.
+    """
+    scene = SCENES[choice(rng, {name: row[0] for name, row in SCENES.items()})]
+    _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
+    azimuth = rng.uniform(*azimuths) * rng.choice([-1, 1])
+    angles = azimuth + np.asarray(
+        [0.0, rng.uniform(1.4, 2.4) * rng.choice([-1, 1]), np.pi + rng.uniform(-0.5, 0.5)]
+    )
+    elevations = np.asarray([rng.uniform(*heights), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)])
+    power = np.asarray([rng.uniform(*key), rng.uniform(*fill), rng.uniform(0.4, 1.2) * fill[1]])
+    tint = rng.uniform(-0.03, 0.03, (3, 3))
+    sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * WARM)
+    exposure, balance, green = (
+        np.exp(rng.normal(0.06, 0.12)),
+        rng.normal(0, 0.045),
+        rng.normal(0, 0.012),
+    )
+    gain = np.clip(exposure, 0.75, 1.3) * np.asarray([1 + balance, 1 + green, 1 - balance])
+    ground = bounce * sky * (1 + rng.uniform(-0.06, 0.06, 3))
+    return _lights(np, angles, elevations, power, tint, warmth, sky, ground, gain)
+
+
+def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
+    """The scenes of `sample_lights` on the device; u: `LIGHT_NUMBERS` numbers in [0, 1)."""
+    odds = np.cumsum(_SCENES[:, 0])
+    row = jnp.asarray(_SCENES)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
+    azimuth, height, key, fill, sky = row[1:11].reshape(5, 2)
+    warmth, bounce = row[11], row[12]
+    within = lambda limits, share: limits[0] + (limits[1] - limits[0]) * share
+    sign = lambda number: jnp.where(number < 0.5, -1.0, 1.0)
+    turns = jnp.stack(
+        [jnp.zeros(()), sign(u[1]) * within((1.4, 2.4), u[2]), np.pi + within((-0.5, 0.5), u[3])]
+    )
+    elevations = jnp.stack(
+        [within(height, u[6]), within((0.1, 0.5), u[7]), within((0.4, 0.9), u[8])]
+    )
+    power = jnp.stack([within(key, u[9]), within(fill, u[10]), within((0.4, 1.2), u[11]) * fill[1]])
+    tint, color = (
+        within((-0.03, 0.03), u[12:21].reshape(3, 3)),
+        within(sky, u[21]) * (1 - 0.5 * warmth * WARM),
+    )
+    normal = lambda number: ndtri(jnp.clip(number, 1e-4, 1 - 1e-4))
+    exposure, balance, green = (
+        0.12 * normal(u[22]) + 0.06,
+        0.045 * normal(u[23]),
+        0.012 * normal(u[24]),
+    )
+    gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack(
+        [1 + balance, 1 + green, 1 - balance]
+    )
+    ground = bounce * color * (1 + within((-0.06, 0.06), u[25:28]))
+    angles = within(azimuth, u[4]) * sign(u[5]) + turns
+    return _lights(jnp, angles, elevations, power, tint, warmth, color, ground, gain)
+
+
+def _lights(
+    numpy: ModuleType,
+    angles: Each,
+    elevations: Each,
+    power: Each,
+    tint: Each,
+    warmth: Number,
+    sky: Each,
+    ground: Each,
+    gain: Each,
+) -> Lights:
+    """numpy: the module of the arrays' kind."""
+    flat = numpy.cos(elevations)
+    directions = numpy.stack(
+        [flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1
+    )
+    strengths = power[:, None] * (1 + tint + warmth * np.outer([1.0, 0.0, 0.0], WARM))
+    return Lights(
+        *(jnp.asarray(x, jnp.float32) for x in (directions, strengths, sky, ground, gain))
+    )
+
+
+def shaded_vertices(
+    vertices: Vectors,
+    normals: Vectors,
+    direction: Float[Array, "3"],
+    faces: Int[Array, "f 3"] | None = None,
+) -> tuple[Values, Values]:
+    """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in
+    [DARKEST, 1].
+
+    faces: where they are given, as for training on the fly, their middles fill the grid as well
+    (meshes may have edges longer than a voxel), and the way to the light is sampled at the nearest
+    voxels, which takes an eighth of the lookups.
+    """
+    low = vertices.min(0) - MARGIN * CELL
+    points, towards_light = vertices, _trilinear
+    if faces is not None:
+        middles = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
+        points, towards_light = jnp.concatenate([vertices, middles]), _nearest
+    x, y, z = ((points - low) / CELL).astype(jnp.int32).T
+    # duplicates all write the same number: the order does not matter
+    grid = _blurred(jnp.zeros(GRID, points.dtype).at[x, y, z].set(1.0, mode="drop"))
+    place = lambda points: (points - low) / CELL - 0.5
+    dark = sum(_trilinear(grid, place(vertices + reach * normals)) for reach in REACH) / len(REACH)
+    openness = jnp.clip(1.08 - 2.6 * dark, 0.35, 1.0)
+    start = vertices + LIFT * normals
+    found = sum(towards_light(grid, place(start + stride * direction)) for stride in STRIDES)
+    return openness, jnp.maximum(jnp.exp(-SHADOW_DENSITY * found), DARKEST)
+
+
+def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
+    """Means over 3 x 3 x 3 voxels, twice; by banded matrices, which XLA does not unroll into one
+    huge expression.
+    """
+    for axis, size in enumerate(GRID):
+        apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+        weights = jnp.asarray(np.maximum(3 - apart, 0) / 9, grid.dtype)
+        grid = jnp.moveaxis(
+            jnp.tensordot(weights, grid, (1, axis), precision=lax.Precision.HIGHEST), 0, axis
+        )
+    return grid
+
+
+def _nearest(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Grid values (n,) at the voxels nearest to fractional indices (n, 3), 0 outside of the
+    grid.
+    """
+    x, y, z = jnp.round(at).astype(jnp.int32).T
+    size = jnp.asarray(GRID)
+    index = (x * GRID[1] + y) * GRID[2] + z
+    inside = (x >= 0) & (y >= 0) & (z >= 0) & (x < size[0]) & (y < size[1]) & (z < size[2])
+    return jnp.where(inside, grid.reshape(-1)[jnp.where(inside, index, 0)], 0.0)
+
+
+def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Grid values (n,) at fractional indices (n, 3); outside of the grid those of its border, which
+    is empty.
+    """
+    base = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, jnp.asarray(GRID) - 2)
+    t = jnp.clip(at - base, 0, 1)
+    index = (base[:, 0] * GRID[1] + base[:, 1]) * GRID[2] + base[:, 2]
+    flat = grid.reshape(-1)
+    total = jnp.zeros(len(at), at.dtype)
+    for corner in range(8):
+        bits = np.asarray([corner & 1, corner >> 1 & 1, corner >> 2])
+        share = jnp.where(bits, t, 1 - t)
+        value = flat[index + (bits[0] * GRID[1] + bits[1]) * GRID[2] + bits[2]]
+        total += share[:, 0] * share[:, 1] * share[:, 2] * value
+    return total
+
+
+def seen_from_behind(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], eye: Float[Array, "3"]
+) -> Bool[Array, " f"]:
+    """(f,) whether a point sees the inner side of a face."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0
+
+
+def light_points(
+    lights: Lights,
+    corners: Array,
+    weights: Vectors,
+    behind: Array,
+    albedo: Vectors,
+    slopes: Vectors,
+    sheen: Values,
+) -> Vectors:
+    """Colors (p, 3) of points on faces.
+
+    corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's
+    face. weights: of the corners.
+    behind: (p,) whether the inner side is seen. albedo, slopes, sheen: of the material there.
+    """
+    wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
+    blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
+    normals, openness, lit = _unit(blended[:, :3]), blended[:, 3], blended[:, 4]
+    normals = jnp.where(behind[:, None], -normals, normals)
+    openness = jnp.where(behind, INSIDE_SHADE, 1.0) * openness
+    # tilted against the gradient of a height field on the surface
+    normals = _unit(normals - (slopes - jnp.sum(slopes * normals, -1, keepdims=True) * normals))
+    return shade(lights, albedo, normals, openness, lit, sheen)
+
+
+def shade(
+    lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, lit: Values, sheen: Values
+) -> Vectors:
+    """Colors in [0, 1] of points; normals are unit, `lit` is the share of the key light that
+    arrives.
+    """
+    up = 0.5 + 0.5 * normals[..., 1:2]
+    light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
+    half = jnp.sqrt(openness)
+    for k in range(lights.directions.shape[0]):
+        arrives = half * lit if k == 0 else half
+        x, y, z = lights.directions[k]
+        cosine = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2] * z
+        wrapped = jnp.clip((cosine + WRAP) / (1 + WRAP), 0, 1)
+        light += lights.strengths[k] * (wrapped * arrives)[..., None]
+        gloss = GLOSS * jnp.clip(cosine, 0, 1) ** 12 * sheen * (lit if k == 0 else 1.0)
+        albedo = albedo + gloss[..., None] * lights.strengths[k]
+    return rolled_off(jnp.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain)
+
+
+def rolled_off(colors: Vectors) -> Vectors:
+    """Colors from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns
+    out at once.
+    """
+    reach = WHITEST - SHOULDER
+    colors = jnp.maximum(colors, 0)
+    return jnp.minimum(colors, SHOULDER) + reach * (
+        1 - jnp.exp(-jnp.maximum(colors - SHOULDER, 0) / reach)
+    )
+
+
+def _unit(vectors: Vectors) -> Vectors:
+    return vectors / (jnp.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-9)
+
+
+def dyes_from(
+    u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[Array, " m"]
+) -> Float[Array, "m 3 3"]:
+    """(m, 3, 3) matrices that recolor each piece: hue, saturation and brightness of cloth.
+
+    Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half
+    of the pieces, brightness changes for all.
+    """
+    turned, turn, pale, bright = u
+    hue = jnp.where(turned < 0.5, 2 * np.pi * (turn - 0.5), 0.0)
+    saturation, brightness = jnp.exp(-0.6 + 0.6 * pale), jnp.exp(-0.5 + 0.8 * bright)
+    grey = jnp.full((3, 3), 1 / 3)
+    # Rodrigues' formula about (1, 1, 1) / sqrt(3)
+    skew = jnp.asarray([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
+    each = lambda values: values[:, None, None]
+    rotation = each(jnp.cos(hue)) * (jnp.eye(3) - grey) + each(jnp.sin(hue)) * skew
+    matrices = each(brightness) * (grey + each(saturation) * rotation)
+    return jnp.where(each(dyeable) > 0, matrices[groups], jnp.eye(3))

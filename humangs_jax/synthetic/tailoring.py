@@ -1,0 +1,429 @@
+"""How clothes are cut and draped: cuts, shells of cloth around the body, tubes (skirts) around hips
+and legs.
+
+A cut is a field over template coordinates (n, 3), see `anatomy`, positive where there is cloth. A
+shell starts on the skin, is smoothed (cloth does not follow navels), moved outwards to the convex
+silhouettes of trunk and limbs, and never comes nearer to the skin than its ease.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.synthetic import surfaces
+from humangs_jax.synthetic.anatomy import (
+    ANKLE,
+    ARM_HEIGHT,
+    FLOOR,
+    LEFT_HIP,
+    LEFT_KNEE,
+    LEFT_SHOULDER,
+    Anatomy,
+    sewn_coordinates,
+    smoothstep,
+)
+from humangs_jax.synthetic.surfaces import (
+    Boundaries,
+    Field,
+    Points,
+    Surface,
+    blurred,
+    hanging,
+    polar,
+    ripples,
+    smooth,
+)
+
+TRUNK_HALF_WIDTH = 0.25
+"""In T-pose everything further out than this is an arm."""
+NECKLINES = {
+    "crew": (0.0, 0.085),
+    "vee": (0.0, 0.085),
+    "scoop": (-0.012, 0.115),
+    "high": (0.052, 0.085),
+    "collar": (0.012, 0.085),
+}
+"""Lift of the neckline's plane, and distance from the neck's axis beyond which the shoulder is
+always covered.
+"""
+HEM_MARGIN = 0.012
+"""Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
+UNDER_A_HEM = 0.009
+"""How much narrower a skirt is below a top that hangs over it, metres."""
+TUBE_COLUMNS, TUBE_STEP = 72, 0.035
+
+
+def neckline(template: Points, style: str, depth: float) -> Field:
+    """Positive below the neckline. depth: of a vee or scoop, metres."""
+    x, y, z = template.T
+    radial = np.sqrt(x * x + (z + 0.005) ** 2)
+    lift, wide = NECKLINES[style]
+    plane = 0.152 + lift - 0.42 * z - y
+    field = np.maximum(plane, np.minimum(radial - wide, 0.17 - y))  # shoulders, but not the head
+    if style == "vee":
+        opening = np.maximum.reduce(
+            [0.13 - depth + np.abs(x) * depth / 0.06 - y, np.abs(x) - 0.06, 0.02 - z]
+        )
+        field = np.minimum(field, opening)
+    if style == "scoop":
+        inside = 1 - (x / 0.105) ** 2 - ((y - 0.15) / (0.02 + depth)) ** 2
+        field = np.minimum(field, np.maximum(-0.05 * inside, 0.02 - z))
+    return field
+
+
+def sleeves(template: Points, end: float) -> Field:
+    """Positive inside of |x| = end; for sleeveless tops (end < 0.2) an armhole down to the
+    armpit.
+    """
+    x, y = np.abs(template[:, 0]), template[:, 1]
+    return (
+        end + 1.6 * np.maximum(0.03 - y, 0) - x if end < 0.2 else np.where(y > -0.1, end - x, 0.5)
+    )
+
+
+def above(template: Points, level: float) -> Field:
+    """Positive above a height of the trunk or the legs."""
+    return template[:, 1] - level
+
+
+def trousers(template: Points, top: float, end: float) -> Field:
+    """Positive on hips and legs between two heights."""
+    x, y, _ = template.T
+    return np.minimum.reduce([top - y, y - end, TRUNK_HALF_WIDTH - np.abs(x)])
+
+
+def front_opening(template: Points, gap: float, spread: float) -> Field:
+    """Positive outside of a gap in front, |x| < gap at the chest, wider by `spread` (m/m) downwards
+    and at the neck.
+    """
+    x, y, z = template.T
+    wide = gap + spread * np.maximum(-0.05 - y, 0) + 0.25 * np.maximum(y - 0.04, 0) * (y < 0.25)
+    return np.maximum(np.abs(x) - wide, 0.03 - z)
+
+
+def collar(template: Points, low: float, high: float, gap: float = 0.012) -> Field:
+    """Positive on a band around the neck between two heights (of the neckline's plane), open in
+    front.
+    """
+    x, y, z = template.T
+    radial, plane = np.sqrt(x * x + (z + 0.005) ** 2), y + 0.42 * z
+    return np.minimum.reduce(
+        [plane - low, high - plane, 0.125 - radial, np.where(z > 0, np.abs(x) - gap, 0.1)]
+    )
+
+
+def lapel(template: Points, gap: float, spread: float, bottom: float) -> Field:
+    """Positive on two tapering strips beside a front opening, from the collar down to `bottom`."""
+    x, y, z = template.T
+    width = np.clip((y - bottom) * 0.42, 0, 0.075) * np.clip((0.2 - y) / 0.05, 0, 1)
+    inner = front_opening(template, gap, spread)
+    return np.minimum.reduce(
+        [inner, width - inner, y - bottom, 0.19 - y, 0.4 * (z - 0.0), 0.14 - np.abs(x)]
+    )
+
+
+def hips_and_legs(template: Points, top: float, bottom: float) -> Field:
+    """Positive on what a tube around hips and legs hides, down to two hands above its hem: they may
+    be seen from below.
+    """
+    x, y, _ = template.T
+    return np.minimum.reduce([top - 0.03 - y, y - bottom - 0.16, TRUNK_HALF_WIDTH - np.abs(x)])
+
+
+def shaft(template: Points, height: float) -> Field:
+    """Positive on feet and legs below a height over the floor."""
+    return FLOOR + height - template[:, 1]
+
+
+def straps(template: Points, low_front: float, low_back: float) -> Field:
+    """Positive on two strips over the shoulders, like a backpack's."""
+    x, y, z = template.T
+    low = np.where(z > -0.01, low_front, low_back)
+    return np.minimum.reduce([0.021 - np.abs(np.abs(x) - 0.092), y - low, 0.2 - y])
+
+
+def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Field:
+    """Positive on a strip across the trunk from one shoulder (x = shoulder, at the top) to the
+    other hip (x = hip).
+    """
+    x, y, _ = template.T
+    along = np.asarray([hip - shoulder, -0.30 - 0.17])
+    along = along / np.linalg.norm(along)
+    across = (x - shoulder) * along[1] - (y - 0.17) * along[0]
+    # the side of the trunk is steep
+    half_width = half_width * (1 - 0.6 * np.clip((x * np.sign(hip) - 0.06) / 0.08, 0, 1))
+    return np.minimum.reduce(
+        [half_width - np.abs(across), y + 0.29, np.where(y > -0.02, 0.186, 0.25) - np.abs(x)]
+    )
+
+
+def necktie(template: Points, length: float, width: float) -> Field:
+    """Positive on a strip down the chest that widens downwards and ends in a point; a knot on
+    top.
+    """
+    x, y, z = template.T
+    top, bottom = 0.137 - 0.42 * z, 0.1 - length
+    knot = 0.007 * np.exp(-(((y - top + 0.012) / 0.014) ** 2))
+    half = width * (0.42 + 0.58 * np.clip((top - y) / length, 0, 1)) + knot
+    return np.minimum.reduce([half - np.abs(x), y - bottom - np.abs(x), top - y, 4 * (z - 0.02)])
+
+
+def bracelet(template: Points, side: float, low: float, high: float) -> Field:
+    """Positive on one arm between two distances from the middle."""
+    x, y, _ = template.T
+    return np.where(y > -0.1, np.minimum(side * x - low, high - side * x), -1.0)
+
+
+def sandal_straps(template: Points) -> tuple[Field, Field]:
+    """Positive on a strap across the toes, and on one around the ankle."""
+    y, z = template[:, 1] - FLOOR, template[:, 2]
+    over_toes = np.minimum.reduce([0.02 - np.abs(z - 0.09 + 0.3 * y), 0.075 - y, y - 0.004])
+    return over_toes, 0.009 - np.abs(y - 0.088 - 0.25 * z)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """How a shell hangs. Metres.
+
+    ease: distance from skin (at least) and from the silhouettes. hang: slope by which hanging cloth
+    may narrow downwards (metres per metre; large clings). sleeve, leg: width added at the end of
+    the limb. fold: height of the folds. hem: depth of the hem.
+    quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this
+    (what is worn below).
+    calm: height above which there are no folds. skirted: below the hips it goes around both legs
+    (tops), not around each.
+    """
+
+    ease: float
+    hang: float = 3.0
+    sleeve: float = 0.0
+    leg: float = 0.0
+    leg_hang: float = 3.0
+    fold: float = 0.004
+    hem: float = 0.008
+    quilt: float = 0.0
+    inner: float = 0.0
+    calm: float = 9.0
+    skirted: bool = False
+
+
+def shell(
+    rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit
+) -> Surface:
+    """A garment that covers the skin where all fields (n,) over the body's vertices are
+    positive.
+    """
+    skin = anatomy.skin
+    surface = skin.with_attributes(
+        skin_point=skin.vertices,
+        arm=anatomy.arm,
+        leg=anatomy.leg,
+        **{f"field{i}": f for i, f in enumerate(fields)},
+    )
+    for i in range(len(fields)):
+        surface = surfaces.cut(surface, surface.attributes[f"field{i}"])
+    return finished(_drape(rng, anatomy, surface, fit), 4, fit.hem)
+
+
+def finished(surface: Surface, iterations: int, hem: float) -> Surface:
+    """A surface with smoothed weights, hems turned in by a depth (metres), and no attributes but
+    `template` and `cloth`.
+    """
+    weights = smooth_weights(surface.weights, surface.faces, iterations)
+    kept = {name: surface.attributes[name] for name in ("template", "cloth")}
+    return surfaces.turn_in_hems(Surface(surface.vertices, surface.faces, weights, kept), hem)
+
+
+def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> np.ndarray:
+    """Skinning weights (n, j) smoothed over a surface; rows sum to 1."""
+    used = weights.max(0) > 0
+    smoothed = np.zeros_like(weights)
+    smoothed[:, used] = smooth(weights[:, used], faces, iterations)
+    return smoothed / smoothed.sum(1, keepdims=True)
+
+
+def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fit) -> Surface:
+    below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
+    normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 2))
+    points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
+    below_armpit = 1 - smoothstep(
+        -0.03, 0.06, points[:, 1] - anatomy.joints[LEFT_SHOULDER, 1] + ARM_HEIGHT
+    )
+    angle, radius = polar(points[:, [0, 2]], np.zeros((1, 2)))
+    wanted = hanging(anatomy.trunk, fit.hang).radius(points[:, 1], angle) + fit.ease
+    grown = radius + (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit * np.maximum(
+        wanted - radius, 0
+    )
+    points = points.astype(np.float64)
+    points[:, [0, 2]] *= (grown / np.maximum(radius, 1e-4))[:, None]
+    for side, sign in ((0, 1), (1, -1)):
+        boundary, along = anatomy.arms[side], np.abs(points[:, 0])
+        start, end = boundary.levels[0] + 0.12, boundary.levels[-1] - 0.1
+        wider = fit.ease, fit.sleeve * np.clip((along - start) / (end - start), 0, 1)
+        points = _push(points, (1, 2), along, boundary, arm * (sign * points[:, 0] > 0), *wider)
+        if not fit.skirted:
+            shape = anatomy.legs[side]
+            inner = dataclasses.replace(
+                shape, radii=np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii)
+            )
+            wider = fit.ease, fit.leg * np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
+            own = leg * (sign * points[:, 0] > 0)
+            points = _push(points, (0, 2), points[:, 1], hanging(inner, fit.leg_hang), own, *wider)
+    points = smooth(points, surface.faces, 3, keep_hems=True)
+    x, y, _ = surface.template.T
+    seat = np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
+    if seat.any():  # smoother between the buttocks and below the belly
+        points = points + seat[:, None] * (
+            smooth(points, surface.faces, 15, keep_hems=True) - points
+        )
+    outer = surfaces.vertex_normals(points, surface.faces)
+    cloth = smooth(
+        surface.attributes["cloth"], surface.faces, 10, keep_hems=True
+    )  # as the points were
+    template = smooth(surface.template, surface.faces, 8, keep_hems=True)
+    points = (
+        points
+        + _fold_heights(rng, sewn_coordinates(cloth, template), arm, leg, fit)[:, None] * outer
+    )
+    distance = np.sum((points - below) * surface.attributes["normals"], -1)
+    least = max(0.55 * fit.ease, fit.inner)
+    points = points + np.maximum(least - distance, 0)[:, None] * surface.attributes["normals"]
+    hems = np.unique(surfaces.boundary_edges(surface.faces))
+    points[hems] = smooth(points, surface.faces, 4, keep_hems=True)[hems]
+    side, thighs = np.sign(x), leg > 0.6  # trouser legs do not cross the middle
+    points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
+    return surface.moved(points).with_attributes(cloth=cloth, template=template)
+
+
+def _fold_heights(
+    rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm: Field, leg: Field, fit: Fit
+) -> Field:
+    """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints
+    and cuffs gather cloth.
+    """
+    along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
+    heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
+    if fit.fold == 0:
+        return heights
+    wander = ripples(rng, cloth[:, :3], wavelength=0.3)
+    drapes = np.sin(2 * np.pi * around / 0.09 + 2.5 * wander) * np.clip(-along / 0.35, 0, 1)
+    heights = heights + 0.8 * fit.fold * drapes * (1 - arm) * np.where(leg > 0.5, 0.35, 1.0)
+    slanted = along + 0.25 * around + 0.012 * ripples(rng, cloth[:, :3], wavelength=0.12)
+    rings = np.sin(2 * np.pi * slanted / 0.055) * (
+        0.6 + 0.4 * ripples(rng, cloth[:, :3], wavelength=0.1)
+    )
+    bend = lambda height, wide: np.exp(-(((along + height) / wide) ** 2))
+    elbows = arm * (bend(0.14, 0.07) + 0.8 * bend(0.34, 0.06))
+    knees = leg * (bend(0.79, 0.07) + 1.3 * bend(1.12, 0.07) + 0.6 * bend(0.46, 0.05))
+    heights = heights + 1.3 * fit.fold * rings * (elbows + knees)
+    heights = heights * (1 - smoothstep(fit.calm - 0.08, fit.calm, along))
+    if fit.quilt > 0:
+        heights = heights + 0.011 * (np.abs(np.sin(np.pi * along / fit.quilt)) - 0.4)
+    return heights
+
+
+def _push(
+    points: Points,
+    across: tuple[int, int],
+    along: Field,
+    boundary: Boundaries,
+    amount: Field,
+    ease: float,
+    extra: Field,
+) -> Points:
+    """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,)
+    on it; across: other axes.
+    """
+    center, axes = boundary.center(along), list(across)
+    angle, radius = polar(points[:, axes], center)
+    missing = np.maximum(boundary.radius(along, angle) + ease + extra - radius, 0)
+    scale = 1 + amount * missing / np.maximum(radius, 1e-4)
+    points = points.copy()
+    points[:, axes] = center + (points[:, axes] - center) * scale[:, None]
+    return points
+
+
+def skirt(
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    heights: tuple[float, float],
+    ease: float,
+    flare: float,
+    pleats: tuple[float | int, float],
+    gap: float = -1.0,
+    spread: float = 0.0,
+    cling: float = 0.0,
+) -> Surface:
+    """A tube around the hips and both legs between two template heights (top, bottom), `ease`
+    metres wider than they are.
+
+    flare: metres added per metre further down. pleats: number, depth. gap: half width of an opening
+    in front, metres, negative for none; it widens by `spread` metres per metre downwards. cling:
+    metres from the top over which it does not flare.
+    """
+    top, bottom = heights
+    rows = max(3, int(np.ceil((top - bottom) / TUBE_STEP)) + 1)
+    template_y, angle, faces = surfaces.tube(
+        np.linspace(top, bottom, rows), surfaces.circle(TUBE_COLUMNS)
+    )
+    height, drop = rest_height(anatomy, template_y), top - template_y
+    below = drop - cling
+    boundary = blurred(hanging(anatomy.hips_and_legs, 0.15))
+    radius = boundary.radius(height, angle) + ease + flare * np.maximum(below, 0)
+    radius = radius - UNDER_A_HEM * np.clip(1 - below / 0.06, 0, 1) * (cling > 0)
+    waves = ripples(rng, surfaces.around(1, angle, 0.3 * height), wavelength=0.9)
+    loose = np.clip(below / 0.25, 0, 1) * (drop / max(top - bottom, 1e-6)) ** 0.5
+    radius = radius + loose * (
+        pleats[1] * np.cos(pleats[0] * angle) + 0.012 * (1 + 4 * flare) * waves
+    )
+    vertices = surfaces.around(radius, angle, height).astype(np.float32)
+    template = surfaces.around(0.16, angle, template_y, (0, 0.02))
+    surface = Surface(vertices, faces, _skirt_weights(anatomy, vertices, template_y))
+    surface = surface.painted(template, template - [0, 0, 0.02], 0.16)
+    if gap > 0:
+        front = np.where(vertices[:, 2] > 0, np.abs(vertices[:, 0]) - gap - spread * drop, 1.0)
+        surface = surfaces.cut(surface, front)
+    return surfaces.turn_in_hems(surface, 0.008)
+
+
+def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
+    """Rest heights of the person's skin for template heights on trunk and legs."""
+    x, y, _ = anatomy.skin.template.T
+    own = (np.abs(x) < 0.2) & (y < 0.14) & (y > ANKLE)
+    bins = np.floor((y[own] - ANKLE) / 0.03).astype(int)
+    counts = np.maximum(np.bincount(bins), 1)
+    template = np.bincount(bins, y[own]) / counts
+    rest = np.bincount(bins, anatomy.skin.vertices[own, 1]) / counts
+    known = np.bincount(bins) > 0
+    inside = np.interp(template_y, template[known], rest[known])
+    below, above = template_y - template[known][0], template_y - template[known][-1]
+    return inside + np.minimum(below, 0) + np.maximum(above, 0)
+
+
+def _skirt_weights(
+    anatomy: Anatomy, vertices: Points, template_y: Field
+) -> Float[np.ndarray, "n j"]:
+    """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's
+    side further down.
+    """
+    x, y, _ = anatomy.skin.template.T
+    near = np.flatnonzero((np.abs(x) < 0.2) & (y < 0.0) & (y > -0.4))[::2]
+    trunk = nearest_weights(anatomy, vertices, near)
+    left = smoothstep(-0.09, 0.09, vertices[:, 0])
+    thigh = 0.96 * smoothstep(0.27, 0.47, -template_y)
+    shin = 0.92 * smoothstep(0.68, 0.9, -template_y)
+    legs = np.zeros_like(trunk)
+    for side, share in ((0, left), (1, 1 - left)):
+        legs[:, LEFT_HIP + side], legs[:, LEFT_KNEE + side] = share * (1 - shin), share * shin
+    return (trunk * (1 - thigh)[:, None] + legs * thigh[:, None]).astype(np.float32)
+
+
+def nearest_weights(anatomy: Anatomy, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """(n, j) mean skinning weights of the body vertices nearest to each point, among candidate
+    vertex indices.
+    """
+    body = anatomy.skin.vertices[candidates]
+    squared = np.sum(points**2, -1)[:, None] - 2 * points @ body.T + np.sum(body**2, -1)[None]
+    nearest = np.argpartition(squared, 6, axis=1)[:, :6]
+    return anatomy.skin.weights[candidates][nearest].mean(1)

@@ -1,0 +1,423 @@
+"""Clothes built: every `Garment` becomes surfaces with materials, layer on layer, and hides what
+lies well below it.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.synthetic import accessories, tailoring, trimmings
+from humangs_jax.synthetic.anatomy import CROTCH, WAIST, Anatomy, leg_coordinates
+from humangs_jax.synthetic.fabrics import Material
+from humangs_jax.synthetic.outfits import BOTTOMS, DRESSES, OUTER, SHOES, SKIRTS, TOPS, Garment
+from humangs_jax.synthetic.surfaces import Field, Surface, compact
+from humangs_jax.synthetic.tailoring import HEM_MARGIN, Fit, shell, skirt
+from humangs_jax.synthetic.trimmings import PADDED, QUILT, sewn
+
+Cover = Callable[[np.ndarray], np.ndarray]
+"""Template points (n, 3) -> (n,) metres inside of a garment's hems, negative outside."""
+
+Cut = tuple[Callable[..., np.ndarray], *tuple[Any, ...]]
+"""A field of `tailoring` over template points, and its further arguments."""
+
+LAYER = 0.006
+"""What one layer is further out than the one below it, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """One surface of one material.
+
+    hidden: (n,) vertices that a later layer covers; None if it knows no template coordinates.
+    """
+
+    surface: Surface
+    material: Material
+    hidden: np.ndarray | None = None
+
+    def visible(self) -> "Piece":
+        """Without the faces whose corners are all hidden."""
+        if self.hidden is None or not self.hidden.any():
+            return self
+        kept = ~self.hidden[self.surface.faces].all(1)
+        return dataclasses.replace(self, surface=compact(self.surface, kept), hidden=None)
+
+
+@dataclasses.dataclass
+class Outfit:
+    """What has been put on so far. cover: (n,) how far inside of some hem each body vertex is,
+    metres; negative on bare skin.
+
+    removed: (n,) hidden body vertices. rng: of the garment that is put on. trunk, legs: distances
+    from the skin of the outermost layer, metres. fit: of the outermost layer on the trunk.
+    """
+
+    anatomy: Anatomy
+    pieces: list[Piece]
+    cover: np.ndarray
+    removed: np.ndarray
+    rng: np.random.Generator
+    trunk: float = 0.0
+    legs: float = 0.0
+    fit: Fit = dataclasses.field(default_factory=lambda: Fit(ease=0.0))
+
+    @property
+    def template(self) -> np.ndarray:
+        """Template coordinates (n, 3) of the body's vertices."""
+        return self.anatomy.skin.template
+
+    @property
+    def lowest(self) -> float:
+        """Template height of the hem of the innermost piece."""
+        return float(self.pieces[0].surface.template[:, 1].min())
+
+    def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
+        """Put one more piece on. layered: whether later layers can hide parts of it."""
+        self.pieces.append(
+            Piece(surface, material, np.zeros(len(surface.vertices), bool) if layered else None)
+        )
+
+    def hide(self, cover: Cover, margin: float, cloth: bool = True) -> None:
+        """Take away what lies further than a margin inside of a garment that is put on next: skin,
+        and cloth if it is below.
+        """
+        field = cover(self.template)
+        self.cover = np.maximum(self.cover, field)
+        self.removed = self.removed | (field > margin)
+        for i, piece in enumerate(self.pieces):
+            if cloth and piece.hidden is not None:
+                below = cover(piece.surface.template) > max(margin, 0.03)
+                self.pieces[i] = dataclasses.replace(piece, hidden=piece.hidden | below)
+
+    def put(
+        self,
+        cuts: Sequence[Cut],
+        fit: Fit,
+        material: Material,
+        margin: float = HEM_MARGIN,
+        finish: Callable[[Surface], Surface] = lambda surface: surface,
+        over: bool = True,
+    ) -> None:
+        """A shell where all cuts (a function of template points, and its further arguments) are
+        positive, and what it hides.
+        """
+        fields = lambda points: [field(points, *arguments) for field, *arguments in cuts]
+        surface = finish(shell(self.rng, self.anatomy, fields(self.template), fit))
+        self.hide(lambda points: np.min(fields(points), axis=0), margin, over)
+        self.add(surface, material)
+
+    def strip(self, field: Field, fit: Fit, material: Material, layered: bool = False) -> None:
+        """A shell that hides nothing. layered: see `add`."""
+        self.add(shell(self.rng, self.anatomy, [field], fit), material, layered)
+
+
+def dress_up(rng: np.random.Generator, anatomy: Anatomy, garments: tuple[Garment, ...]) -> Outfit:
+    """The garments on the body. Each has random numbers of its own, spawned in order."""
+    count = len(anatomy.skin.vertices)
+    outfit = Outfit(anatomy, [], np.full(count, -1.0), np.zeros(count, bool), rng)
+    for garment, own in zip(garments, rng.spawn(len(garments)), strict=True):
+        outfit.rng = own
+        BUILDERS.get(garment.kind, _accessory)(outfit, garment)
+    outfit.pieces = [piece.visible() for piece in outfit.pieces]
+    return outfit
+
+
+def _bodice(
+    outfit: Outfit,
+    neck: str,
+    sizes: Sequence[float],
+    fit: Fit,
+    material: Material,
+    margin: float,
+    opening: Sequence[Cut] = (),
+) -> None:
+    """Cloth on trunk and arms, the outermost so far. sizes: depth of the neckline, ends of the
+    sleeves and of the trunk.
+    """
+    depth, sleeve, bottom = sizes
+    cuts = [
+        (tailoring.neckline, neck, depth),
+        (tailoring.sleeves, sleeve),
+        (tailoring.above, bottom),
+    ]
+    outfit.put([*cuts, *opening], fit, material, margin)
+    outfit.trunk, outfit.fit = fit.ease, fit
+
+
+def _neck(garment: Garment) -> str:
+    return next(neck for neck in tailoring.NECKLINES if neck in garment.details)
+
+
+def _collar(
+    outfit: Outfit,
+    material: Material,
+    fit: Fit,
+    extra: float = 0.004,
+    sizes: Sequence[float] = (0.125, 0.178, 0.012),
+) -> None:
+    """sizes: see `tailoring.collar`."""
+    cut_of = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
+    outfit.strip(tailoring.collar(outfit.template, *sizes), cut_of, material)
+
+
+def _top(outfit: Outfit, garment: Garment) -> None:
+    sizes, kind, details = garment.sizes, garment.kind, garment.details
+    sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
+    fit = Fit(
+        ease=max((0.008 if "tucked" in details else 0.012) + 0.016 * loose, outfit.trunk + LAYER),
+        hang=outfit.rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0,
+        sleeve=0.003 + (0.035 if sleeve < 0.45 else 0.016) * loose,
+        fold=0.0015 + 0.0055 * loose,
+        inner=outfit.trunk + 0.5 * LAYER if outfit.trunk else 0.0,
+        skirted=True,
+    )
+    stitches = sewn(garment, bottom + 0.018, sleeve - 0.016 if sleeve > 0.2 else None)
+    material = Material(stitches, 0.25 + 0.45 * loose, sheen=0.04)
+    opening = [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
+    _bodice(
+        outfit,
+        _neck(garment),
+        (sizes["depth"], sleeve, bottom),
+        fit,
+        material,
+        HEM_MARGIN + 0.03 * loose,
+        opening,
+    )
+    if kind in ("shirt", "polo", "blouse") and "collar" in details:
+        _collar(outfit, material, fit)
+    if kind == "hoodie":
+        outfit.add(
+            accessories.hood(outfit.rng, outfit.anatomy, "hood_up" in details),
+            material,
+            layered=False,
+        )
+
+
+def _outer(outfit: Outfit, garment: Garment) -> None:
+    sizes, kind, details = garment.sizes, garment.kind, garment.details
+    gap, spread, bottom, loose = sizes["gap"], sizes["spread"], sizes["bottom"], sizes["loose"]
+    long, padded, blazer = kind == "coat", kind in PADDED, kind == "blazer"
+    ease = max(outfit.trunk + 0.009 + 0.008 * loose, 0.022 if padded else 0.0)
+    fit = Fit(
+        ease=ease,
+        hang=1.5 if long else 0.8 if blazer else outfit.rng.choice([0.05, 0.3]),
+        sleeve=0.01 + 0.012 * loose,
+        fold=0.002 if padded or blazer else 0.002 + 0.003 * loose,
+        hem=0.014,
+        quilt=QUILT if padded else 0.0,
+        skirted=True,
+        inner=outfit.trunk + 0.5 * LAYER,
+    )
+    stitches = sewn(garment, bottom + 0.018, sizes["sleeve"] - 0.016 if kind != "vest" else None)
+    material = Material(
+        stitches, 0.15 if blazer else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05
+    )
+    opening = [(tailoring.front_opening, gap, spread)] if gap > 0 else []
+    neck, low = "vee" if "lapels" in details else "crew", WAIST - 0.045 if long else bottom
+    _bodice(outfit, neck, (0.09, sizes["sleeve"], low), fit, material, 0.03, opening)
+    if long:
+        width, flare = max(outfit.legs, ease) + 0.002, sizes["flare"]
+        tube = skirt(
+            outfit.rng,
+            outfit.anatomy,
+            (WAIST + 0.02, bottom),
+            width,
+            flare,
+            (5, 0.008),
+            gap,
+            0.5 * spread,
+        )
+        if gap < 0:
+            outfit.hide(lambda t: tailoring.hips_and_legs(t, WAIST, bottom), 0.02)
+        outfit.add(tube, dataclasses.replace(material, draped=True))
+    if "lapels" in details:
+        edge, low = max(gap, 0.004), outfit.rng.uniform(-0.16, -0.08)
+        strip = dataclasses.replace(fit, ease=ease + 0.006, fold=0.0, hem=0.005, inner=ease + 0.003)
+        dark = Material(lambda s: 0.88 * stitches(s), sheen=0.06)  # seen against its pile
+        outfit.strip(
+            tailoring.lapel(outfit.template, edge, spread if gap > 0 else 0.0, low), strip, dark
+        )
+        _collar(outfit, dark, strip, 0.001, (0.12, 0.17, max(edge, 0.03)))
+    elif "hood" in details or kind == "hooded_jacket":
+        outfit.add(accessories.hood(outfit.rng, outfit.anatomy, False), material, layered=False)
+    elif kind not in ("cardigan", "blazer"):
+        _collar(outfit, material, fit, 0.003, (0.12, 0.185 if padded else 0.175, max(gap, 0.01)))
+
+
+LEG_HANG = {"wide": 0.02, "slim": 1.0, "leggings": 3.0, "jeans": 0.12}
+
+
+def _trousers(outfit: Outfit, garment: Garment) -> None:
+    sizes, kind = garment.sizes, garment.kind
+    top, end, loose, tucked = sizes["top"], sizes["end"], sizes["loose"], sizes["tucked"] > 0
+    ease = outfit.trunk + 0.004 if tucked else 0.005
+    hang = outfit.rng.choice([0.05, 0.1])
+    fit = Fit(
+        ease=ease if kind != "leggings" or tucked else 0.004,
+        hang=0.6,
+        leg=sizes["width"],
+        leg_hang=LEG_HANG.get(kind, hang),
+        fold=0.0012 if kind in ("leggings", "slim") else 0.0025 + 0.0035 * loose,
+        calm=9.0 if tucked else outfit.lowest + 0.02,
+    )
+    material = Material(sewn(garment, end + 0.018), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
+    in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.template))
+    margin = HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts"))
+    outfit.put([(tailoring.trousers, top, end)], fit, material, margin, in_two_legs, tucked)
+    x, y, _ = outfit.template.T  # skin between shirt and trousers, below both
+    seat = (np.abs(x) < 0.22) & (y < WAIST - 0.06) & (y > max(end + 0.02, CROTCH - 0.075))
+    outfit.removed = outfit.removed | (seat & (outfit.cover > 0))
+    outfit.legs = ease + sizes["width"]
+    if not tucked:
+        _let_hang_over(outfit, 0.03)
+
+
+def _let_hang_over(outfit: Outfit, margin: float) -> None:
+    """An untucked top hides the last piece below it, except for a margin inside of the top's
+    hem.
+    """
+    lower = outfit.pieces[-1]
+    x, y, _ = lower.surface.template.T
+    hidden = (y > outfit.lowest + margin) & (np.abs(x) < tailoring.TRUNK_HALF_WIDTH)
+    outfit.pieces[-1] = dataclasses.replace(lower, hidden=lower.hidden | hidden)
+
+
+def _skirt(outfit: Outfit, garment: Garment) -> None:
+    sizes, tucked = garment.sizes, garment.sizes["tucked"] > 0
+    top, end = sizes["top"], sizes["end"]
+    ease = outfit.trunk + 0.004 if tucked else 0.004
+    cling = 0.0 if tucked else max(0.0, top - outfit.lowest + 0.02)  # as far as the top reaches
+    stitches = sewn(garment, end + 0.02, seams=False)
+    waistband = lambda s: trimmings.banded(
+        stitches(s), s, garment.fabric.base * 0.8, top - 0.035, top
+    )
+    surface = skirt(outfit.rng, outfit.anatomy, (top, end), ease, *_hem_of(sizes), cling=cling)
+    outfit.hide(lambda t: tailoring.hips_and_legs(t, top, end), 0.0, tucked)
+    outfit.add(surface, Material(waistband, wrinkles=0.35, sheen=0.05, draped=True))
+    outfit.legs = ease + 0.02
+    if not tucked:
+        _let_hang_over(outfit, 0.055)
+
+
+def _hem_of(sizes: Mapping[str, float]) -> tuple[float, tuple[int, float]]:
+    """Of a skirt: metres wider per metre down, so that the hem of a short one stands off as far as
+    a long one's; pleats.
+    """
+    return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
+
+
+def _dress(outfit: Outfit, garment: Garment) -> None:
+    sizes, waist, end = garment.sizes, garment.sizes["waist"], garment.sizes["end"]
+    fit = Fit(ease=0.008, hang=1.0, sleeve=0.004 + 0.03 * sizes["loose"], fold=0.002)
+    material = Material(sewn(garment, end + 0.02, seams=False), wrinkles=0.3, sheen=0.05)
+    bodice = sizes["depth"], sizes["sleeve"], waist - 0.02
+    _bodice(outfit, _neck(garment), bodice, fit, material, HEM_MARGIN + 0.02 * sizes["loose"])
+    surface = skirt(outfit.rng, outfit.anatomy, (waist, end), 0.010, *_hem_of(sizes))
+    outfit.hide(lambda t: tailoring.hips_and_legs(t, waist + 0.03, end), 0.0)
+    outfit.add(surface, dataclasses.replace(material, draped=True))
+    outfit.legs = 0.03
+    if garment.kind == "shirt_dress":
+        _collar(outfit, material, fit)
+
+
+def _socks(outfit: Outfit, garment: Garment) -> None:
+    ribs = lambda s: (0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008))[:, None]
+    material = Material(lambda s: garment.fabric.colors(s) * ribs(s), wrinkles=0.1)
+    fit = Fit(ease=0.003, fold=0.001, hem=0.003)
+    outfit.put([(tailoring.shaft, garment.sizes["height"])], fit, material, 0.008)
+
+
+def _shoes(outfit: Outfit, garment: Garment) -> None:
+    height, sole, over = (garment.sizes[name] for name in ("height", "sole", "over"))
+    material = Material(
+        lambda s: trimmings.leather(s, garment), sheen=0.2 if garment.kind != "sneakers" else 0.08
+    )
+    if garment.kind == "sandals":
+        outfit.add(
+            accessories.pair_of_shoes(outfit.anatomy, 0.024, sole, 0.004), material, layered=False
+        )
+        for field in tailoring.sandal_straps(outfit.template):
+            outfit.strip(field, Fit(ease=0.005, fold=0.0, hem=0.004), material)
+        return
+    surface = accessories.pair_of_shoes(outfit.anatomy, height, sole, 0.017 if over else 0.006)
+    outfit.hide(lambda t: tailoring.shaft(t, height), 0.012)
+    if not over:
+        outfit.pieces = [_unhidden_legs(piece) for piece in outfit.pieces]
+    outfit.add(surface, material, layered=False)
+
+
+def _unhidden_legs(piece: Piece) -> Piece:
+    """Trouser legs hang over low shoes: the shoe hides nothing of them, only socks."""
+    if piece.hidden is None or piece.surface.template[:, 1].min() < -1.2:
+        return piece
+    low = piece.surface.template[:, 1] < -0.9
+    return dataclasses.replace(piece, hidden=piece.hidden & ~low)
+
+
+def _belt(outfit: Outfit, garment: Garment) -> None:
+    top, width = garment.sizes["top"], garment.sizes["width"]
+    fit = Fit(ease=outfit.trunk + 0.009, hang=0.6, fold=0.0, hem=0.006, inner=outfit.trunk + 0.007)
+    material = Material(lambda s: trimmings.buckled(s, garment), sheen=0.15)
+    outfit.strip(tailoring.trousers(outfit.template, top, top - width), fit, material, layered=True)
+
+
+def _tie(outfit: Outfit, garment: Garment) -> None:
+    field = tailoring.necktie(outfit.template, garment.sizes["length"], garment.sizes["width"])
+    raised = outfit.trunk + 0.005 + outfit.fit.fold
+    fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
+    outfit.strip(field, fit, Material(garment.fabric.colors, sheen=0.15), layered=True)
+
+
+def _watch(outfit: Outfit, garment: Garment) -> None:
+    field = tailoring.bracelet(outfit.template, garment.sizes["side"], 0.628, 0.650)
+    outfit.strip(
+        field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colors, sheen=0.3)
+    )
+
+
+def _bag(outfit: Outfit, garment: Garment) -> None:
+    """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
+    on_back, colors = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
+    if on_back:
+        ease, material, straps = (
+            outfit.trunk,
+            Material(colors, 0.1),
+            tailoring.straps(outfit.template, -0.16, -0.03),
+        )
+    else:
+        side, ease = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
+        material = Material(colors, 0.0, 0.12)
+        straps = tailoring.sash(outfit.template, -side * 0.105, side * 0.165, 0.014)
+    surface = accessories.bag(outfit.anatomy, garment, ease)
+    outfit.add(surface, material, layered=False)
+    raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
+    flat = {
+        "ease": raised,
+        "inner": raised - 0.002,
+        "fold": 0.0,
+        "hem": 0.006,
+        "quilt": 0.0,
+        "skirted": True,
+    }
+    strap = Material(garment.fabric.colors, sheen=material.sheen)
+    outfit.strip(straps, dataclasses.replace(outfit.fit, **flat), strap)
+
+
+def _accessory(outfit: Outfit, garment: Garment) -> None:
+    for surface, material in accessories.build(outfit.rng, outfit.anatomy, garment, outfit.trunk):
+        outfit.add(surface, material, layered=False)
+
+
+BUILDERS = {
+    **dict.fromkeys(TOPS, _top),
+    **dict.fromkeys(OUTER, _outer),
+    **dict.fromkeys(BOTTOMS, _trousers),
+    **dict.fromkeys(SKIRTS, _skirt),
+    **dict.fromkeys(DRESSES, _dress),
+    **dict.fromkeys(SHOES, _shoes),
+    **dict.fromkeys(("backpack", "shoulder_bag"), _bag),
+    **{"belt": _belt, "tie": _tie, "socks": _socks, "watch": _watch},
+}
+"""What builds a kind of garment; other kinds: `_accessory`."""

@@ -1,0 +1,306 @@
+"""Synthetic people as capture folders: images, masks, cameras and body poses on disk, made from
+seeds.
+
+out/manifest.json                    settings of the set and finished subjects, see `data.sets`
+out/SEED/                            a capture (docs/capture_format.md): views of one person in one
+                                     or several poses
+out/SEED/held_out/                   a capture of its own with the views that reconstruction may not
+                                     see
+out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
+out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see
+                                     `bank`
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.body.motion import Motion
+from humangs_jax.core.progress import bar as progress_bar
+from humangs_jax.core.progress import say
+from humangs_jax.data.capture import Capture, save_capture
+from humangs_jax.data.capture_checks import checked_json
+from humangs_jax.data.loading.captures import find_captures
+from humangs_jax.data.sets import (
+    DATA_SET,
+    MANIFEST,
+    SYNTHETIC,
+    begin_set,
+    finished,
+    made,
+    read_manifest,
+    write_manifest,
+)
+from humangs_jax.evaluation.kept import body_key
+from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.atomic import check_writable, replace_folder
+from humangs_jax.motion import save_motion
+from humangs_jax.synthetic.bank import export_scan
+from humangs_jax.synthetic.poses import sample_rotations
+from humangs_jax.synthetic.sequences import sample_sequence
+from humangs_jax.synthetic.subject import (
+    GENERATOR_VERSION,
+    PosedSubject,
+    SyntheticSubject,
+    make_subject,
+    pose_subject,
+    render_view,
+    seeds_of,
+    split_of,
+)
+from humangs_jax.synthetic.surfaces import Points
+from humangs_jax.synthetic.surroundings import (
+    Angles,
+    cameras_around,
+    close_cameras,
+    spread_azimuths,
+)
+
+HELD_OUT = "held_out"
+"""Sub-folder of a subject's folder."""
+POSE_STREAM, CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM, MOTION_STREAM = 1, 2, 3, 4, 5
+"""Independent random streams of a seed; stream 0 makes the person."""
+GROUNDED_EVERY = 5
+"""Every how many frames the height of a motion above the ground is measured."""
+CAPTURE = "capture.json"
+MANIFEST_EVERY = 30.0
+"""Seconds between two updates of the manifest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What is written for each person."""
+
+    image_size: int = 512
+    """Pixels a side; smaller sizes are box averages of it (the loader makes them)."""
+    poses: int = 1
+    """How many."""
+    views: int = 60
+    """Cameras of the published protocol that see each pose."""
+    close_views: int = 0
+    """Nearer ones."""
+    held_out_views: int = 0
+    """Cameras of the same pose, and of each of `novel_poses` others, in held_out/."""
+    novel_poses: int = 0
+    frames: int = 0
+    """0: poses are independent.
+
+    Otherwise `poses` evenly spaced frames of a motion of this many frames, 30 a second.
+    """
+    scan_texture: int = 0
+    """Texels a side of the scan's texture, 0: no scan."""
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A camera that sees pose number `frame`."""
+
+    frame: int
+    name: str
+    camera: Camera
+
+
+def sample_pose(subject: SyntheticSubject, index: int) -> PosedSubject:
+    """The subject in its pose of that number, standing on y = 0.
+
+    Pose 0 is the one of the input views.
+    """
+    rng = np.random.default_rng([subject.seed, POSE_STREAM, index])
+    return stand(subject, sample_rotations(rng, subject.build))
+
+
+def stand(subject: SyntheticSubject, rotations: np.ndarray) -> PosedSubject:
+    """The subject in a pose of rotations (j, 3), its lowest point on y = 0."""
+    rotations, translation = np.asarray(rotations, np.float32), np.zeros(3, np.float32)
+    translation[1] = -subject.posed_vertices(rotations, translation)[:, 1].min()
+    return pose_subject(subject, rotations, translation)
+
+
+def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = None) -> Motion:
+    """The subject's motion, see `sequences`; its lowest points, soles of shoes included, are on y =
+    0 about all the time.
+    """
+    sequence = sample_sequence(
+        np.random.default_rng([subject.seed, MOTION_STREAM]), subject.build, frames, kind
+    )
+    rotations, translations = (
+        sequence.rotations.astype(np.float32),
+        sequence.translations.astype(np.float32),
+    )
+    asked = range(0, frames, GROUNDED_EVERY)
+    lowest = [subject.posed_vertices(rotations[i], translations[i])[:, 1].min() for i in asked]
+    translations[:, 1] -= np.median(lowest)
+    return Motion(jnp.asarray(rotations), jnp.asarray(translations), sequence.fps)
+
+
+def capture_views(
+    subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: list[View]
+) -> Capture:
+    """A capture of these views."""
+    rendered = [render_view(poses[view.frame], view.camera) for view in views]
+    images, masks = (np.stack(x) for x in zip(*rendered, strict=True))
+    rotations, translations = (
+        np.stack([getattr(p, name) for p in poses]) for name in ("rotations", "translation")
+    )
+    return Capture(
+        images=images,
+        masks=masks,
+        cameras=stack_cameras([view.camera for view in views]),
+        frames=np.asarray([view.frame for view in views], np.int32),
+        body=body,
+        betas=subject.betas,
+        poses=jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations)),
+        names=tuple(view.name for view in views),
+    )
+
+
+def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout) -> None:
+    """One person as `layout` says. Written whole or not at all; an existing folder is replaced."""
+    subject = make_subject(seed, body)
+    motion = sample_motion(subject, layout.frames) if layout.frames else None
+    if motion is None:
+        posed = [sample_pose(subject, i) for i in range(layout.poses)]
+    else:
+        shown = np.linspace(0, layout.frames - 1, layout.poses).round().astype(int)
+        posed = [
+            pose_subject(
+                subject, np.asarray(motion.rotations[i]), np.asarray(motion.translations[i])
+            )
+            for i in shown
+        ]
+    others = [
+        posed[0],
+        *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses)),
+    ]
+    size = layout.image_size
+    views = _views([seed, CAMERA_STREAM], cameras_around, layout.views, posed, size)
+    views += _views([seed, CLOSE_STREAM], close_cameras, layout.close_views, posed, size, mark="c")
+    held_out = _views([seed, HELD_OUT_STREAM], cameras_around, layout.held_out_views, others, size)
+
+    def write(temporary: Path):
+        save_capture(temporary, capture_views(subject, body, posed, views))
+        if held_out:
+            save_capture(temporary / HELD_OUT, capture_views(subject, body, others, held_out))
+        if motion is not None:
+            save_motion(temporary / "motion.npz", motion)
+        if layout.scan_texture:
+            export_scan(posed[0], temporary / "scan", layout.scan_texture)
+
+    replace_folder(folder, write, mark=CAPTURE)
+
+
+def write_set(
+    out: str | Path,
+    subjects: int,
+    layout: Layout,
+    split: str = "train",
+    first: int = 0,
+    *,
+    workers: int = 1,
+    body: BodyModel | None = None,
+    progress: bool = True,
+) -> list[Path]:
+    """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are
+    there already are kept.
+
+    workers: processes; more than one use the CPU, write the same files, and need the calling script
+    to be guarded by `if __name__ == "__main__"`. body: default: the body that comes with the
+    package. progress: show a bar. Returns the folders.
+
+    Raises: ValueError if the people reach beyond the split, `out` was written with other settings
+    or by another version of the generator, or (at the end) some could not be made; OSError if
+    nothing can be written there.
+    """
+    out, seeds = Path(out), seeds_of(split, first, subjects)
+    made_with = {
+        "generator_version": GENERATOR_VERSION,
+        "split": split,
+        "settings": dataclasses.asdict(layout),
+        "body": body_key(body),
+    }
+    check_writable(out)
+    begin_set(out, SYNTHETIC, made_with)
+    folders = {seed: out / f"{seed:07d}" for seed in seeds}
+    due = {
+        seed: (folder, seed, layout)
+        for seed, folder in folders.items()
+        if not (folder / CAPTURE).is_file()
+    }
+    failed: dict[int, Exception] = {}
+    listed = time.monotonic()
+    try:
+        with progress_bar(
+            total=subjects, initial=subjects - len(due), desc="people", shown=progress
+        ) as bar:
+            for seed, error in made(_write, due, workers, functools.partial(_given, body)):
+                if error is not None:
+                    failed[seed] = error
+                    say(f"seed {seed}: {error}", lines=False)
+                bar.update(1)
+                if time.monotonic() - listed > MANIFEST_EVERY:
+                    write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
+                    listed = time.monotonic()
+    finally:
+        write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
+    if failed:
+        seed, error = next(iter(failed.items()))
+        raise ValueError(
+            f"{out}: {len(failed)} of {subjects} people could not be made, the first of them"
+            f" {seed}: {error}"
+        )
+    return list(folders.values())
+
+
+def _given(body: BodyModel | None) -> BodyModel:
+    return load_body() if body is None else body
+
+
+def _write(body: BodyModel, folder: Path, seed: int, layout: Layout) -> None:
+    write_person(folder, seed, body, layout)
+
+
+def _views(
+    stream: Sequence[int],
+    place: Callable[[np.random.Generator, Points, Angles, int], Camera],
+    count: int,
+    poses: Sequence[PosedSubject],
+    size: int,
+    mark: str = "",
+) -> list[View]:
+    """`count` views of each pose, from cameras that `place` finds."""
+    rng, views = np.random.default_rng(stream), []
+    for frame, posed in enumerate(poses if count else ()):
+        cameras = place(rng, posed.vertices, spread_azimuths(rng, count), size)
+        views += [View(frame, f"{frame}_{mark}{i:02d}", cameras[i]) for i in range(count)]
+    return views
+
+
+def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
+    """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic,
+    only of one split.
+
+    Other folders (real captures, those of `humangs preprocess`) are taken as they are. split None:
+    any.
+    Raises: ValueError if a written set holds a subject of another split, or there is no capture.
+    """
+    root = Path(root)
+    folders = find_captures(root)
+    if split is not None and (root / MANIFEST).is_file():
+        content = checked_json(root / MANIFEST)
+        if isinstance(content, dict) and content.get("format") == DATA_SET.format:
+            return folders
+        read_manifest(root, SYNTHETIC)
+        for folder in folders:
+            if folder.name.isdigit() and (other := split_of(int(folder.name))) != split:
+                raise ValueError(
+                    f"{folder}: a subject of the split '{other}', where '{split}' was expected"
+                )
+    return folders

@@ -1,0 +1,107 @@
+"""Calibrations that contradict the person in the photos, and what they agree without."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.capture.fitting.contradiction import find_contradiction
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.photos import load_photos
+
+PITCH = np.radians(20)
+"""How far the cameras look down: cameras that are level agree upside down, too."""
+
+
+@pytest.fixture(scope="module")
+def photos():
+    """The demo's, as if their cameras looked down."""
+    photos, down = load_photos("demo_capture"), np.eye(4)
+    down[1:3, 1:3] = [[np.cos(PITCH), -np.sin(PITCH)], [np.sin(PITCH), np.cos(PITCH)]]
+    return changed(photos, down @ np.asarray(photos.cameras.cam_from_world))
+
+
+@pytest.fixture(scope="module")
+def keypoints(demo, photos):
+    """What a detector that errs by 2 % of the person's size sees of the demo's body."""
+    model = landmark_model(demo.body, MEDIAPIPE_33.names)
+    places, _ = pose_landmarks(model, jnp.asarray(demo.betas), demo.pose(0))
+    matrices, K = (np.asarray(x) for x in (photos.cameras.cam_from_world, photos.cameras.K))
+    local = np.asarray(places) @ matrices[:, :3, :3].swapaxes(1, 2) + matrices[:, None, :3, 3]
+    seen = local @ K.swapaxes(1, 2)
+    rng, size = np.random.default_rng(0), 400
+    points = seen[..., :2] / seen[..., 2:] + rng.normal(0, 0.02 * size, (*local.shape[:2], 2))
+    known = np.isfinite(points).all(-1)
+    world = np.nan_to_num(local - np.nanmean(local, axis=1, keepdims=True))
+    world = world + rng.normal(0, 0.05, world.shape)
+    return Keypoints(
+        np.nan_to_num(points).astype(np.float32),
+        known.astype(np.float32),
+        MEDIAPIPE_33,
+        world=world.astype(np.float32),
+    )
+
+
+def changed(photos, matrices=None, K=None):
+    cameras = photos.cameras
+    matrices = cameras.cam_from_world if matrices is None else jnp.asarray(matrices, jnp.float32)
+    K = cameras.K if K is None else jnp.asarray(K, jnp.float32)
+    return dataclasses.replace(photos, cameras=replace(cameras, cam_from_world=matrices, K=K))
+
+
+def upside_down(photos):
+    """The calibration of images whose y axis points up: pixels and axes of the cameras."""
+    other = np.diag([1.0, -1.0, 1.0, 1.0])
+    K = np.asarray(photos.cameras.K).copy()
+    K[:, 1, 2] = photos.images.shape[1] - K[:, 1, 2]
+    return changed(photos, other @ np.asarray(photos.cameras.cam_from_world) @ other, K)
+
+
+def test_a_calibration_that_is_right_is_not_contradicted(photos, keypoints):
+    assert find_contradiction(photos, keypoints) is None
+
+
+def test_a_camera_that_is_a_little_off_is_no_contradiction(photos, keypoints):
+    turn, angle = np.eye(4), np.radians(4)
+    turn[:3, :3] = [
+        [np.cos(angle), 0, np.sin(angle)],
+        [0, 1, 0],
+        [-np.sin(angle), 0, np.cos(angle)],
+    ]
+    matrices = np.asarray(photos.cameras.cam_from_world).copy()
+    matrices[1] = turn @ matrices[1]
+    assert find_contradiction(changed(photos, matrices), keypoints) is None
+
+
+def test_images_whose_y_axis_points_up_are_named(photos, keypoints):
+    found = find_contradiction(upside_down(photos), keypoints)
+    assert "contradicts the people" in str(found)
+    assert "with the images' y axis pointing the other way they agree" in str(found)
+
+
+def test_matrices_the_wrong_way_round_are_named(photos, keypoints):
+    inverse = np.linalg.inv(np.asarray(photos.cameras.cam_from_world))
+    found = find_contradiction(changed(photos, inverse), keypoints)
+    assert "with matrices that go from the camera to the world they agree" in str(found)
+
+
+def test_cameras_of_other_photos_contradict_and_nothing_is_named(photos, keypoints):
+    shuffled = np.asarray(photos.cameras.cam_from_world)[[2, 0, 3, 1]]
+    found = find_contradiction(changed(photos, shuffled), keypoints)
+    assert found is not None and found.remedy is None and "of the person's size" in str(found)
+    assert "\n" not in str(found)
+
+
+def test_one_photo_of_four_that_does_not_agree_is_no_matter_of_the_calibration(photos, keypoints):
+    other = dataclasses.replace(keypoints, points=keypoints.points.copy())
+    other.points[2] = 512 - other.points[2]
+    assert find_contradiction(photos, other) is None
+
+
+def test_one_view_and_few_keypoints_say_nothing(photos, keypoints):
+    few = dataclasses.replace(keypoints, confidences=keypoints.confidences.copy())
+    few.confidences[1:] = 0
+    assert find_contradiction(upside_down(photos), few) is None

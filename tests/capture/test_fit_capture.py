@@ -1,0 +1,273 @@
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from changes import edit_json, edit_npz
+from fit_people import POSES, default_body, observe
+
+from humangs_jax.capture.fitting import files, fit_capture
+from humangs_jax.capture.fitting.files import check_place, read_fit_record, write_fitted
+from humangs_jax.capture.fitting.fit_capture import _blind_frames, fit_photos
+from humangs_jax.capture.keypoints.keypoints import COCO_WHOLEBODY_133, Keypoints
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.photos import load_photos
+from humangs_jax.io import reading
+
+SIZE = 16
+FRAMES = tuple(POSES)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A capture folder without body.npz; five frames, four views each, in no order."""
+    joints, _, seen = observe(FRAMES, noise=2.0)
+    order = np.random.default_rng(0).permutation(len(FRAMES) * 4)
+    frames, views = order // 4, order % 4
+    path = tmp_path_factory.mktemp("photos") / "me"
+    K, pose = np.asarray(seen.K)[frames, views], np.asarray(seen.cam_from_world)[frames, views]
+    images = np.full((len(order), SIZE, SIZE, 3), 0.5, np.float32)
+    rest = np.zeros((len(FRAMES), 55, 3)), np.zeros((len(FRAMES), 3))
+    save_capture(
+        path,
+        capture_from_arrays(
+            images, K, pose, *rest, frames=[int(f) for f in frames], body=default_body()
+        ),
+    )
+    (path / "body.npz").unlink()
+    points, confidences = (np.asarray(x)[frames, views] for x in (seen.points, seen.confidences))
+    return path, Keypoints(points, confidences, COCO_WHOLEBODY_133), joints
+
+
+@pytest.fixture(scope="module")
+def fitted(folder):
+    return fit_photos(load_photos(folder[0]), folder[1], default_body())
+
+
+@pytest.mark.slow
+def test_views_are_sorted_by_their_frames(folder, fitted):
+    errors = 1000 * np.linalg.norm(np.asarray(fitted.fit.joints) - folder[2], axis=-1)
+    assert errors.mean() < 10
+    report = fitted.report
+    assert (
+        fitted.capture.frame_count == len(FRAMES)
+        and report.ok
+        and len(report.views) == 4 * len(FRAMES)
+    )
+    assert report.errors["keypoint_error_px"].after == pytest.approx(1.1774 * 2.0, rel=0.1)
+    assert json.loads(json.dumps(report.to_json()))["views"][0]["name"] == fitted.capture.names[0]
+
+
+@pytest.mark.slow
+def test_written_in_place_and_read_again(folder, fitted, tmp_path):
+    path = copied(folder[0], tmp_path)
+    described = (path / "capture.json").read_text()
+    with pytest.raises(CaptureError, match="humangs fit"):
+        load_capture(path)
+    write_fitted(
+        path, check_place(path, None, overwrite=False), fitted.capture, fitted.report, fitted.record
+    )
+    again = load_capture(path)
+    np.testing.assert_array_equal(again.poses.rotations, fitted.capture.poses.rotations)
+    np.testing.assert_array_equal(again.betas, fitted.capture.betas)
+    assert json.loads((path / "capture.json").read_text()) == json.loads(described)
+    record = read_fit_record(path / "fit.npz")
+    np.testing.assert_array_equal(record.keypoints.points, folder[1].points)
+    np.testing.assert_allclose(record.joint_std, fitted.record.joint_std, rtol=1e-6)
+    assert record.names == again.names
+    kind, own = record.keypoints.set, fitted.record.keypoints.set
+    np.testing.assert_allclose(kind.certainty, own.certainty, rtol=1e-6)
+    np.testing.assert_allclose(kind.offsets, own.offsets, atol=1e-7)
+    with pytest.raises(ValueError, match=r"body\.npz exists"):
+        check_place(path, None, overwrite=False)
+    check_place(path, None, overwrite=True)
+
+
+@pytest.mark.slow
+def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path, monkeypatch):
+    """Cameras that were moved belong to the body that was found with them."""
+    path = copied(folder[0], tmp_path)
+    write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
+    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
+    capture = dataclasses.replace(
+        fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved)
+    )
+    with monkeypatch.context() as broken, pytest.raises(OSError, match="disk full"):
+        broken.setattr(files, "write_json", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        write_fitted(path, path, capture, fitted.report)
+    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+    write_fitted(path, path, capture, fitted.report)
+    assert not (path / "fit.npz").exists()
+    np.testing.assert_array_equal(load_capture(path).cameras.cam_from_world, moved)
+
+
+@pytest.mark.slow
+def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted, tmp_path):
+    path = copied(folder[0], tmp_path)
+    edit_json(path / "capture.json", lambda d: d.update(body="params/body.npz"))
+    for out in (None, tmp_path / "out"):
+        target = check_place(path, out, overwrite=False)
+        write_fitted(path, target, fitted.capture, fitted.report, fitted.record)
+        np.testing.assert_array_equal(load_capture(target).betas, fitted.capture.betas)
+        assert (target / "params" / "body.npz").is_file()
+
+
+@pytest.mark.slow
+def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_path, monkeypatch):
+    moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
+    kept = np.full(fitted.capture.body.template.shape, 0.01, np.float32)
+    capture = dataclasses.replace(
+        fitted.capture,
+        cameras=replace(fitted.capture.cameras, cam_from_world=moved),
+        displacement=kept,
+    )
+    target = check_place(folder[0], tmp_path / "out", overwrite=False)
+    write_fitted(folder[0], target, capture, fitted.report)
+    again = load_capture(target)
+    np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
+    np.testing.assert_array_equal(again.displacement, kept)
+    np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
+    assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "
+        ),
+    ):
+        check_place(folder[0], target, overwrite=False)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "diary.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"holds no capture\.json"):
+        check_place(folder[0], tmp_path / "other", overwrite=True)
+    inside = target / "held_out"
+    write_fitted(folder[0], inside, capture, fitted.report)
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):
+        check_place(inside, target, overwrite=True)
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):
+        write_fitted(inside, target, capture, fitted.report)
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):  # the keypoints, say
+        check_place(folder[0], target, overwrite=True, inputs=(None, target / "images"))
+    monkeypatch.setattr(reading, "_current", reading.Limits(photos_outside=True))
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):  # a photo
+        check_place(linked(tmp_path / "linked", target), target, overwrite=True)
+
+
+def linked(folder, photos):
+    """A capture folder whose images are those of another one, through a link."""
+    folder.mkdir()
+    shutil.copyfile(photos / "capture.json", folder / "capture.json")
+    (folder / "images").symlink_to(photos / "images")
+    return folder
+
+
+def test_folders_that_cannot_be_replaced_are_refused_before_the_fit(folder, tmp_path, monkeypatch):
+    work, link = tmp_path / "work", tmp_path / "link"
+    work.mkdir()
+    link.symlink_to(work)
+    monkeypatch.chdir(work)
+    for place, message in ((Path(), "is the working folder"), (link, "is a symbolic link")):
+        with pytest.raises(ValueError, match=message):
+            check_place(folder[0], place, overwrite=True)
+    here = copied(folder[0], tmp_path / "copy")
+    monkeypatch.chdir(here)
+    assert check_place(here, None, overwrite=True) == here  # files are replaced one by one
+
+
+def test_frames_of_one_view_each_are_one_line():
+    seen = np.ones((8, 2, 17), bool)
+    assert list(_blind_frames(seen, smooth=False)) == []
+    seen[1:, 1] = False
+    (line,) = _blind_frames(seen, smooth=False)
+    assert line.startswith("frames 1, 2, 3, 4 and 3 more: each seen by one view")
+    seen[0, :, 3:] = False
+    assert next(_blind_frames(seen, smooth=False)).startswith("frame 0: 3 keypoints are seen")
+
+
+@pytest.mark.slow
+def test_frames_that_views_hardly_show_are_named(folder):
+    points, confidences = folder[1].points, folder[1].confidences.copy()
+    frames = load_photos(folder[0]).frames
+    confidences[frames == 1] = 0
+    confidences[np.flatnonzero(frames == 3)[1:]] = 0
+    found = fit_photos(
+        load_photos(folder[0]), Keypoints(points, confidences, folder[1].set), default_body()
+    )
+    blind, single = found.report.warnings[-2:]
+    assert blind.startswith("frame 1: 0 keypoints are seen")
+    assert single.startswith("frame 3: seen by one view")
+    assert [v.keypoints > 0 for v in found.report.views if v.frame == 3] == [
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p, c: (p, 0 * c), "no view has a keypoint"),
+        (lambda p, c: (p[:3], c[:3]), "keypoints of 3 views, but there are 20 photos"),
+    ],
+)
+def test_what_cannot_be_fitted_is_one_error(folder, change, message):
+    keypoints = Keypoints(*change(folder[1].points, folder[1].confidences), folder[1].set)
+    with pytest.raises(ValueError, match=message):
+        fit_photos(load_photos(folder[0]), keypoints, default_body())
+
+
+@pytest.mark.slow
+def test_a_damaged_record_is_one_error(folder, fitted, tmp_path):
+    path = copied(folder[0], tmp_path)
+    write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
+    for change, message in (
+        ({"set": np.asarray("mine")}, "set: expected one of coco17"),
+        ({"points": np.zeros((2, 3))}, "points: expected shape"),
+        ({"confidences": np.full((20, 133), np.nan)}, "confidences: expected finite"),
+        ({"noise": np.zeros(2)}, "joint_std: expected shape"),
+        ({"determined": None}, "determined: missing"),
+        ({"names": np.asarray([{}], object)}, "names: a pickled object"),
+    ):
+        shutil.copyfile(path / "fit.npz", path / "damaged.npz")
+        edit_npz(path / "damaged.npz", **change)
+        with pytest.raises(CaptureError, match=message):
+            read_fit_record(path / "damaged.npz")
+
+
+def test_a_record_that_lacks_a_key_names_it_and_who_writes_such_files(tmp_path):
+    np.savez(tmp_path / "fit.npz", set=np.asarray("coco17"), names=np.asarray(["a"]))
+    with pytest.raises(
+        CaptureError, match="points: missing: expected a file that `humangs fit` wrote"
+    ):
+        read_fit_record(tmp_path / "fit.npz")
+
+
+def test_expressions_are_not_fitted_as_shape(folder, monkeypatch):
+    """Of SMPL-X, whose directions are those of the shape and then those of the face."""
+    fitted_to, body = [], default_body()
+    names = (*(f"shape_{i}" for i in range(body.shape_directions.shape[-1] - 1)), "expression_0")
+    monkeypatch.setattr(
+        fit_capture, "landmark_model", lambda body, *_: fitted_to.append(body) or 1 / 0
+    )
+    with pytest.raises(ZeroDivisionError):
+        fit_photos(load_photos(folder[0]), folder[1], replace(body, shape_names=names))
+    assert (
+        fitted_to[0].shape_names == names[:-1]
+        and fitted_to[0].shape_directions.shape[-1] == len(names) - 1
+    )
+
+
+def test_a_body_whose_root_is_not_first_is_refused(folder):
+    body = default_body()
+    strange = replace(body, parents=(1, -1, *body.parents[2:]))
+    with pytest.raises(ValueError, match="root to be its first joint, got joint 1"):
+        fit_photos(load_photos(folder[0]), folder[1], strange)
+
+
+def copied(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "me")
