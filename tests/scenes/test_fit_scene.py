@@ -64,7 +64,9 @@ def test_a_scene_is_learned_from_random_points_and_grows_to_its_capacity(posed):
     assert fit.steps == 200 and not fit.interrupted and fit.seconds > 0
     assert len(fit.gaussians.opacities) == 150 and fit.gaussians.harmonics.shape == (150, 3, 3)
     start = first_gaussians(None, list(cameras), config)
-    assert fit.psnr > 3 + fitting._mean_psnr(start, list(cameras), photos, jnp.zeros(3), config)
+    assert fit.psnr > 3 + fitting._mean_psnr(
+        start, list(cameras), list(photos), jnp.zeros(3), config
+    )
 
 
 @pytest.mark.slow

@@ -101,4 +101,4 @@ def test_a_run_of_a_network_that_draws_pixels_is_validated_logged_and_saved(
     assert validated["val_semi_transparent"] is None and validated["val_psnr"] > 0
     variables, model = load_weights(tmp_path / "run" / "best.safetensors")
     assert model.architecture == config.model.architecture
-    assert set(variables["params"]) == {"decoder"}
+    assert set(variables["params"]) == {"driver"}
