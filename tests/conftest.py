@@ -16,7 +16,6 @@ import hashlib
 import importlib.metadata
 import os
 import platform
-import re
 import signal
 import sys
 import zlib
@@ -43,6 +42,7 @@ import jax
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+from rooms import CORE, NEEDS_WINGS, HiddenWings
 from rounding import scaled_comparison
 
 jax.config.update("jax_platforms", "cpu")  # numbers in the tests are the CPU's
@@ -112,28 +112,6 @@ jax.config.update(
 
 for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isclose")):
     setattr(owner, name, scaled_comparison(getattr(owner, name)))
-
-
-CORE = (
-    *("core", "geometry", "io", "body", "rendering", "network", "losses", "scenes"),
-    *("data", "avatar", "refinement", "evaluation", "training"),
-)
-"""Rooms of the core; their tests run with the wings hidden."""
-WINGS = ("capture", "motion", "synthetic", "viewer")
-"""Rooms that the core does not import."""
-NEEDS_WINGS = re.compile(
-    rf"humangs_jax\.({'|'.join((*WINGS, 'apps', 'cli'))})\b|from experiments|command_line|motion_cases"
-)
-"""What the text of a test has that looks at the core and a wing, or a command, together."""
-
-
-class HiddenWings:
-    """Refuses to import a wing."""
-
-    def find_spec(self, name, path=None, target=None):
-        package, _, inside = name.partition(".")
-        if package == "humangs_jax" and inside.split(".")[0] in WINGS:
-            raise ModuleNotFoundError(f"{name} is hidden by --core-alone")
 
 
 def pytest_addoption(parser):

@@ -157,6 +157,7 @@ def test_the_files_of_an_obj_have_names_without_spaces(tmp_path):
             uvs=np.zeros((3, 2), np.float32),
             texture=np.zeros((4, 4, 3), np.uint8),
             weights=np.ones((3, 1), np.float32),
+            source=np.arange(3),
         ),
     )
     assert written.name == "me_and_you.mtl"

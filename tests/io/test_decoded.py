@@ -112,6 +112,7 @@ def test_the_steps_of_start_decode_each_photo_of_a_capture_once(tmp_path, monkey
         load_capture(folder)
 
     monkeypatch.setattr(detect, "detect_photos", looked_at)
+    monkeypatch.setattr(detect, "with_masked", lambda found, *_: found)
     monkeypatch.setattr(detect, "same_people", lambda photos, *_: photos)
     monkeypatch.setattr(Start, "_go_on", steps)
     photos = folder / "images"

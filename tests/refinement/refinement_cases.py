@@ -13,9 +13,13 @@ from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import SplatConfig
 
 WIDTH, HEIGHT = 48, 64
 STEPS = RefineConfig(iterations=0, steps=12, seconds=None, held_out=0.0)
+
+SAME = SplatConfig(max_pairs=1 << 14, max_rows=1 << 13, visibility=True)
+"""Buffers of all tests of the normal lane."""
 
 
 def toy_avatar(body, shade):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refinement_cases import HEIGHT
+from refinement_cases import HEIGHT, SAME
 
 from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.frames import capture_renderings
@@ -30,8 +30,6 @@ def small_photos(monkeypatch):
 
 @pytest.fixture
 def same_head_buffers(monkeypatch):
-    from conftest import SAME
-
     monkeypatch.setattr(heads, "planned", lambda avatar, views: SAME)
 
 
