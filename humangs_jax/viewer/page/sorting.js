@@ -4,6 +4,7 @@
 // means: Float32Array (3 g), canonical. joints: Uint8Array (8 g). weights: Uint16Array (8 g), largest first.
 function makeSorter(count, means, joints, weights) {
   const BITS = 11, BUCKETS = 1 << BITS, LEVELS = (1 << (2 * BITS)) - 1;
+  const HIDDEN_BELOW = -1000;  // metres; see AWAY in face.js
   const depths = new Float32Array(count), keys = new Uint32Array(count), half = new Uint32Array(count);
   const low = new Uint32Array(BUCKETS), high = new Uint32Array(BUCKETS);
 
@@ -21,6 +22,7 @@ function makeSorter(count, means, joints, weights) {
       }
       const depth = a * x + b * y + c * z + d;
       depths[i] = depth;
+      if (y < HIDDEN_BELOW) continue;  // far away so that nobody sees it: levels are for the others
       if (depth < near) near = depth;
       if (depth > far) far = depth;
     }
@@ -33,7 +35,7 @@ function makeSorter(count, means, joints, weights) {
     const scale = LEVELS / Math.max(far - near, 1e-20);
     low.fill(0); high.fill(0);
     for (let i = 0; i < count; i++) {
-      const key = (depths[i] - near) * scale >>> 0;
+      const key = Math.min(Math.max((depths[i] - near) * scale, 0), LEVELS) >>> 0;
       keys[i] = key;
       low[key & (BUCKETS - 1)]++;
       high[key >>> BITS]++;
