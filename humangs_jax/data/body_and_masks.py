@@ -222,36 +222,45 @@ PerVertex = Float[np.ndarray, " n"]
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """How a surface moves to the edges of the masks, metres: within which distance along its
-    normals they are looked for, over which a move spreads, and how far the surface may lie inside.
-    Bodies: the network adds clothes on top, and knows naked ones.
+    """How a surface moves to the edges of the masks. The defaults are those of bodies: the network
+    adds clothes on top, and knows naked ones.
     """
 
     outwards: float = 0.05
+    """How far outwards along a normal a mask's edge is looked for, and the largest move, metres."""
     inwards: float = 0.06
+    """The same inwards, metres."""
     smoothness: float = 0.03
+    """The length over which a move spreads to the vertices around it, metres."""
     inset: tuple[float, float] = (0.005, 0.025)
+    """The least and the most that the surface may lie inside the masks, metres."""
     iterations: int = 2
+    """How often edges are looked for and the surface is moved."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MaskedView:
-    """One photo: the window around the person. coverage: by the person. project: (3, 4) to the
-    window's pixels.
-
-    linear, offset: from the rest pose to the posed body, for each vertex. low, high: x, y of the
-    photo's corners.
-    hidden: where somebody may be in front, and no mask ends that would say something; None:
-    nowhere.
-    """
+    """One photo: the window around the person, and the body as it is posed there."""
 
     coverage: Float[np.ndarray, "h w"]
+    """The share of each pixel that the person covers, (h, w), in [0, 1]."""
     project: Float[np.ndarray, "3 4"]
+    """From the world in metres to homogeneous pixels of the window, (3, 4)."""
     linear: Float[np.ndarray, "n 3 3"]
+    """The linear part of the move from the rest pose to the posed body, for each vertex, (n, 3, 3).
+    """
     offset: Float[np.ndarray, "n 3"]
+    """The offset of that move, (n, 3), metres."""
     low: Float[np.ndarray, "2"]
+    """The least x and y in the window that count as in the photo, (2,), pixels: `NEAR` inside its
+    corner.
+    """
     high: Float[np.ndarray, "2"]
+    """The largest x and y that do, (2,), pixels."""
     hidden: Float[np.ndarray, "h w"] | None = None
+    """Where somebody may be in front, (h, w), in [0, 1]: the ends of masks say nothing there. None:
+    nowhere.
+    """
 
     @functools.cached_property
     def mask(self) -> Float[np.ndarray, "h w"]:

@@ -62,29 +62,32 @@ PixelCenters = Literal["integer", "half"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CalibratedCamera:
-    """One camera, or one image's camera where the format has one per image.
-
-    name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world:
-    (4, 4), OpenCV axes.
-    width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of
-    OpenCV, or None.
-    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera
-    for each image.
-    lens: of `geometry.lens`. refusal: of lenses whose photos are not undistorted here (fisheyes,
-    more coefficients), what is raised where that is needed; their distortion has 8, 12 or, of
-    fisheyes, 4 numbers.
-    """
+    """One camera, or one image's camera where the format has one per image."""
 
     name: str
+    """The name of the camera, or the image's path as the file has it."""
     K: Float[np.ndarray, "3 3"]
+    """The camera matrix, (3, 3), pixels."""
     cam_from_world: Float[np.ndarray, "4 4"]
+    """From the world to the camera, (4, 4), OpenCV axes."""
     width: int | None = None
+    """The width of the image, pixels; None where the format does not say."""
     height: int | None = None
+    """The height of the image, pixels; None where the format does not say."""
     distortion: Float[np.ndarray, " coefficients"] | None = None
+    """OpenCV's k1 k2 p1 p2 k3; 8, 12 or, of fisheyes, 4 numbers where there is a `refusal`. None:
+    the lens does not distort.
+    """
     frame: int = 0
+    """The frame of the image, counted from 0, where there is one camera for each image."""
     mask: str | None = None
+    """The path of the image's mask, where there is one camera for each image."""
     lens: str = "pinhole"
+    """The kind of the lens, as `geometry.lens` names it."""
     refusal: CaptureError | None = None
+    """The error to raise where photos have to be undistorted, for lenses that this is not done for
+    (fisheyes, more coefficients).
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,38 +101,43 @@ class Observations:
     """
 
     points: Float[np.ndarray, "n 3"]
+    """Where the point is in the world, (n, 3)."""
     cameras: Int[np.ndarray, " n"]
+    """The number of the camera that saw it, (n,)."""
     pixels: Float[np.ndarray, "n 2"]
+    """Where the camera saw it, (n, 2), pixels, distortion included."""
     colors: Float[np.ndarray, "n 3"] | None = None
+    """The color of the point, (n, 3), 0 to 255; None where the format has none."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Calibration:
-    """Everything that a calibration says.
-
-    format: what it was read as. file: the one that errors name. cameras: at least one. per_image:
-    one camera for each image, not one for each camera. pixel_centers, up: what the format means by
-    default.
-    observations: None where the format has none. convention: what the matrices in the file mean, of
-    `CONVENTIONS`.
-    stations: how many cameras took the images, where the format says; None: one for each of
-    `cameras`. mask_key: where the file names masks, None if it does not. upright: whether cameras
-    are of photos that obey their EXIF orientation; else sizes tell.
-    estimated: whether the cameras were found from the person.
-    """
+    """Everything that a calibration says."""
 
     format: str
+    """The name of the format that it was read as."""
     file: Path
+    """The file that errors name."""
     cameras: tuple[CalibratedCamera, ...]
+    """The cameras, at least one."""
     per_image: bool
+    """Whether there is one camera for each image, not one for each camera."""
     pixel_centers: PixelCenters
+    """Where the format has the centre of the first pixel, unless the user says otherwise."""
     up: str
+    """The world's up axis in this format, unless the user says otherwise."""
     observations: Observations | None = None
+    """The points that the calibration saw; None where the format has none."""
     convention: str = CAM_FROM_WORLD
+    """What the matrices in the file mean, a key of `CONVENTIONS`."""
     stations: int | None = None
+    """How many cameras took the images, where the format says; None: one for each of `cameras`."""
     mask_key: str | None = None
+    """The key under which the file names masks; None if it does not."""
     upright: bool = False
+    """Whether cameras are of photos that obey their EXIF orientation; if not, sizes tell."""
     estimated: bool = False
+    """Whether the cameras were found from the person."""
     unit: float | None = None
     """Metres in the unit of the format, None where it may be any."""
 
@@ -516,6 +524,7 @@ class Checks:
     camera).
     """
     warnings: tuple[str, ...]
+    """One line for each thing that looks wrong."""
 
 
 def check_calibration(source: Calibration, converted: Calibration, up: str) -> Checks:
@@ -525,6 +534,7 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
     matrices = lambda calibration: np.stack(
         [camera.cam_from_world for camera in calibration.cameras]
     )
+    # what the points and the axes of the cameras say
     reprojection = mean_reprojection_error(converted)
     depths, _ = axes_meeting(matrices(converted))
     distance = None if depths is None else float(np.median(np.abs(depths)))
@@ -534,7 +544,9 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
         warnings.append(
             f"the mean reprojection error is {reprojection:.3g} px {limit}: are these its points?"
         )
+    # matrices are checked before the conversion, where a wrong convention shows
     warnings += _convention_warnings(matrices(source), source.convention)
+    # a wrong unit shows in how far the cameras stand from the person
     low, high = DISTANCES
     if distance is not None and not low <= distance <= high:
         stand = (
@@ -545,6 +557,7 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
             f"{stand}: is scale, the metres in a unit of the source, right? Measure one distance"
         )
     warnings += _up_warnings(matrices(converted), up)
+    # one warning about principal points is enough: all cameras mostly share the cause
     warnings += [warning for camera in converted.cameras for warning in _center_warnings(camera)][
         :1
     ]

@@ -208,6 +208,7 @@ def capture_from_arrays(
         >>> pose = (rotations, translations)
         >>> capture = hg.capture_from_arrays(photos, K, cam_from_world, *pose, masks=masks)
     """
+    # photos, masks and cameras
     images = numbers(images, source, "images")
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
         raise CaptureError(source, "images", f"expected shape (views, h, w, 3), got {images.shape}")
@@ -223,11 +224,13 @@ def capture_from_arrays(
         checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}")
         for i in range(v)
     ]
+    # the person: shape and poses
     body = _load_model(source, str(body_file)) if body is None else body
     parameters = body_parameters(
         body, betas, rotations, translations, source, shape_names, displacement
     )
     rotations = parameters[1]
+    # which of the poses each view shows
     if frames is None:
         if len(rotations) > 1:
             raise CaptureError(
@@ -244,10 +247,12 @@ def capture_from_arrays(
     names = tuple(f"{i:03d}" for i in range(v)) if names is None else tuple(names)
     check_names(names, v, source)
     check_background(background, source)
+    # photos on white, as the network knows them
     if masks is not None and background == "photo":
         if fit_masks:
             masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
         images = np.stack([cut_out(*pair) for pair in zip(images, masks, strict=True)])
+    # what may be hidden counts as background, so that nothing is concluded from it
     if unknown is not None:
         if masks is None:
             raise CaptureError(source, "unknown", "expected masks, too")
@@ -400,6 +405,7 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
         raise CaptureError("", "", error) from error
     if pickled:
         raise CaptureError(file, pickled[0], "expected numbers, got a pickled object")
+    # what the file must hold whatever its body is
     check_keys(values, BODY_KEYS | OPTIONAL_BODY_KEYS, BODY_KEYS, file)
     name = values["body"]
     if name.shape != () or name.dtype.kind not in "US" or not str(name.item()):
@@ -408,6 +414,7 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
     parameters: dict[str, Any] = {
         key: values[key] for key in ("betas", "rotations", "translations")
     }
+    # what only some files hold
     parameters["displacement"] = values.get("displacement")
     if (names := values.get("shape_names")) is not None:
         if names.ndim != 1 or names.dtype.kind not in "US":
@@ -427,6 +434,7 @@ def _check_before_writing(capture: Capture) -> None:
     v, (height, width) = len(capture.images), capture.images.shape[1:3]
     cameras, poses = capture.cameras, capture.poses
     require_pinhole("a capture", cameras)
+    # `capture_from_arrays` makes one camera for each image, of its size; a `Capture` may hold others
     if len(cameras.K) != v:
         raise CaptureError(
             "capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}"
@@ -436,6 +444,7 @@ def _check_before_writing(capture: Capture) -> None:
         raise CaptureError(
             "capture", "cameras", f"expected the image size {width} x {height}, got {got}"
         )
+    # all else, without keeping the result
     capture_from_arrays(
         capture.images,
         np.asarray(cameras.K),

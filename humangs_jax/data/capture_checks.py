@@ -231,6 +231,7 @@ def shape_coefficients(
         f"shape_{i}" for i in range(body.shape_directions.shape[-1])
     )
     places = {name: i for i, name in enumerate(directions)}
+    # numbers without names: those of SMPL-X's shape, or all of the body's directions
     if names is None:
         own = [name for name in directions if not name.startswith("expression_")]
         if betas[len(own) :].any():
@@ -241,6 +242,7 @@ def shape_coefficients(
         if "shape_0" in places or len(betas) == len(own) or not betas.any():
             return betas[: len(own)]
         names = [f"shape_{i}" for i in range(len(betas))]
+    # named numbers: a direction that the body lacks may be named if its number is 0
     if len(names) != len(betas) or len(set(names)) < len(names):
         raise CaptureError(
             file, "shape_names", f"expected {len(betas)} different names, one for each of betas"
@@ -255,6 +257,7 @@ def shape_coefficients(
             f" its own ({known})"
         )
         raise CaptureError(file, "betas", problem)
+    # in the order of the body, up to the last direction that is named
     used = [places[name] for name in names if name in places]
     ordered = np.zeros(max(used, default=-1) + 1, betas.dtype)
     ordered[used] = [value for name, value in zip(names, betas, strict=True) if name in places]

@@ -73,7 +73,9 @@ class Unused:
     """A file that is not used."""
 
     path: Path
+    """The path of the file."""
     why: Reason
+    """The reason."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +83,7 @@ class FolderScan:
     """The photos in a folder and in the folders in it, and what is not used."""
 
     folder: Path
+    """The folder that was searched."""
     photos: tuple[Path, ...]
     """In order."""
     unused: tuple[Unused, ...] = ()

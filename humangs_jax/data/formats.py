@@ -281,6 +281,7 @@ class ArrayKeys:
     six: bool = False
     """Rotations are six numbers each, with the frames as last axis."""
     stays: bool = False
+    """Whether people stay in place in files without positions; if not, such files are refused."""
     kind: str = "poses"
     """What reads it: "ours" are whole rotations, "points" joints in space."""
     page: bool = True

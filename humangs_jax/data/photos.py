@@ -266,6 +266,7 @@ def read_photos(
     Raises: CaptureError.
     """
     file, views = folder / "capture.json", description["views"]
+    # without the number of poses, the views say it; a huge frame number is refused
     if poses is None:
         frames = [
             expect(view.get("frame", 0), int, file, f"views[{i}].frame")
@@ -282,6 +283,7 @@ def read_photos(
                 math.ceil(poses / len(views)),
                 f"frames for each of {len(views)} photos",
             )
+    # the chosen views: all with masks or none
     views = views if chosen is None else [views[i] for i in chosen]
     with_mask = ["mask" in view for view in views]
     if any(with_mask) and not all(with_mask):
@@ -290,6 +292,7 @@ def read_photos(
             file, f"views[{first}].mask", "missing, but other views have one: give all or none"
         )
     check_photos(folder, views, together=True)
+    # photos and cameras
     frames, K, cam_from_world = read_frames_and_matrices(views, poses, file)
     images, masks = _read_images(
         folder, views, description.get("background", "photo") == "white", fit_masks
@@ -301,6 +304,7 @@ def read_photos(
         for i in range(len(views))
     ]
     unknown = _read_unknown(folder, views, images.shape[1:3])
+    # what may be hidden counts as background, so that nothing is concluded from it
     if unknown is not None:
         if masks is None:
             raise CaptureError(file, "views[0].unknown", "expected a mask, too")

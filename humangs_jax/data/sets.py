@@ -23,10 +23,12 @@ K = TypeVar("K")
 
 
 class SetFormat(NamedTuple):
-    """What the manifest of a kind of sets says first."""
+    """The first entries in the manifest of a kind of sets."""
 
     format: str
+    """The name of the format."""
     version: int
+    """Its version."""
 
 
 SYNTHETIC, DATA_SET = SetFormat("humangs-synthetic", 2), SetFormat("humangs-dataset", 1)

@@ -97,18 +97,21 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
     legs = _legs(body)
     if legs is None or capture.masks is None:
         return None
+    # where to look: points between the legs at several heights
     levels, rest = np.linspace(TOP, BOTTOM, ROWS), shaped(body, capture.betas)
     joints = np.asarray(body.joint_regressor, float) @ rest
     radii = _radii(body, rest, joints, legs, levels)
     shares = np.arange(1, GAP + 1)[:, None] / (GAP + 1)
     asked, shown, clear = np.zeros((3, ROWS))
     cameras, empty = jax.tree.map(np.asarray, capture.cameras), empty_views(capture.masks)
+    # each view votes on the points that it sees apart from both legs
     for i in [i for i in range(capture.view_count) if i not in empty]:
         linear, offset = skinned(
             body, joints, capture.poses, int(capture.frames[i]), np.eye(len(joints))
         )
         axes = _along(np.einsum("jab,jb->ja", linear, joints) + offset, legs, levels)
         between = (1 - shares) * axes[0][:, None] + shares * axes[1][:, None]
+        # where the points and the axes of the legs are in the photo
         project = cameras.K[i] @ cameras.cam_from_world[i, :3]
         points, sides = (
             x.reshape(-1, 3) @ project[:, :3].T + project[:, 3] for x in (between, axes)
@@ -117,6 +120,7 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
             continue
         pixels, centers = points[:, :2] / points[:, 2:], sides[:, :2] / sides[:, 2:]
         focal = float(cameras.K[i, 0, 0])
+        # how far each point is from the skin of the nearest leg, metres
         distances = (
             np.linalg.norm(pixels[:, None] - centers, axis=-1) - radii.ravel() * focal / sides[:, 2]
         )
@@ -125,13 +129,16 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
         framed = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
         beside = framed & (apart > BESIDE)
         inside = beside & (at(capture.masks[i], pixels) > MASK_THRESHOLD)
+        # a point between the legs that lies on the mask is cloth
         asked += beside.reshape(ROWS, -1).sum(axis=1)
         shown += inside.reshape(ROWS, -1).sum(axis=1)
         clear = np.maximum(clear, np.where(inside, apart, 0).reshape(ROWS, -1).max(axis=1))
+    # the skirt goes down to the first height that the votes are against
     told = asked >= VOTES
     skirt = told & (shown >= SHOWN * asked)
     ends = np.flatnonzero(told & ~skirt)
     rows = np.flatnonzero(skirt[: ends[0] if len(ends) else ROWS])
+    # wide trousers look like a skirt, so some cloth must be well clear of both legs
     certain = clear[rows] > (CLEAR if len(ends) else LONG_CLEAR)
     return float(levels[rows[-1]]) if np.count_nonzero(certain) >= LEAST_ROWS else None
 

@@ -48,29 +48,34 @@ logger = logging.getLogger(__name__)
 
 @pytree_dataclass
 class SubjectViews:
-    """Views of one subject; each has a pose of its own, so that inputs of varying poses are nothing
-    special.
-
-    images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v,
-    metric.
-    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients.
-    view_count: how many are views, those after them are padding (see `pad_views`); None: all are.
-    depths: (v, h, w) mean z of the person in a pixel, metres, where the mask is not 0; 0: unknown
-    there. None: unknown everywhere. displacement: (n, 3) of the vertices of the shaped body in the
-    T-pose, metres (`data.body_and_masks`); None: none. unknown: (v, h, w) where the person may be
-    hidden, and masks are 0; None: nowhere.
+    """Views of one subject. Each view has a pose, so that inputs of varying poses are no special
+    case.
     """
 
     images: Float[Array, "v h w 3"]
+    """The photos on white, (v, h, w, 3), in [0, 1]."""
     masks: Float[Array, "v h w"]
+    """The coverage by the person, (v, h, w), in [0, 1]."""
     cameras: Camera
+    """A batch of v cameras, metres."""
     rotations: Float[Array, "v j 3"]
+    """Axis-angle rotations of the joints, (v, j, 3), radians."""
     translations: Float[Array, "v 3"]
+    """Translations of the body, (v, 3), metres."""
     betas: Float[Array, " s"]
+    """Shape coefficients, (s,)."""
     view_count: Int[Array, ""] | None = None
+    """How many are views; those after them are padding (see `pad_views`). None: all are."""
     depths: Float[Array, "v h w"] | None = None
+    """The mean z of the person in each pixel where the mask is not 0, (v, h, w), metres; 0: unknown
+    there. None: unknown everywhere.
+    """
     displacement: Float[Array, "n 3"] | None = None
+    """How far the vertices of the shaped body move in the T-pose, (n, 3), metres
+    (`data.body_and_masks`). None: nowhere.
+    """
     unknown: Bool[Array, "v h w"] | None = None
+    """Where the person may be hidden and masks are 0, (v, h, w). None: nowhere."""
 
     def upright(self, body: BodyModel) -> "SubjectViews":
         """The views in a world whose y axis points up; the same object if theirs does.

@@ -227,6 +227,7 @@ def video_subject(
         {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0},
     )
     shown = []
+    # which frames each camera shows, and why others are left out
     for number, (camera, there, masked) in enumerate(zip(cameras, photos, masks, strict=True)):
         known = {frame for owner, frame in listed if owner == camera.name}
         usable = {frame for frame in there if frame not in known and 0 <= frame < count}
@@ -241,6 +242,7 @@ def video_subject(
     if not shown:
         told = ", ".join(f"{reason}: {number}" for reason, number in missing.items())
         raise CaptureError(name, "", f"no photo with a mask and a pose ({told or 'no cameras'})")
+    # frame after frame, so that the poses are read in their order
     frames, owners = np.asarray(sorted(shown), np.int32).T
 
     def read_view(view: int) -> Photo:
@@ -300,11 +302,14 @@ def _cut_out(
 
 
 class FolderLayout(NamedTuple):
-    """Where the files of a data set are: calibration, and the photos and masks of a camera NAME."""
+    """Where the files of a data set are, relative to its folder."""
 
     calibration: str
+    """The path of the calibration."""
     photos: str
+    """The folder of the photos of a camera, with NAME for its name."""
     masks: str
+    """The folder of its masks, with NAME for its name."""
 
 
 THUMAN4 = FolderLayout("calibration.json", "images/NAME", "masks/NAME")
@@ -393,6 +398,7 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
         rows = list(csv.DictReader(io.StringIO(checked_text(file))))
     cameras = []
     for number, row in enumerate(rows, 2):
+        # names are also those of folders, so each is plain and unique
         name = row.get("name")
         if (
             not name
@@ -414,6 +420,7 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
                 ) from None
         values = checked_numbers(numbers, file, name, (len(COLUMNS),), largest=float(limits().side))
         width, height = image_size(values[:2], file, f"{name}.w")
+        # the file has where the camera is; lengths on the image are shares of its sides
         turn, center, (fx, fy, px, py) = (
             rotation(values[2:5], file, name).T,
             values[5:8],
@@ -511,12 +518,14 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
     """One sequence of its main file. Raises: CaptureError naming file and key."""
     main = Path(main)
     photos, notes = Smc(main), Smc(main.parent.parent / "annotations" / f"{main.stem}_annots.smc")
+    # cameras are spread over groups of two kinds
     places = {
         int(name): group for group in GROUPS for name in photos.names(group) if name.isdecimal()
     }
     if not places:
         raise CaptureError(main, "", f"no camera: expected the groups {' and '.join(GROUPS)}")
     parameters = _parameters(notes, body)
+    # photos and masks of each camera by frame; masks are in the other file
     cameras, shown, masks = [], [], []
     for number, group in sorted(places.items()):
         there, masked = f"{group}/{number}/color", f"Mask/{number}/mask"
@@ -534,6 +543,7 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
         image, person = (file.image(key, _colors) for file, key in ((photos, photo), (notes, mask)))
         return _cut_out(image, person.max(axis=-1) > ON_PERSON, notes.path, mask)
 
+    # annotated cameras in the convention of captures
     calibration = Calibration("DNA-Rendering", notes.path, tuple(cameras), False, "integer", "+y")
     cameras = checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
     return video_subject(main, cameras, shown, masks, read, parameters, digits=6)

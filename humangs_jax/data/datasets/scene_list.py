@@ -59,16 +59,18 @@ SIGNIFICANT = 9
 
 
 class SceneFrame(NamedTuple):
-    """A view of a scene. image, mask, arrays: paths relative to the list. K: (3, 3) pixels.
-
-    cam_from_world: (4, 4).
-    """
+    """A view of a scene. Paths are relative to the list."""
 
     image: str
+    """The path of the photo."""
     cam_from_world: Float[np.ndarray, "4 4"]
+    """From the world to the camera, (4, 4)."""
     K: Float[np.ndarray, "3 3"]
+    """The camera matrix, (3, 3), pixels."""
     arrays: str
+    """The path of the arrays of the view."""
     mask: str | None = None
+    """The path of the mask."""
 
 
 def find_scene_list(path: str | Path) -> tuple[Path, ...]:
@@ -140,10 +142,12 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
 
     Raises: CaptureError.
     """
+    # views that share a file of arrays show the same frame
     views, missing = _present(file, name, scene)
     smpl, frames = np.unique([view.arrays for view in views], return_inverse=True)
     arrays = [_inside(file, name, path) for path in smpl.tolist()]
     first = open_arrays(arrays[0])
+    # the arrays hold meshes alone: shape and unit are recovered from that in the T-pose
     scale, betas = recover_shape(body, first.numbers("v_cano", (None, 3)), first.path)
 
     @functools.lru_cache(maxsize=KEPT_FRAMES)
@@ -158,6 +162,7 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
         rotations = np.asarray([rotation for rotation, _ in poses]).reshape(-1, joints, 3)
         return BodyParameters(betas, rotations, np.asarray([t for _, t in poses]).reshape(-1, 3))
 
+    # all images have one size; cameras go from the units of the scene to metres
     sizes = np.asarray([read_checked(image_size, _inside(file, name, views[0].image))] * len(views))
     K, poses = (
         np.stack([view.K for view in views]),

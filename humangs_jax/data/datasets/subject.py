@@ -55,7 +55,9 @@ class FileBody:
     """
 
     model: BodyModel
+    """The body model."""
     file: str = DEFAULT_BODY
+    """The path of its file, or the name of the shipped body."""
 
     @classmethod
     def load(cls, file: str | Path | None = None) -> "FileBody":
@@ -96,13 +98,14 @@ class FileBody:
 
 
 class BodyParameters(NamedTuple):
-    """Shape and poses of a person: coefficients (s,), axis-angle (m, j, 3) radians, translations
-    (m, 3) metres.
-    """
+    """The shape and the poses of a person."""
 
     betas: Float[np.ndarray, " s"]
+    """Shape coefficients, (s,)."""
     rotations: Float[np.ndarray, "m j 3"]
+    """Axis-angle rotations of the joints in each of the m poses, (m, j, 3), radians."""
     translations: Float[np.ndarray, "m 3"]
+    """The translation of each pose, (m, 3), metres."""
 
     def poses(self, rows: Sequence[int]) -> "BodyParameters":
         """The shape with these poses alone."""
@@ -112,16 +115,16 @@ class BodyParameters(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosedPerson:
-    """What a pose makes of a person.
-
-    rest: (n, 3) T-pose. vertices: (n, 3), joints: (j, 3) and joint_transforms: (j, 4, 4), rest ->
-    posed, translation included.
-    """
+    """What a pose makes of a person."""
 
     rest: Float[np.ndarray, "n 3"]
+    """The vertices in the T-pose, (n, 3), metres."""
     vertices: Float[np.ndarray, "n 3"]
+    """The posed vertices, (n, 3), metres."""
     joints: Float[np.ndarray, "j 3"]
+    """The posed joints, (j, 3), metres."""
     joint_transforms: Float[np.ndarray, "j 4 4"]
+    """From rest to posed for each joint, (j, 4, 4), translation included."""
 
 
 @jax.jit
@@ -279,27 +282,28 @@ THREADS = os.cpu_count() or 1
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Subject:
-    """One person, see the module.
-
-    name: what errors and manifests call it. K: (v, 3, 3) pixels of the photo as it is, centres at
-    +0.5. cam_from_world: (v, 4, 4), metres, OpenCV. sizes: (v, 2) width and height. frames: (v,)
-    the pose that a view shows, counted from 0.
-    frame_count: number of poses. view_name: view -> a name such as "cam03_00000120".
-    read: view -> image on white (h, w, 3) and mask (h, w), both in [0, 1]. parameters: frames ->
-    shape and these poses.
-    missing: reason -> how many photos are left out for it.
-    """
+    """One person, see the module."""
 
     name: str
+    """The name in errors and manifests."""
     K: Float[np.ndarray, "v 3 3"]
+    """The camera matrix of the photo as it is, (v, 3, 3), pixels, centres at +0.5."""
     cam_from_world: Float[np.ndarray, "v 4 4"]
+    """From the world to the camera, (v, 4, 4), metres, OpenCV axes."""
     sizes: Int[np.ndarray, "v 2"]
+    """Width and height of each photo, (v, 2), pixels."""
     frames: Int[np.ndarray, " v"]
+    """The pose that each view shows, (v,), counted from 0."""
     frame_count: int
+    """The number of poses."""
     view_name: Callable[[int], str]
+    """Gives a view a name such as "cam03_00000120"."""
     read: Callable[[int], tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]]
+    """Reads a view: the image on white (h, w, 3) and the mask (h, w), both in [0, 1]."""
     parameters: Callable[[Sequence[int]], BodyParameters]
+    """Gives the shape, and the poses of these frames."""
     missing: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """How many photos are left out, by the reason."""
 
     def __len__(self) -> int:
         """Number of views."""
@@ -405,8 +409,11 @@ class Person:
     """
 
     name: str
+    """The name of the subject."""
     open: Callable[[], Subject]
+    """Makes the `Subject`; raises ValueError if it cannot be used."""
     size: int = STORED_SIZE
+    """The side of the stored squares, pixels."""
 
     @functools.cached_property
     def subject(self) -> Subject:

@@ -50,26 +50,32 @@ fingers by as much."""
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """The body of a scan.
-
-    kind: see the module. parameters: of one pose. scale: scan units per metre. A vertex V of the
-    posed body (translation included) lies at V scale in the scan.
-    """
+    """The body of a scan."""
 
     file: Path
+    """The file of the fit."""
     kind: Kind
+    """Which of the three kinds of fits it is, see the module."""
     parameters: BodyParameters
+    """The parameters of the one pose."""
     scale: float
+    """Scan units per metre: a vertex V of the posed body (translation included) lies at V scale in
+    the scan.
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scan:
-    """A textured triangle mesh. uvs: (n, 2), v up. texture: (t, t, 3) bytes, row 0 on top."""
+    """A textured triangle mesh."""
 
     vertices: Float[np.ndarray, "n 3"]
+    """The vertices, (n, 3), scan units."""
     faces: Int[np.ndarray, "f 3"]
+    """Vertex indices, (f, 3)."""
     uvs: Float[np.ndarray, "n 2"]
+    """Texture coordinates of the vertices, (n, 2), v up."""
     texture: UInt8[np.ndarray, "th tw 3"]
+    """Colors as bytes, (th, tw, 3), row 0 on top."""
 
 
 def find_thuman(folder: str | Path) -> tuple[Path, ...]:
@@ -122,6 +128,7 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     """
     values = open_arrays(file)
     file = values.path
+    # which of the three kinds the fit is
     if ("transl" in values) == ("translation" in values):
         raise CaptureError(
             file,
@@ -142,6 +149,7 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
                 f" {len(hand)}",
             )
     kind: Kind = "C" if of_kind == "transl" else "A" if length == PCA_NUMBERS else "B"
+    # place and size; translations in scan units become metres
     scale = values.number("scale")
     if not scale > 0:
         raise CaptureError(file, "scale", f"expected a positive number, got {scale:g}")
@@ -149,6 +157,7 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     translation = checked_numbers(
         offset if kind == "C" else offset / scale, file, of_kind, largest=FARTHEST
     )
+    # poses: hands of principal components become angles, and the mean hand is added
     parts = [values.numbers(key, (1, size), LARGEST_ANGLE)[0] for key, size in _ANGLES.items()]
     if kind == "A":
         components = np.asarray(body.hands.components, np.float64)
@@ -157,6 +166,7 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     rotations = np.concatenate(
         [*parts, *(hand + means[side] for side, hand in enumerate(hands))]
     ).reshape(1, -1, 3)
+    # shape
     shape = [
         values.numbers(key, (1, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")
     ]

@@ -41,13 +41,14 @@ AHEAD = 2
 
 @dataclasses.dataclass
 class Waiting:
-    """How long a loop waited for its data: total seconds, of `items` items, of which the first took
-    `first_seconds`.
-    """
+    """How long a loop waited for its data."""
 
     seconds: float = 0.0
+    """The total, seconds."""
     first_seconds: float = 0.0
+    """What the first item took of it, seconds."""
     items: int = 0
+    """How many items the loop waited for."""
 
     def add(self, seconds: float) -> None:
         """One more item."""
@@ -59,24 +60,25 @@ class Waiting:
 
 @dataclasses.dataclass(frozen=True)
 class Loader:
-    """Batches from a source.
-
-    batch_size: subjects of the global batch, over all processes. seed: of order and views.
-    sharding: how a batch lies on the devices (only its first axis may be split); a process makes
-        the rows that its own devices hold, so that replicas hold equal rows. None: everything on
-        the default device.
-    first_step, first_example: where the numbering of examples starts: those of steps before had
-    other batches.
-    threads: that make examples.
-    """
+    """Batches from a source."""
 
     source: Source
+    """What makes the examples."""
     batch_size: int = 1
+    """Subjects of the global batch, over all processes."""
     seed: int = 0
+    """The seed of order and views."""
     sharding: jax.sharding.Sharding | None = None
+    """How a batch lies on the devices (only its first axis may be split); a process makes the rows
+    that its own devices hold, so that replicas hold equal rows. None: everything on the default
+    device.
+    """
     first_step: int = 0
+    """The step that the numbering of examples starts at: steps before it had other batches."""
     first_example: int = 0
+    """The number of the first example of that step."""
     threads: int = 4
+    """The number of threads that make examples."""
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -128,6 +130,7 @@ class Loader:
         waiting: the time that the loop waited for batches is added to it.
         """
         rows, begun = self.rows, collections.deque[list[Future]]()
+        # one thread places batches on the devices, so that they get there in order
         with (
             ThreadPoolExecutor(self.threads, "humangs-loader") as readers,
             ThreadPoolExecutor(1, "humangs-loader") as placer,
@@ -143,6 +146,7 @@ class Loader:
                 )
 
             try:
+                # the first batches; after these, one is begun for each that is taken
                 for step in range(start, min(start + AHEAD, stop)):
                     begin(step)
                 for step in range(start, stop):
@@ -154,6 +158,8 @@ class Loader:
                         waiting.add(time.perf_counter() - began)
                     yield step, batch
             finally:
+                # the caller has left the loop, or an example failed: what has not begun is not
+                # needed
                 for future in itertools.chain(*begun):
                     future.cancel()
 

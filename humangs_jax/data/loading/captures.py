@@ -152,8 +152,11 @@ class CaptureFolder:
     """A capture folder as a `StoredPerson`."""
 
     name: Path
+    """The path of the folder."""
     body: BodyModel
+    """The body model that the capture must have."""
     body_file: str | Path = DEFAULT_BODY
+    """The file that the body model was read from."""
 
     def summary(self) -> StoredSubject:
         """See `read_summary`."""
@@ -310,18 +313,19 @@ class CaptureCache(PeopleCache):
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
     """People on disk as a `Source`. Example e shows subject e mod n of a permutation drawn for each
-    pass over the n people.
-
-    input_size, target_size: pixels a side of the square views. depths: examples have depths, all
-    unknown, to be mixed with others that are known. A broken person is replaced by the next one in
-    the order.
+    pass over the n people. A broken person is replaced by the next one in the order.
     """
 
     cache: PeopleCache
+    """The people, as they are kept on disk and in memory."""
     sampling: ViewSampling
+    """How the views of an example are chosen."""
     input_size: int
+    """The side of the square input views, pixels."""
     target_size: int
+    """The side of the square target views, pixels."""
     depths: bool = False
+    """Whether examples have depths, all unknown, to be mixed with others that are known."""
 
     @property
     def input_counts(self) -> tuple[int, ...]:

@@ -50,19 +50,26 @@ class ViewSampling:
 
 
 class StoredSubject(NamedTuple):
-    """A decoded capture as bytes on the host; azimuths (v,) of the cameras, radians, are what views
-    are chosen by.
-    """
+    """A decoded capture as bytes on the host."""
 
     images: UInt8[np.ndarray, "v h w 3"]
+    """The photos on white, (v, h, w, 3)."""
     masks: UInt8[np.ndarray, "v h w"]
+    """The coverage by the person, (v, h, w)."""
     K: Float[np.ndarray, "v 3 3"]
+    """The camera matrices, (v, 3, 3), pixels."""
     cam_from_world: Float[np.ndarray, "v 4 4"]
+    """From the world to the cameras, (v, 4, 4), metres, OpenCV axes."""
     frames: Int[np.ndarray, " v"]
+    """The pose that each view shows, (v,)."""
     azimuths: Float[np.ndarray, " v"]
+    """The directions of the cameras, (v,), radians, which views are chosen by."""
     rotations: Float[np.ndarray, "m j 3"]
+    """Axis-angle rotations of the m poses, (m, j, 3), radians."""
     translations: Float[np.ndarray, "m 3"]
+    """Translations of the poses, (m, 3), metres."""
     betas: Float[np.ndarray, " s"]
+    """Shape coefficients, (s,)."""
 
     @classmethod
     def without_photos(
@@ -91,7 +98,9 @@ class Example:
     """One subject to learn from: input views and target views, possibly at another image size."""
 
     inputs: SubjectViews
+    """The views that the network sees."""
     targets: SubjectViews
+    """The views that its avatar is compared with."""
 
 
 @runtime_checkable
@@ -298,15 +307,16 @@ def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tup
 
 @dataclasses.dataclass(frozen=True)
 class Mixture:
-    """Sources mixed by weight, see `source_at`; weights: one positive number each, relative to each
-    other.
+    """Sources mixed by weight, see `source_at`.
 
     Raises: ValueError if there are not as many weights as sources, one is not positive, or the
     sources disagree on `input_counts` (a step has one).
     """
 
     sources: tuple[Source, ...]
+    """The sources."""
     weights: tuple[float | int, ...]
+    """A positive number for each source, relative to each other."""
 
     def __post_init__(self):
         if len(self.sources) != len(self.weights):

@@ -171,20 +171,22 @@ STEP = 1 << 15
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScanRenderer:
-    """A scan on the device, aligned, with a texture for each view's distance.
-
-    vertices, normals: (n, 3), faces: (f, 3), padded. uvs: (n, 2). scan: where the texture comes
-    from. texel: scan units a texel.
-    textures: the texture by the number of times it was halved; made when first used.
-    """
+    """A scan on the device, aligned, with a texture for each view's distance."""
 
     vertices: Float[Array, "n 3"]
+    """The aligned vertices, (n, 3), padded."""
     normals: Float[Array, "n 3"]
+    """Their normals, (n, 3), padded."""
     faces: Int[Array, "f 3"]
+    """Vertex indices, (f, 3), padded."""
     uvs: Float[Array, "n 2"]
+    """Texture coordinates, (n, 2)."""
     scan: Scan
+    """The scan that the texture comes from."""
     texel: float
+    """The side of a texel on the surface, scan units."""
     textures: dict[int, Float[Array, "th tw 3"]] = dataclasses.field(default_factory=dict)
+    """The texture by the number of times it was halved; each is made when it is first used."""
 
     @classmethod
     def of(cls, scan: Scan, vertices: Float[np.ndarray, "n 3"]) -> "ScanRenderer":

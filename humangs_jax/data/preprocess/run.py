@@ -113,15 +113,18 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What is in a set after a run. made: in this run. scenes, views: in all. skipped: name ->
-    reason.
-    """
+    """What is in a set after a run."""
 
     out: Path
+    """The folder of the set."""
     made: int
+    """The number of scenes made in this run."""
     scenes: int
+    """The number of scenes in all."""
     views: int
+    """The number of views in all."""
     skipped: dict[str, str]
+    """Why people were left out, by name."""
 
     def __str__(self) -> str:
         lines = [
@@ -323,16 +326,18 @@ def _write_lists(
 
 
 class View(NamedTuple):
-    """A view to be written. photo: None once it is written. frame: which of the poses it shows.
-
-    Lengths: of the scene.
-    """
+    """A view to be written. Lengths are those of the scene."""
 
     name: str
+    """The name of its files."""
     frame: int
+    """The pose that it shows, counted from 0."""
     K: Float[np.ndarray, "3 3"]
+    """The camera matrix, (3, 3), pixels."""
     cam_from_world: Float[np.ndarray, "4 4"]
+    """From the world to the camera, (4, 4)."""
     photo: Photo | None
+    """The image and the mask; None once they are written."""
 
     @property
     def files(self) -> tuple[str, str]:
@@ -342,20 +347,22 @@ class View(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Content:
-    """What is written of a scene.
-
-    transform: (4, 4) `mesh_transform`. posed: of each frame, before it. parameters: of each frame,
-    in metres. scale: units per metre. views: in the world after the transform, in units. known: for
-    the manifest; complete when the views have run out.
-    """
+    """What is written of a scene."""
 
     transform: Float[np.ndarray, "4 4"]
+    """From the source's world to the scene's, (4, 4), written as `mesh_transform`."""
     posed: Iterable[PosedPerson]
+    """The person in each frame, before the transform."""
     faces: np.ndarray
+    """Vertex indices of the body, (f, 3)."""
     parameters: BodyParameters
+    """The body parameters of all frames, metres."""
     scale: float
+    """Units of the scene per metre."""
     views: Iterator[View]
+    """The views in the world after the transform, in units."""
     known: dict[str, Any]
+    """Entries of the manifest; complete when the views have run out."""
 
 
 def _make_scan(
@@ -398,10 +405,12 @@ def _make_video(
     body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool
 ) -> None:
     """Frames of a video from all cameras, `every` apart."""
+    # the frames to take
     subject = DATASETS[settings.kind](source, body)
     chosen = np.flatnonzero(subject.frames % settings.every == 0)
     if not len(chosen):
         raise ValueError(f"{subject.name}: no photo of every {settings.every}th frame")
+    # the person of the first frame stands upright at the origin; cameras move along
     start = next(posed_people(body.model, subject.parameters([0])))
     transform = video_alignment(start.vertices, start.joints[PELVIS], start.joints[NECK])
     frames, shown = np.unique(subject.frames[chosen], return_inverse=True)
@@ -409,6 +418,7 @@ def _make_video(
     parameters = subject.parameters(frames.tolist())
     known: dict[str, Any] = {"missing": dict(subject.missing), "unreadable": {}}
 
+    # photos are read some at a time, as they are written; those that cannot be read are noted
     def views() -> Iterator[View]:
         with bar(total=len(chosen), desc=name, unit="photo", shown=progress) as done:
             for first in range(0, len(chosen), THREADS):
