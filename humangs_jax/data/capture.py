@@ -434,7 +434,7 @@ def _check_before_writing(capture: Capture) -> None:
     v, (height, width) = len(capture.images), capture.images.shape[1:3]
     cameras, poses = capture.cameras, capture.poses
     require_pinhole("a capture", cameras)
-    # `capture_from_arrays` makes one camera for each image, of its size; a `Capture` may hold others
+    # arrays give cameras of the images' number and size; a `Capture` may hold others
     if len(cameras.K) != v:
         raise CaptureError(
             "capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}"
