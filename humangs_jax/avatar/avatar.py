@@ -66,16 +66,16 @@ TINY = 1e-24
 
 @pytree_dataclass
 class Light:
-    """coefficients: (8,), of `light_terms`. normals: (g, 3), unit, of the body's surface in the
-    T-pose.
-
-    shading: (g,) log of the brightness in the photos: the colors of the Gaussians are those under
-    this light.
-    """
+    """The light of the photos, which other poses are drawn in."""
 
     coefficients: Float[Array, "8"]
+    """Weights of `light_terms`, (8,); their sum is the log of the brightness."""
     normals: Float[Array, "g 3"]
+    """Unit normals of the body's surface in the T-pose at each Gaussian, (g, 3)."""
     shading: Float[Array, " g"]
+    """Log of the brightness in the photos, (g,): the colors of the Gaussians are those under this
+    light.
+    """
 
 
 def light_values(light: Light | None) -> dict[str, tuple[Array | None, Values]]:
@@ -226,6 +226,7 @@ class Avatar(Batchable):
     parents: tuple[int, ...] = static_field()
     """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field()
+    """The name of each joint, in their order."""
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
     """Whether Gaussians take the full linear part of the blended transform, or its rotation."""
     rendering: Literal["exact", "inria"] = static_field(default="exact")
@@ -235,6 +236,7 @@ class Avatar(Batchable):
     face: Face | None = None
     """What poses with an expression need (`with_face`); None: the face is rigid."""
     one_at_a_time: ClassVar[bool] = True
+    """Functions of one avatar refuse a batch (`core.checks`)."""
 
     @property
     def gaussians_per_vertex(self) -> int | None:
@@ -301,6 +303,7 @@ class Avatar(Batchable):
         `load` would refuse the file, as it does numbers that are not finite.
         """
         require_concrete("Avatar.save", "writes a file", self)
+        # a file holds one avatar in the T-pose
         if self.batch_shape:
             raise ValueError(
                 f"expected one avatar, got a batch {self.batch_shape}: save each,"
@@ -312,6 +315,7 @@ class Avatar(Batchable):
             raise ValueError(
                 "gaussians.deformations: expected an avatar in the T-pose, which has none"
             )
+        # names and settings as JSON, numbers as arrays
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -324,6 +328,7 @@ class Avatar(Batchable):
             header["made_from"] = made_from
         values = {name: getattr(self.gaussians, name) for name in _ARRAYS[:5]}
         values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
+        # what only some avatars have
         if self.light is not None:
             values |= {f"light_{name}": getattr(self.light, name) for name in _LIGHT}
         values |= {
@@ -335,6 +340,7 @@ class Avatar(Batchable):
         }
         if self.face is not None:
             values |= _face_arrays(self.face)
+        # files that `load` would refuse are not written
         with reading(path, "avatar"):
             _check_arrays(values, len(self.parents))
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
@@ -455,14 +461,17 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
     )
     if expressions is None:
         return None
+    # a face is there whole or not at all
     keys = [f"face_{name}" for name in _FACE] + [f"face_hidden_{name}" for name in _ARRAYS[:5]]
     if missing := [key for key in keys if key not in of_face]:
         raise Refused(f"missing keys {missing}")
+    # sizes: g Gaussians, q hidden ones, m vertices that expressions move
     g, e = len(arrays["means"]), len(expressions.names)
     q, m = len(np.atleast_1d(of_face["face_hidden_means"])), len(expressions.vertices)
     check_indices("face_row", of_face["face_row"], (g,), m + 1)
     check_indices("face_beside", of_face["face_beside"], (m, None), m + 1)
     unit, lengths, any_number = (-ROUNDING, 1 + ROUNDING), (0.0, LARGEST), (-LARGEST, LARGEST)
+    # the shape of each array and the range of its numbers
     expected = {
         "eyes": ((g, 2), unit),
         "stretching": ((m, of_face["face_beside"].shape[1], 3), any_number),
@@ -481,6 +490,7 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
     for name, (shape, ends) in expected.items():
         check_array(f"face_{name}", of_face[f"face_{name}"], shape, *ends)
     loaded = {name: jnp.asarray(of_face[f"face_{name}"], jnp.float32) for name in expected}
+    # teeth, tongue and lids are Gaussians that are hidden at rest
     hidden = Gaussians(*(loaded.pop(f"hidden_{name}") for name in _ARRAYS[:5]))
     loaded |= {name: jnp.asarray(of_face[f"face_{name}"], jnp.int32) for name in ("row", "beside")}
     return Face(hidden=hidden, expressions=expressions, **loaded)
@@ -494,9 +504,11 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
             f"{'rest_vertices' if g else 'means'}: expected at least one"
             f" {'vertex' if g else 'Gaussian'}"
         )
+    # the range of the numbers in each array; others need only be finite
     unit, lengths = (-ROUNDING, 1 + ROUNDING), (0.0, LARGEST)
     ranges = {"scales": lengths, "low_pass": lengths, "opacities": unit, "skinning_weights": unit}
     ranges["light_normals"] = (-1 - ROUNDING, 1 + ROUNDING)
+    # what every avatar has, then what some have
     shapes = {
         "means": (g, 3),
         "quats": (g, 4),
@@ -519,5 +531,6 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
     for name in arrays:
         if name in shapes:
             check_array(name, arrays[name], shapes[name], *ranges.get(name, (-LARGEST, LARGEST)))
+    # what shapes and ranges do not say
     check_indices("faces", arrays["faces"], (None, 3), n)
     check_row_sums("skinning_weights", arrays["skinning_weights"])

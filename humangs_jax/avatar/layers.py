@@ -58,30 +58,34 @@ half precision has steps of 2 mm at 4 m."""
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExrView:
-    """One rendered view.
-
-    rgba: (h, w, 4) premultiplied colors and coverage. depth: (h, w) metres, or None. K,
-    cam_from_world: (3, 3) pixels and (4, 4) metres of its camera. name: of the part; unique in a
-    file. channels: further (h, w) images by name. attributes: strings for the header.
-    """
+    """One rendered view."""
 
     rgba: Float[np.ndarray, "h w 4"]
+    """Premultiplied colors and coverage, (h, w, 4)."""
     depth: Float[np.ndarray, "h w"] | None
+    """Distances along the camera's axis, (h, w), metres; None: not written."""
     K: Float[np.ndarray, "3 3"]
+    """The camera matrix, (3, 3), pixels."""
     cam_from_world: Float[np.ndarray, "4 4"]
+    """From the world to the camera, (4, 4), metres."""
     name: str
+    """The name of the part, unique in a file."""
     channels: Mapping[str, Float[np.ndarray, "h w"]] = dataclasses.field(default_factory=dict)
+    """Further images by name, (h, w) each."""
     attributes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Strings for the header, by name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExrLayers:
-    """The contents of an EXR file of views, besides colors. half: colors, normals and parts in 16
-    bits; Z and positions stay in 32, since half floats are 2 mm apart at 4 m.
-    """
+    """The contents of an EXR file of views."""
 
     layers: tuple[str, ...] = ("rgba", "z")
+    """The layers to write, of `LAYERS`; colors are always written."""
     half: bool = False
+    """Whether colors, normals and parts have 16 bits. Z and positions stay in 32, since half floats
+    are 2 mm apart at 4 m.
+    """
 
     def check(self) -> None:
         """Raises: ValueError naming a layer that does not exist."""
@@ -119,6 +123,7 @@ def write_views(
     """
     out, count = Path(out), len(poses)
     names = [f"view_{i:03d}" for i in range(count)] if names is None else names
+    # an EXR file is checked before anything is drawn
     if exr is not None:
         exr.check()
         most, size = limits().array_bytes, exr.bytes_of(count, cameras.width, cameras.height)
@@ -144,6 +149,7 @@ def write_views(
         if exr is not None:
             write_exr(folder / EXR_NAME, views, half=exr.half)
 
+    # views of an earlier call go, so that the folder holds those of this one
     old = [file.name for file in (*out.glob("view_*.png"), *out.glob(EXR_NAME))]
     add_files(out, write, without=old, ours=is_own_output)
     return count
@@ -161,11 +167,13 @@ def exr_view(
     """A view with its layers. rendering: of this avatar, pose and camera onto black."""
     layers, alpha = set(layers), np.asarray(rendering.alpha)
     channels, attributes = {}, {}
+    # positions follow from the depth
     if "position" in layers:
         positions = np.where(
             alpha[..., None] > 0, unprojected(camera, np.asarray(rendering.depth)), 0
         )
         channels |= {f"position.{axis}": positions[..., i] for i, axis in enumerate("XYZ")}
+    # normals and parts are drawn in one pass as values of the Gaussians
     values = {}
     if "normal" in layers:
         values["normal"] = gaussian_normals(avatar, pose)
@@ -182,6 +190,7 @@ def exr_view(
         )
         channels |= {f"normal.{axis}": normals[..., i] for i, axis in enumerate("XYZ")}
     if "part" in layers:
+        # each pixel that is covered shows one part
         channels["part"] = np.where(
             alpha >= COVERED, 1 + present[drawn["part"].argmax(axis=-1)], 0
         ).astype(np.float32)

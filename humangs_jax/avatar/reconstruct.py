@@ -190,9 +190,13 @@ class Reconstructed(NamedTuple):
     """A capture by name with its avatar, or with what is wrong with it."""
 
     name: str
+    """The name of the capture."""
     capture: Capture | None = None
+    """The capture; None if it could not be read."""
     avatar: Avatar | None = None
+    """The avatar; None if there is an error."""
     error: Exception | None = None
+    """What is wrong; None if nothing is."""
 
 
 def reconstruct_many(
@@ -529,6 +533,7 @@ def _check(capture: Capture, name: str) -> None:
     check_limit("network_views", capture.view_count, f"photos in {name}")
     require_pinhole(f"reconstruct: {name}", capture.cameras)
     views, height, width = (*np.shape(capture.images), 0, 0, 0)[:3]
+    # one photo, mask, camera and frame for each view, and a body that fits the poses
     shapes = {
         "images": (views, height, width, 3),
         "masks": None if capture.masks is None else (views, height, width),
@@ -542,11 +547,13 @@ def _check(capture: Capture, name: str) -> None:
     for field, shape in shapes.items():
         if shape is not None and (found := np.shape(operator.attrgetter(field)(capture))) != shape:
             raise ValueError(f"reconstruct: {name}: {field}: expected shape {shape}, got {found}")
+    # each view shows a pose that there is
     if not 0 <= np.min(capture.frames) <= np.max(capture.frames) < capture.frame_count:
         raise ValueError(
             f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got"
             f" {capture.frames}"
         )
+    # all numbers are finite, those of images in [0, 1]
     arrays = {
         "body.template": (capture.body.template, FINITE),
         "body.skinning_weights": (capture.body.skinning_weights, FINITE),

@@ -47,21 +47,25 @@ numbers in the capture.
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """One person. truth: the views to compare with. inputs: the photos that a reconstruction may
-    see; None: not known.
-    """
+    """One person to score a method on."""
 
     name: str
+    """The name of the person."""
     truth: Capture
+    """The views to compare with."""
     inputs: Capture | None = None
+    """The photos that a reconstruction may see; None: not known."""
 
 
 class Choice(NamedTuple):
     """Which views are inputs: see `find_people`."""
 
     inputs: int | None = None
+    """How many photos are inputs; None: the usual number."""
     indices: Indices | None = None
+    """Which views are inputs and targets, by person; None: evenly spaced ones."""
     reconstructs: bool = True
+    """Whether the method needs inputs."""
 
 
 ANY = Choice()
@@ -71,19 +75,22 @@ class People(NamedTuple):
     """Cases by name, each loaded when it is asked for."""
 
     names: tuple[str, ...]
+    """The names of the people."""
     load: Callable[[int], Case]
+    """Loads the case of a number."""
 
 
 class Predicted(NamedTuple):
-    """What a method shows of a case's views: images (v, h, w, 3) in [0, 1], alpha (v, h, w) or
-    None, and of which views;
-    missing: what was not found.
-    """
+    """What a method shows of a case's views."""
 
     images: Float[np.ndarray, "v h w 3"]
+    """The images of v of the views, (v, h, w, 3), in [0, 1]."""
     alpha: Float[np.ndarray, "v h w"] | None
+    """Their coverage, (v, h, w); None: not known."""
     views: tuple[int, ...]
+    """The numbers of these views in the case."""
     missing: tuple[str, ...] = ()
+    """The files that were not found."""
 
 
 Method = Callable[[Case, float], Predicted]

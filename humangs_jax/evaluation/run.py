@@ -74,11 +74,14 @@ ORDER = "mean over the images of a frame, then over the frames of a person, then
 
 
 class Column(NamedTuple):
-    """How a score is shown. better: "up", "down" or ""."""
+    """How a score is shown."""
 
     heading: str
+    """The heading of its column."""
     digits: int
+    """Digits after the point."""
     better: str
+    """Where better scores are: "up", "down" or "", if nowhere."""
 
 
 COLUMNS = {
@@ -182,21 +185,24 @@ LISTED = 5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What `evaluate` returns.
-
-    rows: one an image, in the order of the people. reasons: why scores are missing, by name.
-    missing: predictions that were not found. about: what was compared, for reports. gallery: the
-    images of the page.
-    """
+    """What `evaluate` returns."""
 
     name: str
+    """The name of the method."""
     protocol: EvaluationProtocol
+    """The protocol that was used."""
     protocol_name: str
+    """Its name in `PROTOCOLS`, or "custom"."""
     rows: tuple[Scored, ...]
+    """The scores of each image, in the order of the people."""
     reasons: dict[str, str]
+    """Why scores are missing, by the name of the score."""
     missing: tuple[str, ...]
+    """The predictions that were not found."""
     about: dict[str, Any]
+    """What was compared, for reports."""
     gallery: Gallery
+    """The images of the page."""
 
     @functools.cached_property
     def people(self) -> dict[str, Row]:
@@ -219,6 +225,7 @@ class Evaluation:
     def notes(self) -> list[str]:
         """What a reader must know besides."""
         notes = [f"Each number is the {ORDER}."]
+        # how sure the numbers are, and which are missing
         if any(mean is not None and mean.low is not None for mean in self.means.values()):
             over = next(mean.over for mean in self.means.values() if mean is not None)
             notes.append(
@@ -227,6 +234,7 @@ class Evaluation:
         for reason in dict.fromkeys(self.reasons.values()):
             scores = [COLUMNS[name].heading for name, why in self.reasons.items() if why == reason]
             notes.append(f"Missing: {', '.join(scores)}: {reason}.")
+        # what makes them unlike published numbers
         side = self.protocol.published_side
         if side is not None and self.about["sides"] != [[side, side]]:
             found = ", ".join(f"{width} x {height}" for width, height in self.about["sides"])
@@ -351,6 +359,7 @@ def evaluate(
     """
     if isinstance(protocol, str) and protocol not in PROTOCOLS:
         raise ValueError(f"no protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
+    # how images are compared, and by which networks
     rules = PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
     networks = {network.net: network for network in lpips}
     networks |= {
@@ -358,11 +367,13 @@ def evaluate(
         for net in rules.lpips
         if net not in networks and net in installed_lpips()
     }
+    # the people to score on, and the method to score
     choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
     people = find_people(
         source, inputs, choice, body, avatar is None and predictions is None and method is None
     )
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
+    # scores are kept with all that they depend on
     kept = None
     if keep is not None:
         own_key, key_of = method_key(len(people.names), avatar, weights, predictions, method)
@@ -378,6 +389,7 @@ def evaluate(
             "images": page_images,
         }
         kept = KeptScores(Path(keep), said, key_of, ordered=page_images > 0)
+    # one person at a time, so that memory holds the images of one
     rows, missing, scored, gallery = [], [], [], Gallery(page_images)
     for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
         case = people.load(index)
@@ -394,6 +406,7 @@ def evaluate(
         raise ValueError(
             f"no prediction was found; {len(missing)} were expected: {_listed(missing)}"
         )
+    # what was compared, for reports
     people_shown = {row.person for row in rows}
     about = {
         "source": printable(_told(source)),
@@ -408,6 +421,7 @@ def evaluate(
             and any(person["inputs"] is None for person in scored)
         ),
     }
+    # why scores are missing, so that no report has an empty column without a reason
     has = {part: all(person[part] for person in scored) for part in ("masks", "alpha")}
     reasons = missing_reasons(rules, networks, has["masks"], has["alpha"])
     unknown = [

@@ -86,16 +86,17 @@ class MaskBox:
 
 @dataclasses.dataclass(frozen=True)
 class SquareBox:
-    """The bounding box of the pixels where the mask is not 0, `margin` pixels wider where the image
-    goes on, made a square of background, and resampled to `side` pixels (bilinear, without a
-    filter).
+    """The bounding box of the pixels where the mask is not 0, with a margin where the image goes
+    on, made a square of background, and resampled (bilinear, without a filter).
 
     The box ends before the last row and column plus the margin, as in
     https://github.com/lizhe00/AnimatableGaussians/blob/master/eval/score.py.
     """
 
     margin: int = 50
+    """How much wider the box is on each side, pixels."""
     side: int = 512
+    """The side of the resampled square, pixels."""
 
     def cut(
         self, image: Image, mask: Float[np.ndarray, "h w"], background: float
@@ -118,16 +119,18 @@ class SquareBox:
 
 @dataclasses.dataclass(frozen=True)
 class CentredWindow:
-    """The image with its longer side brought to `side` pixels, and of that a window of height x
-    width: the bounding box of the pixels where the mask is not 0 in its middle, moved into the
-    image where it leaves it (metrics/compute_metrics.py of
-    https://github.com/humansensinglab/Generalizable-Human-Gaussians). A smaller image is taken
+    """The image brought to one size, and of that a window: the bounding box of the pixels where the
+    mask is not 0 in its middle, moved into the image where it leaves it (metrics/compute_metrics.py
+    of https://github.com/humansensinglab/Generalizable-Human-Gaussians). A smaller image is taken
     whole.
     """
 
     height: int = 1000
+    """The height of the window, pixels."""
     width: int = 500
+    """The width of the window, pixels."""
     side: int = 1024
+    """The longer side that the image is brought to first, pixels."""
 
     def cut(
         self, image: Image, mask: Float[np.ndarray, "h w"], background: float
@@ -148,23 +151,25 @@ class CentredWindow:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationProtocol:
-    """One way to compare.
-
-    background: behind the person, in truth and prediction. "dataset": the photos as they are;
-    renderings get white.
-    crop: what PSNR and SSIM see. lpips_crop: what LPIPS sees; None: the same.
-    masked: predictions are cut out by the true mask first, which hides errors of the silhouette.
-    lpips: networks under LPIPS. ssim: its window.
-    published_side: pixels a side of the published images; others are compared as they are.
-    """
+    """One way to compare."""
 
     background: Background = "white"
+    """What is behind the person, in truth and prediction. "dataset": the photos as they are;
+    renderings get white.
+    """
     crop: Crop = WholeFrame()
+    """What PSNR and SSIM see."""
     lpips_crop: Crop | None = None
+    """What LPIPS sees; None: the same."""
     masked: bool = False
+    """Whether predictions are cut out by the true mask first, which hides errors of the silhouette.
+    """
     lpips: tuple[Net, ...] = ("vgg",)
+    """The networks under LPIPS."""
     ssim: SsimWindow = GAUSSIAN
+    """The window of SSIM."""
     published_side: int | None = None
+    """The side of the published images, pixels; others are compared as they are."""
 
     @property
     def behind(self) -> float:
@@ -221,21 +226,28 @@ class Scored(NamedTuple):
     """An image's place and scores."""
 
     person: str
+    """The name of the person."""
     frame: int
+    """The frame that the image shows."""
     view: str
+    """The name of the view."""
     scores: Row
+    """The scores of the image."""
 
 
 class Mean(NamedTuple):
-    """A mean and its interval of `CONFIDENCE`; count: how many of `over` it is of. low and high are
-    None for one.
-    """
+    """A mean and its interval of `CONFIDENCE`."""
 
     mean: float
+    """The mean."""
     low: float | None
+    """The lower end of the interval; None for a mean of one."""
     high: float | None
+    """The upper end; None for a mean of one."""
     count: int
+    """How many the mean is of."""
     over: str
+    """What they are: people, frames or images."""
 
 
 def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
@@ -405,6 +417,7 @@ def score_image(
     predicted, truth: in [0, 1], on the protocol's background. mask: the true one. alpha: the
     prediction's coverage.
     """
+    # scores of the person need somebody in the mask
     empty = mask is None or not (mask > 0.5).any()
     predicted, window, row = (
         np.clip(predicted, 0, 1),
@@ -413,6 +426,7 @@ def score_image(
     )
     if protocol.masked and mask is not None:
         predicted = predicted * mask[..., None] + protocol.behind * (1 - mask[..., None])
+    # the whole image or its crop; LPIPS may have a crop that differs
     for crop in protocol.crops:
         if empty and not isinstance(crop, WholeFrame):
             continue
@@ -427,10 +441,12 @@ def score_image(
         for net in protocol.lpips if crop is protocol.crops[-1] else ():
             if net in networks and least >= smallest_side(BACKBONES[net]):
                 row[f"lpips_{net}"] = _lpips(networks[net], *pair, size)
+    # the silhouette
     if mask is not None:
         row["foreground"] = np.mean(mask)
         if alpha is not None:
             row |= alpha_scores(_padded(alpha), _padded(mask))
+    # the person alone, and patches of the person
     if not empty:
         frame = [_padded(x) for x in (predicted, truth, mask, boundary_band(mask))]
         scores, kept = person_scores(*frame, jnp.asarray(mask.shape), window)
@@ -548,14 +564,16 @@ def on_background(
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """Means over views. psnr and psnr_fg in dB, ssim by scikit-image, foreground: share of the true
-    mask.
-    """
+    """Means over views."""
 
     psnr: float
+    """PSNR of the whole image, dB."""
     ssim: float
+    """SSIM as scikit-image computes it."""
     psnr_fg: float
+    """PSNR of the foreground, dB."""
     foreground: float
+    """The share of the image that the true mask covers."""
 
 
 def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:

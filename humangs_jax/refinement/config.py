@@ -41,8 +41,11 @@ class LearningRates:
     quats: Spread = 2e-3
     """Of quaternions that start at unit length."""
     log_scales: Spread = 1e-2
+    """The rate of the logarithms of the scales."""
     opacity_logits: Spread = 3e-2
+    """The rate of the logits of the opacities."""
     color_logits: Spread = 4e-2
+    """The rate of the logits of the colors."""
 
 
 @configuration
@@ -94,6 +97,7 @@ class RefineConfig:
     optimizer: Literal["adam", "adabelief", "lion", "rmsprop", "sgd"] = "adam"
     """What scales the gradients, by its name in optax. The rates suit the steps of Adam."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
+    """How far a step moves each parameter."""
     full_steps: Steps = 100
     """After iterations, a run of more steps than this takes smaller ones in proportion: Gaussians
     that move further overfit to the photos."""

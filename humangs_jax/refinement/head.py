@@ -62,16 +62,18 @@ PARTS = 10
 
 
 class Crops(NamedTuple):
-    """moved: (g,) the Gaussians of the head. drawn: the numbers of those that the crops show.
-    views: the crops. finer: whether these have smaller pixels than the other steps have seen.
-    splat: how they are drawn, with buffers.
-    """
+    """Crops of the photos around the head, and the Gaussians that they are about."""
 
     moved: Bool[np.ndarray, " g"]
+    """Which Gaussians are those of the head, (g,)."""
     drawn: Int[np.ndarray, " d"]
+    """The indices of those that the crops show, (d,)."""
     views: SubjectViews
+    """The crops."""
     finer: bool
+    """Whether the crops have smaller pixels than the other steps have seen."""
     splat: SplatConfig
+    """How they are drawn, with buffers."""
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:

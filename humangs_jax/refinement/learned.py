@@ -61,42 +61,42 @@ knows, and take longer.
 
 @pytree_dataclass
 class Signals:
-    """What photos say about g Gaussians; without the axis v: one photo.
-
-    gradients: of the sum of squared errors of colors and coverage; those of the Gaussians' colors
-    by the foreground alone.
-    visibility: largest weight on a pixel. pixels: sum of the weights.
-    """
+    """What photos say about g Gaussians. Without the axis v it is one photo."""
 
     gradients: Float[Array, "*v g 14"]
+    """Gradients of the sum of squared errors of colors and coverage, (v, g, 14); those of the
+    Gaussians' colors by the foreground alone.
+    """
     visibility: Float[Array, "*v g"]
+    """The largest weight of each Gaussian on a pixel, (v, g)."""
     pixels: Float[Array, "*v g"]
+    """The sum of its weights over the pixels, (v, g)."""
 
 
 @pytree_dataclass
 class Neighbors:
-    """A symmetric graph. index: the neighbours of each point, itself where it has fewer.
-
-    share: 1 / their number, else 0.
-    """
+    """A symmetric graph."""
 
     index: Int[Array, "g k"]
+    """The neighbours of each point, (g, k); itself where it has fewer."""
     share: Float[Array, "g k"]
+    """1 / their number where there is a neighbour, else 0, (g, k)."""
 
 
 @pytree_dataclass
 class Graph:
-    """Of g Gaussians at two levels.
-
-    gaussians, clusters: the neighbours at each. members: the Gaussians of each cluster. nearest:
-    the clusters around each Gaussian. weights: of those, by distance; they sum to 1.
-    """
+    """The graph of g Gaussians, and that of the clusters that they form."""
 
     gaussians: Neighbors
+    """The neighbours of each Gaussian."""
     clusters: Neighbors
+    """The neighbours of each cluster."""
     members: Int[Array, "c m"]
+    """The Gaussians of each cluster, (c, m)."""
     nearest: Int[Array, "g n"]
+    """The clusters nearest to each Gaussian, (g, n)."""
     weights: Float[Array, "g n"]
+    """The weights of these clusters by distance, (g, n); they sum to 1."""
 
 
 def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
@@ -170,16 +170,16 @@ neighbor_mean.defvjp(_mean_forward, _mean_backward)
 
 
 class Refiner(nn.Module):
-    """The network of an iteration.
-
-    width: of its features. layers, cluster_layers: of messages between neighbours. per_photo: width
-    for a photo.
-    """
+    """The network of an iteration."""
 
     width: int = 48
+    """The width of its features."""
     layers: int = 2
+    """How often Gaussians exchange messages with their neighbours."""
     cluster_layers: int = 3
+    """How often clusters do."""
     per_photo: int = 32
+    """The width of the features of one photo."""
 
     @nn.compact
     def __call__(
@@ -195,12 +195,14 @@ class Refiner(nn.Module):
         before the first one.
         """
         dense = lambda name, width: nn.Dense(width, name=name)
+        # what each photo says about a Gaussian; photos that hardly show it count less
         errors = _relative_errors(values, signals)
         seen = jnp.minimum(signals.visibility / SEEN, 1.0)[..., None]
         logs = jnp.log(signals.pixels[..., None] + 0.1)
         photo = jnp.concatenate([errors, signals.visibility[..., None], logs], axis=-1)
         photo = nn.relu(dense("photo_0", self.per_photo)(photo))
         photo = dense("photo_1", self.per_photo)(photo) * seen
+        # photos are pooled, so that their order does not matter
         pooled = [
             jnp.sum(photo, axis=0) / 2,
             jnp.max(photo, axis=0),
@@ -208,6 +210,7 @@ class Refiner(nn.Module):
             jnp.max(seen, axis=0),
             jnp.sum(errors * seen, axis=0) / jnp.maximum(jnp.sum(seen, axis=0), 1e-3),
         ]
+        # what the Gaussian is like, and how far it has moved
         own = [
             values[:, :3] - center,
             values[:, 3:7],
@@ -217,6 +220,7 @@ class Refiner(nn.Module):
             (values - start) / LARGEST_MOVES,
         ]
         features = dense("enter", self.width)(jnp.concatenate([*pooled, *own, hidden], axis=-1))
+        # messages from far by the clusters, from near by the neighbours
         features = features + self.from_clusters(features, graph)
         for i in range(self.layers):
             normed = nn.LayerNorm(name=f"norm_{i}")(features)
@@ -227,6 +231,7 @@ class Refiner(nn.Module):
                 dense(f"update_{i}_0", self.width)(jnp.concatenate([normed, message], axis=-1))
             )
             features = features + dense(f"update_{i}_1", self.width)(update)
+        # an untrained network moves nothing
         normed = nn.LayerNorm(name="norm")(features)
         moves = nn.Dense(COLUMNS, kernel_init=nn.initializers.zeros, name="moves")(normed)
         return values + moves * LARGEST_MOVES, features

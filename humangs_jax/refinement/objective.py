@@ -167,18 +167,18 @@ def loss_gradient(image: Image, photo: Photo, config: RefineConfig) -> Image:
 
 @pytree_dataclass
 class Comparison:
-    """Comparison of an avatar with a photo (or with each of some, leading axis v).
-
-    squared: sum over the pixels that count, `pixels` of them, of the squared error. visibility:
-    (g,) the largest weight of each Gaussian on any pixel. overflow: what the buffers had no room
-    for.
-    """
+    """Comparison of an avatar with a photo (or with each of some, leading axis v)."""
 
     loss: Float[Array, "*v"]
+    """The loss, see `image_loss`."""
     squared: Float[Array, "*v"]
+    """The sum of the squared errors over the pixels that count."""
     pixels: Float[Array, "*v"]
+    """The number of these pixels."""
     visibility: Float[Array, "*v g"]
+    """The largest weight of each Gaussian on any pixel, (g,)."""
     overflow: Int[Array, "*v"]
+    """The (splat, tile) pairs that the buffers had no room for."""
 
     def together(self) -> "Comparison":
         """With all photos: the mean loss, sums of the errors, the largest visibility."""

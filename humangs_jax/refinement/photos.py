@@ -33,11 +33,17 @@ class Photo(Batchable):
     """A view to compare with, and which of its pixels count."""
 
     image: Float[Array, "h w 3"]
+    """The photo on white, (h, w, 3), in [0, 1]."""
     mask: Float[Array, "h w"]
+    """The coverage by the person, (h, w), in [0, 1]."""
     counted: Bool[Array, "h w"]
+    """Which pixels count, (h, w)."""
     camera: Camera
+    """The camera that sees the crop."""
     rotations: Float[Array, "j 3"]
+    """Axis-angle rotations of the joints, (j, 3), radians."""
     translation: Float[Array, "3"]
+    """The translation of the body, (3,), metres."""
 
 
 def photos_of(views: SubjectViews) -> Photo:

@@ -39,14 +39,17 @@ class Refinement:
     avatar: Avatar
     """The best state of the run."""
     iterations: int
-    """Of the learned update; 0 if they were not kept."""
+    """Iterations of the learned update; 0 if they were not kept."""
     steps: int
-    """Of the optimizer, with those of the trial."""
+    """Steps of the optimizer, with those of the trial."""
     seconds: float
-    """Of the run, without compilation."""
+    """The time of the run without compilation."""
     compile_seconds: float
+    """The time of compilation, seconds."""
     loss: tuple[float, float]
-    """Of the avatar that came and of the one that is returned, over the photos that were fitted."""
+    """The loss of the avatar that came and of the one that is returned, over the photos that were
+    fitted.
+    """
     psnr: tuple[float, float]
     """The same in dB over the crops."""
     kept: bool
@@ -59,7 +62,7 @@ class Refinement:
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
     head_steps: int = 0
-    """Of the optimizer, on the head alone; 0 if they were not kept."""
+    """Steps of the optimizer on the head alone; 0 if they were not kept."""
 
     def summary(self) -> str:
         """One line."""

@@ -167,33 +167,39 @@ class Clock:
 
 
 class Task(NamedTuple):
-    """What a run works with.
-
-    avatar: with the low-pass of the photos. fresh: the same with the scales that the learned update
-    was trained with, without any low-pass of its own. photos: with all their pixels. seen:
-    likewise, without the pixels that are held out. config: the user's.
-    settings: what programs are compiled for, the same for runs of 5 s and of 15 s.
-    """
+    """What a run works with."""
 
     avatar: Avatar
+    """The avatar with the low-pass of the photos."""
     fresh: Avatar
+    """The same with the scales that the learned update was trained with: the low-pass that the
+    avatar came with is undone.
+    """
     photos: list[Photo]
+    """The photos, with all their pixels."""
     seen: list[Photo]
+    """The photos without the pixels that are held out."""
     graph: Graph | None
+    """The graph of the learned update; None without iterations."""
     config: RefineConfig
+    """The user's configuration."""
     settings: RefineConfig
+    """The configuration that programs are compiled for, the same for runs of 5 s and of 15 s."""
     clock: Clock
+    """The time and the number of steps of the run."""
 
 
 class Found(NamedTuple):
-    """What a run has found. iterations: that the state has had. used: the photos to fit. kept:
-    whether it is the best so far.
-    """
+    """What a run has found."""
 
     state: RefineState
+    """The state of the Gaussians."""
     iterations: int
+    """How many iterations of the learned update the state has had."""
     used: Int[np.ndarray, " n"]
+    """The numbers of the photos to fit, (n,)."""
     kept: bool = True
+    """Whether the state is the best so far."""
 
 
 def prepare(

@@ -48,23 +48,26 @@ OPTIMIZERS: dict[str, Callable[[], optax.GradientTransformation]] = {
 
 @pytree_dataclass
 class RefineState:
-    """All that steps change, and what they know of the run.
-
-    start: the parameters before the first step. trust: (g,) share of the rates at which a Gaussian
-    moves. moments: those of the optimizer. overflow: (splat, tile) pairs for which the last step
-    had no room. splat: how photos are drawn, with buffers. done,
-    total: steps. share: of the rates, in the whole run.
-    """
+    """All that steps change, and what they know of the run."""
 
     parameters: UnconstrainedGaussians
+    """The parameters of the Gaussians."""
     start: UnconstrainedGaussians
+    """The parameters before the first step, which some are pulled towards."""
     trust: Float[Array, " g"]
+    """The share of the rates at which a Gaussian moves, (g,), in [0, 1]."""
     moments: PyTree
+    """The optimizer's state."""
     overflow: Int[Array, ""]
+    """The (splat, tile) pairs that the last step had no room for."""
     splat: SplatConfig
+    """How photos are drawn, with buffers."""
     done: Int[Array, ""] | int = 0
+    """The number of steps done."""
     total: Int[Array, ""] | int = 1
+    """The number of steps of the whole run."""
     share: Float[Array, ""] | float = 1.0
+    """The share of the learning rates in this run, see `RefineConfig.full_steps`."""
 
 
 def init_state(

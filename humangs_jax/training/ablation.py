@@ -47,15 +47,20 @@ People = int | Sequence[str | Path] | MakeSource
 
 
 class AblationRow(NamedTuple):
-    """A variant. interval: half of the 95 % interval of `difference` by Student's t over paired
-    seeds; None below two pairs.
-    """
+    """A variant beside the base."""
 
     name: str
+    """The name of the variant."""
     seeds: int
+    """How many seeds it has a score of."""
     mean: float
+    """The mean score over these."""
     difference: float
+    """The mean difference from the base, over the seeds that both have."""
     interval: float | None
+    """Half of the 95 % interval of `difference` by Student's t over paired seeds; None below two
+    pairs.
+    """
 
     @property
     def clear(self) -> bool:
@@ -65,16 +70,18 @@ class AblationRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Ablation:
-    """What `ablate` found. scores: of each variant, `metric` by seed. missing: runs that the budget
-    had no room for.
-    longest: seconds of the longest run, those of the base and of each variant compile a program of
-    their own.
-    """
+    """What `ablate` found."""
 
     metric: str
+    """The name of the score."""
     scores: dict[str, dict[int, float]]
+    """The score of each variant by seed."""
     missing: int = 0
+    """How many runs the budget had no room for."""
     longest: float = 0.0
+    """What the longest run took, seconds. The first run of the base and of each variant compiles a
+    program.
+    """
 
     @property
     def rows(self) -> list[AblationRow]:

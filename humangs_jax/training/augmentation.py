@@ -23,31 +23,34 @@ from humangs_jax.geometry.camera import Camera
 
 @configuration
 class Augmentation:
-    """Standard deviations of normal distributions, unless said otherwise; one draw for each photo,
-    or for each example.
-
-    exposure: of every photo, natural logarithm of the gain. tint: of each channel of a photo,
-    likewise.
-    share: of the examples that are disturbed in the other ways, too; 0: nothing is disturbed, and
-    no work.
-    mask_pixels: masks are eroded or dilated by up to this, uniform, and the color of some
-    background appears there.
-    camera_degrees: of a camera about the person. camera_metres: its shift, each axis.
-    pose_degrees: each axis of each joint, the same in all photos of an example, as are the
-    following.
-    body_metres: each axis of the translation. betas: each shape coefficient; the wrong shape is
-    also that of the targets.
+    """Standard deviations of normal distributions, unless a field says otherwise; one draw for each
+    photo, or for each example.
     """
 
     share: Share = 0.0
+    """The share of the examples that are disturbed in other ways than by exposure and tint. 0:
+    nothing is disturbed at all, and no work is done.
+    """
     exposure: Spread = 0.08
+    """The spread of the natural logarithm of the gain of each photo."""
     tint: Spread = 0.03
+    """The spread of the natural logarithm of the gain of each channel of a photo."""
     mask_pixels: Annotated[int, Range(0, 64)] = 2
+    """Masks are eroded or dilated by up to this, uniformly; the color of some background appears
+    there.
+    """
     camera_degrees: Annotated[float, Range(0, 360)] = 0.25
+    """The spread of the turn of a camera about the person, degrees."""
     camera_metres: Spread = 0.002
+    """The spread of the shift of a camera along each axis, metres."""
     pose_degrees: Annotated[float, Range(0, 360)] = 0.15
+    """The spread of each axis of each joint, degrees, the same in all photos of an example."""
     body_metres: Spread = 0.002
+    """The spread of each axis of the translation, metres, the same in all photos of an example."""
     betas: Spread = 0.1
+    """The spread of each shape coefficient, the same in all photos of an example; the wrong shape
+    is also that of the targets.
+    """
 
 
 def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -> Example:

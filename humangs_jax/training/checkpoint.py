@@ -175,6 +175,7 @@ class Checkpoints:
                 described = self._ocp.StandardCheckpointHandler().metadata(
                     self._manager.directory / str(step) / "default"
                 )
+                # another model has other shapes: it is refused before anything is read
                 shapes = sorted(
                     x.shape for x in jax.tree.leaves(getattr(described, "tree", described))
                 )
@@ -187,12 +188,14 @@ class Checkpoints:
                 state = TrainState(**jax.tree.map(_placed_as, restored, wanted))
         except (FileError, FileNotFoundError) as error:
             problem = str(error)
+        # a checkpoint may be whole and still hold other numbers
         recorded = (self._manager.metrics(step) or {}).get(CHECKSUM)
         if state is not None and recorded != (found := _checksum(state)):
             state, problem = (
                 None,
                 f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}",
             )
+        # one process that cannot read it stops all, or they would go on from different steps
         if not _everywhere(state is not None).all():
             state, problem = None, problem or f"{path}: damaged, as another process found"
         return state, problem

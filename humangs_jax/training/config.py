@@ -56,6 +56,7 @@ class OptimizerConfig:
     learning_rate: Spread = 4e-4
     """The peak, reached after `warmup_steps` from 0, then a cosine to 0 at the end of the run."""
     warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
+    """Steps over which the learning rate rises from 0 to its peak."""
     betas: tuple[Below, Below] = (0.9, 0.95)
     """Of the running means of gradients and of their squares."""
     weight_decay: Spread = 0.05
@@ -73,10 +74,15 @@ class Stage:
     """
 
     start: Steps
+    """The step at which the stage begins."""
     image_size: InputSide | None = None
+    """Side of the input photos, pixels."""
     token_capacity: Room | None = None
+    """Tokens that the network has room for."""
     target_size: Side | None = None
+    """Side of the targets, pixels."""
     batch_size: Few | None = None
+    """Subjects per step."""
 
 
 STAGED = {
@@ -96,11 +102,17 @@ class TrainConfig:
     """
 
     model: HumanGSConfig = dataclasses.field(default_factory=presets.small)
+    """The network."""
     views: ViewSampling = ViewSampling()
+    """How the views of an example are chosen."""
     loss: LossConfig = LossConfig()
+    """The weights of the terms of the loss."""
     augmentation: Augmentation = Augmentation()
+    """How examples are disturbed."""
     optimizer: OptimizerConfig = OptimizerConfig()
+    """The optimizer and its learning rate."""
     splat: SplatConfig = SplatConfig()
+    """How targets are drawn."""
     target_size: Side = 128
     """Side of the targets, pixels."""
     steps: Steps = 20_000
@@ -124,10 +136,13 @@ class TrainConfig:
     ema_decay: Share | None = None
     """Of the averaged parameters, None for none."""
     seed: Seed = 0
+    """The seed of the first parameters, the order of the people and all that is drawn at random."""
     log_every: Steps = 20
-    """Steps, as the following."""
+    """Steps between two lines of the log."""
     validate_every: Steps = 1000
+    """Steps between two validations."""
     checkpoint_every: Steps = 1000
+    """Steps between two checkpoints."""
     keep_checkpoints: Steps = 2
     """Newest checkpoints to keep, besides the best."""
 

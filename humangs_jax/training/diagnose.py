@@ -46,18 +46,22 @@ PARTS, DEEPEST = (("encoder",), ("reader",), ("decoder",)), 3
 
 @dataclasses.dataclass(frozen=True)
 class Leaf:
-    """Numbers of one array. bad: entries that are not finite, the first of them at index `first`.
-    Of the finite entries: smallest and largest (+-inf without any), the mean of their magnitudes,
-    their Euclidean norm.
-    """
+    """Numbers of one array. All but `bad` and `first` are those of its finite entries."""
 
     name: str
+    """The path of the array in its pytree."""
     bad: int
+    """How many entries are not finite."""
     first: tuple[int, ...]
+    """The index of the first of these; () if there is none."""
     smallest: float
+    """The smallest entry, +inf without any."""
     largest: float
+    """The largest entry, -inf without any."""
     mean: float
+    """The mean of the magnitudes."""
     norm: float
+    """The Euclidean norm."""
 
     @classmethod
     def of(cls, name: str, array: np.ndarray) -> "Leaf":
@@ -72,15 +76,18 @@ class Leaf:
 
 @pytree_dataclass
 class StageReport:
-    """values: what a stage gave (or what was stored there). taken, returned: gradients at what it
-    took and gave. gradients: those of its parameters. Arrays by name, or `Leaf`s of them.
-    """
+    """What went through a stage forward and back: arrays by name, or `Leaf`s of them."""
 
     name: str = static_field()
+    """The name of the stage."""
     values: Named
+    """What the stage gave, or what was stored there."""
     taken: Named = dataclasses.field(default_factory=dict)
+    """Gradients with respect to what it took."""
     returned: Named = dataclasses.field(default_factory=dict)
+    """Gradients with respect to what it gave."""
     gradients: Named = dataclasses.field(default_factory=dict)
+    """Gradients with respect to its parameters."""
 
     @property
     def gradient_norm(self) -> float:
@@ -118,8 +125,11 @@ class Fault:
     """
 
     direction: Literal["stored", "forward", "backward"]
+    """How the array came to be: stored, computed (forward) or sent back (backward)."""
     stage: str
+    """The name of the stage."""
     leaf: Leaf
+    """The numbers of the array."""
 
     def __str__(self) -> str:
         what = {
@@ -145,11 +155,17 @@ class Diagnosis:
     """
 
     step: int
+    """Steps done before this one."""
     subject: int
+    """The row of the subject in the batch."""
     loss: float
+    """The loss of the subject."""
     skip_norm: float
+    """Steps whose gradient is longer than this are skipped."""
     stored: tuple[StageReport, ...]
+    """What the step began with: state and batch."""
     stages: tuple[StageReport, ...]
+    """The stages in the order in which they end."""
 
     @property
     def gradient_norm(self) -> float:
@@ -205,6 +221,7 @@ class Diagnosis:
         )
 
     def __str__(self) -> str:
+        # one line for the step, then a row for each stage
         title = (
             f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm"
             f" {self.gradient_norm:.4g}"
@@ -221,6 +238,7 @@ class Diagnosis:
                 "norm",
             )
         ]
+        # entries that are not finite: none is 0, and no array at all is an empty cell
         bad = lambda leaves: str(sum(leaf.bad for leaf in leaves.values())) if leaves else ""
         for report in (*self.stored, *self.stages):
             leaves, columns = (

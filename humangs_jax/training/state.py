@@ -24,17 +24,18 @@ INFINITY_STAND_IN = 1e-6
 
 @pytree_dataclass
 class TrainState:
-    """step: steps done, skipped ones included. params, batch_stats: of the network
-    (`init_humangs`).
-
-    opt_state: of `make_optimizer`. ema_params: running average of params, or None.
-    """
+    """All that a step of training changes."""
 
     step: Int[Array, ""]
+    """Steps done, skipped ones included."""
     params: PyTree
+    """The parameters of the network (`init_humangs`)."""
     batch_stats: PyTree
+    """The batch statistics of the network."""
     opt_state: PyTree
+    """The state of `make_optimizer`."""
     ema_params: PyTree | None
+    """The running average of `params`; None: there is none."""
 
     @property
     def variables(self) -> Variables:
@@ -57,16 +58,16 @@ def init_state(config: TrainConfig, variables: Variables | None = None) -> Train
 
 
 class GuardState(NamedTuple):
-    """skipped: steps skipped so far. nonfinite: steps so far whose loss or gradient was not finite,
-    skipped or not.
-
-    norm: gradient norm of the last step, made finite, before clipping. inner: what is guarded.
-    """
+    """The state of `guard`."""
 
     skipped: Int[Array, ""]
+    """Steps skipped so far."""
     nonfinite: Int[Array, ""]
+    """Steps so far whose loss or gradient was not finite, skipped or not."""
     norm: Float[Array, ""]
+    """The norm of the last gradient, made finite, before clipping."""
     inner: PyTree
+    """The state of the optimizer that is guarded."""
 
 
 def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:

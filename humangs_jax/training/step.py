@@ -83,12 +83,14 @@ def subject_loss(
     axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
     """Loss of one subject, with the updated batch statistics and metrics."""
+    # the avatar of the inputs, in training mode
     if config.augmentation.share:
         example = augment(jax.random.fold_in(key, AUGMENTED), example, body, config.augmentation)
     variables, targets = {"params": params, "batch_stats": batch_stats}, example.targets
     outputs, batch_stats = reconstruct_example(
         variables, body, example.inputs, config, True, axis_name
     )
+    # targets on random backgrounds, so that coverage is learned; drivers without it stay on white
     driver = config.model.architecture.driver
     colored = config.loss.random_background if driver is None or driver.has_alpha else 0.0
     backgrounds = random_backgrounds(key, len(targets.translations), colored)
@@ -98,6 +100,7 @@ def subject_loss(
     compare = lambda drawn: loss_terms(
         drawn, images, targets.masks, targets.depths, config.loss, networks
     )
+    # the terms of the loss, and what the log shows
     terms = stage("loss", compare, drawn, apart=True)
     metrics = {
         **terms,

@@ -64,19 +64,22 @@ WEIGHTS = 4
 class BodyMesh:
     """A textured mesh in T-pose. A vertex of the body stands once for each chart of the texture
     that it is in.
-
-    vertices: (u, 3) metres. normals: (u, 3). faces: (f, 3), counter-clockwise from outside. uvs:
-    (u, 2), v up. texture: (t, t, 3) bytes, row 0 on top (v = 1). weights: (u, j) skinning weights,
-    rows sum to 1. source: (u,) which vertex each is of the body.
     """
 
     vertices: Float[np.ndarray, "u 3"]
+    """The vertices, (u, 3), metres."""
     normals: Float[np.ndarray, "u 3"]
+    """Unit normals, (u, 3)."""
     faces: Int[np.ndarray, "f 3"]
+    """Vertex indices, (f, 3), counter-clockwise from outside."""
     uvs: Float[np.ndarray, "u 2"]
+    """Texture coordinates, (u, 2), v up."""
     texture: UInt8[np.ndarray, "t t 3"]
+    """Colors as bytes, (t, t, 3), row 0 on top (v = 1)."""
     weights: Float[np.ndarray, "u j"]
+    """Skinning weights, (u, j); rows sum to 1."""
     source: Int[np.ndarray, " u"]
+    """Which vertex of the body each one is, (u,)."""
 
     def posed(self, avatar: Avatar, pose: BodyPose) -> "BodyMesh":
         """The mesh in a pose of the avatar's joints; normals by the rotations of blended

@@ -43,12 +43,14 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
     with open_archive(io.BytesIO(data), len(data)) as archive:
         root = _root(archive)
         meta = parse_json(_member(archive, root + META, "text_bytes").decode("utf-8"))
+        # the description in the bundle: other versions store other pictures
         if not isinstance(meta, dict) or meta.get("version") != VERSION:
             found = shown(meta.get("version")) if isinstance(meta, dict) else "none"
             convert = "`npx @playcanvas/splat-transform scene.sog scene.ply` makes a .ply of it"
             raise Refused(f"{META}: version {found}, expected {VERSION}: {convert}")
         if (model := meta.get("model", USUAL)) != USUAL:
             said.append(f"model {shown(model)} is not applied (SplatConfig.antialiased draws such)")
+        # one pixel of a picture holds one Gaussian
         count = _whole(meta.get("count"), "count")
         check_limit("gaussians", count, "Gaussians")
         pictures = lambda part, number: [
@@ -57,6 +59,7 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
         low, high = pictures("means", 2)
         scales, quats, colors = (pictures(part, 1)[0] for part in ("scales", "quats", "sh0"))
         harmonics = _harmonics(archive, root, meta, count)
+    # bytes to numbers: two bytes for places, tables of values for scales and colors
     arrays = {
         "means": _positions(meta["means"], low, high),
         "quats": with_largest(

@@ -190,6 +190,7 @@ def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> 
         name: np.stack([_bits(words[name], *place) for place in places], axis=1)
         for name, places in WORDS.items()
     }
+    # each chunk of Gaussians has a range that its numbers are shares of
     count, chunks = len(words["color"]), len(next(iter(chunk.values())))
     if chunks != -(-count // CHUNK):
         raise Refused(
@@ -205,6 +206,7 @@ def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> 
             + np.repeat(high, CHUNK, axis=0)[:count] * part
         )
 
+    # only newer files have ranges of colors
     colors = bits["color"][:, :3]
     arrays = {
         "packed_position": between(bits["position"], *"xyz"),
@@ -389,6 +391,7 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
         return array.astype(np.float64)
 
     check_limit("gaussians", len(tensors.get("means", ())), "Gaussians")
+    # gsplat stores logarithms of scales and logits of opacities
     arrays = {
         f"{SPLATS}.means": tensor("means", 3),
         f"{SPLATS}.quats": tensor("quats", 4),
@@ -396,6 +399,7 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
         f"{SPLATS}.opacities": expit(tensor("opacities")),
         f"{SPLATS}.sh0": colors_of(tensor("sh0", 1, 3)[:, 0]),
     }
+    # harmonics of the higher degrees, if there are any
     rest = tensors.get("shN")
     functions = 0 if rest is None or rest.ndim != 3 else rest.shape[1]
     if functions not in COUNTS:
@@ -438,6 +442,7 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     if not len(means):
         raise ValueError(f"{path}: expected at least one Gaussian")
+    # the extension's attributes, and colors for viewers without it
     arrays = {
         "POSITION": ("VEC3", means),
         "COLOR_0": ("VEC4", np.column_stack([linear_of(colors), np.clip(opacities, 0, 1)])),
@@ -450,10 +455,12 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         name: ("VEC3", harmonics[:, i]) for i, name in enumerate(COEFFICIENTS[: harmonics.shape[1]])
     }
     writer = GlbWriter()
+    # glTF requires the bounds of the positions
     attributes = {
         name: writer.array(kind, values, VERTICES, bounds=name == "POSITION")
         for name, (kind, values) in arrays.items()
     }
+    # how the Gaussians are to be drawn
     about = {
         "kernel": KERNEL,
         "colorSpace": SRGB,
@@ -482,12 +489,14 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     Raises: Refused; what damaged numbers raise.
     """
     content, binary = parse_glb(data)
+    # files that cannot be read right without another extension are refused
     if needed := sorted(
         set(content.get("extensionsRequired", [])) - {EXTENSION, "KHR_mesh_quantization"}
     ):
         raise Refused(
             f"needs the extension {shown(needed[0])}: expected {EXTENSION} without compression"
         )
+    # each part of a mesh is placed by its node
     places = node_matrices(content.get("nodes", []))
     placed = [
         (part, places[i])
@@ -497,6 +506,7 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     ]
     if not placed:
         raise Refused(f"no Gaussians: expected parts of meshes with {EXTENSION}")
+    # sizes are checked before anything is read
     check_limit("parts", len(placed), "parts of meshes")
     counts = [count_of(content["accessors"][part["attributes"]["POSITION"]]) for part, _ in placed]
     check_limit("gaussians", sum(counts), "Gaussians")
@@ -507,6 +517,7 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
             " these colors, too"
         )
     said += _other_parts(placed)
+    # all parts become one set of Gaussians, in one space
     parts = [_part(content, binary, part["attributes"], place, said) for part, place in placed]
     if len({None if part.harmonics is None else part.harmonics.shape[1] for part in parts}) > 1:
         raise Refused("parts with harmonics of different degrees: expected one degree")

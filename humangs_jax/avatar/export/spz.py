@@ -162,6 +162,7 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
     Raises: Refused; what gzip and zstd raise for damaged files.
     """
     header, parts = _with_table(data, said) if data.startswith(b"NGSP") else _of_gzip(data)
+    # what is in the file and not used
     if header.flags & ANTIALIASED:
         said.append(
             "trained antialiased, as Mip-Splatting does; drawn without that it looks thicker from"
@@ -170,10 +171,12 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
     if header.flags & MORE_BEHIND and header.version < WITH_TABLE:
         said.append("records of other programs at its end are not used")
     count, version = header.count, header.version
+    # each part holds one property of all Gaussians
     positions, opacities, colors, scales, quats, harmonics = (
         np.frombuffer(part, "u1").reshape(count, width)
         for part, width in zip(parts, header.widths, strict=True)
     )
+    # bytes to numbers; places and rotations differ by the version
     arrays = {
         "positions": (
             positions.view("<f2") if version == 1 else _fixed_point(positions, header.bits)

@@ -64,6 +64,7 @@ def write_vrma(
         )
     writer = GlbWriter()
     joints = np.asarray(avatar.rest_joints, np.float64)
+    # the skeleton at rest stands on the ground
     sole = np.asarray([0, float(np.asarray(avatar.rest_vertices)[:, 1].min()), 0])
     nodes: list[dict[str, Any]] = []
     for j, parent in enumerate(avatar.parents):
@@ -76,6 +77,7 @@ def write_vrma(
     rotations, names = np.asarray(motion.rotations), bone_names()
     quats = continuous(np.asarray(quaternion.from_axis_angle(motion.rotations)))
     root = avatar.parents.index(-1)
+    # joints that never move need no track, except the root
     tracks = [
         (j, "rotation", "VEC4", quats[:, j][:, [1, 2, 3, 0]])
         for j in range(rotations.shape[1])
@@ -83,6 +85,7 @@ def write_vrma(
     ]
     tracks.append((root, "translation", "VEC3", np.asarray(motion.translations) + joints[root]))
 
+    # an expression is a node whose x is its weight
     custom = {}
     values = np.zeros((len(rotations), 0)) if motion.expressions is None else motion.expressions
     for shape, weights in zip(motion.expression_names, np.asarray(values).T, strict=True):
@@ -90,6 +93,7 @@ def write_vrma(
         tracks.append((len(nodes), "translation", "VEC3", weights[:, None] * (1.0, 0, 0)))
         nodes.append({"name": shape})
 
+    # which node each bone of VRM is
     bones = {names[x]: {"node": j} for j, x in enumerate(avatar.joint_names) if x in names}
     extension: dict[str, Any] = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
     if custom:
