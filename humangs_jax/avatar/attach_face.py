@@ -46,21 +46,21 @@ COVER = 0.6
 gaps.
 """
 THICKNESS = 0.25
-"""Of a hidden Gaussian, over its smaller side."""
+"""The thickness of a hidden Gaussian, over its smaller side."""
 LID_LIFT = 0.003
 """Metres by which lids lie in front of the body's: Gaussians of the eye are as thick."""
 EYE = (0.0165, 0.0095, 0.005, 0.03)
 """Metres: half the width and height of the opening between the lids, and the depths before the
 centre of the eye between which Gaussians show the eye."""
 SOFT = 0.3
-"""Of the opening: over so much of it a Gaussian belongs to the eye in part."""
+"""The share of the opening over which a Gaussian belongs to the eye in part."""
 AROUND_EYE = (0.02, 0.045)
 """Metres from the centre of an eye, of the skin whose color its lids get."""
 BESIDE = 8
 """Vertices beside one, from which its stretch is found."""
 RIDGE = 0.01
-"""Of the sum of the squared edges: skin is not stretched along its normal, which edges tell
-little about.
+"""A weight relative to the sum of the squared edges: it keeps skin from being stretched along its
+normal, which edges say little about.
 """
 NEAR = {"mouth": 0.06, "lid": 0.04}
 """Metres around teeth or lids: how vertices there lie against those of the mean body says where

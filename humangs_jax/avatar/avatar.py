@@ -44,7 +44,7 @@ from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 TERMS = 8
 LIMIT = 0.7
-"""Of the change of the log: no pose makes a Gaussian more than twice as bright, or less than
+"""The largest change of the log: no pose makes a Gaussian more than twice as bright, or less than
 half, as it is in the photos.
 """
 STEPS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233)
@@ -61,7 +61,7 @@ RIDGE = 0.003
 """Weight of the squares of the coefficients: a body without contrast has no light."""
 ITERATIONS = 10
 TINY = 1e-24
-"""Of squares: keeps the gradient of a vanishing normal finite."""
+"""The least sum of squares: it keeps the gradient of a vanishing normal finite."""
 
 
 @pytree_dataclass
@@ -188,7 +188,7 @@ ALIKE = 1e-3
 """Skinning weights that differ by less are those of one vertex."""
 _LIGHT = ("coefficients", "normals", "shading")
 _OPTIONAL = ("low_pass", "harmonics")
-"""Of the Gaussians."""
+"""Arrays that only some Gaussians have."""
 
 
 @pytree_dataclass
@@ -212,19 +212,19 @@ class Avatar(Batchable):
     """
 
     gaussians: Gaussians
-    """Canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement
-    has added some.
+    """The Gaussians in the T-pose, metres: vertex-major, the k Gaussians of a vertex together,
+    unless refinement has added some.
     """
     skinning_weights: Float[Array, "g j"]
-    """Rows sum to 1."""
+    """The weights of the joints for each Gaussian, (g, j); rows sum to 1."""
     rest_vertices: Float[Array, "n 3"]
-    """The shaped body in the T-pose, metres."""
+    """The vertices of the shaped body in the T-pose, (n, 3), metres."""
     rest_joints: Float[Array, "j 3"]
-    """Its joints, metres."""
+    """The joints of the shaped body in the T-pose, (j, 3), metres."""
     faces: Int[Array, "f 3"]
-    """Vertex indices, counter-clockwise seen from outside."""
+    """Vertex indices, (f, 3), counter-clockwise seen from outside."""
     parents: tuple[int, ...] = static_field()
-    """Parent of each joint, -1 for the root."""
+    """The parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field()
     """The name of each joint, in their order."""
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
@@ -232,7 +232,7 @@ class Avatar(Batchable):
     rendering: Literal["exact", "inria"] = static_field(default="exact")
     """The splatting that the Gaussians were trained for, a name in `SPLAT_PRESETS`."""
     light: Light | None = None
-    """Of the photos, where it has been estimated; other poses are drawn in it."""
+    """The light of the photos, where it has been estimated; other poses are drawn in it."""
     face: Face | None = None
     """What poses with an expression need (`with_face`); None: the face is rigid."""
     one_at_a_time: ClassVar[bool] = True
@@ -254,7 +254,7 @@ class Avatar(Batchable):
 
     @property
     def expression_names(self) -> tuple[str, ...]:
-        """Of the coefficients of a pose's expression; none without a face."""
+        """The names of the coefficients of a pose's expression; none without a face."""
         return () if self.face is None else self.face.expressions.names
 
     def with_face(self, body: BodyModel | None = None) -> "Avatar":
@@ -497,7 +497,7 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
-    """Of an avatar of j joints, as its file holds them. Raises: Refused."""
+    """Check the arrays of an avatar of j joints, as its file holds them. Raises: Refused."""
     g, n = (len(arrays[name]) for name in ("means", "rest_vertices"))
     if not g or not n:
         raise Refused(

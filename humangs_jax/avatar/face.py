@@ -26,8 +26,8 @@ BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 SMALLEST_OPENING = 0.001
 """Metres: half of what the lips are apart where the mouth begins to show its inside."""
 RIM = 0.3
-"""Of the opening's radius, over which its inside fades towards the lips: Gaussians are some
-millimetres wide.
+"""The share of the opening's radius over which its inside fades towards the lips: Gaussians are
+some millimetres wide.
 """
 BEFORE_LIPS = 0.004
 """Metres in front of the lips, where a tongue is seen whole."""
@@ -42,7 +42,9 @@ class Face(Batchable):
     row: Int[Array, " g"]
     """The row of `expressions.directions` that each Gaussian follows; m: it stays."""
     eyes: Float[Array, "g 2"]
-    """Shares in [0, 1] by which each Gaussian belongs to the left and to the right eye."""
+    """The shares by which each Gaussian belongs to the left and to the right eye, (g, 2), in [0,
+    1].
+    """
     beside: Int[Array, "m k"]
     """Rows of the vertices beside each one that moves; m: one that stays."""
     stretching: Float[Array, "m k 3"]
@@ -50,23 +52,24 @@ class Face(Batchable):
     hidden_normals: Float[Array, "q 3"]
     """Unit normals of the hidden Gaussians, for the light."""
     hidden_directions: Float[Array, "q 3 e"]
-    """How they move, metres per unit of a coefficient."""
+    """How the hidden Gaussians move, (q, 3, e), metres per unit of a coefficient."""
     hidden_shown: Float[Array, "q e"]
-    """How much opacity they get for a unit of a coefficient: the sum is clipped to [0, 1]."""
+    """How much opacity they get for a unit of a coefficient, (q, e): the sum is clipped to [0, 1].
+    """
     in_mouth: Float[Array, " q"]
     """1 for those of the mouth, which are seen between the lips alone; 0 for lids."""
     lips: Float[Array, "4 3"]
-    """Metres in T-pose: the inner edges of the upper and the lower lip in the middle, the left
-    and the right corner.
+    """The inner edges of the upper and the lower lip in the middle, the left and the right corner,
+    (4, 3), metres in the T-pose.
     """
     lip_directions: Float[Array, "4 3 e"]
-    """How these move per unit of a coefficient, metres."""
+    """How these points of the lips move, (4, 3, e), metres per unit of a coefficient."""
     hidden: Gaussians
     """Teeth, tongue, the inside of the mouth and closed lids in T-pose, with the opacities that
     they have when shown.
     """
     expressions: Expressions
-    """Of the avatar's rest vertices."""
+    """The expressions, as moves of the avatar's rest vertices."""
 
     def select(self, index: Array | np.ndarray) -> "Face":
         """The face of an avatar with these of its Gaussians."""

@@ -47,8 +47,8 @@ FOLLOWING = 0.5
 """Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and
 swinging arms, of about a second, do not reach it; a walk does."""
 WIDEST = 2
-"""Of the Gaussian that smooths, over the length of the path: wider ones leave less than 1e-8 of
-anything but a straight line.
+"""The largest width of the Gaussian that smooths, over the length of the path: wider ones leave
+less than 1e-8 of anything but a straight line.
 """
 TRACKED, TRACKED_OPACITY = 1024, 0.5
 """A person's extent is measured on this number of Gaussians, evenly spread, of at least this
@@ -443,7 +443,8 @@ def without_unseen(
 
 
 SHOWN, NEARLY_ALL = 0.9, 0.999
-"""Of the opaque Gaussians, those that a circle of cameras is made to show: outliers are far away.
+"""The share of the opaque Gaussians that a circle of cameras is made to show: outliers are far
+away.
 """
 COMPACT = 3.0
 """Where nearly all are within so many times the distance of `SHOWN`, as of a person, there are no

@@ -72,7 +72,7 @@ HAND_JOINTS = ("wrist", "index", "middle", "pinky", "ring", "thumb")
 BLOCK = 256
 """Vertices whose sources are weighed at a time: bounds the memory."""
 TINY = 1e-6
-"""Of distances and weights, so that quotients and logarithms are finite."""
+"""The least distance and weight, so that quotients and logarithms are finite."""
 
 
 def with_guesses(
@@ -114,15 +114,15 @@ class Regions(NamedTuple):
     """
 
     head: Bool[Array, " n"]
-    """Those of the head."""
+    """Which belong to the head, (n,)."""
     free: Bool[Array, " n"]
-    """Those that take guesses: all but the face."""
+    """Which take guesses, (n,): all but the face."""
     sources: Bool[Array, " n"]
-    """Those that give guesses: of the head the hair alone."""
+    """Which give guesses, (n,): of the head the hair alone."""
     features: Float[Array, "n f"]
-    """Where they lie, metres."""
+    """Where the vertices lie, (n, f), metres."""
     mirrored: Float[Array, "n f"]
-    """Where their mirror images lie, metres."""
+    """Where their mirror images lie, (n, f), metres."""
 
 
 def body_regions(body: BodyModel, rest: Float[Array, "n 3"]) -> Regions:

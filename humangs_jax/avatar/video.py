@@ -24,7 +24,7 @@ from humangs_jax.io.images import DRAWN, is_own_output, to_uint8, write_png
 
 Frame = Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"]
 CHANNELS = (3, 4)
-"""Of a frame: colors, or colors and alpha."""
+"""The channels of a frame: colors, or colors and alpha."""
 CONSTANT_RATE_FACTOR = 17
 """x264's quality; 18 counts as visually lossless."""
 VP9_QUALITY = 18

@@ -41,12 +41,12 @@ logger = logging.getLogger(__name__)
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
 LEAST_SHARE = 0.05
-"""Of the body in the frame that lies on the mask.
+"""The least share of the body in the frame that lies on the mask.
 
 In the demo's photos the head alone has 6 to 7 %, an inverted mask 1.4 %.
 """
 POINTS = 1000
-"""On the skin."""
+"""The number of points on the skin."""
 
 
 def usable_views(capture: Capture) -> Capture:
@@ -212,7 +212,7 @@ man fitted to keypoints alone, and at most 0.02 for his fits refined by the mask
 LONGEST = 480
 """Pixels of the window around the person in which silhouettes are compared."""
 MARGIN = 0.12
-"""Around the person, of its height."""
+"""The room around the person, as a share of its height."""
 
 
 Points = Float[np.ndarray, "n 3"]
@@ -414,8 +414,8 @@ def _window(
 def _share_outside(
     views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]
 ) -> float:
-    """Of the free vertices, those that are `OUTSIDE` outside of a mask; if few are outside at all,
-    these.
+    """The share of the free vertices that are `OUTSIDE` outside of a mask, or, if few are outside
+    at all, the share of these.
     """
 
     def share(outside: Callable[[MaskedView, np.ndarray, np.ndarray], np.ndarray]) -> float:

@@ -31,7 +31,7 @@ ROUNDED_ROTATION = 5e-3
 by the nearest rotation.
 """
 LARGEST_COEFFICIENT = 1e100
-"""Of a lens: products of larger ones are not finite."""
+"""The largest coefficient of a lens: products of larger ones are not finite."""
 ROTATION_TO_Y_UP = {
     "+x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
@@ -171,7 +171,7 @@ class Source:
 
     @functools.cached_property
     def text(self) -> str:
-        """Of the file. Raises: CaptureError."""
+        """The text of the file. Raises: CaptureError."""
         return checked_text(self.path)
 
     @functools.cached_property
@@ -516,9 +516,9 @@ class Checks:
     """What was measured, and warnings."""
 
     reprojection: float | None
-    """Mean over all observations, pixels; None without any."""
+    """The mean reprojection error over all observations, pixels; None without any."""
     observations: int
-    """How many."""
+    """The number of observations."""
     distance: float | None
     """Median from the cameras to where their axes meet, metres; None where they are parallel (one
     camera).

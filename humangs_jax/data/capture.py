@@ -5,7 +5,7 @@ folder on disk.
                           "views": [...]}
     me/body.npz           body (name or file of the model), betas and shape_names (s,), rotations
                           (m, j, 3), translations (m, 3) and perhaps displacement (n, 3)
-    me/images/*.png ...   one photo per view, all of one size; masks likewise
+    me/images/*.png ...   one photo per view, all of one size; the same for masks
 
 docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a
 `CaptureError`: one line that names the file, the field and what was expected. In memory the images
@@ -66,21 +66,21 @@ class Capture:
     """A capture in memory (numpy on the host). `capture_from_arrays` makes a checked one."""
 
     images: Float[np.ndarray, "v h w 3"]
-    """In [0, 1], white behind the masks."""
+    """The photos, (v, h, w, 3), in [0, 1], white behind the masks."""
     masks: Float[np.ndarray, "v h w"] | None
-    """Coverage in [0, 1]."""
+    """The coverage by the person, (v, h, w), in [0, 1]; None: there are no masks."""
     cameras: Camera
-    """A batch of v, metres."""
+    """A batch of v cameras, metres."""
     frames: Int[np.ndarray, " v"]
-    """The frame that each view shows, an index into `poses`."""
+    """The frame that each view shows, (v,), an index into `poses`."""
     body: BodyModel
     """The model that the parameters belong to."""
     betas: Float[np.ndarray, " s"]
-    """Its shape; fewer than it has are allowed."""
+    """The person's shape coefficients, (s,); fewer than the body has are allowed."""
     poses: BodyPose
-    """A batch of m."""
+    """A batch of m poses."""
     names: tuple[str, ...]
-    """One per view, used as file names."""
+    """The names of the views, which are used as file names."""
     body_file: str = DEFAULT_BODY
     """Where the model comes from, "makehuman" or a path."""
     displacement: Float[np.ndarray, "n 3"] | None = None
@@ -88,10 +88,13 @@ class Capture:
     registered them (SMPL+D); joints stay. It belongs to `betas`: who changes those leaves it out.
     None: `reconstruct` finds one by the masks."""
     calibrated: bool = True
-    """False: the cameras were found from the person, and are centimetres off."""
+    """Whether the cameras were calibrated; if not, they were found from the person, and are
+    centimetres off.
+    """
     gains: Float[np.ndarray, "v 3"] | None = None
-    """By what `data.exposure.equal_exposure` has multiplied red, green and blue of each view; None:
-    the colors are as they were photographed."""
+    """The factors of red, green and blue by which `data.exposure.equal_exposure` has multiplied
+    each view, (v, 3); None: the colors are as they were photographed.
+    """
     unknown: Bool[np.ndarray, "v h w"] | None = None
     """Where somebody or something in front may hide the person; masks are 0 there.
 

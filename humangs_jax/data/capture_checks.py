@@ -85,7 +85,7 @@ KINDS: dict[type, str] = {
     int: "an integer",
     float: "a number",
 }
-"""Of JSON values, in words."""
+"""The types of JSON values, in words."""
 
 
 def expect(value: Any, kind: type, file: object, field: str) -> Any:

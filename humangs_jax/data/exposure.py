@@ -38,8 +38,8 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 EXPOSURE_SIZE = 256
 """Pixels a side of the crops around the person that are compared."""
 FACING, THICKNESS = 0.5, 0.02
-"""Of a point that a photo shows: least cosine between normal and ray; metres by which it may lie
-behind the nearest surface.
+"""A photo shows a point where the cosine between normal and ray is at least the first, and where it
+lies at most the second, metres, behind the nearest surface.
 """
 INSIDE, WHOLE, BLUR = 5, 0.99, 3
 """Side of the square of pixels around each point that lies in the mask, least value of the mask in
@@ -109,7 +109,7 @@ def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
 def points_of(
     capture: Capture,
 ) -> tuple[Float[np.ndarray, "v n 3"], Bool[np.ndarray, "v n"]]:
-    """Of each photo the colors of the body's vertices, and which of them it shows.
+    """The colors of the body's vertices in each photo, and which of them it shows.
 
     capture: photos on white, with masks, all of which show the person.
     """
@@ -267,9 +267,9 @@ class PartColor(NamedTuple):
     """The color of a part of the body in a group of views."""
 
     color: Float[np.ndarray, "3"]
-    """Median of the logarithms."""
+    """The median of the logarithms of the colors, (3,)."""
     error: float
-    """Standard error of its tint."""
+    """The standard error of its tint."""
 
 
 def part_colors(
@@ -278,7 +278,7 @@ def part_colors(
     parts: Int[np.ndarray, " n"],
     groups: Int[np.ndarray, " v"],
 ) -> list[list[PartColor | None]]:
-    """Of each group of views the color of each of `PARTS`; None where it shows too little of it.
+    """The color of each of `PARTS` in each group of views; None where it shows too little of it.
 
     Arguments: see `gains_between`.
     """
@@ -351,7 +351,7 @@ def seen_colors(
     mask: Float[Array, "h w"],
     camera: Camera,
 ) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Of one photo the colors of the body's vertices, and which of them it shows."""
+    """The colors of the body's vertices in one photo, and which of them it shows."""
     vertices = pose_body(body, rest, pose).vertices
     towards = camera.center - vertices
     normals = vertex_normals(vertices, body.faces)

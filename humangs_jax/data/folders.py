@@ -41,7 +41,7 @@ OTHER_VIDEOS = (".webm", ".mts", ".m2ts", ".3gp", ".wmv", ".mpg")
 SYSTEM_FOLDERS = ("__MACOSX", "@eaDir")
 """Folders of previews, which archives of macOS and disks of Synology have."""
 NAMES_SHOWN = 3
-"""Of each kind of files that are not used."""
+"""How many files of each unused kind are named."""
 
 _WORDS = "(?:masks?|mattes?|alpha|silhouettes?|seg|segmentation)"
 _MASK_BEHIND = re.compile(rf"(?P<photo>.+?)[._ -]+{_WORDS}", re.IGNORECASE)
@@ -53,7 +53,7 @@ class Reason:
     """Why files are not used, as in "2 videos beside photos"."""
 
     noun: str
-    """What they are, singular."""
+    """What the files are, singular."""
     because: str
     """The rest of the phrase."""
 
@@ -85,11 +85,14 @@ class FolderScan:
     folder: Path
     """The folder that was searched."""
     photos: tuple[Path, ...]
-    """In order."""
+    """The photos, in order."""
     unused: tuple[Unused, ...] = ()
-    """In order. Files that nobody takes for a photo or a video are not among them."""
+    """The files that are not used, in order. Files that nobody takes for a photo or a video are not
+    among them.
+    """
     masks: tuple[Path, ...] = ()
-    """Of the photos in the same folder, where each photo has one; else these are unused."""
+    """The masks of the photos in the same folder, where each photo has one; else these are unused.
+    """
 
 
 def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False) -> FolderScan:

@@ -66,9 +66,9 @@ class CameraFormat(SourceFormat):
     pixel_centers: Literal["integer", "half"] = "integer"
     """Where the centre of the first pixel is: at (0, 0) or at (0.5, 0.5)."""
     per_image: bool = False
-    """Whether it has one camera for each image, not one for each camera."""
+    """Whether there is one camera for each image, not one for each camera."""
     unit: float | None = None
-    """Metres in its unit of length; None where it may be any."""
+    """Metres in the unit of length of the format; None where it may be any."""
 
     def __str__(self) -> str:
         return f"{self.about} ({', '.join(self.names)})" if self.files else self.about
@@ -247,7 +247,7 @@ PLACES = {
     "right_hand": (40, 15),
     "hands": (25, 30),
 }
-"""Of SMPL-X's joints: the first, and how many.
+"""Where parts are among SMPL-X's joints: the first, and how many.
 
 SMPL's body and limbs end with two more, whole hands.
 """
@@ -262,15 +262,17 @@ class ArrayKeys:
     poses: dict[str, str]
     """The key of each of `PLACES`: axis-angles or rotation matrices."""
     moves: tuple[str, ...] = ("trans", "transl")
-    """Positions: the first that is there. Without any, people stay in place where `stays`."""
+    """The keys of positions: the first that is there. Without any, people stay in place where
+    `stays`.
+    """
     rates: tuple[str, ...] = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
-    """Frames per second: the first that is there."""
+    """The keys of frames per second: the first that is there."""
     fps: float | None = None
-    """Frames per second without any; None: there must be one."""
+    """Frames per second of files that say none; None: they must."""
     up: str = "y"
     """The axis that is up in files of this format."""
     fixed: bool = False
-    """It is, whatever the poses look like."""
+    """Whether that axis is up whatever the poses look like."""
     also: tuple[str, ...] = ()
     """Other axes that are up in some of them, see `rules.up_axis`."""
     scaling: str | None = None
@@ -279,13 +281,13 @@ class ArrayKeys:
     """What a person turns about, and positions are of: the pelvis at rest, the "origin" (in which
     positions are applied last), the "head", or the root "joint" in space."""
     six: bool = False
-    """Rotations are six numbers each, with the frames as last axis."""
+    """Whether rotations are six numbers each, with the frames as last axis."""
     stays: bool = False
     """Whether people stay in place in files without positions; if not, such files are refused."""
     kind: str = "poses"
-    """What reads it: "ours" are whole rotations, "points" joints in space."""
+    """The kind of reader: "ours" are whole rotations, "points" joints in space."""
     page: bool = True
-    """Whether the page reads it, too."""
+    """Whether the page reads the format, too."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -295,7 +297,8 @@ class MotionFormat(Format):
     """
 
     arrays: ArrayKeys | None = None
-    """Of files of arrays by key; the first that fits a file is used, whatever its suffix."""
+    """The keys of files of arrays; the first format that fits a file is used, whatever its suffix.
+    """
 
 
 def _arrays(
@@ -457,10 +460,10 @@ class DataSetFormat(Format):
     layout.
     """
     lists: bool = False
-    """A file lists many: code(path, body, size) -> tuple of `subject.Person`."""
+    """Whether a file lists many people: code(path, body, size) -> tuple of `subject.Person`."""
     scans: bool = False
-    """Textured scans: there are no photos before `humangs preprocess` has rendered some. code: see
-    `preprocess.run`.
+    """Whether people are textured scans: there are no photos before `humangs preprocess` has
+    rendered some. code: see `preprocess.run`.
     """
 
 

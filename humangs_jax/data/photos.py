@@ -70,17 +70,17 @@ class Photos:
     """Photos of one person (numpy on the host)."""
 
     images: Float[np.ndarray, "v h w 3"]
-    """In [0, 1], white behind the masks."""
+    """The photos, (v, h, w, 3), in [0, 1], white behind the masks."""
     masks: Float[np.ndarray, "v h w"] | None
-    """Coverage in [0, 1]."""
+    """The coverage by the person, (v, h, w), in [0, 1]; None: there are no masks."""
     cameras: Camera
-    """A batch of v, metres."""
+    """A batch of v cameras, metres."""
     frames: Int[np.ndarray, " v"]
-    """The frame that each view shows."""
+    """The frame that each view shows, (v,)."""
     names: tuple[str, ...]
-    """One per view."""
+    """The names of the views."""
     calibrated: bool = True
-    """False: the cameras were found from the person."""
+    """Whether the cameras were calibrated; if not, they were found from the person."""
     unknown: Bool[np.ndarray, "v h w"] | None = None
     """Where somebody or something in front may hide the person; masks are 0 there.
 

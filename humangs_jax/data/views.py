@@ -270,7 +270,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
 
 
 CROP_MARGIN = 0.04
-"""Of a crop's side, on each side of the person."""
+"""The room on each side of the person, as a share of the crop's side."""
 
 
 def cropped(capture: Capture, size: int) -> Capture:

@@ -64,7 +64,7 @@ from humangs_jax.network.parts import Variables
 SIDE, INPUT_SIDE = 320, 128
 """Longest side of the images on the page, pixels."""
 QUALITY = 88
-"""Of the JPEGs."""
+"""The quality of the JPEGs."""
 LARGEST_ERROR = 0.25
 """Mean absolute difference of the channels that gets the last color."""
 _MARK = re.compile(r"\{\{(\w+)\}\}")

@@ -219,7 +219,7 @@ Row = dict[str, float | None]
 """Scores by name; None for what is missing."""
 CONFIDENCE = 0.95
 RESAMPLES, BLOCKS = 2000, 20
-"""Of the bootstrap, and in how many parts it is computed, for memory."""
+"""Resamples of the bootstrap, and in how many parts they are computed, for memory."""
 
 
 class Scored(NamedTuple):

@@ -37,9 +37,9 @@ class LearningRates:
     """
 
     means: Spread = 2e-4
-    """Metres, in the T-pose."""
+    """The rate of the places in the T-pose, metres."""
     quats: Spread = 2e-3
-    """Of quaternions that start at unit length."""
+    """The rate of quaternions that start at unit length."""
     log_scales: Spread = 1e-2
     """The rate of the logarithms of the scales."""
     opacity_logits: Spread = 3e-2
@@ -58,7 +58,7 @@ class RefineConfig:
         gain="0.25 to 0.5 s each with 4 photos",
         measured=MEASURED,
     )
-    """Of the learned update (see `learned.py`), before the first step. 0: none."""
+    """Iterations of the learned update (see `learned.py`), before the first step. 0: none."""
     steps: RefineSteps | None = knob(
         None, cost="blur at few", gain="time in proportion", measured=MEASURED
     )
@@ -113,7 +113,7 @@ class RefineConfig:
     checks: Few = 5
     """How often the PSNR is measured."""
     seed: Seed = 0
-    """Of the order of the photos and of the blocks."""
+    """The seed of the order of the photos and of the blocks."""
 
     def __post_init__(self):
         """Raises ValueError for settings that do not fit together, naming them."""

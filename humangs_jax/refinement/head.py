@@ -58,7 +58,7 @@ OUTLIERS = 1.0
 FAR = 1e4
 """Pixels: bound of places outside of photos."""
 PARTS = 10
-"""Of a run; between them it can be interrupted."""
+"""The parts of a run; between them it can be interrupted."""
 
 
 class Crops(NamedTuple):

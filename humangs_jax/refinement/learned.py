@@ -39,7 +39,7 @@ from humangs_jax.rendering.splatting import Rendering
 SHIPPED = "assets/refiner.safetensors"
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "color_logits")
 COLUMNS = 14
-"""Of these parameters side by side."""
+"""The number of these parameters side by side."""
 LARGEST_MOVES = np.asarray([0.01] * 3 + [0.1] * 4 + [0.2] * 3 + [0.5] * 4, np.float32)
 """What an output of 1 moves: metres, quaternions, log scales, logits of opacity and colors."""
 NEIGHBORS = 8
@@ -100,7 +100,7 @@ class Graph:
 
 
 def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
-    """Of Gaussians at these places. On the host."""
+    """The graph of Gaussians at these places, on the host."""
     members = clusters_of(means)
     centers = means[members].mean(axis=1)
     distances, nearest = KDTree(centers).query(means, NEAREST_CLUSTERS)

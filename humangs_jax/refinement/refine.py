@@ -51,7 +51,7 @@ class Refinement:
     fitted.
     """
     psnr: tuple[float, float]
-    """The same in dB over the crops."""
+    """The PSNR of the two over the crops, dB."""
     kept: bool
     """Whether the avatar has become better by that loss; if not, it is unchanged."""
     interrupted: bool = False

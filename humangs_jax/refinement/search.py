@@ -51,7 +51,7 @@ ALLOWED_LOSS = 0.5
 all photos are fitted. With six validation people they lose up to 0.4 there, and gain at least 0.1
 in other views of that pose by all photos."""
 ALLOWED_LOSS_OF_ITERATIONS = 1.0
-"""Decibels, likewise, that the learned update may lose there: one of eight test people loses 0.2
+"""Decibels, too, that the learned update may lose there: one of eight test people loses 0.2
 and gains 2.1 by all.
 """
 SUSPICIOUS = 1.5

@@ -175,9 +175,9 @@ def ablate(
             would do for what is missing. None: all runs.
         people: to train on: a number of synthetic people, who are rendered during training; capture
             folders; or a source.
-        validation: other people to compare on, likewise. Of a number and of folders each is looked
-            at once, of a source the first eight. Photos and targets are those of the base for all
-            variants.
+        validation: other people to compare on, in the same forms. Of a number and of folders each
+            is looked at once, of a source the first eight. Photos and targets are those of the base
+            for all variants.
         out: folder of the runs.
         metric: of validation: "psnr", "psnr_fg", "ssim" and so on.
         body: that the people's parameters belong to. None: the shipped one.

@@ -34,7 +34,7 @@ from humangs_jax.training.augmentation import Augmentation
 
 logger = logging.getLogger(__name__)
 Below = Annotated[float, Range(0, 0.999_999)]
-"""Of a running mean that forgets."""
+"""A decay of a running mean; at 1 it would never forget."""
 HOST_SETTINGS = {
     "seed": 0,
     "log_every": 1,
@@ -49,22 +49,24 @@ for.
 
 @configuration
 class OptimizerConfig:
-    """Of `state.make_optimizer`."""
+    """The optimizer, see `state.make_optimizer`."""
 
     name: Literal["adamw", "nadamw", "lamb", "lion"] = "adamw"
-    """Of `optax`."""
+    """The name of the optimizer in `optax`."""
     learning_rate: Spread = 4e-4
-    """The peak, reached after `warmup_steps` from 0, then a cosine to 0 at the end of the run."""
+    """The peak of the learning rate, reached after `warmup_steps` from 0; then it falls by a cosine
+    to 0 at the end of the run.
+    """
     warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
     """Steps over which the learning rate rises from 0 to its peak."""
     betas: tuple[Below, Below] = (0.9, 0.95)
-    """Of the running means of gradients and of their squares."""
+    """The decays of the running means of gradients and of their squares."""
     weight_decay: Spread = 0.05
-    """It acts on parameters with two or more axes (products, textures, the class token)."""
+    """The decay of parameters with two or more axes (products, textures, the class token)."""
     clip_norm: Annotated[float, Range(0, 1e12)] = 1.0
     """Gradients longer than this are scaled down to it."""
     skip_norm: Annotated[float, Range(0, 1e12)] = 100.0
-    """Above it the step is skipped."""
+    """Steps whose gradient is longer than this are skipped."""
 
 
 @configuration
@@ -116,7 +118,7 @@ class TrainConfig:
     target_size: Side = 128
     """Side of the targets, pixels."""
     steps: Steps = 20_000
-    """Of the whole run, which the learning rate ends with."""
+    """Steps of the whole run, which the learning rate ends with."""
     batch_size: Few = 1
     """Subjects per step."""
     microbatch_size: Few = knob(
@@ -129,12 +131,12 @@ class TrainConfig:
     needs least memory and suits CPUs. The upsampler's batch statistics are of the subjects that all
     devices work on at once."""
     stages: tuple[Stage, ...] = ()
-    """In the order of their starts, for instance larger photos for the last steps.
+    """The stages in the order of their starts, for instance larger photos for the last steps.
 
     Before the first one the fields here hold.
     """
     ema_decay: Share | None = None
-    """Of the averaged parameters, None for none."""
+    """The decay of the averaged parameters; None: there are none."""
     seed: Seed = 0
     """The seed of the first parameters, the order of the people and all that is drawn at random."""
     log_every: Steps = 20

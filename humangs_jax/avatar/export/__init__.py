@@ -26,26 +26,27 @@ class ExportFormat(Format):
     up: Up = "y"
     """The axis that the readers of this format take for up."""
     mesh: bool = False
-    """It holds the body as a textured mesh, not Gaussians."""
+    """Whether it holds the body as a textured mesh, not Gaussians."""
     animated: bool = False
-    """One file holds all frames of a motion."""
+    """Whether one file holds all frames of a motion."""
     rest_fields: bool = False
     """It may have all 45 `f_rest_*` fields, which some importers (Unity) require: code(path,
     gaussians, rest_fields).
     """
     versions: tuple[int, ...] = ()
-    """Those that are written, where one may be chosen, the usual one first: code(path, gaussians,
-    version).
+    """The versions that are written, where one may be chosen, the usual one first: code(path,
+    gaussians, version).
     """
     backwards: bool = False
-    """Its axes are to the right, up and back: half a turn about y from ours."""
+    """Whether its axes are to the right, up and back: half a turn about y from ours."""
     beside: tuple[str, ...] = ()
     """Suffixes of further files, of the same name, that are written with it."""
     reader: str | Callable[[bytes], Any] = ""
-    """Of Gaussians, called with the bytes of a file and a list that takes what is to be said of it;
-    raises `io.reading.Refused`."""
+    """The reader of Gaussians, called with the bytes of a file and a list that takes lines about
+    it; raises `io.reading.Refused`.
+    """
     magic: tuple[bytes, ...] = ()
-    """How its files may begin; empty: that does not tell."""
+    """How files of the format may begin; empty: their beginning does not say."""
 
 
 EXPORTS = Formats(
@@ -127,9 +128,9 @@ class VideoFormat(Format):
     """One format. code: called as code(path, frames, fps, shape of a frame)."""
 
     transparent: bool = False
-    """Its frames may have alpha."""
+    """Whether frames may have alpha."""
     even_sides: bool = False
-    """Its codec wants even sides: odd ones get one more row or column."""
+    """Whether its codec wants even sides: odd ones get one more row or column."""
 
 
 _VIDEO = "humangs_jax.avatar.video"

@@ -103,7 +103,7 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
 
 
 def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]:
-    """Of 0 and +-1."""
+    """The rotation as a matrix of 0 and +-1."""
     with jax.ensure_compile_time_eval():  # the turn is known inside of transformations, too
         return np.asarray(quaternion.to_matrix(jnp.asarray(turn)), np.float32).round()
 
@@ -332,7 +332,7 @@ def colors_of(coefficients: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"
 
 
 def unit_quats(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
-    """Of length 1; the identity where they have no length."""
+    """The quaternions at length 1; the identity where they have no length."""
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
 
@@ -342,7 +342,7 @@ def unit_quats(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
 
 
 DIGITS = 4
-"""Of the numbers in the names of a sequence."""
+"""Digits of the numbers in the names of a sequence."""
 
 
 def frame_range(text: str, count: int) -> range:

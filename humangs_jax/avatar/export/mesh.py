@@ -55,7 +55,7 @@ CHUNK = 16384
 SMALLEST_SCALE = 1e-4
 """Metres; flat Gaussians are seen as if they were a tenth of a millimetre thick."""
 LEAST_WEIGHT = 1e-4
-"""Of the nearest Gaussian, so that points that no Gaussian covers have a color."""
+"""The least weight of the nearest Gaussian, so that points that no Gaussian covers have a color."""
 WEIGHTS = 4
 """Joints of a vertex that all programs read."""
 

@@ -26,7 +26,7 @@ from humangs_jax.rendering.gaussians import COUNTS, Gaussians
 META = "meta.json"
 VERSION = 2
 USUAL = "default"
-"""Of `model`, which is also "antialiased" or "2dgs"."""
+"""The usual `model`; others are "antialiased" and "2dgs"."""
 LEVELS = 256
 """Numbers in a codebook, at most."""
 FIRST_PLACE = 252

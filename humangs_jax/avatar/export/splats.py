@@ -62,7 +62,9 @@ TYPES = {
 TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
 CHUNK = 256
 REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
-"""Of the bytes of compressed harmonics: the middle of each step, the ends of the first and last."""
+"""The values of the bytes of compressed harmonics: the middle of each step, and the ends of the
+first and last.
+"""
 DEGREE_4 = 72
 """Properties of harmonics up to degree 4."""
 FILTER = "filter_3D"
@@ -227,7 +229,7 @@ WORDS = {
     "scale": _ELEVEN,
     "color": [(24, 8), (16, 8), (8, 8), (0, 8)],
 }
-"""Of compressed Gaussians: the lowest bit and the width of each part."""
+"""The lowest bit and the width of each part of compressed Gaussians."""
 
 
 def _bits(words: np.ndarray, lowest: int, width: int) -> Float[np.ndarray, " g"]:

@@ -36,7 +36,7 @@ else:
     from backports import zstd
 
 Version = Literal[3, 4]
-"""Of the files that are written. More programs read 3."""
+"""The versions that are written. More programs read 3."""
 SPZ_MAGIC = 0x5053474E
 """NGSP."""
 WITH_TABLE = 4

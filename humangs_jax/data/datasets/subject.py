@@ -35,7 +35,7 @@ LARGEST_ANGLE = 4 * np.pi
 FARTHEST = 100.0
 """Metres of a translation or of a camera from the origin; millimetres are far above."""
 LARGEST_COEFFICIENT = 30.0
-"""Of shape and expression: standard deviations, usually below 5."""
+"""The largest coefficient of shape and expression, standard deviations; usually below 5."""
 
 open_arrays = functools.partial(array_files.ArrayFile.open, error=CaptureError)
 checked_numbers = functools.partial(file_numbers, some=True)

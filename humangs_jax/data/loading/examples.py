@@ -34,13 +34,13 @@ class ViewSampling:
     input_counts: tuple[Few, ...] = (4,)
     """Numbers of input views; one is drawn per step (each compiles once)."""
     target_count: Few = 3
-    """Target views."""
+    """The number of target views."""
     jitter: Spread = 0.7
     """Inputs stand evenly around the subject, each off by up to half this share of the spacing."""
     scattered_share: Share = 0.2
-    """Of examples whose inputs stand anywhere instead."""
+    """The share of examples whose inputs stand anywhere instead."""
     mixed_pose_share: Share = 0.3
-    """Of examples whose inputs may each show another pose (frame)."""
+    """The share of examples whose inputs may each show another pose (frame)."""
     rule: Literal["random", "window"] = "random"
     """"random": inputs stand around the subject, targets are drawn from all other views, of any
     pose. "window": the release's. Of a random window in the order of the views, whose ends are 25

@@ -87,19 +87,19 @@ class Settings:
     """What a preprocessed set is made with."""
 
     kind: str
-    """Of `data.formats.DATASETS`."""
+    """The kind of the data set, a key of `data.formats.DATASETS`."""
     layout: Layout = "scenes"
-    """Of the output."""
+    """The layout of the output."""
     size: int = SIZE
-    """Pixels a side."""
+    """The side of the square images, pixels."""
     views: int = VIEWS
-    """Of a scan."""
+    """Views of each scan."""
     factors: tuple[float, float] = FACTORS
-    """Of scans: range of the distance in bounding radii."""
+    """The range of the cameras' distance from a scan, in bounding radii."""
     supersample: int = 3
-    """Of scans: samples along a pixel."""
+    """Samples along each side of a pixel, for scans."""
     every: int = EVERY
-    """Of videos: the frame step."""
+    """The step between the frames of a video that are taken."""
     train: int = TRAIN
     """Scans of the training list."""
     test: int = TEST
@@ -341,7 +341,7 @@ class View(NamedTuple):
 
     @property
     def files(self) -> tuple[str, str]:
-        """Of the photo and its mask."""
+        """The files of the photo and of its mask."""
         return f"images/{self.name}.png", f"masks/{self.name}.png"
 
 
