@@ -245,9 +245,11 @@ def _hidden(avatar: Avatar, body: BodyModel, follows: np.ndarray) -> dict[str, A
     parts, names = _shipped_parts(), expressions.names
     corners, colors = parts.corners.copy(), np.zeros((len(parts.parts), 3))
     shown = np.zeros((len(parts.parts), len(names)))
+    # the vertices that expressions move, on the mean body and on this one
     moves = np.asarray(expressions.vertices)
     before, after = np.asarray(body.template)[moves], np.asarray(avatar.rest_vertices)[moves]
 
+    # the mouth and the lids follow those vertices
     in_mouth = ~np.isin(parts.parts, [PARTS.index("left_lid"), PARTS.index("right_lid")])
     of_mouth = _map_around(corners[in_mouth], before, after, NEAR["mouth"])
     corners[in_mouth], lips = of_mouth(corners[in_mouth]), of_mouth(parts.lips)
@@ -264,6 +266,7 @@ def _hidden(avatar: Avatar, body: BodyModel, follows: np.ndarray) -> dict[str, A
         colors[lid] = _skin_around(avatar, eye, follows)
         shown[lid, at] = CLOSING
 
+    # a Gaussian for each of their faces
     hidden, normals = _gaussians_of(corners, drawn, colors, in_mouth)
     arrays = {
         "hidden_normals": normals,

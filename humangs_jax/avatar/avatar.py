@@ -399,6 +399,7 @@ def _read(
 
 def _load(cls: type[Avatar], path: Any) -> Avatar:
     arrays, header = _read(path)
+    # which arrays the file must have
     with_light = any(f"light_{name}" in arrays for name in _LIGHT)
     wanted = _ARRAYS + tuple(f"light_{name}" for name in _LIGHT if with_light)
     wanted += tuple(name for name in _OPTIONAL if name in arrays)
@@ -414,6 +415,7 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
             f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation',"
             " 'exact' or 'inria'"
         )
+    # shapes and ranges are checked before the checksum, since their errors say more
     of_face = {
         name: array for name, array in arrays.items() if name.startswith(("face_", "expression_"))
     }

@@ -280,6 +280,7 @@ def excerpt(
         )
     if loop < 1:
         raise ArgumentError("loop", f"{loop}: expected at least 1")
+    # the limit holds for the frames that come out, not for those that are read
     rate = motion.fps if fps is None else fps
     check_limit(
         "frames", loop * (stop - start) * rate, f"frames in {loop * (stop - start):g} seconds"
@@ -290,6 +291,7 @@ def excerpt(
     part = part if fps is None else part.at_rate(fps)
     if loop == 1:
         return part
+    # repetitions go on along the ground
     path = np.asarray(part.translations)
     period = len(path) / max(len(path) - 1, 1)  # the last frame is a step before the end
     travelled = period * (path[-1] - path[0]) * [1, 0, 1]

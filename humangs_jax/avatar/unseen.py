@@ -320,6 +320,7 @@ def unseen_sides(capture: Capture) -> list[str]:
     def share(found: Bool[np.ndarray, " n"], chosen: Bool[np.ndarray, " n"]) -> float:
         return float(np.sum(areas * chosen * found) / max(np.sum(areas * chosen), TINY))
 
+    # Sides are by the direction of the surface, parts by the joint that moves it most.
     dominant = np.asarray(body.joint_names)[np.argmax(weights, axis=1)]
     sides = {name: normals @ along > 0.5 for name, along in SIDES.items()}
     parts = {

@@ -103,6 +103,7 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
     """
     if not folder.is_dir():
         return FolderScan(folder, ())
+    # folders that are captures already, and those of previews, are not looked into
     captures: list[Path] = []
 
     def skipped(place: Path) -> bool:
@@ -114,6 +115,7 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
 
     with reading(folder, "folder of photos", CaptureError):
         files = sorted(walk(folder, skipped))
+    # pictures are photos, masks of these, or drawn by this program
     pictures = [file for file in files if is_photo(file)]
     unused = [Unused(place, CAPTURE) for place in captures]
     unused += [Unused(file, OWN) for file in pictures if is_own_picture(file)]
@@ -123,6 +125,7 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
     photos = [file for file in pictures if file not in masks]
     whole = len(set(masks.values())) == len(photos)  # else who knows which of them are meant
     unused += [] if whole else [Unused(file, MASK) for file in masks]
+    # what a user may have meant as photos is named, all else is not
     for file in files:
         suffix = file.suffix.lower()
         if suffix in VIDEO_SUFFIXES and photos:

@@ -184,6 +184,7 @@ def sector_votes(
     do those where both sides of it are white.
     """
     distances = signed_distance(mask)
+    # points on the end of the mask, with the direction inwards, in sectors around the middle
     normal = np.stack(np.gradient(ndimage.gaussian_filter(distances, 1.0)))
     pixels = np.nonzero(np.abs(distances) < 0.5)
     if not len(pixels[0]):
@@ -205,6 +206,7 @@ def sector_votes(
     def change(one, other):
         return np.linalg.norm(one[0] - other[0], axis=-1), one[1] & other[1]
 
+    # how much colors change across each depth: the highest change in a sector is its edge
     steps = np.arange(-REACH, REACH + STEP / 2, STEP) * unit
     line = [colors(depth) for depth in [steps[0] - STEP * unit, *steps, steps[-1] + STEP * unit]]
     profile = np.zeros((count, len(steps)))
@@ -220,6 +222,7 @@ def sector_votes(
     lag = min(unit, max(abs(whole) - CLEAR, 0.5))
     beside = [colors(-np.sign(whole) * lag * i) for i in (-1, 1, 3, 5)]
     (across, over), *textures = [change(one, other) for one, other in itertools.pairwise(beside)]
+    # a sector votes if its edge stands out from the texture beside it
     votes = [0, 0]
     for sector in range(count):
         chosen = over & (sectors == sector)

@@ -126,6 +126,7 @@ def read_description(file: Path) -> dict[str, Any]:
     description = checked_json(
         file, missing="no such file: a capture is a folder with a capture.json"
     )
+    # what kind of file it is, before anything else is read of it
     for key, wanted in (("format", FORMAT), ("version", VERSION)):
         if (found := expect(description, dict, file, "").get(key)) != wanted:
             raise CaptureError(file, key, f"expected {wanted!r}, got {shown(found)}")
@@ -139,6 +140,7 @@ def read_description(file: Path) -> dict[str, Any]:
         raise CaptureError(file, "body", f"expected the name of an npz file, got {shown(body)}")
     check_inside(file, "body", body)
     check_background(description.get("background", "photo"), file)
+    # the views, one at a time, so that errors name the view
     if not views:
         raise CaptureError(file, "views", "expected a list of at least one view")
     for i, view in enumerate(views):

@@ -148,6 +148,7 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
 
     Raises: ValueError if it has no such legs.
     """
+    # each vertex of the tube combines vertices of the body, and so does all that belongs to it
     combined = _tube(body, np.linspace(TOP, hem, ROWS))
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
     linear = {
@@ -156,6 +157,7 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     for name, own in linear.items():
         added = (combined @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
         linear[name] = np.concatenate([own, added.astype(own.dtype)])
+    # two triangles for each square of the tube
     added, loop = combined.shape[0], 2 * (GAP + HALF)
     upper = np.arange(added).reshape(ROWS, loop)[:-1]
     following, lower = np.roll(upper, -1, axis=1), loop

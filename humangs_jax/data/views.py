@@ -231,6 +231,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
     ) -> Float[Array, "n 3"]:
         return pose_body(body, rest, BodyPose(rotations, translation)).vertices
 
+    # the body in the pose of each view, and all lengths in units of the body
     posed = jax.vmap(pose_view)(views.rotations, views.translations)
     unit = subject_unit(rest.vertices)
     canonical, cameras = rest.vertices / unit, views.cameras.in_units(unit)
@@ -246,6 +247,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
 
     # one view after the other: a vmapped rasterizer would make every view pay for the fullest one
     position_maps, depth_maps = jax.lax.map(rasterize_view, (posed, cameras))
+    # what the network looks at: the mask and the body, or the mask alone where there is one
     foreground = (views.masks > MASK_THRESHOLD) | (depth_maps >= 0)
     if config.conventions.pixels == "person":
         masked = jnp.any(views.masks > MASK_THRESHOLD, axis=(1, 2), keepdims=True)

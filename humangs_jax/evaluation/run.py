@@ -465,11 +465,13 @@ def _score_person(
     }
     if not predicted.views:
         return about
+    # views without a prediction are not scored
     truth, inputs = case.truth.select(predicted.views), case.inputs
     try:
         scored = list(score_views(predicted.images, truth, rules, predicted.alpha, networks))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
+    # a row for each image, and its place in the gallery
     for i, scores in enumerate(scored):
         mask = None if truth.masks is None else truth.masks[i]
         shot = functools.partial(

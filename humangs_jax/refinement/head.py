@@ -165,6 +165,7 @@ def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops 
     """Crops of the photos around the region; None if the body has none or no photo shows it.
     capture: of usable views.
     """
+    # the Gaussians that the joints of the region move; faint ones may lie outside of the crops
     columns = [
         i
         for i, name in enumerate(avatar.joint_names)
@@ -174,6 +175,7 @@ def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops 
     sure = moved & (np.asarray(avatar.gaussians.opacities) > OPAQUE)
     if not sure.any():
         return None
+    # photos at the size at which heads are about as large as they should be
     longest = max(capture.images.shape[1:3])
     others = min(longest, config.image_size or longest)
     size = min(others, LOOK)
@@ -185,6 +187,7 @@ def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops 
         seen, middles, side = _squares(_pixels(avatar, views)[:, sure], views)
     if not len(seen):
         return None
+    # squares of one size around the head, in the photos that show it
     half = -(-(side + 2 * MARGIN) // SIDES) * SIDES // 2 - MARGIN
     boxes = [[(int(at) - half, int(at) + half) for at in middles[i]] for i in seen]
     views = replace(views, rotations=views.rotations[seen], translations=views.translations[seen])
@@ -196,6 +199,7 @@ def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops 
         hidden = np.asarray(views.unknown)[seen]
         unknown = windows(np.asarray(views.images)[seen], hidden, views.cameras[seen], boxes)[1] > 0
     views = replace(views, images=images, masks=masks, cameras=cameras, unknown=unknown)
+    # all Gaussians that the crops may show are drawn; powers of two are few programs
     pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
     shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved
     drawn = np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))])

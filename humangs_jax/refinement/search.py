@@ -287,13 +287,16 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
     photos, at first.
     """
     config, clock, everybody = task.config, task.clock, np.arange(len(losses))
+    # iterations alone need no trial, unless one photo contradicts the others
     if config.steps == 0 and np.max(losses) < SUSPICIOUS * np.median(losses):
         clock.planned = 0
         yield iterated(task, start, everybody)[0]
         return
+    # the photo that fits best checks the others: it is surely right
     checked = int(np.argmin(losses))
     asked = [task.photos[checked]]
     best, before, began = start, psnr_of(task, start, asked), clock.elapsed()
+    # iterations on all photos, or without the one that fits least
     for used in (
         (everybody, np.delete(everybody, int(np.argmax(losses)))) if config.iterations else ()
     ):
@@ -309,6 +312,7 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
     )  # iterations with all photos are still to come
     if best.iterations:
         yield best
+    # the trial: after which steps the photo that they do not see is still good
     total = clock.plan(lambda: stepped(task, best.state, others[0]), ahead)
     tried = round(TRIAL * total)
     share = 0.0 if tried else 1.0
@@ -316,6 +320,7 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
         if psnr_of(task, found, asked) > before - ALLOWED_LOSS:
             share = int(found.state.done) / tried
         yield found._replace(kept=False)
+    # the same share of the steps on all photos, from the start
     begin = start
     if best.iterations:
         begin, _ = iterated(task, start, used)

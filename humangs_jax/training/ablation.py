@@ -207,6 +207,7 @@ def ablate(
     base = fitting_losses(read_config(base) if isinstance(base, str) else base, networks)
     # what is compared is the end of a run
     base = dataclasses.replace(base, validate_every=base.steps, checkpoint_every=base.steps)
+    # all variants, people and scores are checked before the first run
     runs = {BASE: base, **_checked_variants(base, variants, networks)}
     folders = {name: Path(out) / folder for name, folder in _folder_names(list(runs)).items()}
     body = load_body() if body is None else body
@@ -217,6 +218,7 @@ def ablate(
     if validation and not isinstance(validation, int):
         shown = {name: as_validated(config.at(config.steps - 1)) for name, config in runs.items()}
         _check_people(shown, compared, body)
+    # seed after seed, so that a budget that ends leaves pairs to compare
     scores: dict[str, dict[int, float]] = {name: {} for name in runs}
     began, longest = time.monotonic(), 0.0
     order = [(name, seed) for seed in range(seeds) for name in runs]

@@ -177,6 +177,7 @@ class Watch:
             return
         (done, metrics, bad_samples), self._pending = self._pending, None
         numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        # whether the step failed, and how many have in a row
         counts = int(numbers["skipped"]), int(numbers["nonfinite"])
         skipped, replaced = (now > before for now, before in zip(counts, self._counts, strict=True))
         self._counts = counts
@@ -194,6 +195,7 @@ class Watch:
             self._log.event(done, "skipped" if skipped else "nonfinite", what, **details)
             if samples and jax.process_index():  # whose log is not written
                 logger.warning("step %d: %s", done, text)
+        # a run whose steps all fail learns nothing: the log says so once
         for count, problem in (
             (self._in_a_row, ALL_SKIPPED),
             (self._without_gradient, NO_GRADIENT),

@@ -153,6 +153,7 @@ def local_gradients(
         (_, aux), gradients = jax.value_and_grad(microbatch_loss, has_aux=True)(params, *microbatch)
         return jax.tree.map(lambda a, x: a + x * (size / count), total, gradients), aux
 
+    # one microbatch after the other, with gradients in one place
     microbatches = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), (batch, keys))
     zeros = jax.tree.map(jnp.zeros_like, params)
     gradients, (losses, (updated, metrics)) = jax.lax.scan(accumulate, zeros, microbatches)
@@ -252,10 +253,12 @@ def update(
                 " would be rounded away; to compute in bfloat16, keep the parameters and set"
                 ' model.runtime.dtype to "bfloat16"'
             )
+    # the gradient of the batch
     keys = subject_keys(seed, state.step, batch.inputs.betas.shape[0])
     loss, gradients, batch_stats, metrics = batch_gradients(
         state.params, state.batch_stats, body, batch, keys, config, networks, mesh
     )
+    # the step of the optimizer; one that is skipped leaves parameters and statistics as they are
     optimizer = make_optimizer(config.optimizer, config.steps)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params, value=loss)
     opt_state = cast(GuardState, opt_state)

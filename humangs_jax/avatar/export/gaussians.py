@@ -404,6 +404,7 @@ def export(
     """
     require_concrete("export", "writes a file", avatar, motion)
     path = Path(path)
+    # whether the format holds what is asked for
     form = chosen_format(path.suffix, mesh)
     if form is None:
         known = EXPORTS.where(lambda each: each.mesh >= mesh).suffixes
@@ -417,6 +418,7 @@ def export(
             f"{path}: has no rest fields: expected a name ending in {alternatives(holding)}"
         )
     _check_version(path, form, version)
+    # one file for each frame, unless one holds a whole motion
     frames = 1 if motion is None else len(motion.translations)
     if not form.animated and frames != (1 if numbers is None else len(numbers)):
         given = "no numbers" if numbers is None else f"{len(numbers)} numbers"
@@ -431,6 +433,7 @@ def export(
         if one
         else [path.with_stem(f"{path.stem}_{number:0{DIGITS}d}") for number in numbers or ()]
     )
+    # meshes take the motion, Gaussians are posed frame after frame
     if form.mesh:
         form(path, files, avatar, motion, up or form.up, name)
         return files

@@ -262,6 +262,7 @@ def _elements(data: bytes) -> dict[str, Columns]:
     end = re.compile(rb"end_header[ \t]*\r?\n").search(data, 0, LONGEST_HEADER)
     if end is None:
         raise Refused("no PLY file: expected a header that ends in end_header")
+    # the header: names, numbers and types
     order, counts, types = None, {}, {}
     for line in data[: end.start()].decode("ascii", "replace").splitlines():
         match line.split():
@@ -287,6 +288,7 @@ def _elements(data: bytes) -> dict[str, Columns]:
     if not order:
         check_limit("text_bytes", len(data), "bytes")
         lines = io.StringIO(data[end.end() :].decode("ascii"))
+    # the rows of each element, from bytes or from lines of text
     found, at = {}, end.end()
     for name, count in counts.items():
         if any(kind is None for _, kind in types[name]):

@@ -97,6 +97,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Versi
     Raises: ValueError for Gaussians farther than 8,000 km from the origin.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
+    # places have 24 bits: as many behind the point as the farthest Gaussian leaves
     farthest = np.abs(means).max(initial=1e-6)
     bits = min(MOST_FRACTIONAL_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
     if bits < 0:
@@ -106,6 +107,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Versi
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     with np.errstate(divide="ignore"):
         steps = SCALE_STEPS * (np.log(scales) + SCALE_ZERO)
+    # one array for each property, as few bytes as the format has for it
     arrays = (
         fixed[..., None].view("u1")[..., :3],  # the lower three of four bytes
         _byte(255 * opacities),
@@ -116,6 +118,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Versi
     )
     parts = [np.ascontiguousarray(array).tobytes() for array in arrays]
     numbers = (SPZ_MAGIC, version, len(means), COUNTS.index(harmonics.shape[1]), bits, 0)
+    # older files are one stream of gzip
     if version < WITH_TABLE:
         content = HEADER.pack(*numbers, 0) + b"".join(parts)
         write_bytes(path, gzip.compress(content, 9, mtime=0))

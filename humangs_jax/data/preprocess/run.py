@@ -277,6 +277,7 @@ def _write_lists(
     out: Path, names: Sequence[str], settings: Settings, made_with: dict[str, Any]
 ) -> dict[str, Any]:
     """Lists and manifest of what is there."""
+    # all that lies in the folder counts, whichever run has made it
     scenes = {
         name: _read_scene(out / name / SCENE, settings) for name in finished(out, settings.mark)
     }
@@ -285,6 +286,7 @@ def _write_lists(
         for file in sorted((out / SKIPPED).glob("*.json"))
         if file.stem not in scenes
     }
+    # the split is that of all names, so that it does not depend on what is finished
     train, test = (
         split_ids(names, settings.train, settings.test)
         if DATASETS[settings.kind].scans
@@ -294,6 +296,7 @@ def _write_lists(
         "train": [name for name in train if name in scenes],
         "test": [name for name in test if name in scenes],
     }
+    # lists of the published layout
     if settings.layout == "scenes":
         for part, chosen in split.items():
             if chosen or part == "test":  # compact: 2,300 scenes of 60 views are 50 MB
@@ -308,6 +311,7 @@ def _write_lists(
                     evaluation_indices(counts, inputs),
                     indent=None,
                 )
+    # the manifest says what is known of all people, whatever the layout
     known = {name: scene["known"] for name, scene in scenes.items()}
     counts = {
         "scenes": len(scenes),
