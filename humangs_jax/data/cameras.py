@@ -135,7 +135,7 @@ class Calibration:
     mask_key: str | None = None
     """The key under which the file names masks; None if it does not."""
     upright: bool = False
-    """Whether cameras are of photos that obey their EXIF orientation; if not, sizes tell."""
+    """Whether cameras are of photos that obey their EXIF orientation; if not, sizes decide."""
     estimated: bool = False
     """Whether the cameras were found from the person."""
     unit: float | None = None
