@@ -59,13 +59,12 @@ OPACITY = 0.55
 
 @pytree_dataclass
 class BodyImage:
-    """The posed body as one camera sees it. shaded: (h, w, 3) lit from the camera, black outside.
-
-    covered: (h, w).
-    """
+    """The posed body as one camera sees it."""
 
     shaded: Float[Array, "h w 3"]
+    """Colors, (h, w, 3), lit from the camera, black outside of the body."""
     covered: Bool[Array, "h w"]
+    """Pixels that show the body, (h, w)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +72,7 @@ class ViewCheck:
     """One view."""
 
     name: str
+    """Name of the view, as in the capture."""
     iou: float | None
     """Of body and mask; None without masks."""
     outside: float | None
@@ -80,16 +80,19 @@ class ViewCheck:
     inside: float
     """Share of the body in the image."""
     warning: str | None = None
+    """What looks wrong with the view, in a line; None if nothing does."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CheckReport:
-    """One row per view; `str(report)` is the table that the command line prints. warnings: about
-    the capture as a whole.
+    """How well body, photos and masks agree; `str(report)` is the table that the command line
+    prints.
     """
 
     views: tuple[ViewCheck, ...]
+    """One entry per view, in the order of the capture."""
     warnings: tuple[str, ...] = ()
+    """What looks wrong with the capture as a whole, a line each."""
     displaced: float = 0.0
     """Metres that `reconstruct` moves the body at most, so that it fits the masks; 0: it fits
     already.
@@ -106,6 +109,7 @@ class CheckReport:
 
     def __str__(self) -> str:
         """A table, then the warnings."""
+        # views with a warning end in an exclamation mark
         rows = [["view", "silhouette IoU", "body outside mask", "body in frame"]]
         for view in self.views:
             iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
@@ -114,6 +118,7 @@ class CheckReport:
                 [view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warning))]
             )
         lines = text_table(rows)
+        # what the yellow lines of the sheet are
         if self.displaced:
             how = "as body.npz says" if self.registered else "to the masks"
             lines.append(
@@ -126,6 +131,7 @@ class CheckReport:
             )
         lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {view.warning}" for view in self.views if view.warning]
+        # silhouettes are nearly symmetric, so a silent check is no proof
         if self.ok:
             lines.append(
                 "no warnings; look at the sheet all the same: silhouettes do not show whether left"
@@ -144,11 +150,13 @@ def check_capture(
     Raises: OSError if the sheet cannot be written.
     """
     right = keypoints is not None and not find_camera_errors(capture, keypoints)
+    # faults look at the photos as they are, the sheet at smaller ones
     found = faults(capture)
     whole, vertices = capture, _posed_frames(capture)
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
     shown, tints = _shown(whole, capture, vertices), side_tints(capture.body)
+    # the body as `reconstruct` will use it, moved to the masks and with a skirt, is drawn in yellow
     moves, worn = capture.displacement, None
     if capture.masks is not None:
         moves = displacement(capture.body, capture, always=False) if moves is None else moves
@@ -161,6 +169,7 @@ def check_capture(
         else _posed_frames(dataclasses.replace(capture, body=body, displacement=None), moves)
     )
     moved_tints = side_tints(body)
+    # compare each silhouette with its mask, and draw it
     overlays, views = [], []
     for i, (name, warning, inside) in enumerate(
         zip(capture.names, found.views, found.inside, strict=True)
@@ -176,6 +185,7 @@ def check_capture(
             iou, outside = _agreement(covered, capture.masks[i] > MASK_THRESHOLD)
             if warning is None and outside > MOST_OUTSIDE:
                 warning = WIDER.format(outside, *(FIXED if right else FREE))
+        # the sheet shows the person close, the comparison is of the whole photo
         if shown is not capture:
             drawn = _body_image(
                 vertices[int(capture.frames[i])], capture.body.faces, tints, shown.cameras[i]
@@ -188,6 +198,7 @@ def check_capture(
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, inside, warning))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
+    # a skirt has vertices of its own behind those of the body, which do not count
     farthest = (
         0.0
         if moves is None
@@ -350,6 +361,7 @@ def _with_keypoints(
     from PIL import Image, ImageDraw
 
     height, width = image.shape[:2]
+    # drawn larger and shrunk at the end, for smooth lines
     canvas = Image.fromarray(to_uint8(image)).resize(
         (FINE * width, FINE * height), Image.Resampling.BILINEAR
     )
@@ -359,6 +371,7 @@ def _with_keypoints(
     discs, crosses = within(keypoints.points[view]), within(examination.landmarks[view])
     shown = np.flatnonzero(examination.compared[view])
     radii = [FINE * (SMALL if _is_small(name) else RADIUS) for name in keypoints.set.names]
+    # lines and crosses first, so that discs lie over them
     for k in shown:
         (x, y), arm = crosses[k], 1.5 * radii[k]
         for line in (
@@ -368,6 +381,7 @@ def _with_keypoints(
         ):
             pen.line(line, fill=CROSS, width=FINE)
     for k in shown:
+        # outliers are rings, since they did not count in the fit
         color, outlier = _color(keypoints.set.names[k]), examination.outliers[view, k]
         pen.circle(
             tuple(discs[k]),

@@ -482,6 +482,7 @@ def write_found(
     Raises: ValueError if two photos have the same name but for the suffix, or for a file of others,
     see `check_found_place`.
     """
+    # photos that differ in their suffix only would share a mask
     files = [mask_name(photo.name) for photo in photos]
     owners: dict[str, str] = {}
     for photo, file in zip(photos, files, strict=True):
@@ -494,11 +495,13 @@ def write_found(
             ImagePeople(photo.name, photo.size, (None if each is None else each.person,))
             for photo, each in shown
         ]
+        # the chosen person alone: `humangs fit` need not choose again
         write_people(temporary / KEYPOINTS_FILE, images)
         write_sheet(temporary / SHEET_FILE, photos, person)
         for photo, file in zip(photos, files, strict=True) if masks else ():
             (temporary / file).parent.mkdir(parents=True, exist_ok=True)
             write_png(temporary / file, person_mask(photo, person), mark=MASK)
+        # the capture names the masks only once they are all written
         if to_capture:
             description = read_description(folder / "capture.json")
             views = []
@@ -567,6 +570,7 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
     picture = np.asarray(photo.thumbnail, np.float64).copy()
     height, width = picture.shape[:2]
     heads = []
+    # color everybody's pixels; those who were not chosen are fainter
     for i, found in enumerate(photo.people):
         if found is None:
             continue
@@ -575,10 +579,12 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
             FAINT if chosen in (None, i) else FAINT / 2
         )
         picture = picture * (1 - mask) + color * mask
+        # the number stands above the nose, inside the picture
         x, y = found.person.points[0, :2] * width / photo.size[0]
         heads.append((float(np.clip(x, 8, width - 24)), float(np.clip(y - 30, 2, height - 26)), i))
     canvas = Image.fromarray(to_uint8(picture))
     pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(22)
+    # a question mark tells that numbers of different photos are not the same people
     for x, y, i in heads:
         number = str(i) if photo.known else f"{i}?"
         pen.text(

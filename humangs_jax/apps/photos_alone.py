@@ -45,16 +45,18 @@ stay as they are.
 
 @dataclasses.dataclass(frozen=True)
 class PhotosImported:
-    """What `import_photos` did, a line each; warnings: what a user should know. people, person: who
-    was found in the photos, and the number of the one who is meant. one_moment: whether several
-    photos share one pose, so that cameras can be refined.
-    """
+    """What `import_photos` did."""
 
     lines: tuple[str, ...]
+    """What was written and found, a line each."""
     warnings: tuple[str, ...]
+    """What a user should know, a line each."""
     people: list[PhotoPeople]
+    """The people in each photo, at the size of the photos that were looked at."""
     person: int
+    """Number of the one who is meant among the people."""
     one_moment: bool
+    """Whether several photos share one pose, so that cameras can be refined."""
 
 
 def import_photos(
@@ -117,15 +119,18 @@ def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
 
 
 class _Looked(NamedTuple):
-    """photos: all of them. shown: those with the person `number`. seen: of these. cropped: a line
-    for photos that were cut.
-    """
+    """The people in the photos, and what is seen of the one who is meant."""
 
     photos: list[PhotoPeople]
+    """All photos, with their people."""
     number: int
+    """Number of the person who is meant."""
     shown: list[int]
+    """Indices of the photos that show the person."""
     seen: PersonViews
+    """Landmarks of the person in these photos."""
     cropped: tuple[str, ...]
+    """A line for photos that were cut; empty if none was."""
 
 
 class _Choice(NamedTuple):
@@ -140,6 +145,7 @@ class _Choice(NamedTuple):
 def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:
     names = [file.relative_to(images).as_posix() for file in looked_at]
     photos = detect.detect_photos(names, map(detect.upright, looked_at))
+    # given masks show the detector the person where others are in front
     if choice.masks is not None:
         masks = [upright_mask(choice.masks, images, file) for file in files]
         pictures = [detect.upright(file) for file in looked_at]
@@ -147,8 +153,10 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
         photos = detect.with_masked(photos, masks, cut)
     photos = same_people(photos)
     photos, number = _chosen(photos, images, files, choice)
+    # cameras are found from photos with the person only
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]
+    # EXIF gives the focal length of the file, which may have been reduced since
     known = (
         (focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size))
         for i in shown
@@ -264,6 +272,7 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
     centers = np.asarray([camera.center for camera in found.cameras], float)
     distance = float(np.median(np.hypot(centers[:, 0], centers[:, 2])))
     count = len(found.views)
+    # how many poses the photos show decides what can be refined
     if count == 1:
         which = "one photo: what it does not show is a guess"
     elif found.moments == 1:
@@ -273,6 +282,7 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
             f"{count} photos of several moments: the person has a pose of its own in each, and one"
             " shape"
         )
+    # focal lengths over the diagonal, since photos may differ in size
     focal = np.median(
         [
             float(c.K[0, 0]) / np.hypot(*seen.sizes[view])

@@ -84,16 +84,16 @@ MISTAKES_OF_IMAGES: dict[str, Callable[[Cells, Cells], tuple[Cells, Cells]]] = {
 
 
 class Faults(NamedTuple):
-    """What is wrong. whole: with the capture, a line each. views: with each view, a line or None.
-
-    inside: of each view, the share of the body in the frame. explained: views that `whole`
-    explains.
-    """
+    """What is wrong with a capture."""
 
     whole: tuple[str, ...]
+    """What is wrong with the capture as a whole, a line each."""
     views: tuple[str | None, ...]
+    """What is wrong with each view, a line or None."""
     inside: tuple[float, ...]
+    """Share of the body in the frame, of each view, 0 to 1."""
     explained: set[int]
+    """Indices of the views that `whole` explains."""
 
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:

@@ -29,36 +29,44 @@ RIVAL = 0.35
 
 
 class Found(NamedTuple):
-    """A person in a photo. mask: 8 bits, the part of the photo that begins at corner (row, column).
-    area: pixels of the person; of one who is covered by others, as many as there would be without
-    them. covered: somebody else may stand in front.
-    mirrored: left and right were exchanged, as other views show; it is repaired. apart: the
-    landmarks do not meet those of other photos of the moment: the camera is off, or this is
-    somebody else.
-    """
+    """A person who was found in a photo."""
 
     person: SeenPerson
+    """Landmarks in pixels of the photo and in metres, and whether they are seen."""
     mask: UInt[np.ndarray, "h w"]
+    """The person's mask, (h, w), 0 to 255, in the part of the photo that begins at `corner`."""
     corner: tuple[int, int]
+    """Row and column of the first pixel of the mask in the photo."""
     area: float
+    """Pixels of the person; of one who is covered by others, as many as there would be without
+    them.
+    """
     mirrored: bool = False
+    """Whether left and right were exchanged, as other views show; it is repaired."""
     apart: bool = False
+    """Whether the landmarks do not meet those of other photos of the moment: the camera is off, or
+    this is somebody else.
+    """
     covered: bool = False
+    """Whether somebody else may stand in front."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PhotoPeople:
-    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet.
-    people: None who is not in it.
-    known: False if several are large, and nothing tells who of them is who of another photo: they
-    are in the order of size.
-    """
+    """A photo, and the people who were found in it."""
 
     name: str
+    """Name of the photo's file."""
     size: tuple[int, int]
+    """Width and height of the photo, pixels."""
     thumbnail: Float[np.ndarray, "h w 3"]
+    """The photo reduced for the sheet, (h, w, 3), 0 to 1."""
     people: tuple[Found | None, ...]
+    """The people by number, the same in all photos; None for those who are not in it."""
     known: bool = True
+    """Whether the numbers tell who is who. False if several people are large and nothing tells who
+    of them is who of another photo: they are in the order of size.
+    """
 
 
 def inside_photo(

@@ -52,39 +52,41 @@ KIND = "humangs_jax settings"
 class Settings:
     """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the
     screen.
-
-    views: photos that are used at most, chosen by `select_views`; None: all. runtime: of the
-    network. refine_iterations,
-    refine_steps, head_steps: of refinement, see `RefineConfig`; the first two 0 for none.
-    refine_size: photos whose longer side is larger are reduced to it for refinement, pixels. splat:
-    as `Shot.splat`. prune: as `Shot.prune`.
     """
 
     views: Few | None = knob(
         None, cost="what the other photos show", gain="time in proportion", measured=MEASURED
     )
+    """The most photos that are used, chosen by `select_views`; None for all."""
     runtime: Runtime = dataclasses.field(default_factory=Runtime)
+    """How the network runs."""
     refine_iterations: Iterations = knob(
         0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED
     )
+    """Iterations of the learned update, see `RefineConfig`; 0 for none."""
     refine_steps: RefineSteps = knob(
         0, cost="time in proportion", gain="detail of the photos", measured=MEASURED
     )
+    """Steps of the optimizer, see `RefineConfig`; 0 for none."""
     head_steps: RefineSteps = knob(
         0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
     )
+    """Further steps on the head, see `RefineConfig`."""
     refine_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED
     )
+    """Longer side to which larger photos are reduced for refinement, pixels; None: as they are."""
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
     )
+    """How frames are splatted, as `Shot.splat`."""
     prune: bool = knob(
         False,
         cost="less than 0.001 dB",
         gain="time of frames that are drawn often",
         measured=MEASURED,
     )
+    """Whether Gaussians that no frame shows are left out, as `Shot.prune`."""
 
     @property
     def refinement(self) -> RefineConfig | None:
@@ -287,6 +289,7 @@ def tune(
         >>> tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
         >>> avatar = hg.reconstruct_with(tuned.settings, *hg.load_weights(), capture)
     """
+    # refinement needs masks
     presets = {
         name: settings
         for name, settings in PRESETS.items()
@@ -294,6 +297,7 @@ def tune(
     }
     measured: dict[str, Cost] = {}
     best = None
+    # from the fastest on: slower ones would only exceed the budget further
     for name, settings in bar(presets.items(), desc="tune", unit="preset", shown=progress):
         cost = measured[name] = measure(settings, variables, config, capture, size)
         if memory_mb is not None and cost.memory_mb is None:
@@ -306,6 +310,7 @@ def tune(
         if any(exceeded):
             break
         best = name
+    # say what the fastest takes, so that the budget can be set
     if best is None:
         name, cost = next(iter(measured.items()))
         raise ValueError(

@@ -50,24 +50,26 @@ OWN_DETECTOR = (
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """What a folder has.
-
-    folder: that was looked at. images: the folder of its photos. photos: their number. size: of the
-    first one, pixels.
-    cameras, keypoints: file or folder, masks: folder, None where there is none. alpha: whether
-    photos carry their mask.
-    unused: what the folder has besides.
-    """
+    """What a folder has."""
 
     folder: Path
+    """The folder that was looked at."""
     images: Path
+    """The folder of its photos."""
     photos: int
+    """Number of the photos."""
     size: tuple[int, int]
+    """Width and height of the first photo, pixels."""
     cameras: Path | None = None
+    """File or folder of a calibration; None if there is none."""
     masks: Path | None = None
+    """Folder of masks; None if there is none."""
     alpha: bool = False
+    """Whether photos carry their mask as alpha channel."""
     keypoints: Path | None = None
+    """File or folder of keypoints; None if there are none."""
     unused: tuple[Unused, ...] = ()
+    """What the folder has besides."""
 
     def __str__(self) -> str:
         """A line for each kind of thing, and one for what is not used."""
@@ -91,13 +93,14 @@ class Material:
 
 @dataclasses.dataclass(frozen=True)
 class Missing:
-    """Something that is not there. why: what it is for. how: command lines and advice, a line
-    each.
-    """
+    """Something that is not there, and how to make it."""
 
     name: str
+    """What is missing: cameras, masks or keypoints."""
     why: str
+    """What it is for."""
     how: tuple[str, ...]
+    """Command lines and advice, a line each."""
 
     def __str__(self) -> str:
         """Indented lines under a heading."""
@@ -124,9 +127,11 @@ def look(
             raise CaptureError(path, "", "no such file or folder")
     scan = scan_photos(folder)
     images, photos = scan.folder, scan.photos
+    # places by their names; what the arguments name goes before them
     mask_folders = [folder / name for name in MASK_FOLDERS if has_photos(folder / name)]
     named = [folder / KEYPOINT_FOLDER] if (folder / KEYPOINT_FOLDER).exists() else []
     named += [found[1]] if (found := KEYPOINTS.found(folder)) else []
+    # detectors name their files in many ways, nearly all with this word
     others = sorted(
         path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
     )
@@ -197,6 +202,7 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
     have to be of those.
     """
     folder, found = material.folder, []
+    # two ways to cameras: structure from motion, or a calibrated set
     if material.cameras is None:
         workspace = folder / "colmap"
         model = workspace / "sparse" / "0"
@@ -221,6 +227,7 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
             f"  put calibration.json, or intri.yml and extri.yml, into {folder} (docs/cameras.md)",
         )
         found.append(Missing("cameras", "where each photo was taken from, and its lens", how))
+    # a photo with an alpha channel has its mask already
     if material.masks is None and not material.alpha:
         how = (
             OWN_DETECTOR,
@@ -233,6 +240,7 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
             "photos with nothing but white behind the person: --without-masks",
         )
         found.append(Missing("masks", "what of each photo is the person", how))
+    # keypoints have to be of the photos that the capture has
     if material.keypoints is None:
         source, target = images or material.images, folder / "keypoints"
         how = (
@@ -282,10 +290,12 @@ CLEARLY = 0.1
 
 
 class HeldOut(NamedTuple):
-    """Of the photo with that name. psnr: dB over the person."""
+    """How well a photo that an avatar did not see is reproduced."""
 
     name: str
+    """Name of the photo that was held out."""
     psnr: float
+    """PSNR over the person, dB."""
 
     def __str__(self) -> str:
         """One line."""

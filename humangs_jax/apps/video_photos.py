@@ -88,6 +88,7 @@ def photos_of_video(video: Path, folder: Path) -> str:
     with reading(video, "video", CaptureError):
         status = video.stat()
     of_video = {"video": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns}
+    # frames of the same video are kept; anything else in the folder is left alone
     if folder.exists() or folder.is_symlink():
         known = read_json(folder / MARK) if (folder / MARK).is_file() else None
         if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
@@ -97,6 +98,7 @@ def photos_of_video(video: Path, folder: Path) -> str:
             )
             raise CaptureError(folder, "", problem)
         return _told(video, folder, known["chosen"], known["frames"], known.get("by_direction"))
+    # without the detector, or if the person does not turn, frames that look different are taken
     sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
     with reading(video, "video", CaptureError):
         chosen = _by_direction(video, sharpness) if available() else []

@@ -99,6 +99,7 @@ class Animate:
         if self.camera is not None:
             said = ["turn"] * (self.turn != 0) + ["no-follow"] * (not self.follow)
             _require_no_circle("--camera", self.shot, FROM_THE_SIDE, said)
+        # a wrong output name is found before JAX starts
         with stage("starting"):
             from humangs_jax.avatar.attach_face import with_face_for
             from humangs_jax.avatar.avatar import Avatar
@@ -113,15 +114,18 @@ class Animate:
             avatar = Avatar.load(self.avatar)
             motion = self.part.load(self.motion, avatar.rest_joints)
             avatar = with_face_for(avatar, motion)
+            # cut and repeat the motion before cameras are made for its frames
             with reading(self.motion or "the motion", "motion"):
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             frames = len(motion.translations)
             if self.camera is None:
+                # without a camera file the camera goes along, or circles
                 poses, cameras = motion_views(avatar, motion, shot, self.turn, self.follow)
             else:
                 found = one_size(self.camera, file_cameras(self.camera, shot, upright=True))
                 poses, cameras = motion_poses(avatar, motion), camera_path(found, frames)
             check_video(self.out, frames, cameras.width, cameras.height)
+        # Gaussians that no frame shows are left out once for the whole video
         avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
             written = write_video(
@@ -179,12 +183,14 @@ class Render:
     """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
+        # a video is one turn; images are 8 views of a circle
         video, views = self.out.suffix != "", self.views
         if views is None:
             views = max(2, round(TURN_SECONDS * self.fps)) if video else 8
         if video and self.exr:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         self._require_one_kind_of_cameras()
+        # Gaussians of other programs have no body to pose
         if self.avatar.suffix.lower() in (*SPLATS, *OTHERS):
             return self._render_gaussians(views)
         with stage("starting"):
@@ -202,6 +208,7 @@ class Render:
             from humangs_jax.data.capture import load_capture
             from humangs_jax.data.exposure import exposures
 
+            # everything that can be wrong with the options is found before the avatar is read
             check_video(
                 self.out,
                 views,
@@ -214,6 +221,7 @@ class Render:
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             exposed = names = None
+            # cameras of a file, of the capture, or on a circle
             if self.camera is not None:
                 found = file_cameras(self.camera, shot, upright=True)
                 cameras, names = one_size(self.camera, found), list(found)
@@ -229,6 +237,7 @@ class Render:
                 poses, cameras = turntable_views(avatar, pose, views, shot)
         avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
+            # a video, or one image for each view
             if video:
                 written = write_video(
                     self.out, images(avatar, poses, cameras, shot, "render"), self.fps
@@ -250,6 +259,7 @@ class Render:
         suggest("humangs animate", self.avatar)
 
     def _render_gaussians(self, views: int) -> None:
+        # options that need a skeleton do not apply
         said = {
             "pose": self.pose != "t",
             "capture": self.capture,
@@ -275,11 +285,13 @@ class Render:
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             gaussians = load_gaussians(self.avatar)
+            # a circle around the Gaussians, whose up axis the format tells
             if self.camera is None:
                 cameras = circle_cameras(gaussians, SPLATS[self.avatar.suffix.lower()], views, shot)
             else:
                 cameras = file_cameras(self.camera, shot)
         with stage("drawing"):
+            # a video needs one size of frames, images do not
             if self.out.suffix:
                 count = write_video(self.out, splat_images(gaussians, cameras, shot), self.fps)
                 size = _size(self.out, next(iter(cameras.values())))

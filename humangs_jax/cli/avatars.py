@@ -469,6 +469,7 @@ class Export:
 
     def run(self) -> None:
         out = Path("avatar.ply") if self.out is None and self.html is None else self.out
+        # a mesh goes into fewer formats than Gaussians
         suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
         if out is not None:
             require_file(out, suffixes, read=(self.avatar, self.motion))
@@ -481,7 +482,9 @@ class Export:
             motion = (
                 None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
             )
+            # a motion with expressions needs an avatar with a face
             avatar = avatar if motion is None else with_face_for(avatar, motion)
+        # the page has the T-pose and the motion, whatever frame the file has
         if self.html is not None:
             with stage("making the page"):
                 from humangs_jax.viewer.page import write_page
@@ -495,6 +498,7 @@ class Export:
             )
         if out is not None:
             self._write(out, avatar, motion)
+        # suggest the other thing that this motion can be used for
         played = self.part.options(self.motion)
         if self.html is None:
             suggest("humangs export", self.avatar, "--html avatar.html", *played)
@@ -610,6 +614,7 @@ class Tune:
     """Network weights (.safetensors). Default: the shipped ones."""
 
     def run(self) -> None:
+        # without a limit there is nothing to choose by
         budgets: dict[str, Any] = {
             "reconstruct_ms": self.reconstruct_ms,
             "frame_ms": self.frame_ms,
@@ -626,11 +631,13 @@ class Tune:
             from humangs_jax.apps.settings import save_settings, tune
             from humangs_jax.network.weights import load_weights
 
+        # the photos are checked by `humangs check`, not here
         photos = _read_capture(self.capture, check=False)
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
         with stage("measuring"):
             tuned = tune(variables, config, photos, **budgets, size=self.size, progress=True)
+        # the file keeps what was measured beside the settings
         costs = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
         about = {
             "name": tuned.name,

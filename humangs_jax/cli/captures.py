@@ -257,6 +257,7 @@ class Synth:
             raise UsageError(
                 f"--poses {self.poses}: expected at most --motion-frames {self.motion_frames}"
             )
+        # --for-training stands for other options, which may not contradict it
         small = FOR_TRAINING if self.for_training else {}
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         for name, value in small.items():
@@ -269,6 +270,7 @@ class Synth:
         with stage("starting"):
             from humangs_jax.synthetic.writer import Layout, write_set
 
+        # close views are part of the full set, and of another only where they are asked for
         layout = Layout(
             small.get("size", self.size),
             small.get("poses", self.poses),

@@ -162,11 +162,13 @@ class Fit:
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
 
+        # all that can be refused is refused before the work
         target = check_place(
             self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body)
         )
         tell_deleted(target, unless=target if self.out is None else self.capture)
         detections = self.detections
+        # without a file the shipped detector finds the keypoints
         if detections.keypoints is None:
             if not available():
                 raise UsageError(
@@ -192,6 +194,7 @@ class Fit:
             )
         with stage("examining the fit"):
             report = fitted.report
+        # the report shows what the keypoint file had to say, too
         report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
         with stage("writing"):
             write_fitted(self.capture, target, fitted.capture, report, fitted.record)
@@ -213,7 +216,9 @@ class Fit:
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
+            # a capture without a record was not made by `humangs fit`
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
+        # cameras that no photo determines stay as they are
         fixed = self.refinement.fixed_cameras or cameras_are_unseen(start)
         config = usual_config(
             record is not None,
@@ -224,6 +229,7 @@ class Fit:
         with stage("refining cameras and body"):
             refinement = refine_capture(start, keypoints=keypoints, config=config)
         tell(refinement.report)
+        # a result that is no better is not written
         if not refinement.report.kept:
             tell("nothing was written: refinement did not improve the capture")
             return
@@ -263,6 +269,7 @@ class Check:
             from humangs_jax.io.atomic import check_ours
             from humangs_jax.io.images import is_own_output
 
+            # files that nobody named must not replace those of others
             unasked = [sheet, *([self.out] if self.out == DEFAULT_SHEET else [])]
             check_ours(unasked, is_own_output, "choose another name by --out, or move it away")
             from humangs_jax.capture.detection.people import available
@@ -273,9 +280,11 @@ class Check:
             capture = load_capture(self.capture, fit_masks=True)
             try:
                 keypoints, record = self.detections.read_or_recorded(self.capture, capture)
+            # an older fit may be of other photos
             except UnknownViewError as error:
                 warn(f"{error}; the check does without that fit")
                 keypoints, record = None, None
+        # the detector finds what the capture lacks
         if available() and (capture.masks is None or keypoints is None):
             capture, keypoints = self._found(capture, keypoints)
         with stage("drawing the body"):
@@ -283,6 +292,7 @@ class Check:
         tell(report)
         wrote(self.out, "the body over the photos")
         ok = report.ok
+        # a second sheet shows the keypoints
         if keypoints is not None:
             with stage("examining the fit"):
                 from humangs_jax.apps.check import fit_sheet

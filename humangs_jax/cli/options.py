@@ -112,16 +112,17 @@ WHOLE = PartOfMotion()
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Annotation of an option that says where results go. Without suffixes it is a folder, which is
-    made if it does not exist.
+    """Annotation of an option that says where results go.
 
-    suffixes: of a file. folder: a name without suffix is a folder. avatar: the file replaces an
-    avatar only.
+    Without suffixes it is a folder, which is made if it does not exist.
     """
 
     suffixes: tuple[str, ...] = ()
+    """Suffixes that the file may have; empty for a folder."""
     folder: bool = False
+    """Whether a name without suffix is a folder."""
     avatar: bool = False
+    """Whether the file replaces an avatar only."""
 
 
 AVATAR = Place((".npz",), avatar=True)

@@ -190,6 +190,7 @@ class Start:
         from humangs_jax.capture.detection.people import available
         from humangs_jax.io.reading import read_json
 
+        # a body that is there is used again
         if self._resumes():
             mark = read_json(self.out / MARK)
             self._check_same_options(mark)
@@ -202,14 +203,17 @@ class Start:
             return
         if self.overwrite:
             tell_deleted(self.out)
+        # without cameras the person gives them
         if material.cameras is None and available():
             self._from_photos_alone(material, limits)
             return
+        # with cameras: import them, and name what is still to be made
         report = self._import(material) if material.cameras is not None else None
         changed = report is not None and (report.undistorted or report.turned or report.heic)
         masked = self.without_masks or (report is not None and report.masks)
         needed = missing(material, self.out / "images" if changed else None)
         needed = [each for each in needed if not (masked and each.name == "masks")]
+        # what the detector finds is not asked for
         detected = [
             each.name for each in needed if each.name in ("masks", "keypoints") and available()
         ]
@@ -329,12 +333,14 @@ class Start:
                 overwrite=True,
                 also=self._mark(),
             )
+        # the folder scan has named these files already
         told = {each.path for each in material.unused}
         tell(
             dataclasses.replace(
                 report, unused=tuple(each for each in report.unused if each.path not in told)
             )
         )
+        # keypoints of the photos before the import do not fit those after it
         if report.undistorted and material.keypoints is not None:
             warn(
                 f"lens distortion was removed: {material.keypoints} should be of the photos in"
@@ -465,6 +471,7 @@ class Start:
             capture = usable_views(capture)
             weights = load_weights()
             avatar = reconstruct(*weights, photos_to_read(capture))
+        # refinement compares with masks, and is left out without them
         if limits is not None and capture.masks is not None:
             with stage("refining"):
                 from humangs_jax.refinement.config import RefineConfig
@@ -477,6 +484,7 @@ class Start:
             tell(refinement.summary())
             if refinement.interrupted:
                 raise KeyboardInterrupt
+        # the number tells a user what to expect of views that no photo shows
         if estimate is None:
             with stage("holding one photo out"):
                 from humangs_jax.apps.start import held_out_psnr
@@ -487,6 +495,7 @@ class Start:
                 )
         if estimate is not None:
             tell(estimate)
+        # name the parts that no photo shows
         guess = guess_line(capture)
         if guess is not None:
             tell(guess)

@@ -79,6 +79,7 @@ class Preprocess:
         part = shard_of(self.shard)
         from humangs_jax.data.preprocess.protocol import NEAR_FACTORS
 
+        # options are checked before the protocol's module, which imports JAX
         factors = NEAR_FACTORS if scans.near else scans.factors
         if not 0 < factors[0] <= factors[1]:
             raise UsageError(
@@ -312,9 +313,11 @@ class Convert:
             from humangs_jax.network.weights import save_weights
 
         with stage("reading"):
+            # loss networks are read only if they are asked for
             networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
             converted = load_checkpoint(checkpoint, self.head_width)
         with stage("writing"):
+            # shapes do not tell how features are pooled: the option does
             save_weights(
                 out,
                 converted.variables,
@@ -324,6 +327,7 @@ class Convert:
             if losses is not None:
                 write_bytes(losses, save(networks))
         wrote(out, describe(converted))
+        # say what of the checkpoint was left out
         if losses is None:
             tell(
                 f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*);"
@@ -411,6 +415,7 @@ class Evaluate:
             from humangs_jax.evaluation.run import evaluate
             from humangs_jax.losses.loss_networks import load_lpips
 
+        # LPIPS of each backbone whose files are given
         networks = []
         for net in ("vgg", "alex", "squeeze"):
             if found := getattr(self.lpips, f"lpips_{net}"):
@@ -420,6 +425,7 @@ class Evaluate:
                         f" {len(found)}"
                     )
                 networks.append(load_lpips(net, *found))
+        # scores of an interrupted run of the same command are used again
         keep = self._kept()
         if keep is not None and (scored := len(list(keep.glob("person_*.json")))):
             tell(f"going on: {scored} {'person is' if scored == 1 else 'people are'} scored")
@@ -440,6 +446,7 @@ class Evaluate:
             )
         tell(result.summary())
         result.write(**files)
+        # a finished evaluation needs them no more
         if keep is not None:
             shutil.rmtree(keep, ignore_errors=True)
         for name, path in files.items():

@@ -66,25 +66,34 @@ DRAWN_FIELDS = ("near", "alpha_min", "alpha_max", "jacobian_margin")
 
 @dataclasses.dataclass
 class Packed:
-    """An avatar and a motion. header: what JSON holds. data: arrays, one after the other, each at a
-    multiple of 4 bytes.
+    """An avatar and a motion, as the page holds them.
 
-    Little-endian; `low`, `high` and `step` are in the header:
-        means uint16 (g, 3): from low to high, per axis, metres. scales uint16 (g, 3): log of
-        metres, from low to high. quats int16 (g, 4): unit, wxyz, times 32767. opacities uint16
-        (g,): [0, 1]. colors uint16 (g, 3): from low to high. harmonics uint16 (g, k, 3): from low
-        to high; only if the Gaussians have some. weights uint16 (g, 8): skinning weights, the
-        largest first; every row sums to 65535. weight_joints uint8 (g, 8). light_normals int8 (g,
-        3): times 127. light_shading uint16 (g,): from low to high. Both only if the avatar has a
-        light. rest_joints float32 (j, 3): metres. rotations int16 (m, j, 3): axis-angle times step,
-        radians. translations float32 (m, 3): metres. Of the motion. shape_directions int16 (s, n,
-        3): how vertices move per unit of a shape coefficient, times step, metres. shape_joints
-        float32 (s, j, 3): likewise of joints, metres. Both only if the body is known. face_...: of
-            an avatar with a face, see `page_face.pack_face`; its hidden Gaussians come last.
+    Each array of `data` is little-endian and begins at a multiple of 4 bytes. `low`, `high` and
+    `step` are in the header.
+
+    Of the Gaussians: means uint16 (g, 3), from low to high, per axis, metres. scales uint16 (g, 3),
+    log of metres, from low to high. quats int16 (g, 4), unit, wxyz, times 32767. opacities uint16
+    (g,), [0, 1]. colors uint16 (g, 3), from low to high. harmonics uint16 (g, k, 3), from low to
+    high; only if the Gaussians have some. weights uint16 (g, 8), skinning weights, the largest
+    first; every row sums to 65535. weight_joints uint8 (g, 8).
+
+    Of the light, if the avatar has one: light_normals int8 (g, 3), times 127. light_shading uint16
+    (g,), from low to high.
+
+    Of the skeleton and the motion: rest_joints float32 (j, 3), metres. rotations int16 (m, j, 3),
+    axis-angle times step, radians. translations float32 (m, 3), metres.
+
+    Of the shape, if the body is known: shape_directions int16 (s, n, 3), how vertices move per unit
+    of a shape coefficient, times step, metres. shape_joints float32 (s, j, 3), the same of joints,
+    metres.
+
+    Of an avatar with a face: face_..., see `page_face.pack_face`; its hidden Gaussians come last.
     """
 
     header: dict[str, Any]
+    """What the page reads as JSON: counts, names, ranges, and where each array begins."""
     data: bytes
+    """The arrays, one after the other."""
 
 
 def pack(
@@ -101,6 +110,7 @@ def pack(
     Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other
     joints, or a body that does not explain the avatar's vertices.
     """
+    # a page with wrong numbers would show nothing and not say why
     check_values(
         "the page",
         gaussian_values(avatar.gaussians)
@@ -122,6 +132,7 @@ def pack(
         )
     how = SPLAT_PRESETS[avatar.rendering]
     vertices = np.asarray(avatar.rest_vertices, np.float64)
+    # the page draws by the same rules as the renderer, which it gets as numbers
     header: dict[str, Any] = {
         "version": VERSION,
         "parents": avatar.parents,
@@ -135,6 +146,7 @@ def pack(
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
     arrays: dict[str, np.ndarray] = {}
+    # axis-angles fit 16 bits with the step of the largest
     if motion is not None:
         rotations = np.asarray(motion.rotations, np.float64)
         step = max(float(np.abs(rotations).max()), SMALLEST_RANGE) / 32767
@@ -148,6 +160,7 @@ def pack(
         }
     if body is not None:
         _pack_shape(avatar, body, header, arrays)
+    # hidden Gaussians join the others here, so they are counted and packed afterwards
     if avatar.face is not None and len(avatar.expression_names) < 255:
         avatar = pack_face(avatar, motion, header, arrays)
     header["count"] = len(avatar.gaussians.means)
@@ -212,9 +225,11 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
     means, quats, scales, opacities, colors = (
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
     )
+    # sizes span orders of magnitude: their logarithms lose the same share everywhere
     logs = np.log(np.maximum(scales, SMALLEST_SCALE))
     header["means"], arrays["means"] = _quantized(means, means.min(0), means.max(0))
     header["scales"], arrays["scales"] = _quantized(logs, logs.min(), logs.max())
+    # colors may leave [0, 1] after refinement
     header["colors"], arrays["colors"] = _quantized(
         colors, min(colors.min(), 0.0), max(colors.max(), 1.0)
     )
@@ -228,6 +243,7 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
     joints, weights = largest_weights(np.asarray(avatar.skinning_weights))
     arrays["weights"], arrays["weight_joints"] = weights.astype("<u2"), joints.astype("u1")
     arrays["rest_joints"] = np.asarray(avatar.rest_joints, "<f4")
+    # light needs a normal and a shading for each Gaussian
     if avatar.light is not None:
         header["light"] = np.asarray(avatar.light.coefficients, np.float64).tolist()
         arrays["light_normals"] = np.rint(127 * np.asarray(avatar.light.normals)).astype("i1")

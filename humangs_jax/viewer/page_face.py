@@ -41,16 +41,20 @@ def pack_face(
         [np.asarray(face.expressions.directions), np.asarray(face.hidden_directions)]
     )
     directions = np.moveaxis(directions, -1, 0)
+    # one step for all offsets, so that the page scales them by one number
     step = max(SMALLEST_STEP, float(np.abs(directions).max(initial=0)) / 32767)
+    # rows beyond the moved vertices stand for Gaussians that stay
     rows = np.asarray(face.row)
     rows = np.where(rows < moved, rows, STAYS)
     arrays["face_rows"] = np.concatenate([rows, moved + np.arange(hidden)]).astype("<u2")
     arrays["face_directions"] = np.rint(directions / step).astype("<i2")
     eyes = np.concatenate([np.asarray(face.eyes), np.zeros((hidden, 2))])
     arrays["face_eyes"] = np.rint(255 * eyes).astype("u1")
+    # sliders of shape move a hidden Gaussian with the vertex that is nearest
     tree = KDTree(np.asarray(avatar.rest_vertices))
     nearest = tree.query(np.asarray(face.hidden.means))[1] if hidden else np.zeros(0)
     arrays["face_vertices"] = nearest.astype("<u2")
+    # what is in the mouth is shown by the gap between the lips, the rest by an expression
     shown = np.asarray(face.hidden_shown)
     in_mouth = np.asarray(face.in_mouth) > 0
     arrays["face_shown"] = np.where(in_mouth, 255, shown.argmax(axis=1)).astype("u1")
@@ -64,6 +68,7 @@ def pack_face(
         "blinks": [names.index(name) if name in names else -1 for name in BLINKS],
         "eyes": [avatar.joint_names.index(name) for name in EYES],
     }
+    # the motion's coefficients, in 16 bits as its rotations
     faces = None if motion is None else motion.expressions_of(names)
     if faces is not None:
         values = np.asarray(faces, np.float64)
