@@ -74,9 +74,9 @@ class ViewCheck:
     name: str
     """Name of the view, as in the capture."""
     iou: float | None
-    """Of body and mask; None without masks."""
+    """Intersection over union of body and mask, 0 to 1; None without masks."""
     outside: float | None
-    """Share of the body's pixels that are more than one pixel off the mask."""
+    """Share of the body's pixels that are more than one pixel off the mask; None without masks."""
     inside: float
     """Share of the body in the image."""
     warning: str | None = None
@@ -198,7 +198,7 @@ def check_capture(
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, inside, warning))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
-    # a skirt has vertices of its own behind those of the body, which do not count
+    # the vertices of a skirt follow those of the body, and do not count
     farthest = (
         0.0
         if moves is None
@@ -381,7 +381,7 @@ def _with_keypoints(
         ):
             pen.line(line, fill=CROSS, width=FINE)
     for k in shown:
-        # outliers are rings, since they did not count in the fit
+        # outliers are hollow: body and photo disagree there
         color, outlier = _color(keypoints.set.names[k]), examination.outliers[view, k]
         pen.circle(
             tuple(discs[k]),

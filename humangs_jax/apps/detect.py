@@ -501,7 +501,7 @@ def write_found(
         for photo, file in zip(photos, files, strict=True) if masks else ():
             (temporary / file).parent.mkdir(parents=True, exist_ok=True)
             write_png(temporary / file, person_mask(photo, person), mark=MASK)
-        # the capture names the masks only once they are all written
+        # a capture has to name its masks
         if to_capture:
             description = read_description(folder / "capture.json")
             views = []

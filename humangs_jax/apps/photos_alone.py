@@ -145,7 +145,7 @@ class _Choice(NamedTuple):
 def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:
     names = [file.relative_to(images).as_posix() for file in looked_at]
     photos = detect.detect_photos(names, map(detect.upright, looked_at))
-    # given masks show the detector the person where others are in front
+    # where nobody found fits a given mask, the detector looks at the photo cut to it
     if choice.masks is not None:
         masks = [upright_mask(choice.masks, images, file) for file in files]
         pictures = [detect.upright(file) for file in looked_at]
@@ -272,7 +272,7 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
     centers = np.asarray([camera.center for camera in found.cameras], float)
     distance = float(np.median(np.hypot(centers[:, 0], centers[:, 2])))
     count = len(found.views)
-    # how many poses the photos show decides what can be refined
+    # how many poses the photos show tells how much they determine
     if count == 1:
         which = "one photo: what it does not show is a guess"
     elif found.moments == 1:

@@ -86,7 +86,7 @@ class Settings:
         gain="time of frames that are drawn often",
         measured=MEASURED,
     )
-    """Whether Gaussians that no frame shows are left out, as `Shot.prune`."""
+    """Whether Gaussians that no image shows are left out, as `Shot.prune`."""
 
     @property
     def refinement(self) -> RefineConfig | None:
@@ -238,7 +238,7 @@ class Tuned:
     """What `tune` has found."""
 
     name: str
-    """Of the preset."""
+    """Name of the best preset within the budget."""
     measured: dict[str, Cost]
     """Costs of the presets that were timed, by name."""
 

@@ -131,7 +131,7 @@ def look(
     mask_folders = [folder / name for name in MASK_FOLDERS if has_photos(folder / name)]
     named = [folder / KEYPOINT_FOLDER] if (folder / KEYPOINT_FOLDER).exists() else []
     named += [found[1]] if (found := KEYPOINTS.found(folder)) else []
-    # detectors name their files in many ways, nearly all with this word
+    # where no name is known: whatever is called keypoints
     others = sorted(
         path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
     )

@@ -99,7 +99,7 @@ class Animate:
         if self.camera is not None:
             said = ["turn"] * (self.turn != 0) + ["no-follow"] * (not self.follow)
             _require_no_circle("--camera", self.shot, FROM_THE_SIDE, said)
-        # a wrong output name is found before JAX starts
+        # an output that cannot be written is refused before anything is read
         with stage("starting"):
             from humangs_jax.avatar.attach_face import with_face_for
             from humangs_jax.avatar.avatar import Avatar
@@ -125,7 +125,7 @@ class Animate:
                 found = one_size(self.camera, file_cameras(self.camera, shot, upright=True))
                 poses, cameras = motion_poses(avatar, motion), camera_path(found, frames)
             check_video(self.out, frames, cameras.width, cameras.height)
-        # Gaussians that no frame shows are left out once for the whole video
+        # the same Gaussians are left out of all frames
         avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
             written = write_video(

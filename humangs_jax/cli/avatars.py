@@ -484,7 +484,7 @@ class Export:
             )
             # a motion with expressions needs an avatar with a face
             avatar = avatar if motion is None else with_face_for(avatar, motion)
-        # the page has the T-pose and the motion, whatever frame the file has
+        # the page has the whole motion, whichever frame --out has
         if self.html is not None:
             with stage("making the page"):
                 from humangs_jax.viewer.page import write_page

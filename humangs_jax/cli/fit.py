@@ -216,9 +216,9 @@ class Fit:
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
-            # a capture without a record was not made by `humangs fit`
+            # without --keypoints those of an earlier fit
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
-        # cameras that no photo determines stay as they are
+        # cameras stay where nothing tells how they should move
         fixed = self.refinement.fixed_cameras or cameras_are_unseen(start)
         config = usual_config(
             record is not None,

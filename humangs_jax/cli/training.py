@@ -79,7 +79,7 @@ class Preprocess:
         part = shard_of(self.shard)
         from humangs_jax.data.preprocess.protocol import NEAR_FACTORS
 
-        # options are checked before the protocol's module, which imports JAX
+        # wrong options are refused before the work is imported
         factors = NEAR_FACTORS if scans.near else scans.factors
         if not 0 < factors[0] <= factors[1]:
             raise UsageError(

@@ -216,10 +216,12 @@ def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Su
         garment.sizes["brim"],
         garment.kind == "brim_hat",
     )
+    # points on the ears are not of the edge of the hat
     no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
     ring, out = _ring(
         anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2]
     )
+    # a brim goes around the head; a peak is in front only, or behind
     if closed:
         start, widths = ring + out * 0.012, size * (1 + 0.12 * np.cos(AZIMUTH))
         droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
@@ -231,10 +233,12 @@ def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Su
         widths = (0.030 + size * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
         droop = 0.010 + 0.016 * across**2
     start[:, 1] += 0.004
+    # the sheet droops more the further out it is
     steps = np.linspace(0, 1, 5)[:, None]
     sheet = start[None] + (steps * widths[None])[..., None] * out[None]
     sheet[..., 1] -= steps**2 * droop[None]
     vertices, faces = sheet.reshape(-1, 3), grid_faces(len(steps), len(start), closed=closed)
+    # coordinates of the paint, around the head
     template = vertices - anatomy.joints[HEAD]
     template[:, 1] = np.repeat(0.4 + 0.05 * steps, len(start))
     return surfaces.turn_in_hems(_on_head(anatomy, vertices, faces, template), 0.004)
@@ -248,13 +252,16 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
     middle, apart = eyes.mean(0), np.abs(eyes[0, 0])
     template, vertices = anatomy.skin.template, anatomy.skin.vertices
     x, y, z = template.T
+    # how far in front of the face glasses sit, and where the ears are
     brow = (np.abs(x) < 0.055) & (np.abs(vertices[:, 1] - middle[1]) < 0.022) & (z > 0.05)
     front = np.quantile(vertices[brow, 2], 0.97) + 0.003
     ear = (np.abs(x) > 0.068) & (np.abs(y - 0.343) < 0.012) & (np.abs(z - 0.005) < 0.02)
     half, tall = min(0.0255 * size, apart * 0.93), 0.0195 * size
+    # one outline for both rims, from round to square
     c, s = np.cos(circle(28)), np.sin(circle(28))
     radius = (np.abs(c) ** squareness + np.abs(s) ** squareness) ** (-1 / squareness)
     parts, lenses = [], []
+    # each side has a rim, a hinge and a temple that hooks behind the ear
     for side in (1, -1):
         x, y = side * apart * 1.06 + half * radius * c, middle[1] - 0.004 + tall * radius * s
         path = np.stack([x, y, front - 9.0 * np.abs(x) ** 2.0 * 0.6], -1)
@@ -278,10 +285,12 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
                 np.concatenate([line, [hook + np.asarray([0, -0.014, -0.014])]]), UP, 1.1 * wire, 6
             )
         )
+        # clear lenses are not modelled
         if dark:
             inner = np.concatenate([[path.mean(0) + np.asarray([0, 0, 0.002])], path])
             fan = np.stack([np.zeros(28, int), 1 + np.arange(28), 1 + (np.arange(28) + 1) % 28], -1)
             lenses.append((inner.astype(np.float32), fan.astype(np.int32)))
+    # the bridge joins the rims above the nose
     across, flat = np.linspace(-1, 1, 7), np.full(7, front + 0.002)
     bridge = np.stack(
         [(apart * 1.06 - half) * across, middle[1] + 0.004 + 0.003 * (1 - across**2), flat], -1
@@ -311,6 +320,7 @@ def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
     """
     x, y, z = anatomy.skin.template.T
     size = garment.sizes["size"]
+    # where the bag is, and the skin that it moves with
     if garment.kind == "backpack":
         near = (np.abs(x) < 0.1) & (y > -0.2) & (y < 0.08) & (z < -0.05)
         half, turn = np.asarray([0.145, 0.21, 0.075]) * size, np.pi
@@ -329,10 +339,12 @@ def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
         )
         reach = around.mean() + ease + half[2] + 0.008
         center = np.asarray([reach * np.sin(turn), height, reach * np.cos(turn)])
+    # a ball whose exponent makes it a box with round edges
     directions, faces = surfaces.ball(14, 24)
     unit_box = directions / (np.sum(np.abs(directions) ** 4.0, -1, keepdims=True) ** (1 / 4.0))
     points, c, s = unit_box * half, np.cos(turn), np.sin(turn)
     vertices = (points @ np.asarray([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + center).astype(np.float32)
+    # a bag is stiff: all of it moves as the skin near it does on average
     weights = np.repeat(anatomy.skin.weights[near].mean(0, keepdims=True), len(vertices), 0)
     return Surface(vertices, faces, weights).painted(unit_box, points, 0.15)
 

@@ -66,16 +66,20 @@ undefined.
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """A body as the prior needs it: rest joints (j, 3), parents, and radii in metres of its clothed
-    parts.
-    """
+    """A body as the pose prior needs it."""
 
     joints: Rotations
+    """Joints at rest, (j, 3), metres."""
     parents: tuple[int, ...]
+    """Parent of each joint; -1 for the root."""
     torso_radius: float
+    """Radius of the clothed torso, metres."""
     thigh_radius: float
+    """Radius of a clothed thigh, metres."""
     shin_radius: float
+    """Radius of a clothed shin, metres."""
     arm_radius: float
+    """Radius of a clothed arm, metres."""
 
     @property
     def leg(self) -> float:
@@ -148,18 +152,20 @@ def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Foot:
-    """Position of a foot, given by the point that a flat sole would touch.
-
-    x, z: the point below the ball, metres. yaw: its heading. pitch: positive rolls it onto the
-    toes, which stay flat where they are, negative onto the heel. lift: of all of it above the
-    ground, metres.
-    """
+    """Position of a foot, given by the point that a flat sole would touch."""
 
     x: float
+    """The point below the ball of the foot, along x, metres."""
     z: float
+    """The same point along z, metres."""
     yaw: float = 0.0
+    """Heading of the foot, radians about y."""
     pitch: float = 0.0
+    """Roll of the foot, radians: positive onto the toes, which stay flat where they are, negative
+    onto the heel.
+    """
     lift: float = 0.0
+    """Height of the whole foot above the ground, metres."""
 
 
 Feet = tuple[Foot, ...]
@@ -273,23 +279,27 @@ SAME_GIRTH = 1e-4
 
 @dataclasses.dataclass(frozen=True)
 class Anatomy:
-    """skin: the whole body at rest, with attributes `template` (n, 3), `normals` (n, 3), `cloth`
-    (n, 4).
-
-    joints: (j, 3) at rest. parents: of the joints. arm, leg: (n,) membership in [0, 1].
-    trunk: silhouettes of trunk and thighs across y. legs, arms: silhouettes of the left and right
-    limb, across y and across |x|.
-    """
+    """A shaped body, measured for clothes."""
 
     skin: Surface
+    """The whole body at rest, with attributes `template` (n, 3), `normals` (n, 3), `cloth` (n, 4).
+    """
     joints: np.ndarray
+    """Joints at rest, (j, 3), metres."""
     parents: tuple[int, ...]
+    """Parent of each joint."""
     arm: np.ndarray
+    """Membership of each vertex in the arms, (n,), 0 to 1."""
     leg: np.ndarray
+    """Membership of each vertex in the legs, (n,), 0 to 1."""
     trunk: Boundaries
+    """Silhouettes of trunk and upper thighs, in slices across y."""
     hips_and_legs: Boundaries
+    """Silhouettes of everything below the waist, in slices across y."""
     legs: tuple[Boundaries, Boundaries]
+    """Silhouettes of the left and the right leg, in slices across y."""
     arms: tuple[Boundaries, Boundaries]
+    """Silhouettes of the left and the right arm, in slices across |x|."""
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
@@ -371,13 +381,16 @@ def measure(
     vertices = np.asarray(vertices, np.float32)
     attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
     skin = Surface(vertices, faces, weights, attributes)
+    # slices are 2 cm apart
     levels, along = np.arange(-1.3, 0.5, 0.02), np.arange(0.05, 0.8, 0.02)
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
+    # parts are told apart in template coordinates, which all bodies share
     trunk_points = vertices[body & (template[:, 1] > -0.6)]
     spine = np.zeros((len(levels), 2))
     torso = boundaries(trunk_points[:, 1], trunk_points[:, [0, 2]], levels, spine, 0.025)
     lower = vertices[body & (template[:, 1] < WAIST + 0.03)]
     hips = boundaries(lower[:, 1], lower[:, [0, 2]], levels, spine, 0.025)
+    # slices of a limb are centred on the line through its joints
     legs, arms = [], []
     for offset, side in enumerate((1, -1)):
         line = joints[[LEFT_ANKLE + offset, LEFT_KNEE + offset, LEFT_HIP + offset]]

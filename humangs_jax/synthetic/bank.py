@@ -70,16 +70,16 @@ HEAD_JOINTS, SKIN_AND_EYES = (HEAD, 22, 23, 24), (0, 1)
 
 @dataclasses.dataclass(frozen=True)
 class BakedSubject:
-    """The textures of a person at rest.
-
-    atlas: texture coordinates. albedo: (t, t, 3) bytes, 255 is 1, row 0 on top (v = 1).
-    slopes: (t, t, 3) bytes, gradients of painted folds, `SLOPE_ZERO` + steps of `SLOPE_STEP`, axes
-    of `Spots.cloth`.
-    """
+    """The textures of a person at rest."""
 
     atlas: Atlas
+    """Texture coordinates of the mesh."""
     albedo: UInt8[np.ndarray, "t t 3"]
+    """Colors without light, (t, t, 3) bytes, 255 is 1, row 0 on top (v = 1)."""
     slopes: UInt8[np.ndarray, "t t 3"]
+    """Gradients of painted folds, (t, t, 3) bytes, `SLOPE_ZERO` + steps of `SLOPE_STEP`, in the
+    axes of `Spots.cloth`.
+    """
 
 
 def bake_subject(
@@ -140,11 +140,13 @@ def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 204
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     subject, baked = posed.subject, bake_subject(posed.subject, texture_size)
+    # the light of the pose is in the texture, so viewers must not shade it again
     image = Image.fromarray(lit_texture(posed, baked))
     materials = {
         "obj": SimpleMaterial(image=image, diffuse=[255, 255, 255, 255]),
         "glb": PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0),
     }
+    # what is known of the person lies beside the meshes
     known = {"betas": subject.betas, "rotations": posed.rotations, "translation": posed.translation}
     known = {"seed": subject.seed, "lit": True} | {
         name: value.tolist() for name, value in known.items()
@@ -199,45 +201,54 @@ MOST_MATERIALS = 32
 class PeopleBank:
     """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and
     stacked.
-
-    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts: (p,) without
-    padding.
-    vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n,
-    k).
-    faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`,
-    v DOWN.
-    face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of
-    one number are dyed alike, dyeable (p, m): 1 where a piece is cloth that may have another color.
-    texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `BakedSubject`).
-    rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
-    displacements: (p, b, 3) of a body's vertices to the silhouettes of the dressed person
-    (`data.body_and_masks`), metres; b is 0 in a bank without.
-    Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds;
-    generator: `GENERATOR_VERSION`.
     """
 
     seeds: Int[Array, " p"]
+    """Seed of each person, (p,)."""
     betas: Float[Array, "p s"]
+    """Shape coefficients of the bodies, (p, s)."""
     joints: Float[Array, "p j 3"]
+    """Joints at rest, (p, j, 3), metres."""
     vertex_counts: Int[Array, " p"]
+    """Vertices of each mesh without padding, (p,)."""
     vertices: Float[Array, "p n 3"]
+    """Vertices at rest, (p, n, 3), metres."""
     normals: Float[Array, "p n 3"]
+    """Unit normals at rest, (p, n, 3)."""
     joint_ids: UInt8[Array, "p n k"]
+    """The joints that move each vertex, (p, n, k)."""
     joint_weights: Float[Array, "p n k"]
+    """Skinning weights of these joints, (p, n, k); rows sum to 1."""
     faces: UInt[Array, "p f 3"]
+    """Triangles, (p, f, 3)."""
     uvs: UInt[Array, "p f 3 2"]
+    """Texture coordinates of the faces' corners, (p, f, 3, 2), steps of 1 / `UV_STEPS`, v DOWN."""
     face_pieces: UInt8[Array, "p f"]
+    """Number of the piece that each face belongs to, (p, f), below m."""
     sheen: Float[Array, "p m"]
+    """Soft highlight of each piece, (p, m), 0 to 1."""
     groups: UInt8[Array, "p m"]
+    """Group of each piece, (p, m); pieces of one group are dyed alike."""
     dyeable: Float[Array, "p m"]
+    """1 where a piece is cloth that may have another color, else 0, (p, m)."""
     texture: UInt8[Array, "p t t 6"]
+    """Albedo (255 is 1) and slopes (see `BakedSubject`), (p, t, t, 6)."""
     rotations: Float[Array, "p q j 3"]
+    """Poses of each person, (p, q, j, 3), axis-angle, radians."""
     nearest: Int[Array, "p q"]
+    """Number of the pose that is most like each one, (p, q)."""
     displacements: Float[Array, "p b 3"]
+    """Offsets of a body's vertices to the silhouettes of the dressed person
+    (`data.body_and_masks`), (p, b, 3), metres; b is 0 in a bank without.
+    """
     parents: tuple[int, ...] = static_field(default=())
+    """Parent of each joint. Static."""
     mirrored_joints: tuple[int, ...] = static_field(default=())
+    """Mirror image of each joint. Static."""
     split: str = static_field(default="")
+    """Name of the range that the seeds are from, see `subject.SPLITS`. Static."""
     generator: int = static_field(default=GENERATOR_VERSION)
+    """`GENERATOR_VERSION` of the code that made the people. Static."""
 
     @property
     def people(self) -> int:

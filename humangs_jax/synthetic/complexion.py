@@ -33,25 +33,32 @@ FAIR_ODDS, DARK_ODDS = np.asarray(
 
 @dataclasses.dataclass(frozen=True)
 class Complexion:
-    """Colors (3,) of skin, lips, hair and iris; the rest are strengths in [0, 1].
-
-    brow: of the brows. freckles. wrinkles: of age. shadow: make-up on the lids, with its color.
-    liner: around the eyes.
-    blush: on the cheeks. tan: of arms and face against the rest.
-    """
+    """Colors of skin, hair and eyes, and strengths of what is painted on the face."""
 
     skin: np.ndarray
+    """Color of the skin, (3,), 0 to 1."""
     lips: np.ndarray
+    """Color of the lips, (3,), 0 to 1."""
     hair: np.ndarray
+    """Color of hair, brows and beard, (3,), 0 to 1."""
     iris: np.ndarray
+    """Color of the iris, (3,), 0 to 1."""
     shadow_color: np.ndarray
+    """Color of the make-up on the lids, (3,), 0 to 1."""
     brow: float
+    """Strength of the brows, 0 to 1."""
     freckles: float
+    """Strength of freckles, 0 to 1; 0 for none."""
     wrinkles: float
+    """Strength of the wrinkles of age, 0 to 1."""
     shadow: float
+    """Strength of the make-up on the lids, 0 to 1."""
     liner: float
+    """Strength of the line around the eyes, 0 to 1."""
     blush: float
+    """Strength of the make-up on the cheeks, 0 to 1."""
     tan: float
+    """How much darker the arms are than skin under clothes, 0 to 1."""
 
 
 def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Complexion:
@@ -181,12 +188,14 @@ def _cheeks_and_eyes(
 ) -> Points:
     """Cheeks, nose and ears; freckles; sockets, make-up, lashes."""
     x, y, front, template = face
+    # cheeks, nose and ears are redder, with or without make-up
     cheeks = _bell((x, 0.043, 0.02), (y, 0.292, 0.018))
     nose = 0.7 * _bell((x, 0, 0.012 * features["nose"]), (y, 0.295, 0.012))
     result = _tinted(result, (1.02, 0.82, 0.80), 0.6 * front * np.clip(cheeks + nose, 0, 1))
     blush = _bell((x, 0.050, 0.018), (y - 0.298, 0.3 * (x - 0.05), 0.014))
     result = _tinted(result, (1.05, 0.68, 0.70), tones.blush * front * blush)
     result = _tinted(result, (1.0, 0.8, 0.77), 0.7 * ((x > 0.0745) & (y > 0.27) & (y < 0.36)))
+    # freckles across the nose and the cheeks
     if tones.freckles > 0:
         spots = (
             _bell((y, 0.305, 0.022))
@@ -197,6 +206,7 @@ def _cheeks_and_eyes(
     result = _tinted(
         result, (0.72, 0.66, 0.66), 0.7 * _bell((x, EYE_X, 0.017), (y, EYE_Y, 0.010)) * front
     )
+    # shadow on the lids, then lashes, and the liner with its wing over both
     lid = _bell((x - EYE_X, 0.002, 0.017), (y - EYE_Y, 0.008, 0.007)) * (y > EYE_Y)
     result = mix(result, tones.shadow_color, tones.shadow * lid * front)
     rim = np.sqrt(
@@ -245,6 +255,7 @@ def _mouth_and_brows(
     there.
     """
     x, y, front, template = face
+    # lips: the upper one is bowed, the lower one fuller, a dark line parts them
     width, ahead = 0.026 * features["lip_width"], template[:, 2] > 0.08
     corner = np.clip(1 - (x / width) ** 2, 0, 1)
     bow = 0.009 * features["lip_fullness"] * corner * (1 - 0.35 * _bell((x, 0, 0.005)))
@@ -254,10 +265,12 @@ def _mouth_and_brows(
     result = mix(result, tones.lips * shine[:, None], 0.85 * lips)
     line = band(y, MOUTH_Y - 0.0012, MOUTH_Y + 0.0012, 0.001) * (x < width) * ahead
     result = mix(result, tones.lips * 0.35, line)
+    # nostrils are painted dark
     nostril = _bell((x, 0.0085 * features["nose"], 0.004), (y, 0.2845, 0.0025)) * (
         template[:, 2] > 0.1
     )
     result = mix(result, result * 0.3, np.clip(nostril, 0, 1))
+    # brows: an arch of single hairs
     arch = (
         0.3485 + features["brow_height"] + features["brow_arch"] * (0.0045 - 18 * (x - 0.033) ** 2)
     )
@@ -272,6 +285,7 @@ def _mouth_and_brows(
         result, np.minimum(tones.hair, 0.42) * 0.75, np.clip(tones.brow * brow * hairs, 0, 1)
     )
 
+    # roots of the hair, where a cut covers the scalp or is shaved
     grain = 0.7 + 0.6 * lattice(template / 0.0026, seed + 11)
     above = above_line(template, SHORT_LINE, haircut.receding)
     cover = np.clip((above + 0.006) / 0.016, 0, 1) * (1 - (np.abs(x) > 0.0765) * (y < 0.355))
@@ -281,6 +295,7 @@ def _mouth_and_brows(
     elif haircut.cut in LONG_CUTS:
         cover = cover * (above > 0.0)
     result = mix(result, tones.hair * 0.8, np.clip(scalp * cover * grain, 0, 1))
+    # roots of the beard
     chin = {"none": 0.0, "stubble": 0.75}.get(haircut.beard, 0.9)
     if chin > 0:
         kind = haircut.beard if haircut.beard in ("moustache", "goatee") else "full"

@@ -25,15 +25,18 @@ ALBEDO_LIMIT = 0.88
 
 @dataclasses.dataclass(frozen=True)
 class Spots:
-    """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3)
-    template coordinates.
+    """Points on a surface.
 
     Coordinates of sleeves and trouser legs are recomputed, so that they are sharp at seams, where
     patterns meet.
     """
 
     cloth: Float[np.ndarray, "n 4"]
+    """Coordinates around the limb or the trunk and its girth, (n, 4), metres, see
+    `anatomy.cloth_coordinates`.
+    """
     template: Points
+    """Template coordinates, (n, 3)."""
 
     def __post_init__(self):
         object.__setattr__(self, "cloth", sewn_coordinates(self.cloth, self.template))
@@ -70,14 +73,16 @@ class Spots:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """albedo: Spots -> (n, 3). wrinkles: of the normals, strength; draped: they run down. sheen:
-    soft highlight in [0, 1].
-    """
+    """How a surface looks."""
 
     albedo: Callable[[Spots], np.ndarray]
+    """Gives the colors (n, 3) at `Spots`."""
     wrinkles: float = 0.0
+    """Strength of the folds that are painted into the normals; 0 for none."""
     sheen: float = 0.0
+    """Strength of a soft highlight, 0 to 1."""
     draped: bool = False
+    """Whether the folds run down, as in hanging cloth."""
 
 
 def color(hue: float, saturation: float, value: float) -> Vector:
@@ -138,15 +143,16 @@ def band(
 
 @dataclasses.dataclass(frozen=True)
 class Fabric:
-    """pattern: key of PATTERNS. base, other: (3,) dyes.
-
-    seed: of everything else about it (periods, prints, buttons).
-    """
+    """What a garment is made of."""
 
     pattern: str
+    """Name of the pattern, a key of PATTERNS."""
     base: Vector
+    """The main dye, (3,), 0 to 1."""
     other: Vector
+    """The dye of the pattern, (3,), 0 to 1."""
     seed: int
+    """Seed of everything else about it: periods, prints, buttons."""
 
     def rng(self, stream: int) -> np.random.Generator:
         """Random numbers of the fabric's own; one stream for each feature."""

@@ -74,28 +74,33 @@ BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full"
 
 @dataclasses.dataclass(frozen=True)
 class Haircut:
-    """cut: one of CUTS. fringe: one of FRINGES. side: +1 or -1, of parting and braid. thickness in
-    metres.
-
-    bottom: template height where long hair ends. wave: height of its waves, metres. receding: shift
-    of the hairline upwards.
-    beard: one of BEARDS; beard_length in metres. grain: contrast of strands.
-    """
+    """The hair and the beard of a person."""
 
     cut: str
+    """Name of the cut, one of CUTS."""
     fringe: str
+    """Kind of fringe, one of FRINGES."""
     side: float
+    """Side of the parting and of a braid, +1 or -1."""
     thickness: float
+    """Thickness of the hair on the scalp, metres."""
     bottom: float
+    """Template height where long hair ends."""
     wave: float
+    """Height of the waves of long hair, metres."""
     receding: float
+    """Shift of the hairline upwards, metres."""
     beard: str
+    """Kind of beard, one of BEARDS."""
     beard_length: float
+    """Length of the beard, metres."""
     grain: float
+    """Contrast of single strands, 0 to 1."""
 
 
 def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set[str]) -> Haircut:
     """A random cut that fits under the headwear; old men lose hair."""
+    # what a hat would not leave room for is not drawn, or is thinner
     headwear = bool(worn & set(HEADWEAR))
     odds = {name: value[0 if male else 1] for name, value in CUTS.items()}
     if male and years > 45:
@@ -103,6 +108,7 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
     cut = drawn(rng, odds | (dict.fromkeys(NOT_UNDER_HEADWEAR, 0) if headwear else {}))
     thickness = row(rng, {name: value[2] for name, value in CUTS.items()}, cut)
     thickness = min(thickness, 0.010) if headwear else thickness
+    # bottom and waves matter to long hair only
     bottom = rng.uniform(0.15, 0.2) if cut == "bob" else rng.uniform(-0.17, 0.1)
     wave = rng.choice([rng.uniform(0.002, 0.004), rng.uniform(0.006, 0.014)], p=[0.55, 0.45])
     receding = (
@@ -256,9 +262,11 @@ def scalp_shell(
         above_line(template, CAP_LINE if hat else SHORT_LINE, shift),
         0.011 if hat else 0.0025,
     )
+    # a hairline is irregular, the edge of a hat is not
     if not hat:
         above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
     surface = cut(anatomy.skin.with_attributes(above=above), above)
+    # smooth normals keep the thickness even where the head is not
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 8))
     full = smoothstep(-0.002, 0.022, surface.attributes["above"])
     grown = thickness * full * (1 + bumps * ripples(rng, surface.template, size))
@@ -266,6 +274,7 @@ def scalp_shell(
     base = smooth(surface.vertices, surface.faces, 3, keep_hems=True)
     x, y, z = surface.template.T
     top = smoothstep(0.385, 0.425, y)
+    # a parting is a groove, and the hair on its far side is fuller
     if side:
         parting = np.exp(-(((x - side * 0.035) / 0.009) ** 2)) * top * (z > -0.02)
         grown = (

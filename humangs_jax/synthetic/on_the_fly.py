@@ -59,10 +59,12 @@ class OnTheFlyConfig:
     """What an example shows."""
 
     input_views: Few = 4
+    """How many views the network reads."""
     view_counts: tuple[Few, ...] = ()
     """If given, how many of the `input_views` an example has, one of these at random. The last one
     is repeated after them, so that one program serves all numbers (`SubjectViews.view_count`)."""
     target_views: Few = 3
+    """How many views the rendering is compared with."""
     input_size: Side = 256
     """Pixels a side."""
     target_size: Side = 256
@@ -104,22 +106,24 @@ ON_THE_FLY = OnTheFlyConfig()
 
 @pytree_dataclass
 class Scene:
-    """What all views of an example share: a person in several poses o, dyes and light.
-
-    person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3)
-    metres.
-    corners: (o, f, 15) of every face's corners normal, openness and share of the key light that
-    arrives.
-    dyes: (m, 3, 3) color matrix of every piece. lights.
-    """
+    """What all views of an example share: a person in several poses o, dyes and light."""
 
     person: Int[Array, ""]
+    """Number of the person in the bank, ()."""
     rotations: Float[Array, "o j 3"]
+    """Poses, (o, j, 3), axis-angle, radians."""
     translations: Float[Array, "o 3"]
+    """Translations of the body, (o, 3), metres."""
     vertices: Float[Array, "o n 3"]
+    """Posed vertices of the dressed person, (o, n, 3), metres."""
     corners: Float[Array, "o f 15"]
+    """Normal (3), openness and share of the key light that arrives at each of a face's three
+    corners, (o, f, 15).
+    """
     dyes: Float[Array, "m 3 3"]
+    """Color matrix of every piece, (m, 3, 3)."""
     lights: surroundings.Lights
+    """What the person stands in."""
 
 
 def on_the_fly_example(
@@ -450,21 +454,23 @@ class GeneratedSource:
     """Examples that `make` computes from keys; all keys are of people of one split
     (`subject.SPLITS`).
 
-    make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see
-    `ViewSampling`.
-    on_host: bring the arrays to the host, where they mix with those of files and are divided among
-    devices.
-    person_of: called as person_of(key, input_count), gives the seed of the person whom `make`
-    shows; None: that of the key.
-
     Raises: ValueError if there is no such split.
     """
 
     make: MakeExample
+    """Called as make(key, input_count); runs wherever it is jitted to run."""
     split: str = "train"
+    """Name of the split that the people are from."""
     input_counts: tuple[int, ...] = (4,)
+    """How many photos an example may have as input, see `ViewSampling`."""
     on_host: bool = False
+    """Whether arrays are brought to the host, where they mix with those of files and are divided
+    among devices.
+    """
     person_of: Callable[[Key, int], int] | None = None
+    """Called as person_of(key, input_count); gives the seed of the person that `make` shows. None:
+    the seed of the key.
+    """
 
     def __post_init__(self):
         if self.split not in SPLITS:
@@ -509,14 +515,16 @@ def _described(person: int, appearance: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class EachPerson:
-    """Each person of a bank once, in order: people to compare on. input_counts, on_host: see
-    `GeneratedSource`.
-    """
+    """Each person of a bank once, in order: people to compare on."""
 
     bank: PeopleBank
+    """The people."""
     config: OnTheFlyConfig
+    """What each example shows."""
     input_counts: tuple[int, ...] = (4,)
+    """As `GeneratedSource.input_counts`."""
     on_host: bool = False
+    """As `GeneratedSource.on_host`."""
 
     @property
     def broken(self) -> Mapping[str, str]:

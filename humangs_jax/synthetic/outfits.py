@@ -52,14 +52,16 @@ KINDS = TOPS + OUTER + BOTTOMS + SKIRTS + DRESSES + HEADWEAR + SHOES + EXTRAS
 
 @dataclasses.dataclass(frozen=True)
 class Garment:
-    """One piece of clothing. kind: one of KINDS. fabric. sizes: what its builder needs. details:
-    features that it has.
-    """
+    """One piece of clothing."""
 
     kind: str
+    """Kind of garment, one of KINDS."""
     fabric: Fabric
+    """What it is made of."""
     sizes: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Numbers that its builder needs, by name."""
     details: frozenset[str] = frozenset()
+    """Names of the features that it has, such as a hood or pockets."""
 
 
 Odds = Mapping[str, float | int]
@@ -67,27 +69,34 @@ Odds = Mapping[str, float | int]
 
 @dataclasses.dataclass(frozen=True)
 class Style:
-    """Clothes that go together. men, women: odds of the style. tops, bottoms, coats, shoes: odds of
-    kinds of garments.
-
-    The rest are probabilities of something over the others, of a top tucked in, of a skirt, a
-    scarf, kinds of headwear and of no sunglasses.
-    """
+    """Clothes that go together."""
 
     men: float
+    """Odds of the style for men."""
     women: float
+    """Odds of the style for women."""
     tops: Odds
+    """Odds of the kinds of tops."""
     bottoms: Odds
+    """Odds of the kinds of trousers."""
     shoes: Odds
+    """Odds of the kinds of shoes."""
     coats: Odds = dataclasses.field(default_factory=lambda: {"hooded_jacket": 1, "jacket": 1})
+    """Odds of the kinds of coats and jackets."""
     outer: float = 0.06
+    """Probability of a coat or jacket over the others."""
     tucked: float = 0.22
+    """Probability of a top that is tucked in."""
     skirt: float = 0.12
+    """Probability of a skirt, for women."""
     scarf: float = 0.1
+    """Probability of a scarf."""
     headwear: Odds = dataclasses.field(
         default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05}
     )
+    """Probability of each kind of headwear; the rest wear none."""
     no_sunglasses: float = 0.96
+    """1 less the probability of sunglasses."""
 
 
 STYLES = {
@@ -194,10 +203,12 @@ STYLES = {
 
 @dataclasses.dataclass(frozen=True)
 class OneOf:
-    """One of some specifications, all of which are drawn; odds: of each, None: equal."""
+    """One of some specifications, all of which are drawn."""
 
     options: tuple
+    """The specifications."""
     odds: tuple[float, ...] | None = None
+    """Odds of each; None for equal ones."""
 
 
 def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
@@ -367,6 +378,7 @@ def _top(
     sleeve = row(rng, SLEEVES, kind, long=long, short=short)
     details = {row(rng, MENS_NECKS if male else NECKS, kind)}
     cropped = not male and not tucked and rng.random() < 0.08
+    # a tucked top ends just below the waist; cropped ones are rare
     bottom = (
         waist - 0.03
         if tucked
@@ -374,18 +386,21 @@ def _top(
         if cropped
         else rng.uniform(-0.385, -0.30)
     )
+    # only plain tops may be tight
     wide = kind not in ("tank", "tee", "longsleeve", "turtleneck")
     loose = rng.uniform(0.25, 1.0) if wide else rng.uniform(0.0, 1.0) ** 1.3
     if kind == "hoodie":
         loose = 0.5 + 0.5 * loose
     elif style == "street":
         loose = 0.4 + 0.6 * loose
+    # details that another garment would hide, or that need an open front, are left out
     for detail, kinds, odds in TOP_DETAILS:
         possible = kind in kinds and not (detail == "open" and (tucked or outer))
         if possible and (odds == 1 or rng.random() < odds) and not (detail == "hood_up" and outer):
             details.add(detail)
     if tucked:
         details.add("tucked")
+    # what is worn under or in something else is close to the body
     sleeve, loose = (
         float(min(sleeve, WRIST - 0.01) if outer else sleeve),
         min(loose, 0.2) if outer or tucked else loose,
@@ -405,6 +420,7 @@ def _trousers(
         kind = "shorts"
     end = row(rng, LEG_ENDS | {"shorts": (-0.77, -0.62)} if male else LEG_ENDS, kind)
     width, loose = row(rng, LEG_WIDTHS, kind), row(rng, LEG_LOOSENESS, kind)
+    # a tucked or cropped top shows the waist; under a longer one trousers may sit lower
     upper = (
         waist
         if tucked or top.sizes["bottom"] > -0.25
@@ -417,6 +433,7 @@ def _trousers(
         if rng.random() < 0.6
         else set()
     )
+    # some trousers are cropped or turned up
     if rng.random() < 0.15 and kind in ("jeans", "chinos") and not male:
         end = rng.uniform(-1.12, -1.05)
     if kind == "jeans" and rng.random() < 0.25:
@@ -562,6 +579,7 @@ def _extras(
         result.append(_made(rng, kind, plainness, **sizes))
         kinds.add(kind)
 
+    # a hood leaves no room for a scarf or a hat
     if not hooded and rng.random() < style.scarf:
         put(
             "scarf",
@@ -569,6 +587,7 @@ def _extras(
             thickness=rng.uniform(0.022, 0.038),
             tails=rng.choice([0.0, rng.uniform(0.15, 0.4)]),
         )
+    # at most one kind of headwear, chosen by one number
     left = rng.random()
     for kind, odds in (style.headwear if male else {**style.headwear, "headscarf": 0.06}).items():
         if left < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
@@ -580,6 +599,7 @@ def _extras(
             )
             break
         left -= odds
+    # glasses or sunglasses, never both
     eyes = rng.random()
     if eyes < 0.2 + 0.15 * (years > 50):
         put(
@@ -597,6 +617,7 @@ def _extras(
             squareness=rng.uniform(2, 5),
             wire=rng.uniform(0.0015, 0.003),
         )
+    # at most one bag
     carried = rng.random()
     if carried < 0.09 and "headscarf" not in kinds:
         put("backpack", 0.7, size=rng.uniform(0.8, 1.15))

@@ -37,19 +37,22 @@ Capsule = tuple[kin.Vector, kin.Vector, float]
 
 @dataclasses.dataclass(frozen=True)
 class Stance:
-    """Feet and pelvis before the person is turned. Lengths in legs, x to the left of the pelvis, z
-    in front of it.
+    """Feet and pelvis before the person is turned.
 
-    feet: left, right. sink: how much lower the pelvis is than it could be, in legs. tilt: of the
-    pelvis forward. roll: of the pelvis, left side up. lean: how far forward the trunk bends to keep
-    the balance.
+    Lengths are in lengths of a leg, x to the left of the pelvis, z in front of it; angles in
+    radians.
     """
 
     feet: kin.Feet
+    """Left and right foot."""
     sink: float = 0.0
+    """How much lower the pelvis is than it could be."""
     tilt: float = 0.0
+    """Tilt of the pelvis forward."""
     roll: float = 0.0
+    """Roll of the pelvis, positive with the left side up."""
     lean: float = 0.0
+    """How far forward the trunk bends to keep the balance."""
 
 
 def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> Stance:
@@ -237,20 +240,21 @@ legs.
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """Target of a wrist. odds: of being drawn.
-
-    place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
-    raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the
-    front. flexed: of the elbow.
-    collar: how much the collar is raised.
-    """
+    """Target of a wrist. Angles are in radians; pairs are ranges."""
 
     odds: float
+    """Odds of being drawn."""
     place: tuple[float, float, float]
+    """Place of the left wrist relative to the shoulder, in arm lengths, in the axes of the chest.
+    """
     raised: tuple[float, float] = (-1.45, -0.1)
+    """Elevation of the upper arm; 0 is horizontal."""
     forward: tuple[float, float] = (-0.5, 1.4)
+    """Turn of the upper arm towards the front."""
     flexed: tuple[float, float] = (0.05, 2.2)
+    """Bend of the elbow."""
     collar: float = -0.08
+    """How much the collar is raised, radians."""
 
 
 GOALS = {

@@ -58,16 +58,18 @@ KeyPose = tuple[kin.Rotations, kin.Vector, float]
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """rotations: (m, j, 3) axis-angle. translations: (m, 3) metres.
-
-    planted: (m, 2) feet that are on the ground. kind, fps.
-    """
+    """A motion of one person."""
 
     kind: str
+    """Kind of motion, one of KINDS."""
     rotations: Float[np.ndarray, "m j 3"]
+    """Rotations of the joints, (m, j, 3), axis-angle, radians."""
     translations: Float[np.ndarray, "m 3"]
+    """Translations of the body, (m, 3), metres."""
     planted: Bool[np.ndarray, "m 2"]
+    """Whether the left and the right foot are on the ground, (m, 2)."""
     fps: float = FPS
+    """Frames per second."""
 
 
 def sample_sequence(
@@ -89,18 +91,22 @@ def sample_sequence(
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """cadence: strides a second. step: metres forward per step. bend: radians turned per step.
-    width: metres of a foot from the line. lift: metres that a swinging foot is raised. turn_out: of
-    the feet. swing: of the arms, radians.
-    """
+    """How a person walks or turns on the spot."""
 
     cadence: float
+    """Strides per second; a stride is two steps."""
     step: float
+    """Way forward per step, metres."""
     bend: float
+    """Turn per step, radians."""
     width: float
+    """Distance of a foot from the line that is walked, metres."""
     lift: float
+    """Height to which a swinging foot is raised, metres."""
     turn_out: float
+    """Turn of the feet outwards, radians."""
     swing: float
+    """Swing of the arms, radians."""
 
 
 def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:

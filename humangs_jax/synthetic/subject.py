@@ -134,23 +134,26 @@ LENGTHS = ("height", "leg_length", "torso_length")
 
 @dataclasses.dataclass(frozen=True)
 class Person:
-    """seed; betas: (s,) shape coefficients; male: dressed as a man; years; stature in metres,
-    without shoes.
-
-    complexion: colors of skin, hair, eyes. haircut: hair and beard. garments: clothes, shoes and
-    accessories, innermost first.
-    lights: what the person stands in.
-    """
+    """The description of a synthetic person."""
 
     seed: int
+    """Seed that everything about the person is drawn from."""
     betas: Float[np.ndarray, " s"]
+    """Shape coefficients of the body, (s,)."""
     male: bool
+    """Whether the person is dressed as a man."""
     years: float
+    """Age, years."""
     stature: float
+    """Height without shoes, metres."""
     complexion: Complexion
+    """Colors of skin, hair and eyes."""
     haircut: Haircut
+    """Hair and beard."""
     garments: tuple[Garment, ...]
+    """Clothes, shoes and accessories, innermost first."""
     lights: Lights
+    """What the person stands in."""
 
 
 def describe(seed: int, body: BodyModel) -> Person:
@@ -197,24 +200,28 @@ def sample_shape(
 
 @dataclasses.dataclass(frozen=True)
 class SyntheticSubject:
-    """A dressed person.
-
-    seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`,
-    `cloth`. face_materials: (f,) indices into materials. lights. build: what the pose prior knows.
-    person: what all of this was built from.
-    cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on
-    everything else.
-    """
+    """A dressed person."""
 
     seed: int
+    """Seed of the person."""
     betas: Float[np.ndarray, " s"]
+    """Shape coefficients of the body, (s,)."""
     surface: Surface
+    """The mesh at rest with attributes `template`, `cloth`."""
     face_materials: Int[np.ndarray, " f"]
+    """Index of each face's material, (f,)."""
     materials: tuple[Material, ...]
+    """Materials of skin, eyes, clothes and hair, in this order."""
     lights: Lights
+    """What the person stands in."""
     build: Build
+    """What the pose prior knows of the body."""
     cover: Field
+    """How far a vertex of the skin lies inside of a hem, (n,), metres; negative on bare skin and on
+    everything else.
+    """
     person: Person
+    """The description that all of this was built from."""
 
     def posed_vertices(self, rotations: Rotations, translation: Vector) -> Points:
         """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
@@ -240,12 +247,14 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
         raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
     person = describe(seed, body) if person is None else person
     rest = _shape(body, jnp.asarray(person.betas))
+    # the body is measured at rest, and dressed from the inside out
     template, faces, weights, *_ = _host_arrays(body)
     vertices, joints = np.asarray(rest.vertices), np.asarray(rest.joints)
     anatomy = measure(vertices, joints, template, faces, weights, body.parents)
     outfit = wardrobe.dress_up(np.random.default_rng([seed, 20]), anatomy, person.garments)
     hooded = any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments)
     removed = outfit.removed
+    # what hair or cloth covers is taken out of the skin
     if person.haircut.cut in hair.LONG_CUTS or hooded:
         removed = removed | hair.ears(template)
     hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk, hooded)
@@ -255,6 +264,7 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
         np.random.default_rng([seed, 22]), person.complexion, person.haircut
     )
     eyes = wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(person.complexion))
+    # one mesh; the order of the pieces is that of the materials
     pieces = [wardrobe.Piece(skin, skin_material), eyes, *outfit.pieces, *hairs]
     surface, materials = (
         join([piece.surface for piece in pieces]),
@@ -371,19 +381,22 @@ Values = Float[np.ndarray, "m 3"]
 
 @dataclasses.dataclass(frozen=True)
 class PosedSubject:
-    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n,
-    3), openness (n,).
-
-    lit: (n,) share of the key light that arrives.
-    """
+    """A person in one pose, with what its light needs."""
 
     subject: SyntheticSubject
+    """The dressed person."""
     rotations: Rotations
+    """Rotations of the joints, (j, 3), axis-angle, radians."""
     translation: Vector
+    """Translation of the body, (3,), metres."""
     vertices: Points
+    """Vertices in the world, (n, 3), metres."""
     normals: Points
+    """Unit normals, (n, 3)."""
     openness: Field
+    """How much of the surroundings each vertex sees, (n,), 0.35 to 1."""
     lit: Field
+    """Share of the key light that arrives at each vertex, (n,)."""
 
 
 def pose_subject(

@@ -134,15 +134,16 @@ Values = Float[np.ndarray, "n c"]
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """vertices: (n, 3) metres at rest. faces: (f, 3). weights: (n, j) skinning weights.
-
-    attributes: name -> (n, ...).
-    """
+    """A skinned mesh at rest, with values at its vertices."""
 
     vertices: Points
+    """Vertices at rest, (n, 3), metres."""
     faces: Faces
+    """Triangles, (f, 3)."""
     weights: Float[np.ndarray, "n j"]
+    """Skinning weights, (n, j); rows sum to 1."""
     attributes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Further values of the vertices, name -> (n, ...)."""
 
     @property
     def template(self) -> Points:
@@ -391,14 +392,14 @@ _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
 
 @dataclasses.dataclass(frozen=True)
 class Boundaries:
-    """levels: (l,) increasing positions along the axis. centers: (l, 2) across it.
-
-    radii: (l, ANGLES). Metres.
-    """
+    """Silhouettes of a part of the body, in slices along an axis. Metres."""
 
     levels: np.ndarray
+    """Positions of the slices along the axis, (l,), increasing."""
     centers: np.ndarray
+    """Centres of the slices, across the axis, (l, 2)."""
     radii: np.ndarray
+    """Distances from the centres in each direction, (l, ANGLES)."""
 
     def center(self, level: np.ndarray) -> np.ndarray:
         """(n, 2) centre of the slice at each position along the axis."""

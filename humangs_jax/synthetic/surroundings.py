@@ -266,17 +266,18 @@ Values = Float[Array, "*p"]
 
 @pytree_dataclass
 class Lights:
-    """directions: (k, 3) towards the lights, the key light first. strengths: (k, 3).
-
-    sky, ground: (3,) ambient from above and below. gain: (3,) exposure and white balance of the
-    camera.
-    """
+    """What a person stands in: some lights, ambient light, and a camera that exposes for them."""
 
     directions: Float[Array, "k 3"]
+    """Unit directions towards the lights, (k, 3), the key light first."""
     strengths: Float[Array, "k 3"]
+    """Colors of the lights, times their strength, (k, 3)."""
     sky: Float[Array, "3"]
+    """Ambient light from above, (3,)."""
     ground: Float[Array, "3"]
+    """Ambient light from below, (3,)."""
     gain: Float[Array, "3"]
+    """Exposure and white balance of the camera, (3,)."""
 
 
 def sample_lights(rng: np.random.Generator) -> Lights:
@@ -306,11 +307,13 @@ def sample_lights(rng: np.random.Generator) -> Lights:
 def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     """The scenes of `sample_lights` on the device; u: `LIGHT_NUMBERS` numbers in [0, 1)."""
     odds = np.cumsum(_SCENES[:, 0])
+    # the first number chooses the scene, as its odds say
     row = jnp.asarray(_SCENES)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
     azimuth, height, key, fill, sky = row[1:11].reshape(5, 2)
     warmth, bounce = row[11], row[12]
     within = lambda limits, share: limits[0] + (limits[1] - limits[0]) * share
     sign = lambda number: jnp.where(number < 0.5, -1.0, 1.0)
+    # key light, fill light, and one from the opposite side
     turns = jnp.stack(
         [jnp.zeros(()), sign(u[1]) * within((1.4, 2.4), u[2]), np.pi + within((-0.5, 0.5), u[3])]
     )
@@ -322,6 +325,7 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
         within((-0.03, 0.03), u[12:21].reshape(3, 3)),
         within(sky, u[21]) * (1 - 0.5 * warmth * WARM),
     )
+    # exposure and white balance err as those of real cameras
     normal = lambda number: ndtri(jnp.clip(number, 1e-4, 1 - 1e-4))
     exposure, balance, green = (
         0.12 * normal(u[22]) + 0.06,

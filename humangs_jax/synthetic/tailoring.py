@@ -184,28 +184,30 @@ def sandal_straps(template: Points) -> tuple[Field, Field]:
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """How a shell hangs. Metres.
-
-    ease: distance from skin (at least) and from the silhouettes. hang: slope by which hanging cloth
-    may narrow downwards (metres per metre; large clings). sleeve, leg: width added at the end of
-    the limb. fold: height of the folds. hem: depth of the hem.
-    quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this
-    (what is worn below).
-    calm: height above which there are no folds. skirted: below the hips it goes around both legs
-    (tops), not around each.
-    """
+    """How a shell hangs. Lengths in metres."""
 
     ease: float
+    """Distance from the skin (at least) and from its silhouettes."""
     hang: float = 3.0
+    """Slope by which hanging cloth may narrow downwards, metres per metre; large values cling."""
     sleeve: float = 0.0
+    """Width added at the end of the sleeve."""
     leg: float = 0.0
+    """Width added at the end of the trouser leg."""
     leg_hang: float = 3.0
+    """As `hang`, of the cloth of each leg."""
     fold: float = 0.004
+    """Height of the folds; 0 for none."""
     hem: float = 0.008
+    """Depth of the hem that is turned in."""
     quilt: float = 0.0
+    """Period of padded rings; 0 for none."""
     inner: float = 0.0
+    """Distance from the skin below which nothing comes: what is worn below."""
     calm: float = 9.0
+    """Height above which there are no folds."""
     skirted: bool = False
+    """Whether it goes around both legs below the hips (tops), not around each."""
 
 
 def shell(

@@ -153,6 +153,7 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a
     scene.
     """
+    # everything is drawn first, so that front and back show the same print
     number, base = "number" in garment.details, garment.fabric.base
     ink = accent(rng, base)
     ink2 = accent(rng, ink)
@@ -167,6 +168,7 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     words = lambda x, y: written(cells, x / cell + 0.5 * width, y / cell + 0.5 * ROWS)
     badge = lambda x, y, size: emblem(shape, x / size, y / size, points)
 
+    # paint the print once, around its own middle
     def motif(result, x, y, where):
         if kind in ("words", "number"):
             if framed and kind == "words":
@@ -179,6 +181,7 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
             return mix(
                 result, ink, np.clip(badge(x - 0.075, y - 0.04, 0.02) * 8 + 0.5, 0, 1) * where
             )
+        # a picture is noise in three colors
         if kind == "picture":
             inside = band(np.maximum(np.abs(x), 0.8 * np.abs(y)), -1, 1.2 * size)
             scene = lattice(np.stack([x / 0.05, y / 0.03], -1), seed)
@@ -192,6 +195,7 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
             result = mix(result, ink2, words(x * 1.25, (y + size * 1.1 + 5 * cell) * 1.25) * where)
         return result
 
+    # the chest, and on the back mirrored, so that words can be read
     trunk, x, y = _trunk(s), 1.1 * s.template[:, 0], s.template[:, 1] - height
     result = motif(colors, x, y, trunk * (s.cloth[:, 2] > 0))
     return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result

@@ -28,14 +28,14 @@ LAYER = 0.006
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """One surface of one material.
-
-    hidden: (n,) vertices that a later layer covers; None if it knows no template coordinates.
-    """
+    """One surface of one material."""
 
     surface: Surface
+    """The mesh of the piece."""
     material: Material
+    """How it looks."""
     hidden: np.ndarray | None = None
+    """Vertices that a later layer covers, (n,); None if it knows no template coordinates."""
 
     def visible(self) -> "Piece":
         """Without the faces whose corners are all hidden."""
@@ -47,21 +47,24 @@ class Piece:
 
 @dataclasses.dataclass
 class Outfit:
-    """What has been put on so far. cover: (n,) how far inside of some hem each body vertex is,
-    metres; negative on bare skin.
-
-    removed: (n,) hidden body vertices. rng: of the garment that is put on. trunk, legs: distances
-    from the skin of the outermost layer, metres. fit: of the outermost layer on the trunk.
-    """
+    """What has been put on so far."""
 
     anatomy: Anatomy
+    """The body that is dressed."""
     pieces: list[Piece]
+    """What has been put on, innermost first."""
     cover: np.ndarray
+    """How far inside of some hem each body vertex is, (n,), metres; negative on bare skin."""
     removed: np.ndarray
+    """Body vertices that are hidden, (n,)."""
     rng: np.random.Generator
+    """Random numbers of the garment that is put on."""
     trunk: float = 0.0
+    """Distance of the outermost layer on the trunk from the skin, metres."""
     legs: float = 0.0
+    """Distance of the outermost layer on the legs from the skin, metres."""
     fit: Fit = dataclasses.field(default_factory=lambda: Fit(ease=0.0))
+    """Fit of the outermost layer on the trunk."""
 
     @property
     def template(self) -> np.ndarray:
@@ -165,6 +168,7 @@ def _collar(
 def _top(outfit: Outfit, garment: Garment) -> None:
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
+    # looser tops stand off further, hang more, and have higher folds
     fit = Fit(
         ease=max((0.008 if "tucked" in details else 0.012) + 0.016 * loose, outfit.trunk + LAYER),
         hang=outfit.rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0,
@@ -175,6 +179,7 @@ def _top(outfit: Outfit, garment: Garment) -> None:
     )
     stitches = sewn(garment, bottom + 0.018, sleeve - 0.016 if sleeve > 0.2 else None)
     material = Material(stitches, 0.25 + 0.45 * loose, sheen=0.04)
+    # an open front is one more cut through the bodice
     opening = [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
     _bodice(
         outfit,
@@ -185,6 +190,7 @@ def _top(outfit: Outfit, garment: Garment) -> None:
         HEM_MARGIN + 0.03 * loose,
         opening,
     )
+    # collars and hoods are pieces that lie on the bodice
     if kind in ("shirt", "polo", "blouse") and "collar" in details:
         _collar(outfit, material, fit)
     if kind == "hoodie":

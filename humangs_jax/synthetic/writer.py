@@ -82,14 +82,15 @@ class Layout:
     image_size: int = 512
     """Pixels a side; smaller sizes are box averages of it (the loader makes them)."""
     poses: int = 1
-    """How many."""
+    """How many poses each person has."""
     views: int = 60
     """Cameras of the published protocol that see each pose."""
     close_views: int = 0
-    """Nearer ones."""
+    """Further cameras of each pose that are nearer, and see parts of the person."""
     held_out_views: int = 0
     """Cameras of the same pose, and of each of `novel_poses` others, in held_out/."""
     novel_poses: int = 0
+    """Further poses that only held_out/ shows."""
     frames: int = 0
     """0: poses are independent.
 
@@ -104,8 +105,11 @@ class View:
     """A camera that sees pose number `frame`."""
 
     frame: int
+    """Number of the pose that the camera sees."""
     name: str
+    """Name of the view, and of its image."""
     camera: Camera
+    """The camera."""
 
 
 def sample_pose(subject: SyntheticSubject, index: int) -> PosedSubject:
@@ -165,6 +169,7 @@ def capture_views(
 def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout) -> None:
     """One person as `layout` says. Written whole or not at all; an existing folder is replaced."""
     subject = make_subject(seed, body)
+    # poses are independent, or evenly spaced frames of one motion
     motion = sample_motion(subject, layout.frames) if layout.frames else None
     if motion is None:
         posed = [sample_pose(subject, i) for i in range(layout.poses)]
@@ -176,11 +181,13 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
             )
             for i in shown
         ]
+    # held-out views show the first pose and further ones that no input has
     others = [
         posed[0],
         *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses)),
     ]
     size = layout.image_size
+    # each kind of camera has its stream: more of one does not change the others
     views = _views([seed, CAMERA_STREAM], cameras_around, layout.views, posed, size)
     views += _views([seed, CLOSE_STREAM], close_cameras, layout.close_views, posed, size, mark="c")
     held_out = _views([seed, HELD_OUT_STREAM], cameras_around, layout.held_out_views, others, size)
@@ -220,6 +227,7 @@ def write_set(
     nothing can be written there.
     """
     out, seeds = Path(out), seeds_of(split, first, subjects)
+    # a set is made with one set of settings, which its manifest keeps
     made_with = {
         "generator_version": GENERATOR_VERSION,
         "split": split,
@@ -229,6 +237,7 @@ def write_set(
     check_writable(out)
     begin_set(out, SYNTHETIC, made_with)
     folders = {seed: out / f"{seed:07d}" for seed in seeds}
+    # folders that are finished are not made again
     due = {
         seed: (folder, seed, layout)
         for seed, folder in folders.items()
@@ -240,11 +249,13 @@ def write_set(
         with progress_bar(
             total=subjects, initial=subjects - len(due), desc="people", shown=progress
         ) as bar:
+            # one person that fails does not stop the others
             for seed, error in made(_write, due, workers, functools.partial(_given, body)):
                 if error is not None:
                     failed[seed] = error
                     say(f"seed {seed}: {error}", lines=False)
                 bar.update(1)
+                # the manifest names what is finished, in case this is interrupted
                 if time.monotonic() - listed > MANIFEST_EVERY:
                     write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
                     listed = time.monotonic()

@@ -229,7 +229,7 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
     logs = np.log(np.maximum(scales, SMALLEST_SCALE))
     header["means"], arrays["means"] = _quantized(means, means.min(0), means.max(0))
     header["scales"], arrays["scales"] = _quantized(logs, logs.min(), logs.max())
-    # colors may leave [0, 1] after refinement
+    # colors may leave [0, 1]
     header["colors"], arrays["colors"] = _quantized(
         colors, min(colors.min(), 0.0), max(colors.max(), 1.0)
     )
