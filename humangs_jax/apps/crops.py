@@ -12,9 +12,9 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
 
 MARGIN = 0.15
-"""Of the person's longer side, left free around the person on each side."""
+"""Share of the person's longer side that is left free around the person, on each side."""
 LARGEST_SHARE = 0.7
-"""Of the photo's area: more than that is not cut, the photo is shown whole."""
+"""Share of the photo's area above which a window is not cut: the photo is shown whole."""
 
 
 def around_person(

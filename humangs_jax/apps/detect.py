@@ -63,7 +63,7 @@ KEYPOINTS_FILE, SHEET_FILE, MASKS, UNKNOWN = "keypoints.json", "people.png", "ma
 THUMBNAIL = 480
 """Pixels of the longest side of a photo on the sheet."""
 COLORS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
-"""Of the people on the sheet, by number."""
+"""Colors of the people on the sheet, by number."""
 FAINT = 0.45
 """Share of the color over a person's pixels."""
 BEYOND = 0.03
@@ -105,7 +105,7 @@ def left_out(folder: Path) -> str | None:
 
 
 def found_in_capture(folder: Path) -> list[PhotoPeople]:
-    """The same for the photos of a capture folder; their names are the views'.
+    """The people in the photos of a capture folder; the photos are named as the views.
 
     Raises: see `found_in_photos`.
     """
@@ -209,7 +209,7 @@ def person_in_capture(
 
 
 Masks = Sequence[Float[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]]
-"""Of the photos, each of its size."""
+"""Masks of the photos, each of the size of its photo."""
 
 
 def person_of(
@@ -584,7 +584,7 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
         heads.append((float(np.clip(x, 8, width - 24)), float(np.clip(y - 30, 2, height - 26)), i))
     canvas = Image.fromarray(to_uint8(picture))
     pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(22)
-    # a question mark tells that numbers of different photos are not the same people
+    # a question mark: the same number in another photo may be somebody else
     for x, y, i in heads:
         number = str(i) if photo.known else f"{i}?"
         pen.text(

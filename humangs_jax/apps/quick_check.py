@@ -29,7 +29,7 @@ LEAST_IOU = 0.5
 pose or camera.
 """
 SURELY_IOU = 0.6
-"""From here on a mistake that was undone explains a view."""
+"""Intersection over union above which a mistake that was undone explains a view."""
 LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
 """Share of the points in the frame: below the first it is a warning, the second is asked of an
 explanation.
@@ -39,7 +39,7 @@ LEAST_HEIGHT = 0.05
 GRID = 64
 """Cells of a silhouette along the longer side of the image."""
 POINTS = 6000
-"""On the surface of the body: several for each cell that it covers."""
+"""Points on the surface of the body: several for each cell that it covers."""
 VIEWS = 24
 """Most views that are looked at before a reconstruction, evenly chosen."""
 LONGEST_TURN = 2 * math.pi + 0.5
@@ -80,7 +80,7 @@ MISTAKES_OF_IMAGES: dict[str, Callable[[Cells, Cells], tuple[Cells, Cells]]] = {
     "the mask is inverted": lambda body, mask: (body, ~mask),
     "the photo is mirrored": lambda body, mask: (body[:, ::-1], mask),
 }
-"""The same for silhouettes of body and mask."""
+"""What people do wrong with photos, and the silhouettes of body and mask without it."""
 
 
 class Faults(NamedTuple):

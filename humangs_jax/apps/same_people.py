@@ -158,8 +158,8 @@ def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]
     """The same where those who are the only large ones of their photos are one person, matched or
     not.
 
-    Two of whom one photo shows both stay two. So does everybody where somebody else is large in
-    many photos: whoever is alone in a photo may then be either.
+    Two people that one photo shows together stay two. Where somebody else is large in many photos,
+    nobody is joined: whoever is alone in a photo may then be either.
     """
     alone = {large[0] for large in map(_large, rows) if len(large) == 1}
     if not alone:
@@ -223,7 +223,7 @@ def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
 def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
     """Tells whether somebody in a photo may be the person who is not known to be in it.
 
-    That is somebody large whom no photo shows together with the person.
+    That is somebody large that no photo shows together with the person.
     """
     people = photos[photo].people
     if not photos[photo].known:

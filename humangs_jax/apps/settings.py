@@ -45,7 +45,7 @@ from humangs_jax.refinement.refine import Refinement, refine_with_report
 
 MEASURED = "tradeoff.md"
 KIND = "humangs_jax settings"
-"""Of a file of settings, its field "kind"."""
+"""The field "kind" of a file of settings."""
 
 
 @configuration

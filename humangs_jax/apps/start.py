@@ -45,7 +45,7 @@ KEYPOINT_FOLDER = "keypoints"
 OWN_DETECTOR = (
     "pip install 'humangs_jax[photos]', and the same command finds them; or with another program:"
 )
-"""For masks and keypoints: said where LiteRT is not installed."""
+"""Advice for masks and keypoints where LiteRT is not installed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,7 +265,7 @@ def has_photos(folder: Path) -> bool:
 
 
 def _scan(folder: Path) -> FolderScan:
-    """Without masks, and without what other programs have made of photos."""
+    """Scan a folder without masks and without what other programs have made of photos."""
     others = (
         *MASK_FOLDERS,
         KEYPOINT_FOLDER,
@@ -366,8 +366,8 @@ def better_body(
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
-    """Between the cameras as the person sees them, in the axes of the pelvis: of somebody who turns
-    before one camera, too. A photo is none of its own neighbours.
+    """Distances between the cameras as the person sees them, in the axes of the pelvis. They
+    also serve for somebody who turns before one camera. A photo is not its own neighbour.
     """
     frames = np.asarray(capture.frames)
     pelvis = capture.poses.rotations[:, 0]

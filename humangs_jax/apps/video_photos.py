@@ -47,7 +47,7 @@ from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.reading import read_json, reading, write_json
 
 MARK = "video.json"
-"""In the folder of photos: the video that they are of, and which frames."""
+"""File in the folder of photos that names the video that they are of, and which frames."""
 FOLLOWED = 640
 """Pixels of the longer side of frames in which the person is followed: twice what the landmark
 network looks at.

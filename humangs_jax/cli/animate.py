@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from humangs_jax.geometry.camera import Camera
 
 RATE, FINITE = Range(0.01, 1000.0), at_least(-LARGEST)
-"""Of frames per second, and of any number."""
+"""Ranges of frames per second, and of any number."""
 VIDEO = Place(VIDEOS.suffixes, folder=True)
 _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
 FROM_THE_SIDE = Shot(azimuth=20.0)
@@ -363,7 +363,7 @@ def _drawn_by(shot: Shot, preset: Preset | None, config: Path | None) -> Shot:
 
 
 def _pruned(avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: Shot) -> "Avatar":
-    """Without what no image shows, if asked, which is said."""
+    """The avatar without what no image shows, if that is asked for; the count is printed."""
     from humangs_jax.avatar.frames import splatting_of, without_unseen
 
     if not shot.prune:
@@ -380,8 +380,8 @@ ON_A_CIRCLE = ("azimuth", "elevation", "distance", "fov")
 
 
 def _require_no_circle(option: str, shot: Shot, usual: Shot, said: list[str]) -> None:
-    """Nothing is said about a circle of cameras beside an option that has its own. said: names of
-    other options that are given.
+    """Refuse options of a circle of cameras beside an option that brings cameras. said: names of
+    further options that are given.
 
     Raises: UsageError naming the first.
     """

@@ -172,9 +172,7 @@ def option_names(command: type[Any]) -> set[str]:
 
 
 def _options(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any, Any, bool]]:
-    """Of each field: itself, its annotation, what that annotates, and whether it is a positional
-    argument.
-    """
+    """Each field, its annotation, what that annotates, and whether it is a positional argument."""
     hints = get_type_hints(command, include_extras=True)
     for field in dataclasses.fields(command):
         hint = hints[field.name]
@@ -323,7 +321,7 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 
 
 ITERATIONS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}
-"""Of refinement, where nothing is asked for: some seconds, however large the photos."""
+"""Refinement where nothing is asked for: some seconds, however large the photos."""
 
 
 def refine_limits(text: str, option: str) -> dict[str, Any]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from humangs_jax.data.capture import Capture
 
 MARK = START_MARK
-"""In a capture folder that `humangs start` imported: a later run may replace it until it has a
+"""File in a capture folder that `humangs start` imported: a later run may replace it until it has a
 body, and go on from there.
 """
 

@@ -339,9 +339,9 @@ class Convert:
 
 
 KEPT_SECONDS = 30 * 24 * 3600.0
-"""For which the scores of an interrupted evaluation are kept."""
+"""Time for which the scores of an interrupted evaluation are kept."""
 PAGE_IMAGES = 120
-"""That the page of an evaluation shows."""
+"""Most images that the page of an evaluation shows."""
 
 
 @dataclasses.dataclass(frozen=True)

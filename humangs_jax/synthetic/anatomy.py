@@ -55,8 +55,8 @@ LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation (left and right exchanged)."""
 BALL_HEIGHT, HEEL_BACK = 0.0112, 0.064
-"""Of the shipped body, in lengths of a leg: the joint at the ball of the foot above the sole; the
-heel behind the ankle.
+"""Height of the joint at the ball of the foot above the sole, and distance of the heel behind the
+ankle, of the shipped body, in lengths of a leg.
 """
 REACH = 0.998
 """Largest stretch of a leg as a share of its length: a straight leg leaves the knee's direction
@@ -361,7 +361,7 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)
 def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Field, Field]:
-    """Of the mean body: template, coordinates of cloth, membership of arms and legs."""
+    """Template, coordinates of cloth, membership of arms and legs of the mean body."""
     template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
     # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
     arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])

@@ -61,8 +61,8 @@ SHELLS = {
     "quiff": (0.2, 0.05, 1),
     "short": (0.22, 0.035, 1),
 }
-"""Of hair on the scalp: height of its bumps as a share of the thickness, their width in metres, 1
-if it is parted.
+"""Height of the bumps of hair on the scalp as a share of the thickness, their width in metres, and
+1 if the hair is parted.
 """
 TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
 """Range of their lengths; distance of the knots, metres."""

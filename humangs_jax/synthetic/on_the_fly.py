@@ -40,17 +40,17 @@ from humangs_jax.synthetic.subject import APPEARANCES, SPLITS, SUPERSAMPLING, su
 from humangs_jax.synthetic.surroundings import pick
 
 POSES, MIXING = 2, 0.5
-"""Of an example; largest share of the way to the nearest pose: the other half of the way is reached
-from that pose.
+"""Poses of an example; largest share of the way to the nearest pose: the other half of the way is
+reached from that pose.
 """
 DYED_SHARE, CLOSE_SHARE = 0.7, 0.2
-"""Of examples whose clothes get other colors; of close cameras among the targets."""
+"""Share of examples whose clothes get other colors; share of close cameras among the targets."""
 DISPLACED, COUNTED = 1, 2
-"""They make the keys that decide whether the body is displaced and how many views there are from
-that of an example.
+"""Numbers that are folded into the key of an example: the new keys decide whether the body is
+displaced, and how many views there are.
 """
 Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
-"""Of views: numbers for cameras, azimuths, poses, shares of close cameras."""
+"""Numbers for the cameras of views, azimuths, poses, and shares of close cameras."""
 BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
 
 
@@ -66,25 +66,25 @@ class OnTheFlyConfig:
     target_views: Few = 3
     """How many views the rendering is compared with."""
     input_size: Side = 256
-    """Pixels a side."""
+    """Side of the inputs, pixels."""
     target_size: Side = 256
-    """Pixels a side."""
+    """Side of the targets, pixels."""
     mixed_pose_share: Share = 0.3
-    """Of examples whose inputs show any of the `POSES` too, each, as targets do; otherwise all show
-    the first.
+    """Share of examples whose inputs show any of the `POSES`, as targets do; in the others all
+    inputs show the first.
     """
     jitter: Spread = 0.7
     """See `surroundings.azimuths_from`."""
     scattered_share: Share = 0.2
     """See `surroundings.azimuths_from`."""
     mirrored_share: Share = 0.5
-    """Of examples."""
+    """Share of examples that are mirrored."""
     displaced_share: Share = 0.0
-    """Of examples: their body is displaced to the silhouettes of the clothes, and they are not
+    """Share of examples whose body is displaced to the silhouettes of the clothes; they are not
     mirrored.
     """
     depths: bool = False
-    """Also of every view."""
+    """Whether every view has its depths, too."""
     views_at_once: Few = knob(
         1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
     )
@@ -92,7 +92,9 @@ class OnTheFlyConfig:
     pixels_per_step: Slots = knob(
         1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
     )
-    """Of the person, that are colored at a time: few for CPUs, whole images for accelerators."""
+    """Pixels of the person that are colored at a time: few for CPUs, whole images for
+    accelerators.
+    """
 
     def __post_init__(self):
         if max(self.view_counts, default=0) > self.input_views:
@@ -260,8 +262,8 @@ def pose_person(
 def _plans(
     numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None
 ) -> tuple[Plan, Plan]:
-    """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares
-    of close cameras (v,).
+    """The plans of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses
+    (v,), shares of close cameras (v,).
 
     count: of the inputs; after them the last one is repeated. None: all.
     """
@@ -565,7 +567,7 @@ def _compiled() -> Callable[..., Example]:
 
 
 def person_drawn(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> int:
-    """The seed of the person of a bank whom `on_the_fly_example` shows."""
+    """The seed of the person of a bank that `on_the_fly_example` shows."""
     number = _draw_numbers(bank, key, config)["person"]
     return int(bank.seeds[pick(number, bank.people)])
 

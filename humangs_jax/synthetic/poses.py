@@ -25,7 +25,7 @@ keep clear of the body.
 """
 CANDIDATES = 400
 HAND_LENGTH = 0.6
-"""From the wrist to the knuckles and a little beyond, in lengths of the forearm."""
+"""Length from the wrist to a little beyond the knuckles, in lengths of the forearm."""
 HEAD_RADIUS = 0.14
 MARGIN = 0.015
 """Metres that forearm and hand keep away from the body."""

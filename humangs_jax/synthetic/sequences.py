@@ -47,9 +47,9 @@ TRIES = 12
 
 
 Heading = Callable[[float | np.ndarray], float | np.ndarray]
-"""From the phase, in strides, to the angle about y."""
+"""Gives the angle about y at a phase in strides."""
 Track = Callable[[float], kin.Vector]
-"""From the phase to the body's place on its path."""
+"""Gives the body's place on its path at a phase."""
 Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Bool[np.ndarray, "m 2"]]
 """Rotations, positions of the pelvis, feet that are planted."""
 KeyPose = tuple[kin.Rotations, kin.Vector, float]

@@ -53,7 +53,7 @@ def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> 
 
 
 class Folds:
-    """Creases of cloth: ridges in a few directions, each in patches of its own. The same object is
+    """Creases of cloth: ridges in a few directions, each in separate patches. The same object is
     the same function always.
 
     upright: all of them run along y.
@@ -383,7 +383,7 @@ def around(
 
 
 ANGLES, EMPTY = 48, 1e-3
-"""Of a silhouette; radius (metres) of a slice without points."""
+"""Directions of a silhouette; radius (metres) of a slice without points."""
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)

@@ -43,7 +43,7 @@ UP = (0.0, 1.0, 0.0)
 Angles = Float[np.ndarray, " v"]
 Number = Float[Array, ""] | float
 Each = Float[Array | np.ndarray, "3 ..."]
-"""Of three lights or channels."""
+"""Values of three lights or channels."""
 
 
 def bounding_sphere(vertices: Points) -> tuple[Vector, float]:

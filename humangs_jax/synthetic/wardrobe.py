@@ -38,7 +38,7 @@ class Piece:
     """Vertices that a later layer covers, (n,); None if it knows no template coordinates."""
 
     def visible(self) -> "Piece":
-        """Without the faces whose corners are all hidden."""
+        """The piece without the faces whose corners are all hidden."""
         if self.hidden is None or not self.hidden.any():
             return self
         kept = ~self.hidden[self.surface.faces].all(1)
@@ -117,7 +117,7 @@ class Outfit:
 
 
 def dress_up(rng: np.random.Generator, anatomy: Anatomy, garments: tuple[Garment, ...]) -> Outfit:
-    """The garments on the body. Each has random numbers of its own, spawned in order."""
+    """The garments on the body. Each has a separate random stream, spawned in order."""
     count = len(anatomy.skin.vertices)
     outfit = Outfit(anatomy, [], np.full(count, -1.0), np.zeros(count, bool), rng)
     for garment, own in zip(garments, rng.spawn(len(garments)), strict=True):
@@ -308,8 +308,8 @@ def _skirt(outfit: Outfit, garment: Garment) -> None:
 
 
 def _hem_of(sizes: Mapping[str, float]) -> tuple[float, tuple[int, float]]:
-    """Of a skirt: metres wider per metre down, so that the hem of a short one stands off as far as
-    a long one's; pleats.
+    """Metres by which a skirt gets wider per metre down, so that the hem of a short one stands off
+    as far as that of a long one; and its pleats.
     """
     return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
 

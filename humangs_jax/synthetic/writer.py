@@ -4,7 +4,7 @@ seeds.
 out/manifest.json                    settings of the set and finished subjects, see `data.sets`
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one
                                      or several poses
-out/SEED/held_out/                   a capture of its own with the views that reconstruction may not
+out/SEED/held_out/                   a separate capture with the views that reconstruction may not
                                      see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
 out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see

@@ -54,7 +54,7 @@ SMALLEST_SCALE = 1e-7
 A thousandth of eps2d for a camera at any distance.
 """
 SMALLEST_RANGE = 1e-6
-"""Of quantized values: keeps the division finite where all are the same."""
+"""Least range of quantized values: keeps the division finite where all are the same."""
 SHAPE_STEP = 1e-4
 """Metres."""
 SHAPE_TOLERANCE = 1e-3
@@ -256,8 +256,8 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
 def _pack_shape(
     avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> None:
-    """Of every direction its offsets of the vertices; the Gaussians of a vertex move with it (they
-    are vertex-major).
+    """Add how each shape coefficient moves the vertices; the Gaussians of a vertex move with it
+    (they are vertex-major).
     """
     betas = fitted_shape(avatar, body)
     vertices = len(avatar.rest_vertices)
