@@ -134,12 +134,16 @@ class _Looked(NamedTuple):
 
 
 class _Choice(NamedTuple):
-    """What says who is meant, see `import_photos`; and the capture folder."""
+    """What says who is meant, see `import_photos`, and where the capture goes."""
 
     person: int | None
+    """Number on people.png, or in the keypoint file if there is one."""
     keypoints: Path | None
+    """Keypoint file of another program."""
     masks: Path | None
+    """Folder of masks of another program."""
     out: Path
+    """The capture folder."""
 
 
 def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:

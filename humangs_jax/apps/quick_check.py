@@ -135,19 +135,24 @@ def faults(capture: Capture) -> Faults:
 
 
 class _View(NamedTuple):
-    """What is compared, in numpy: JAX would compile each of the small operations.
-
-    points: (p, 3) on the posed skin.
-    """
+    """What is compared, in numpy: JAX would compile each of the small operations."""
 
     name: str
+    """Name of the view."""
     image: Float[np.ndarray, "h w 3"]
+    """The photo, (h, w, 3), 0 to 1."""
     mask: Float[np.ndarray, "h w"] | None
+    """The person's mask, (h, w), 0 to 1; None without masks."""
     cells: Cells | None
+    """The mask as a coarse silhouette; None without masks."""
     points: Float[np.ndarray, "p 3"]
+    """Points on the posed skin, (p, 3), metres, in the world."""
     K: Float[np.ndarray, "3 3"]
+    """Intrinsics, (3, 3), pixels."""
     matrix: Matrix
+    """`cam_from_world` of the camera, (4, 4)."""
     translation: Float[np.ndarray, "3"]
+    """Translation of the body in the view's frame, (3,), metres."""
 
 
 def _coarse_views(capture: Capture) -> list[_View]:
