@@ -1,15 +1,12 @@
-"""The size and shape of the project, counted from its files."""
+"""How much code there is and how plainly it is said, counted from the files."""
 
 import ast
 import inspect
 import io
-import itertools
-import os
-import re
 import subprocess
 import sys
 import tokenize
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -19,296 +16,210 @@ from experiments.harness import Run, entry
 from experiments.results import REPOSITORY, markdown_table
 
 PACKAGE = "humangs_jax"
-LONG = 500
-"""Lines from which on a module is long."""
-GENERATED = ("docs/benchmarks/", "docs/knobs.md", "docs/api/")
-"""Pages that scripts write."""
+WINGS = ("capture", "motion", "synthetic", "viewer")
+"""Folders of the package that its core does not import."""
+FORMER_WINGS = (
+    *("data/calibration", "data/keypoints", "data/motion"),
+    *("detection", "fitting", "people"),
+)
+"""Where the files of the wings were before there were wings."""
+COLUMNS = 100
+"""Width from which on a line is too long."""
+LONG = 30
+"""Lines from which on a function needs a comment."""
+LAYOUT = {
+    *(tokenize.COMMENT, tokenize.NL, tokenize.INDENT, tokenize.DEDENT),
+    *(tokenize.ENCODING, tokenize.ENDMARKER),
+}
+"""Kinds of tokens that are no code."""
+FSTRING_START = getattr(tokenize, "FSTRING_START", None)
+"""Begins an f-string, from Python 3.12 on; before, an f-string is one token."""
+FSTRING_END = getattr(tokenize, "FSTRING_END", None)
+"""Ends an f-string, from Python 3.12 on."""
+Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @entry
-def count(run: Run, before: Path | None = None, details: bool = False, walks: bool = False) -> None:
-    """Lines, modules, words, annotations, importers and circles of imports of package, tests,
-    experiments and docs.
+def count(run: Run, before: str | None = None, details: bool = False, walks: bool = False) -> None:
+    """Code tokens, names, assignments, long lines, comments and described fields of the package,
+    and code tokens of its tests.
 
-    Only files that git knows. "Annotated": all arguments and the result; functions in functions,
-    lambdas and __methods__ do not count. "One importer": modules that a single other module
-    imports, also inside of functions; tables of names are not read.
+    Only files that git knows. Code tokens: without comments, docstrings and newlines. Names,
+    functions and classes: those of modules, without methods. Lines of a function: its body with
+    its docstring.
 
     Tables: size
 
     Options:
-    before: another checkout of the project, whose numbers stand beside these
-    details: names of long modules, of those with one importer, of circles, and of the functions of
-    walks
-    walks: also how many functions a datum enters, see `walked`; a minute, and of this checkout
-    alone
+    before: commit, branch or tag whose numbers stand beside those of the files as they are
+    details: names of the long functions without a comment, and of the functions of walks
+    walks: also how many functions a datum enters, see `walked`; a minute, and of the files as they
+    are alone
     """
-    columns = {"before": measure(before)} if before else {}
-    columns["now"] = measure(REPOSITORY) | (all_walks() if walks else {})
+    columns = {} if before is None else {"before": measure(sources(REPOSITORY, before))}
+    columns["now"] = measure(sources(REPOSITORY))
+    if walks:
+        columns["now"] |= all_walks()
+
     if details:
         for name, value in columns["now"].items():
             if isinstance(value, list):
-                print(f"{name}: {', '.join(map(str, value)) or 'none'}")
-    shown = lambda value: (
-        f"{len(value) if isinstance(value, list) else value:,}"
-        if not isinstance(value, str)
-        else value
-    )
+                print(f"{name}: {', '.join(value) or 'none'}")
+
     rows = [
-        [name, *(shown(column.get(name, "")) for column in columns.values())]
+        [name, *(_shown(column.get(name)) for column in columns.values())]
         for name in columns["now"]
     ]
     numbers = {
-        title: {
-            name: len(value) if isinstance(value, list) else value for name, value in column.items()
-        }
+        title: {name: _number(value) for name, value in column.items()}
         for title, column in columns.items()
     }
     run.show(markdown_table(["", *columns], rows), numbers, "size")
 
 
-def measure(root: Path) -> dict[str, Any]:
-    """Numbers, shares as text, and lists of names."""
-    files = subprocess.run(
-        ["git", "ls-files"], cwd=root, capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    known = [name for name in files if (root / name).is_file()]
-    python = {name: (root / name).read_text() for name in known if name.endswith(".py")}
-    of = lambda *folders: {name: text for name, text in python.items() if name.startswith(folders)}
-    lines = lambda texts: sum(text.count("\n") for text in texts.values())
-    package, found = of(f"{PACKAGE}/"), {}
-    parts = {"package": package, "tests": of("tests/"), "experiments": of("experiments/")}
-    for name, texts in parts.items():
-        found |= {
-            f"{name}: lines": lines(texts),
-            f"{name}: modules": sum(1 for text in texts.values() if text.strip()),
-        }
-    for folder in sorted(
-        {name.split("/")[1] for name in parts["experiments"] if name.count("/") > 1}
-    ):
-        found[f"experiments/{folder}: lines"] = lines(of(f"experiments/{folder}/"))
-    pages = [
-        name
-        for name in known
-        if name == "README.md" or (name.startswith("docs/") and name.endswith(".md"))
-    ]
-    found |= {
-        "docs: pages": len(pages),
-        "docs: words": sum(len((root / name).read_text().split()) for name in pages),
-    }
-    by_hand = {
-        name: written((root / name).read_text()) for name in pages if not name.startswith(GENERATED)
-    }
-    found["docs: words by hand, without code and generated tables"] = sum(
-        len(text.split()) for text in by_hand.values()
-    )
-    found["docs: words of README"] = len((root / "README.md").read_text().split())
-    found["docs: tables on pages written by hand"] = sum(
-        text.count("| --- ") > 0 for text in by_hand.values()
-    )
-    found |= helps(root)
-    found["public functions with arguments, results, errors and an example in the docstring"] = (
-        documented(root)
-    )
-    results = [name for name in known if name.startswith("docs/results/")]
-    found["docs/results: lines"] = sum((root / name).read_text().count("\n") for name in results)
-    for kind, private in (("public", False), ("private", True)):
-        each = [
-            annotated(node) for node, hidden in functions(package.values()) if hidden == private
-        ]
-        found[f"{kind} functions annotated"] = (
-            f"{sum(each):,} of {len(each):,}, {sum(each) / max(1, len(each)):.0%}"
+def _number(value: int | float | list[str]) -> int | float:
+    """Gives a value as a number: of a list of names how many there are."""
+    return len(value) if isinstance(value, list) else value
+
+
+def _shown(value: int | float | list[str] | None) -> str:
+    """Formats a value for the table, a share in percent."""
+    if value is None:
+        return "-"
+    number = _number(value)
+    return f"{number:.0%}" if isinstance(number, float) else f"{number:,}"
+
+
+def sources(root: Path, revision: str | None = None) -> dict[str, str]:
+    """Reads the Python files of package and tests, as they are or as a revision has them.
+
+    Raises: ValueError for a revision that git does not know.
+    """
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", *arguments], cwd=root, capture_output=True, encoding="utf-8", check=False
         )
-    found[f"modules above {LONG} lines"] = [
-        name for name, text in package.items() if text.count("\n") > LONG
-    ]
-    always, anywhere = imports(package, True), imports(package, False)
-    importers: dict[str, set[str]] = {}
-    for module, targets in anywhere.items():
-        for target in targets - {module}:
-            importers.setdefault(target, set()).add(module)
-    found["modules with one importer"] = [
-        f"{name} ({next(iter(by))})"
-        for name, by in sorted(importers.items())
-        if len(by) == 1 and name != PACKAGE
-    ]
-    found["public names"] = len(public_names(root))
-    found["circles of imports"] = circles(always)
-    found["circles with imports inside of functions"] = circles(anywhere)
-    return found
+        if done.returncode:
+            raise ValueError(f"git {' '.join(arguments)}: {done.stderr.strip()}")
+        return done.stdout
+
+    folders = (f"{PACKAGE}/", "tests/")
+    if revision is None:
+        listed = git("ls-files", "-z", *folders)
+    else:
+        listed = git("ls-tree", "-r", "-z", "--name-only", revision, *folders)
+
+    texts = {}
+    for name in listed.split("\0"):
+        if not name.endswith(".py"):
+            continue
+        if revision is not None:
+            texts[name] = git("show", f"{revision}:{name}")
+        elif (root / name).is_file():  # else it is removed, and not yet committed
+            texts[name] = (root / name).read_text(encoding="utf-8")
+    return texts
 
 
-def written(text: str) -> str:
-    """A page without what scripts write into it, and without code."""
-    text = re.sub(r"<!-- (table|formats): .*?<!-- end -->", "", text, flags=re.DOTALL)
-    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+def measure(texts: dict[str, str]) -> dict[str, Any]:
+    """Counts what the table shows: numbers, a share, and a list of names."""
+    package = {name: text for name, text in texts.items() if name.startswith(f"{PACKAGE}/")}
+    tests = [text for name, text in texts.items() if name.startswith("tests/")]
+    outside = tuple(f"{PACKAGE}/{folder}/" for folder in (*WINGS, *FORMER_WINGS))
+    core = [text for name, text in package.items() if not name.startswith(outside)]
+
+    # what is a name, a statement or an expression of Python
+    trees = {name: ast.parse(text) for name, text in package.items()}
+    statements = [node for tree in trees.values() for node in tree.body]
+    nodes = [node for tree in trees.values() for node in ast.walk(tree)]
+    defined = [node for node in statements if isinstance(node, Function | ast.ClassDef)]
+    described = [has for node in defined for has in described_fields(node)]
+
+    # what is a line
+    lines = [line for text in package.values() for line in text.splitlines()]
+    comments = {name: comment_lines(text) for name, text in package.items()}
+    silent = [
+        f"{name}:{function}"
+        for name, tree in trees.items()
+        for function in long_without_comment(tree, comments[name])
+    ]
+
+    return {
+        "package: code tokens": sum(map(code_tokens, package.values())),
+        "package: public names": sum(not node.name.startswith("_") for node in defined),
+        "package: functions and classes": len(defined),
+        "package: module assignments": _how_many(statements, ast.Assign | ast.AnnAssign),
+        f"package without {', '.join(WINGS)}: code tokens": sum(map(code_tokens, core)),
+        f"package: lines over {COLUMNS} columns": sum(len(line) > COLUMNS for line in lines),
+        "package: conditional expressions": _how_many(nodes, ast.IfExp),
+        "package: walruses": _how_many(nodes, ast.NamedExpr),
+        "package: lines with a comment": sum(map(len, comments.values())),
+        f"package: functions over {LONG} lines without a comment": silent,
+        "package: fields of public dataclasses with a sentence": (
+            sum(described) / max(1, len(described))
+        ),
+        "tests: code tokens": sum(map(code_tokens, tests)),
+    }
+
+
+def _how_many(nodes: list[Any], kind: Any) -> int:
+    """Counts the nodes of a kind."""
+    return sum(isinstance(node, kind) for node in nodes)
 
 
 def code_tokens(text: str) -> int:
-    """Words and signs of a module, without comments, docstrings and what only lays it out."""
-    layout = {
-        tokenize.COMMENT,
-        tokenize.NL,
-        tokenize.INDENT,
-        tokenize.DEDENT,
-        tokenize.ENCODING,
-        tokenize.ENDMARKER,
-    }
-    kept = [
-        token
-        for token in tokenize.generate_tokens(io.StringIO(text).readline)
-        if token.type not in layout
-    ]
-    count, begins = 0, True
-    kinds = [token.type for token in kept]
-    for kind, following in itertools.pairwise([*kinds, tokenize.NEWLINE]):
-        docstring = kind == tokenize.STRING and begins and following == tokenize.NEWLINE
-        begins = kind == tokenize.NEWLINE
-        count += not (docstring or begins)
-    return count
+    """Counts words and signs of a module, without comments, docstrings and what only lays it out.
 
-
-def helps(root: Path) -> dict[str, Any]:
-    """Of the command line: lines of all help texts at 80 columns, and lines that are examples."""
-    from humangs_jax.cli import COMMANDS
-
-    environment = os.environ | {
-        "COLUMNS": "80",
-        "NO_COLOR": "1",
-        "TERM": "dumb",
-        "PYTHONPATH": str(root),
-    }
-    lines: list[str] = []
-    for name in COMMANDS:
-        command = [sys.executable, "-m", "humangs_jax.cli", name, "--help"]
-        lines += subprocess.run(
-            command, cwd=root, env=environment, capture_output=True, text=True
-        ).stdout.splitlines()
-    examples = sum(line.startswith("  humangs ") for line in lines)
-    return {"command line: lines of help": len(lines), "command line: examples": examples}
-
-
-def documented(root: Path) -> str:
-    """Public functions whose docstring has a section for all that they take, return and raise, and
-    an example.
+    An f-string is one token on every version of Python.
     """
-    complete = every = 0
-    tree = ast.parse((root / PACKAGE / "__init__.pyi").read_text())
-    for node in (node for node in tree.body if isinstance(node, ast.ImportFrom)):
-        place = root / PACKAGE / str(node.module).replace(".", "/")
-        file = (
-            place.with_suffix(".py")
-            if place.with_suffix(".py").is_file()
-            else place / "__init__.py"
-        )
-        names = {each.name for each in node.names}
-        for function in ast.parse(file.read_text()).body:
-            if isinstance(function, ast.FunctionDef) and function.name in names:
-                text, taken = ast.get_docstring(function) or "", function.args
-                wanted = ["Args:"] * bool(taken.args or taken.kwonlyargs or taken.kwarg) + [
-                    "Examples:"
-                ]
-                returned = function.returns
-                wanted += ["Returns:"] * (returned is not None and ast.unparse(returned) != "None")
-                every += 1
-                complete += all(f"\n{section}\n" in text for section in wanted)
-    return f"{complete} of {every}"
+    total, depth = 0, 0
+    line: list[int] = []
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.NEWLINE:
+            # a string alone is a docstring: of a module, a class, a function or a field
+            total += 0 if line == [tokenize.STRING] else len(line)
+            line = []
+        elif token.type == FSTRING_START:
+            if depth == 0:
+                line.append(tokenize.STRING)
+            depth += 1
+        elif token.type == FSTRING_END:
+            depth -= 1
+        elif depth == 0 and token.type not in LAYOUT:
+            line.append(token.type)
+    return total
 
 
-def functions(
-    texts: Iterable[str],
-) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
-    """Functions and methods of modules, and whether one is private."""
-
-    def inside(body, hidden):
-        for node in body:
-            if isinstance(node, ast.ClassDef):
-                yield from inside(node.body, hidden or node.name.startswith("_"))
-            elif isinstance(
-                node, ast.FunctionDef | ast.AsyncFunctionDef
-            ) and not node.name.startswith("__"):
-                yield node, hidden or node.name.startswith("_")
-
-    for text in texts:
-        yield from inside(ast.parse(text).body, False)
+def comment_lines(text: str) -> set[int]:
+    """Finds the lines of a module that have a comment, alone or after code."""
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return {token.start[0] for token in tokens if token.type == tokenize.COMMENT}
 
 
-def annotated(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    """All arguments but self and cls, and the result."""
-    given = function.args
-    named = [
-        *given.posonlyargs,
-        *given.args,
-        *given.kwonlyargs,
-        *filter(None, (given.vararg, given.kwarg)),
-    ]
-    typed = all(each.annotation for each in named if each.arg not in ("self", "cls"))
-    return typed and function.returns is not None
+def long_without_comment(tree: ast.Module, comments: set[int]) -> Iterator[str]:
+    """Names the long functions of a module that have none of its comments."""
+    for node in tree.body:
+        if isinstance(node, Function):
+            end = node.end_lineno or node.lineno
+            is_long = end + 1 - node.body[0].lineno > LONG
+            if is_long and comments.isdisjoint(range(node.lineno, end + 1)):
+                yield node.name
 
 
-def imports(package: dict[str, str], at_import: bool) -> dict[str, set[str]]:
-    """Module -> modules of the package that it imports. at_import: without those inside of
-    functions and for types alone.
+def described_fields(node: ast.stmt) -> Iterator[bool]:
+    """Tells of each public field of a public dataclass whether a sentence stands below it.
+
+    A dataclass has a decorator: dataclass, pytree_dataclass, configuration or part.
     """
-    name_of = lambda path: path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    modules = {name_of(path): text for path, text in package.items()}
-
-    def statements(body):
-        for node in body:
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                yield node
-            elif (
-                at_import and isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-            ):
-                yield from statements(node.orelse)
-            elif not (at_import and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)):
-                yield from statements(ast.iter_child_nodes(node))
-
-    found: dict[str, set[str]] = {}
-    for module, text in modules.items():
-        names = []
-        for node in statements(ast.parse(text).body):
-            if isinstance(node, ast.ImportFrom):
-                names += [f"{node.module}.{each.name}" for each in node.names]
-            else:
-                names += [each.name for each in node.names]
-        # a name of a module is an import of that module
-        found[module] = {
-            each if each in modules else each.rpartition(".")[0] for each in names
-        } & set(modules) - {module}
-    return found
-
-
-def circles(graph: dict[str, set[str]]) -> list[str]:
-    """Sets of modules that import each other, by way of others."""
-
-    def reached(start):
-        seen, todo = set(), [start]
-        while todo:
-            for each in graph.get(todo.pop(), ()):
-                if each not in seen:
-                    seen.add(each)
-                    todo.append(each)
-        return seen
-
-    reach = {module: reached(module) for module in graph}
-    found = {
-        frozenset(other for other in reach[module] if module in reach[other])
-        for module in graph
-        if module in reach[module]
-    }
-    return [" <-> ".join(sorted(each)) for each in found]
-
-
-def public_names(root: Path) -> list[str]:
-    """What `import humangs_jax` offers."""
-    tree = ast.parse((root / PACKAGE / "__init__.pyi").read_text())
-    return [
-        each.asname or each.name
-        for node in tree.body
-        if isinstance(node, ast.ImportFrom)
-        for each in node.names
-    ]
+    if not isinstance(node, ast.ClassDef) or node.name.startswith("_"):
+        return
+    decorators = [ast.unparse(each).partition("(")[0] for each in node.decorator_list]
+    if not any(each.endswith(("dataclass", "configuration", "part")) for each in decorators):
+        return
+    for field, following in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(field, ast.AnnAssign) and not ast.unparse(field.target).startswith("_"):
+            below = following.value if isinstance(following, ast.Expr) else None
+            yield isinstance(below, ast.Constant) and isinstance(below.value, str)
 
 
 def walked(call: Callable[[], object], *datum: type) -> list[str]:

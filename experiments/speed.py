@@ -5,6 +5,7 @@ The unit is the CPU time of a plain product of two matrices by the same JAX, whi
 busier machine changes alike.
 """
 
+import ast
 import json
 import os
 import subprocess
@@ -92,7 +93,7 @@ def slower_than(before: dict[str, float], now: dict[str, float], factor: float) 
 
 def code_by_room(root: Path) -> dict[str, int]:
     """Tokens of code of each folder of the package at a place, and its public names."""
-    from experiments.count import code_tokens, public_names
+    from experiments.count import code_tokens
 
     package = root / "humangs_jax"
     found: dict[str, int] = {}
@@ -101,6 +102,17 @@ def code_by_room(root: Path) -> dict[str, int]:
         room = f"{inside[0]}/" if len(inside) > 1 else "the package itself"
         found[room] = found.get(room, 0) + code_tokens(file.read_text(encoding="utf-8"))
     return found | {PUBLIC: len(public_names(root))}
+
+
+def public_names(root: Path) -> list[str]:
+    """What `import humangs_jax` offers at a place."""
+    tree = ast.parse((root / "humangs_jax" / "__init__.pyi").read_text(encoding="utf-8"))
+    return [
+        each.asname or each.name
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for each in node.names
+    ]
 
 
 @contextmanager

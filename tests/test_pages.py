@@ -5,7 +5,6 @@ import re
 import subprocess
 from pathlib import Path
 
-from experiments.count import GENERATED, written
 from experiments.results import REPOSITORY
 
 TERMS = (
@@ -14,6 +13,14 @@ TERMS = (
 )
 DIALECT = re.compile(rf"\b({TERMS}|colour\w*)\b")
 """Words that the field does not use."""
+GENERATED = ("docs/benchmarks/", "docs/knobs.md", "docs/api/")
+"""Pages that scripts write."""
+
+
+def written(text: str) -> str:
+    """A page without what scripts write into it, and without code."""
+    text = re.sub(r"<!-- (table|formats): .*?<!-- end -->", "", text, flags=re.DOTALL)
+    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
 
 
 def broken_links(root: Path, name: str) -> list[str]:

@@ -3,7 +3,6 @@
 import pytest
 
 from experiments import speed
-from experiments.count import code_tokens
 from experiments.harness import call
 from experiments.results import REPOSITORY
 
@@ -40,14 +39,6 @@ def test_a_change_that_is_too_slow_fails_and_the_report_has_code_by_room(monkeyp
     assert "| the same with its gradient | 20 | 30 |" in shown and "code tokens, core/" in shown
     assert "30.00 plain products, 20.00 before: 1.50 times" in shown
     assert call(speed.speed, ["--turns", "1", "--before", "v1", "--slower", "2"]) == 0
-
-
-def test_tokens_are_code_without_comments_docstrings_and_layout():
-    text = '"""A module."""\n\nx = 1  # one\n\n\ndef f(a):\n    """A function."""\n    return "a" + a\n'
-    assert code_tokens(text) == len(
-        ["x", "=", "1", "def", "f", "(", "a", ")", ":", "return", "'a'", "+", "a"]
-    )
-    assert code_tokens(text.replace("  # one", "").replace("\n\n", "\n")) == code_tokens(text)
 
 
 def test_rooms_are_those_of_the_package(tmp_path):
