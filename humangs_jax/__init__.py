@@ -3,7 +3,7 @@
 The public interface is the list in `__init__.pyi`, which editors and type checkers read. Each name
 is imported when it is first used, so that `import humangs_jax` and `humangs --help` cost nothing.
 The import itself sets one flag of XLA where the installed version of JAX would compute wrong
-numbers without it.
+numbers without it. Modules that have moved are still imported under their old names.
 """
 
 import ast
@@ -11,6 +11,7 @@ import importlib
 from pathlib import Path
 
 from humangs_jax.core.jax_faults import avoid_wrong_sums
+from humangs_jax.core.moved import find_moved_modules
 
 __version__ = "0.2.0"
 
@@ -24,6 +25,7 @@ _PUBLIC = {
 __all__ = ["__version__", *_PUBLIC]
 
 avoid_wrong_sums()
+find_moved_modules()
 
 
 def __getattr__(name: str) -> object:

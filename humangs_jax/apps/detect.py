@@ -69,9 +69,7 @@ FAINT = 0.45
 BEYOND = 0.03
 """Share of a person's size that a landmark outside of the photo is beyond its border."""
 AREA_OF_CROP = 0.1
-"""Pixels of a person over those of the detector's crop; 0.09 to 0.14 of twelve people who stand
-free.
-"""
+"""Pixels of a person over those of the detector's crop: a usual value of people who stand free."""
 LEAST_AGREEMENT = 0.6
 """Intersection over union of a mask that is given and of the person found there below which
 somebody else may have been found.

@@ -394,9 +394,7 @@ MOST_LOOKS, SETTLED = 4, 0.05
 below which it has found it.
 """
 LEAST_ON_REST = 0.6
-"""`LEAST_ON_MASK` of a person who is partly painted over, whose mask then has holes: 0.67 to 1 of
-ten people; of what was taken for people in sixteen photos of one person, presence and share were at
-most 0.95 and 0.79, 1.0 and 0.4."""
+"""`LEAST_ON_MASK` for a person who is partly painted over, whose mask then has holes."""
 PAINTED = 0.4
 """Probability from which on a pixel of a mask is painted over; the detector's masks end there."""
 MARGINS = (1 / 150, 1 / 100)

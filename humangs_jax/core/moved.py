@@ -1,0 +1,67 @@
+"""Modules that have moved are still imported under the names that they had, with a warning."""
+
+import importlib
+import sys
+import warnings
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+MOVED = {
+    "humangs_jax.data.calibration.calibration": "humangs_jax.data.cameras",
+    "humangs_jax.data.calibration": "humangs_jax.capture.calibration",
+    "humangs_jax.data.keypoints": "humangs_jax.capture.keypoints",
+    "humangs_jax.data.motion": "humangs_jax.motion",
+    "humangs_jax.detection": "humangs_jax.capture.detection",
+    "humangs_jax.fitting": "humangs_jax.capture.fitting",
+    "humangs_jax.people": "humangs_jax.synthetic",
+}
+"""New names of modules and packages by their old ones, the longest first."""
+
+
+def new_name(name: str) -> str | None:
+    """The name that a module has now, by its old one; None for what has not moved.
+
+    Examples:
+        >>> new_name("humangs_jax.people.bank")
+        'humangs_jax.synthetic.bank'
+    """
+    for old, new in MOVED.items():
+        if name == old or name.startswith(f"{old}."):
+            return new + name[len(old) :]
+    return None
+
+
+class MovedModules:
+    """Finds modules by their old names: the same modules, imported once."""
+
+    def __init__(self) -> None:
+        self._specs: dict[str, Any] = {}
+
+    def find_spec(
+        self, name: str, path: Any = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """A spec that leads to the module of today; None for every other name."""
+        if not name.startswith("humangs_jax.") or new_name(name) is None:
+            return None
+        return ModuleSpec(name, self)  # ty: ignore[invalid-argument-type]
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """The module of today. Raises: ModuleNotFoundError by its new name if there is none."""
+        new = str(new_name(spec.name))
+        module = importlib.import_module(new)
+        message = f"{spec.name} is {new} now; its old name goes in version 0.3"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        self._specs[spec.name] = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Nothing is run again; the module keeps the spec of its new name."""
+        old = getattr(module.__spec__, "name", "")
+        module.__spec__ = self._specs.pop(old, module.__spec__)
+
+
+def find_moved_modules() -> None:
+    """Make the old names known to `import`."""
+    if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
+        sys.meta_path.insert(0, MovedModules())
