@@ -17,7 +17,7 @@ from types import SimpleNamespace
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [
     str(HERE),
-    *(str(HERE.parent / name) for name in ("network", "data", "data/datasets", "")),
+    *(str(HERE.parent / name) for name in ("network", "capture", "data/datasets", "")),
 ]
 os.environ |= {"JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "2"}
 

@@ -21,7 +21,7 @@ from humangs_jax.core.progress import printable
 HERE = Path(__file__).parent
 sys.path[:0] = [
     str(HERE),
-    *(str(HERE.parent / name) for name in ("network", "data", "data/datasets", "")),
+    *(str(HERE.parent / name) for name in ("network", "capture", "data/datasets", "")),
 ]
 
 from hostile_cases import all_cases  # noqa: E402

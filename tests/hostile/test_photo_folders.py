@@ -185,7 +185,7 @@ FOLDERS = {
     "two people": (
         beside((1.0, 0.9)),
         None,
-        r"2 people in both0\.png, both1\.png: expected one\. Person 0 to 1",
+        r"both0\.png, both1\.png: which of the people of .*people\.png is meant\?",
     ),
     "a photo cut short": (files(odd_jpg=jpeg()[:2000]), None, r"odd\.jpg"),
     "an empty file": (files(odd_jpg=b""), None, r"odd\.jpg"),

@@ -171,7 +171,8 @@ def prepare():
     late.
     """
     sys.path[:0] = [
-        str(ROOT / "tests" / name) for name in ("hostile", "network", "data", "data/datasets", "")
+        str(ROOT / "tests" / name)
+        for name in ("hostile", "network", "capture", "data/datasets", "")
     ]
     os.environ |= {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
     import jax
