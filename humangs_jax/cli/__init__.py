@@ -170,7 +170,9 @@ def _parsed(arguments: list[str]) -> Command:
         import tyro
 
         every = {each: described(_command(each)) for each in COMMANDS}
-        return tyro.extras.subcommand_cli_from_dict(every, prog="humangs", args=arguments)  # ty: ignore[no-matching-overload]
+        return tyro.extras.subcommand_cli_from_dict(  # ty: ignore[no-matching-overload]
+            every, prog="humangs", args=arguments
+        )
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else "`humangs --help` lists them"

@@ -335,7 +335,8 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
 
     Raises: Refused; what zipfile raises for damaged archives.
     """
-    ending = zipfile._EndRecData(file)  # ty: ignore[missing-attribute]  the list of members is not read yet
+    # the list of members is not read yet
+    ending = zipfile._EndRecData(file)  # ty: ignore[missing-attribute]
     if not ending:
         raise zipfile.BadZipFile("not a zip archive, or cut off")
     check_limit("members", ending[5] // 46, "members")  # each takes 46 bytes and its name

@@ -70,7 +70,8 @@ DEGREE_4 = 72
 FILTER = "filter_3D"
 """The property of Mip-Splatting and GOF that belongs to scales and opacities."""
 KNOWN = re.compile(
-    r"[xyz]|n[xyz]|red|green|blue|alpha|(f_dc|f_rest|scale|rot|packed|min|max)_\w+|opacity|filter_3D"
+    r"[xyz]|n[xyz]|red|green|blue|alpha|opacity|filter_3D"
+    r"|(f_dc|f_rest|scale|rot|packed|min|max)_\w+"
 )
 """Properties that are used, or say the same as those."""
 SHOWN = 6

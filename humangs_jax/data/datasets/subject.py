@@ -89,7 +89,10 @@ class FileBody:
             model.shape_directions,
             model.joint_regressor,
         )
-        return tuple(np.asarray(x, np.float64) for x in (template, directions, regressor))  # ty: ignore[invalid-explicit-return]
+        template, directions, regressor = (
+            np.asarray(x, np.float64) for x in (template, directions, regressor)
+        )
+        return template, directions, regressor
 
     def rest_joints(self, betas: Float[np.ndarray, " s"]) -> Float[np.ndarray, "j 3"]:
         """Where the joints of a person are in the T-pose, metres."""
