@@ -60,30 +60,34 @@ class Reading(NamedTuple):
     """What `load_motion` was asked, as readers need it; see there."""
 
     fps: float | None = None
+    """Frames per second in place of those in the file."""
     person: int | None = None
+    """Number of the person, in a file of several."""
     clip: str | None = None
+    """Name or number of the animation of a GLB file; None: the first."""
 
 
 class Poses(NamedTuple):
-    """What a reader finds: rotations (m, 55, 3), translations (m, 3) and rate, in the world of the
-    file, of which `up` is up.
-
-    fixed: whatever the poses look like; also: other axes that are up in some files of the format,
-    see `rules.up_axis`.
-    frames: (m,) numbers of the frames, whose gaps are filled; None: consecutive. said: lines for
-    the user about the file.
-    face: what the file says of the face.
-    """
+    """What a reader finds: poses and their rate, in the world of the file."""
 
     rotations: Float[np.ndarray, "m j 3"]
+    """Rotation vectors of the joints, (m, 55, 3), radians."""
     translations: Float[np.ndarray, "m 3"]
+    """Translations of the body, (m, 3)."""
     fps: float
+    """Frames per second."""
     up: str = "y"
+    """The axis of the world that is up."""
     fixed: bool = False
+    """Whether `up` holds whatever the poses look like, see `rules.up_axis`."""
     also: tuple[str, ...] = ()
+    """Other axes that are up in some files of the format, see `rules.up_axis`."""
     frames: np.ndarray | None = None
+    """Numbers of the frames, (m,), whose gaps are filled; None: consecutive."""
     said: str = ""
+    """Lines for the user about the file."""
     face: FaceTrack | None = None
+    """The face track of the file, None without one."""
 
 
 @checked_arguments

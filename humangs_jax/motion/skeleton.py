@@ -44,24 +44,26 @@ from humangs_jax.motion.rules import sampled_frames, up_axis
 
 @dataclasses.dataclass(frozen=True)
 class Clip:
-    """A skeleton in motion, in the units and the world of its file.
-
-    names: of its s joints. parents: -1 for roots; parents come first. rest: (s, 3) places in the
-    rest pose. turns: (m, s, 3, 3) rotation of each joint from the rest pose to the frame, in the
-    world. places: (m, s, 3). fps: frames per second. up: the axis that the format says is up; None:
-    found from the rest pose. said: lines for the user about the file. face: what the file says of
-    the face.
-    """
+    """A skeleton in motion, in the units and the world of its file."""
 
     names: tuple[str, ...]
+    """Names of the s joints."""
     parents: tuple[int, ...]
+    """Index of the parent of each joint, -1 for roots; parents come first."""
     rest: Float[np.ndarray, "s 3"]
+    """Places of the joints in the rest pose, (s, 3)."""
     turns: Float[np.ndarray, "m s 3 3"]
+    """Rotation of each joint from the rest pose to the frame, in the world, (m, s, 3, 3)."""
     places: Float[np.ndarray, "m s 3"]
+    """Places of the joints in each frame, (m, s, 3)."""
     fps: float
+    """Frames per second."""
     up: str | None = None
+    """The axis that the format declares as up; None: found from the rest pose."""
     said: str = ""
+    """Lines for the user about the file."""
     face: FaceTrack | None = None
+    """The face track of the file, None without one."""
 
 
 def bytes_of_clip(frames: int, joints: int) -> int:

@@ -41,7 +41,9 @@ class Change:
     """An error of the result, and of the start where there was one."""
 
     after: float
+    """Error of the result."""
     before: float | None = None
+    """Error of the start, None without one."""
 
 
 @dataclasses.dataclass(frozen=True)

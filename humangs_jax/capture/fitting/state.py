@@ -242,14 +242,14 @@ the shape's own std.
 
 @pytree_dataclass
 class CameraState:
-    """Deviations of c cameras with g focal lengths. rotations, centers: (c, 3).
-
-    log_focals: (g,).
-    """
+    """Deviations of c cameras with g focal lengths, in units of `StateStd`."""
 
     rotations: Float[Array, "c 3"]
+    """Deviations of the rotations, (c, 3)."""
     centers: Float[Array, "c 3"]
+    """Deviations of the centres, (c, 3)."""
     log_focals: Float[Array, " g"]
+    """Deviations of the logarithms of the focal lengths, (g,)."""
 
 
 @pytree_dataclass

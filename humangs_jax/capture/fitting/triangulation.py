@@ -149,11 +149,14 @@ ITERATIONS = 10
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Similarity:
-    """x -> scale rotation x + translation. rotation: (3, 3), proper. translation: (3,)."""
+    """x -> scale rotation x + translation."""
 
     scale: float
+    """Factor of lengths."""
     rotation: Float[np.ndarray, "3 3"]
+    """Proper rotation, (3, 3)."""
     translation: Float[np.ndarray, "3"]
+    """Shift after scale and rotation, (3,)."""
 
     def __call__(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
         return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation

@@ -123,23 +123,26 @@ def _set_of(name: str, file: Path) -> KeypointSet:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SeenPerson:
-    """A person in an image. points: (k, 3) pixels and visibility. world: (k, 3) metres.
-
-    presence: in [0, 1].
-    """
+    """A person in an image."""
 
     points: Float[np.ndarray, "k 3"]
+    """Pixels and visibility of the points, (k, 3)."""
     world: Float[np.ndarray, "k 3"]
+    """Places of the points, (k, 3), metres."""
     presence: float
+    """Presence of the person, in [0, 1]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImagePeople:
-    """An image, its (width, height) in pixels, and its people, None for those who are not in it."""
+    """An image and its people."""
 
     image: str
+    """Name of the image."""
     size: tuple[int, int]
+    """Width and height, pixels."""
     people: tuple[SeenPerson | None, ...]
+    """The people, None for those who are not in the image."""
 
 
 def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
