@@ -28,7 +28,7 @@ PLACES = (
     ("conda/recipe.yaml", r"(?m)^  homepage: .*$", "  homepage: {Documentation}"),
     ("conda/recipe.yaml", r"(?m)^  repository: .*$", "  repository: {Repository}"),
 )
-"""File, what is found in it, and what stands there instead."""
+"""Of each file: its name, the text to find in it, and the text to put in its place."""
 
 
 def facts() -> dict[str, str]:

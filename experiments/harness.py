@@ -3,8 +3,8 @@ lists them.
 
 An experiment is a function with `@entry`. Its first argument is a `Run`, the others are its
 options: those without a default are positional, annotations are numbers, paths, flags, `Literal`
-choices and tuples of these. A dataclass as default stands for its fields. Lines `name: text` below
-`Options:` in a docstring are the help.
+choices and tuples of these. A default that is a dataclass becomes one option for each of its
+fields. Lines `name: text` below `Options:` in a docstring are the help.
 
 Its table has its name, unless a line `Tables: NAMES` of the docstring says otherwise.
 

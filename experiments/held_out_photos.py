@@ -40,7 +40,7 @@ def held_out_scores(
 
     Arguments: capture: what the package makes of the photos. make: an avatar from a part of it.
     views: that are held out in turn.
-    truth, masks: of the person alone on white; those of the capture if not given.
+    truth, masks: photos and masks of the person alone on white. Default: those of the capture.
     """
     rows: dict[str, list[Scores]] = {"own": [], "shared": []}
     gains = camera_gains(capture)

@@ -1,7 +1,7 @@
 """Speed against accuracy of the whole path: what each knob costs in decibels and takes in time,
 memory and bytes.
 
-Quality is the mean over people of the split "tradeoff", whom nothing else has seen: new views in
+Quality is the mean over people of the split "tradeoff", which nothing else has seen: new views in
 the pose of the photos and in novel poses. Photos and true images have 512 pixels; frames of another
 size are brought to 512 before they are compared. Times are CPU times of all threads, of the first
 person, in turns with the default point's, and kept as ratios of medians: other programs stretch

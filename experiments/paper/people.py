@@ -1,4 +1,4 @@
-"""Plain people, whom small networks learn to read on two cores: one cut of clothes in plain dyes,
+"""Plain people, which small networks learn to read on two cores: one cut of clothes in plain dyes,
 one light, eight poses.
 
 Bodies, skin, dyes and cameras differ. Each person is seen in two of the poses.
