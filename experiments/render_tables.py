@@ -5,7 +5,7 @@
 Every section `<!-- table: NAME -->` ... `<!-- end -->` becomes what docs/results/NAME.json holds
 (format: `experiments/results.py`). --check writes nothing; exit status 1 if a page differs from its
 JSON files, if a section has no file, or if a file is shown nowhere. `<!-- formats: NAME -->` ...
-`<!-- end -->` becomes the formats that the package reads.
+`<!-- end -->` becomes the formats that the package reads, or its limits.
 """
 
 import argparse
@@ -64,8 +64,11 @@ def render_pages(repository: Path, write: bool) -> list[str]:
 
 
 def format_table(name: str) -> str:
-    """The "cameras", "keypoints" or "motions" that are read, as a table in Markdown."""
+    """The "cameras", "keypoints" or "motions" that are read, or the "limits", as a table in
+    Markdown.
+    """
     from humangs_jax.data.formats import CAMERAS, KEYPOINTS, MOTIONS
+    from humangs_jax.io.reading import Limits
 
     centers = {"half": "+0.5", "integer": "whole numbers"}
     quoted = lambda files: ", ".join(f"`{file}`" for file in files)
@@ -95,6 +98,14 @@ def format_table(name: str) -> str:
                 "must be given" if each.fps is None else f"{each.fps:g}",
             )
             for about, each in arrays
+        ]
+    elif name == "limits":
+        from experiments.knobs import docstrings
+
+        header = ("limit", "default", "of")
+        rows = [
+            (f"`{field}`", f"{int(getattr(Limits(), field)):,}", " ".join(text.split()))
+            for field, text in docstrings(Limits).items()
         ]
     else:
         header = ("format", "usual names", "content")

@@ -42,61 +42,71 @@ LONGEST_LINE, LONGEST_REASON = 1000, 300
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """What a file may cost. Each error line that a limit causes names it.
+    """What a file or a command may cost. Each error line that a limit causes names it.
 
-    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the
-        JSON in a scan (GLB), whose readers are slow. mesh_bytes: of a scan; image_bytes: of a photo
-        before it is decoded.
-    array_bytes: all arrays of an archive unpacked, or of an EXR file. Below it a file may always
-        unpack to plain_bytes, and beyond that to `ratio` times its size. plain_bytes also bounds a
-        sparse matrix made dense.
-    members: entries of an archive. opcodes: instructions of a pickle. nesting: of JSON and YAML.
-    pixels, side: of a photo, and along one of its sides. scans: passes of a progressive JPEG.
-    corners: of the triangles of a scan, every instance counted. joints: of a body. gaussians: of a
-    file.
-    photos_outside: whether photos and masks of a capture may lie outside of its folder.
-
-    What a command may cost, checked before it begins:
-    capture_pixels: of all photos that are read together, or textures of a scan. video_pixels: of
-    the frames of videos.
-    views: photos that are read together; network_views: that the network looks at together;
-    views_per_photo: that name it.
-    frames: of a motion or a capture, read or written; frames_per_photo: of a capture that has no
-    poses yet, shown or not.
-    rate: frames per second of a motion. people: in keypoint files, and their images.
-    parts: materials of an OBJ file, solids of an STL file, parts of meshes of a GLB file. entries:
-    of a folder that is searched.
+    From `capture_pixels` on they are of a command, and are checked before it begins.
     """
 
     file_bytes: int = 16 << 30
+    """Bytes of any file."""
     text_bytes: int = 64 << 20
+    """Bytes of JSON and other text, and of the pickle inside of a `.pt`."""
     slow_text_bytes: int = 1 << 19
+    """Bytes of YAML, of the JSON of a GLB scan and of the header of safetensors: slow readers."""
     mesh_bytes: int = 512 << 20
+    """Bytes of a scan."""
     image_bytes: int = 256 << 20
+    """Bytes of a photo before it is decoded."""
     array_bytes: int = 4 << 30
+    """Bytes of all arrays of an archive, unpacked, or of an EXR file that is written."""
     plain_bytes: int = 256 << 20
+    """Bytes to which a file of any size may unpack, and of a sparse matrix made dense."""
     ratio: int = 100
+    """Beyond `plain_bytes`: unpacked size over the size of the file."""
     members: int = 65_536
+    """Entries of an archive."""
     opcodes: int = 4_000_000
+    """Instructions of a pickle."""
     nesting: int = 64
+    """Lists in lists of JSON and YAML."""
     pixels: int = 64_000_000
+    """Pixels of a photo."""
     side: int = 32_768
+    """Pixels of the longer side of a photo."""
     scans: int = 64
+    """Passes of a progressive JPEG."""
     corners: int = 60_000_000
+    """Corners of the triangles of a scan, every instance counted."""
     joints: int = 1024
+    """Joints of a body."""
     gaussians: int = 20_000_000
+    """Gaussians of a file."""
     photos_outside: bool = False
+    """1: photos and masks of a capture may lie outside of its folder."""
     capture_pixels: int = 1_000_000_000
+    """Pixels of all photos that are read together (16 bytes each in memory), or of a scan's
+    textures.
+    """
     video_pixels: int = 50_000_000_000
+    """Pixels of all frames that are taken out of videos."""
     views: int = 4096
+    """Photos that are read together."""
     network_views: int = 512
+    """Photos that the network looks at together."""
     views_per_photo: int = 16
+    """Views of a capture that name one photo."""
     frames: int = 250_000
+    """Frames of a motion or a capture, read or written."""
     rate: int = 1000
+    """Frames per second of a motion; the least is 0.01."""
     frames_per_photo: int = 100
+    """Frames of a capture without poses, over its photos."""
     people: int = 100_000
+    """People in keypoint files, and their images."""
     parts: int = 2000
+    """Materials of an OBJ, solids of an STL, or mesh parts of a GLB file."""
     entries: int = 1_000_000
+    """Files of a folder that is searched for photos or keypoints."""
 
 
 _current: Limits | None = None
