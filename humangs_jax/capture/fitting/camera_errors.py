@@ -96,6 +96,7 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
     seen = _Seen.of(photos, keypoints, camera_of)
     if seen is None:
         return ()
+    # the cameras that explain most are turned one after the other, as long as each is clear
     gradients, matrices = seen.equations()
     solved = lambda cameras: _solved(gradients, matrices, cameras)
     chosen: list[int] = []
@@ -109,6 +110,7 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
     if not chosen:
         return ()
     rotations = solved(chosen).rotations
+    # large rotations mean that the calibration is something else than a little off
     sizes = np.degrees(np.linalg.norm(rotations, axis=-1))
     if sizes.max() > MOST_DEGREES:
         return ()
@@ -116,6 +118,7 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
     for camera, rotation, size in zip(chosen, rotations, sizes, strict=True):
         if size <= LEAST_DEGREES:
             continue
+        # other cameras that would explain as much in its place are named with it
         without = [c for c in chosen if c != camera]
         rest = solved(without).gain if without else 0.0
         others = (c for c in range(seen.count) if c not in chosen)
@@ -144,14 +147,20 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Seen:
-    """Keypoints of m moments in c views, k landmarks; camera: (m, c) numbers below `count`."""
+    """Keypoints of m moments in c views, with k landmarks, as float64."""
 
     points: Float[np.ndarray, "m c k 2"]
+    """Detections, (m, c, k, 2), pixels."""
     weights: Float[np.ndarray, "m c k"]
+    """Confidences, (m, c, k); 0 where fewer than two views see a landmark."""
     K: Float[np.ndarray, "m c 3 3"]
+    """Intrinsics, (m, c, 3, 3), pixels."""
     matrices: Float[np.ndarray, "m c 4 4"]
+    """Camera poses, from the world to the camera, (m, c, 4, 4)."""
     camera: Int[np.ndarray, "m c"]
+    """Number of each view's camera, below `count`, (m, c)."""
     count: int
+    """Number of cameras."""
 
     @classmethod
     def of(
@@ -247,6 +256,8 @@ class _Seen:
         Gauss and Newton.
         """
         rotation, local, depth, slope, focal, errors = self._project(turned, points)
+        # derivatives of the pixels by the point in the camera's axes, by the point in the world,
+        # and by the camera's turn
         by_local = np.zeros((*depth.shape, 2, 3))
         by_local[..., [0, 1], [0, 1]] = focal / depth[..., None]
         by_local[..., 2] = -focal * slope / depth[..., None]
@@ -254,6 +265,7 @@ class _Seen:
         by_turn = np.einsum(
             "mckia,mckab->mckib", by_local, np.cross(local[..., None, :], np.eye(3))
         )
+        # a step of Gauss and Newton for each point, with the cameras held still
         own = np.einsum("mck,mckia,mckib->mkab", weights, by_point, by_point)
         inverse = np.linalg.inv(
             own + (1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]) * np.eye(3)
@@ -262,6 +274,8 @@ class _Seen:
             "mkab,mck,mckib,mcki->mka", inverse, weights, by_point, errors, optimize=True
         )
         left = errors - np.einsum("mckib,mkb->mcki", by_point, step)
+        # the Schur complement of the points: what is left are equations of the cameras, added up
+        # where several views are of one camera
         mixed = np.einsum("mck,mckia,mckib->mckab", weights, by_turn, by_point)
         k, n = points.shape[1], self.count
         gradients, matrices = np.zeros((n, k, 3)), np.zeros((n, n, k, 3, 3))
@@ -281,13 +295,14 @@ def _solve(
 
 
 class _Solved(NamedTuple):
-    """rotations: (s, 3). gain: by how much the cost falls. clear: standard errors of the last
-    camera's rotation.
-    """
+    """What turning some cameras achieves."""
 
     rotations: Float[np.ndarray, "s 3"]
+    """Rotations of the cameras, axis-angle, (s, 3), radians."""
     gain: float
+    """How much the cost falls."""
     clear: float
+    """Size of the last camera's rotation in standard errors."""
 
 
 def _solved(

@@ -42,17 +42,16 @@ LEAST_DEPTH = 1e-6
 
 
 class Agreement(NamedTuple):
-    """How well cameras agree with keypoints.
-
-    missed: median distance of keypoints from triangulated landmarks over the person's size.
-    pixels: the same distance, pixels. mirrored: whether the triangulated person is a mirror image.
-    behind: whether most of the person is behind the cameras.
-    """
+    """How well cameras agree with keypoints."""
 
     missed: float
+    """Median distance of keypoints from triangulated landmarks, as a share of the person's size."""
     pixels: float
+    """The same distance in pixels."""
     mirrored: bool
+    """Whether the triangulated person is a mirror image."""
     behind: bool
+    """Whether most of the person is behind the cameras."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +87,7 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
     found = agreement(K, matrices, frames, keypoints)
     if found is None or _agrees(found):
         return None
-    # what is said of cameras that are turned a little is said elsewhere
+    # cameras that are turned a little are reported by `find_camera_errors`, not here
     turned = find_camera_errors(photos, keypoints)
     cameras = mended(photos, turned).cameras
     again = agreement(K, np.asarray(cameras.cam_from_world, np.float64), frames, keypoints)
@@ -146,6 +145,7 @@ def agreement(
     """How well cameras and keypoints agree; None where too few landmarks are in several views."""
     errors, sizes, plain, mirrored, behind, count = [], [], 0.0, 0.0, [], 0
     for frame in np.unique(frames):
+        # landmarks where the rays of the views of one moment meet
         own = np.flatnonzero(frames == frame)
         points = np.asarray(keypoints.points, np.float64)[own]
         seen = np.asarray(keypoints.confidences)[own] > SEEN
@@ -154,6 +154,7 @@ def agreement(
         count += int(known.sum())
         if not known.any():
             continue
+        # where each camera shows them; depths near 0 must not divide
         local = np.einsum("vab,kb->vka", matrices[own, :3, :3], places) + matrices[own, None, :3, 3]
         depth = local[..., 2]
         safe = np.where(np.abs(depth) < LEAST_DEPTH, LEAST_DEPTH, depth)
@@ -162,11 +163,13 @@ def agreement(
             used = known & seen[i]
             if not used.any():
                 continue
+            # distances from the keypoints, with the person's size in this view
             size = float(np.ptp(points[i][seen[i]], axis=0).max())
             off = np.linalg.norm(shown[i][used] - points[i][used], axis=-1)
             errors.append(off)
             sizes.append(np.full(len(off), max(size, 1.0)))
             behind.append(depth[i][used] <= 0)
+            # the detector's 3D landmarks tell the person from a mirror image
             if keypoints.world is not None and used.sum() >= LEAST_LANDMARKS:
                 as_seen = np.asarray(keypoints.world[v], np.float64)[used]
                 plain += _apart(local[i][used], as_seen)

@@ -49,14 +49,20 @@ class UnknownViewError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitRecord:
-    """Contents of fit.npz, see the module."""
+    """The contents of fit.npz: v views, m frames, j joints, s shape coefficients."""
 
     keypoints: Keypoints
+    """Keypoints of the v views, with the set as the fit found that the detector uses it."""
     names: tuple[str, ...]
+    """Names of the v views."""
     noise: Float[np.ndarray, " m"]
+    """Standard deviation of the detections in each frame, (m,), pixels."""
     joint_std: Float[np.ndarray, "m j"]
+    """Standard deviations of the joints' positions, (m, j), metres."""
     determined: Float[np.ndarray, "m j"]
+    """Share of each joint's rotation that the views determine, (m, j)."""
     shape_covariance: Float[np.ndarray, "s s"]
+    """Covariance of the shape coefficients, (s, s)."""
 
     def of_views(self, names: Sequence[str]) -> Keypoints:
         """The keypoints of views, in their order. Raises: UnknownViewError."""
@@ -94,6 +100,7 @@ def read_fit_record(path: str | Path) -> FitRecord:
                 path, missing[0], "missing: expected a file that `humangs fit` wrote"
             )
         own = lambda key, shape=None: numbers(file.array(key), path, key, shape)
+        # the set says how many keypoints the arrays have to have
         name, names = str(file.array("set")), tuple(map(str, file.array("names")))
         if name not in KEYPOINT_SETS:
             raise CaptureError(
@@ -103,6 +110,7 @@ def read_fit_record(path: str | Path) -> FitRecord:
         v, k = len(names), len(kind.names)
         kind = kind.adapted(own("places", (k, 3)), own("certainty", (k,)))
         keypoints = Keypoints(own("points", (v, k, 2)), own("confidences", (v, k)), kind)
+        # the number of frames is that of the noise; the other arrays have to agree
         noise = own("noise", (None,))
         joint_std = own("joint_std", (len(noise), None))
         return FitRecord(

@@ -56,17 +56,16 @@ keypoints.
 
 
 class Uncertainty(NamedTuple):
-    """The uncertainty of a fit of m frames.
-
-    joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j)
-    share of the prior's variance of a joint's rotation, mean over axes, that the views remove: 1
-    all, 0 nothing, as for joints that no keypoint depends on.
-    shape_covariance: (s, s).
-    """
+    """The uncertainty of a fit of m frames."""
 
     joint_covariances: Float[np.ndarray, "m j 3 3"]
+    """Covariances of the joints' positions, (m, j, 3, 3), square metres."""
     determined: Float[np.ndarray, "m j"]
+    """Share of the prior's variance of a joint's rotation that the views remove, (m, j), mean over
+    axes: 1 is all; 0 is nothing, as for joints that no keypoint depends on.
+    """
     shape_covariance: Float[np.ndarray, "s s"]
+    """Covariance of the shape coefficients, (s, s)."""
 
     @property
     def joint_std(self) -> Float[np.ndarray, "m j"]:
@@ -78,11 +77,13 @@ def fit_uncertainty(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> Uncertainty:
     """The covariance of a fit to these observations, in float64."""
+    # derivatives of the residuals by the pose of their own frame and by the shape that all share
     model = replace(model, certainty=fit.certainty)
     derivatives = _derivatives(model, replace(observations, noise=fit.noise), fit)
     residuals_by, joints_by = (np.asarray(x, np.float64) for x in derivatives)
     shapes = len(fit.betas)
     by_pose, by_shape = np.split(residuals_by, [residuals_by.shape[-1] - shapes], axis=-1)
+    # Schur complement: the poses are eliminated, which leaves the information about the shape
     own = np.linalg.inv(
         np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1])
     )
@@ -92,6 +93,7 @@ def fit_uncertainty(
         "mas,mat->st", coupling, carried
     )
     shape = np.linalg.inv(shape_information + np.eye(shapes))
+    # covariance of pose and shape together, frame by frame, and of the joints, which depend on both
     poses = own + carried @ shape @ carried.swapaxes(-1, -2)
     mixed = -carried @ shape
     whole = np.block(
@@ -158,15 +160,16 @@ last stage of a fit.
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Examination:
-    """The report on a body and keypoints, and the arrays behind it, of v views and k keypoints.
-
-    landmarks: (v, k, 2) of the body, pixels. compared, outliers: (v, k).
-    """
+    """The report on a body and keypoints, and the arrays behind it, of v views and k keypoints."""
 
     report: FitReport
+    """The report."""
     landmarks: Float[np.ndarray, "v k 2"]
+    """Landmarks of the body in the views, (v, k, 2), pixels."""
     compared: Bool[np.ndarray, "v k"]
+    """Which keypoints were compared with the body, (v, k)."""
     outliers: Bool[np.ndarray, "v k"]
+    """Which of these are outliers, (v, k)."""
 
 
 def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = None) -> Examination:
@@ -191,6 +194,7 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
             " again"
         )
     observations, views = group_by_frame(capture, keypoints)
+    # errors of the body's landmarks, frame by frame
     expected, poses = (
         np.asarray(observations.noise),
         jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses),
@@ -203,6 +207,7 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
+    # noise of the detections: from the fit, or else from the errors themselves
     if record is None:
         noise, undetermined = (
             np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)),
@@ -213,12 +218,14 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
     outliers = compared & (lengths * np.asarray(model.certainty) > OUTLIER * noise[:, None, None])
 
+    # back from frames to the order of the views
     frame_of, slot_of = np.argwhere(views >= 0)[np.argsort(views[views >= 0])].T
     by_view = lambda values: values[frame_of, slot_of]
     numbers = zip(
         capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True
     )
     rows = tuple(_view_report(*own) for own in numbers)
+    # exchanged hands are reported once, not again as exchanged sides of their view
     violations = limit_violations(names, poses)
     hands = find_exchanged_hands(keypoints, capture.names)
     explained = {swap.views[0] for swap in hands}
@@ -284,18 +291,20 @@ half their distance.
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedCapture:
-    """A fit in memory: the capture with its body, and the record that is stored beside it.
-
-    notes, warnings: of the fit itself. camera_errors: turns of cameras, which the capture's are
-    without.
-    """
+    """A fit in memory: the capture with its body, and the record that is stored beside it."""
 
     capture: Capture
+    """Photos, cameras and the fitted body; cameras that were turned are turned back."""
     record: FitRecord
+    """Keypoints of the fit, and how well its result is known."""
     fit: LandmarkFit
+    """Result of the optimisation."""
     notes: tuple[str, ...]
+    """Further results of the fit, a line each."""
     warnings: tuple[str, ...]
+    """What points to a mistake in the fit, a line each."""
     camera_errors: tuple[CameraError, ...] = ()
+    """Cameras that were turned back."""
 
     @functools.cached_property
     def report(self) -> FitReport:
@@ -333,12 +342,14 @@ def fit_photos(
             f"body '{body.name}': expected the root to be its first joint, got joint"
             f" {body.parents.index(-1)}"
         )
+    # cameras that the keypoints show to be turned are turned back first
     fixed_cameras = (
         fixed_cameras or not photos.calibrated
     )  # found from such keypoints, which tell nothing new about them
     errors = () if fixed_cameras else find_camera_errors(photos, keypoints)
     photos = mended(photos, errors) if errors else photos
     kind = keypoints.set
+    # the fit, and how well its result is known
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
     observations, _ = group_by_frame(photos, keypoints)
     seen = np.asarray(observations.confidences) * np.asarray(model.known) > 0
@@ -349,6 +360,8 @@ def fit_photos(
     capture = Capture(
         **vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file
     )
+    # the record keeps the set as this detector uses it, so that later refinements need not find it
+    # again
     moved = np.zeros((len(kind.names), 3))
     if fit.state.places is not None:
         moved = model.by_landmark(PLACE_STD * fit.state.places)

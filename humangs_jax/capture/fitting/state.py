@@ -119,12 +119,16 @@ Vector = tuple[float, float, float]
 
 
 class Range(NamedTuple):
-    """Of a joint's rotation vector."""
+    """The prior of one joint's rotation vector, by axis."""
 
     mean: Vector
+    """Usual rotation vector, radians."""
     std: Vector
+    """Standard deviation of each component, radians."""
     lower: Vector
+    """Least value of each component, radians."""
     upper: Vector
+    """Largest value of each component, radians."""
 
 
 _UNKNOWN = Range(
@@ -169,15 +173,19 @@ vector are not joint angles.
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosePrior:
-    """Arrays (j, 3) in the order of a body's joints, radians.
+    """The prior of the rotations of a body's j joints, in their order.
 
-    The root's are not used: every orientation is as likely.
+    The root's is not used: every orientation is as likely.
     """
 
     mean: Float[np.ndarray, "j 3"]
+    """Usual rotation vectors, (j, 3), radians."""
     std: Float[np.ndarray, "j 3"]
+    """Standard deviations, (j, 3), radians."""
     lower: Float[np.ndarray, "j 3"]
+    """Least values, (j, 3), radians."""
     upper: Float[np.ndarray, "j 3"]
+    """Largest values, (j, 3), radians."""
 
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
@@ -216,22 +224,27 @@ same.
 
 @pytree_dataclass
 class StateStd:
-    """Expected size of the deviations, standard deviations. Numbers, or arrays () where a program
-    is compiled for all of them.
+    """Expected size of the deviations from an origin, as standard deviations.
 
-    focal: share. camera_rotation, global_orient, body_pose (each joint): degrees, by axis.
-    camera_center, transl: metres, by axis. betas: of coefficients. clothing: thickness of clothes
-    and hair on each segment of the body, metres.
+    Numbers, or arrays () where one program is compiled for all of them.
     """
 
     focal: Float[Array, ""] | float = 0.05
+    """Focal lengths, as a share."""
     camera_rotation: Float[Array, ""] | float = 2.0
+    """Rotation of a camera about each axis, degrees."""
     camera_center: Float[Array, ""] | float = 0.05
+    """Position of a camera along each axis, metres."""
     global_orient: Float[Array, ""] | float = 3.0
+    """Orientation of the person about each axis, degrees."""
     transl: Float[Array, ""] | float = 0.05
+    """Position of the person along each axis, metres."""
     body_pose: Float[Array, ""] | float = 4.0
+    """Rotation of each joint about each axis, degrees."""
     betas: Float[Array, ""] | float = 0.3
+    """Coefficients of the shape."""
     clothing: Float[Array, ""] | float = 0.03
+    """Thickness of clothes and hair on each segment of the body, metres."""
 
 
 FREE = StateStd(global_orient=math.degrees(0.3), transl=0.1, betas=1.0)
@@ -256,52 +269,63 @@ class CameraState:
 class FitState:
     """What a fit moves, in units of `StateStd`; parts that it does not move are None.
 
-    betas: (s,). global_orient, transl: (3,), or (m, 3) of m frames. body_pose: (a, 3) or (m, a, 3)
-    of a free joints.
-    clothing: (a + 1,) of the segments of the root and the free joints. log_scale: () of the metres
-    per unit of a scan. places: (g, 3) of the landmarks, see `LandmarkModel.moved`.
+    A fit of m frames has one shape and a leading axis (m, ...) of poses. a is the number of free
+    joints.
     """
 
     betas: Float[Array, " s"]
+    """Deviations of the shape coefficients, (s,)."""
     global_orient: Float[Array, "*m 3"]
+    """Turns of the root after its rotation in the origin, (3,) or (m, 3)."""
     transl: Float[Array, "*m 3"]
+    """Deviations of the position, (3,) or (m, 3)."""
     body_pose: Float[Array, "*m a 3"]
+    """Deviations of the rotation vectors of the free joints, (a, 3) or (m, a, 3)."""
     cameras: CameraState | None = None
+    """Deviations of the cameras."""
     clothing: Float[Array, " b"] | None = None
+    """Thickness of clothes on the segments of the root and of the free joints, (a + 1,)."""
     log_scale: Float[Array, ""] | None = None
+    """Logarithm of the metres per unit of a scan, (), in units of `LOG_SCALE_STD`."""
     places: Float[Array, "g 3"] | None = None
+    """Deviations of the places of groups of landmarks, (g, 3), see `LandmarkModel.moved`."""
 
 
 @pytree_dataclass
 class CameraOrigin:
-    """v views. K: (v, 3, 3). cam_from_world: (v, 4, 4).
-
-    camera, focal, frame: (v,) which ones of the state a view has.
-    """
+    """The cameras of v views where a fit begins, and which numbers of the state move each."""
 
     K: Float[Array, "v 3 3"]
+    """Intrinsics, (v, 3, 3), pixels."""
     cam_from_world: Float[Array, "v 4 4"]
+    """Camera poses, (v, 4, 4), metres."""
     camera: Int[Array, " v"]
+    """Index of each view's camera in the state, (v,)."""
     focal: Int[Array, " v"]
+    """Index of each view's focal length in the state, (v,)."""
     frame: Int[Array, " v"]
+    """Index of each view's frame, (v,)."""
 
 
 @pytree_dataclass
 class Origin:
-    """Where zeros are, and the unit of each number.
-
-    betas: (s,). pose: of one frame or a batch of m. body_pose_std: (a, 3) radians. segment: (j,)
-    which number of `FitState.clothing` covers what a joint moves. std: of what moves. Static:
-    joints, the a free ones besides the root (joint 0).
-    """
+    """Where the zeros of a state are, and the unit of each of its numbers."""
 
     betas: Float[Array, " s"]
+    """Shape coefficients, (s,)."""
     pose: BodyPose
+    """Pose of one frame, or a batch of m."""
     body_pose_std: Float[Array, "a 3"]
+    """Standard deviations of the free joints' rotation vectors, (a, 3), radians."""
     cameras: CameraOrigin | None = None
+    """Cameras of the views; None for a fit that does not move cameras."""
     segment: Int[Array, " j"] | None = None
+    """Which number of `FitState.clothing` covers what a joint moves, (j,); None without clothing.
+    """
     joints: tuple[int, ...] = static_field(default=())
+    """Indices of the a free joints; the root (joint 0) is free besides."""
     std: StateStd = FREE
+    """Units of everything that moves but the joints."""
 
     @property
     def views(self) -> CameraOrigin:
