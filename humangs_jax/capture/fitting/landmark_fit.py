@@ -82,22 +82,24 @@ TOLERANCE = 3e-4
 
 @pytree_dataclass
 class LandmarkFit:
-    """A person in m frames. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j,
-    3) metres.
-
-    noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's
-    origin. smoothness: () the acceleration that the motion was held to, metres per frame squared;
-    0: to none. certainty: (k,) of the landmarks.
-    """
+    """A person in m frames, as a fit found it."""
 
     betas: Float[Array, " s"]
+    """Shape coefficients, (s,)."""
     poses: BodyPose
+    """A batch of m poses."""
     landmarks: Float[Array, "m k 3"]
+    """Landmarks of the body, (m, k, 3), metres."""
     joints: Float[Array, "m j 3"]
+    """Joints of the body, (m, j, 3), metres."""
     noise: Float[Array, " m"]
+    """Standard deviation of the detections, (m,), pixels."""
     state: FitState
+    """The solution in units of the problem's origin."""
     smoothness: Float[Array, ""]
+    """Acceleration prior that was used, (), metres per frame squared; 0: none."""
     certainty: Float[Array, " k"]
+    """Certainty of the landmarks, (k,): the reciprocal of each one's noise over that of all."""
 
 
 @checked_arguments
@@ -213,6 +215,7 @@ def _rigid_starts(
     resting = zero_state(problem.origin)
     landmarks, joints = problem.landmarks_and_joints(resting)
     pelvis = joints[0]
+    # candidate orientations: the trunk turned onto triangulated points, and those of a cube
     weights = trunk_weights(problem.model.names) * problem.known
     product = functools.partial(jnp.matmul, precision=EXACT)
     turned = _kabsch(landmarks, points, weights * (counts >= 2))
@@ -220,6 +223,7 @@ def _rigid_starts(
     positions = jax.vmap(
         lambda r: _position(observations, product(landmarks - pelvis, r.T), weights)
     )(rotations)
+    # each candidate as a state
     vectors = quaternion.to_axis_angle(quaternion.from_matrix(rotations))
     start = lambda vector, position: replace(
         resting,
@@ -299,15 +303,16 @@ def _metres_per_pixel(
 
 @pytree_dataclass
 class _Stage:
-    """One run of the solver. views: (k,) weights of keypoints.
-
-    targets: triangulated points with weights. free: what moves.
-    """
+    """One run of the solver."""
 
     views: Float[Array, " k"]
+    """Weights of the keypoints, (k,)."""
     targets: Targets
+    """Triangulated points with their weights."""
     scale: Float[Array, ""]
+    """Robust scale, standard deviations."""
     free: FitState
+    """Which numbers of the state move, booleans."""
 
 
 BODY = (*BODY_NAMES, "jaw")
@@ -435,6 +440,7 @@ def smooth_motion(
         )
         return jax.vmap(errors)(seen, landmarks)
 
+    # how much worse the keypoints of a frame may become, see above
     observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
     limit = costs(fit.state) + jnp.minimum(6 + 3 * len(problem.origin.joints), observed)
 
@@ -453,6 +459,8 @@ def smooth_motion(
         )
         return (state, kept, held), None
 
+    # frames without keypoints begin between their neighbours; levels follow each other from weak to
+    # strong, and the last good one is kept
     start = _bridged(problem, seen, fit.state)
     kept = jax.tree.map(
         lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state
@@ -476,6 +484,7 @@ def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> F
     frames = jnp.arange(m)
     before = jax.lax.cummax(jnp.where(shown, frames, -1))
     after = jax.lax.cummin(jnp.where(shown, frames, m), reverse=True)
+    # frames before the first that shows something, or behind the last, take that one's pose
     low, high = jnp.where(before < 0, after, before), jnp.where(after >= m, before, after)
     low, high = (jnp.clip(x, 0, m - 1) for x in (low, high))
     share = (frames - low) / jnp.maximum(high - low, 1)

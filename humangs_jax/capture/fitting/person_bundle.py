@@ -70,36 +70,42 @@ VIEW = 9
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """Landmarks of a person in c photos. points: (c, k, 2) pixels from the principal point.
-    weights: (c, k). noise: (c,) pixels.
-
-    world: (c, k, 3) metres in camera axes about their weighted mean, all of one size. focal: (c,)
-    pixels; focal_std: (c,) of its logarithm. kinds: (c,) from 0: cameras of one kind keep the ratio
-    of their focal lengths. bones: (b, 2, 2) landmarks of left bones and of their right partners.
-    """
+    """The landmarks of a person in c photos, and what is known of the cameras."""
 
     points: Float[np.ndarray, "c k 2"]
+    """Detections from the principal point, (c, k, 2), pixels."""
     weights: Float[np.ndarray, "c k"]
+    """Weights of the landmarks, (c, k); 0: not seen."""
     noise: Float[np.ndarray, " c"]
+    """Standard deviation of the detections, (c,), pixels."""
     world: Float[np.ndarray, "c k 3"]
+    """The detector's 3D landmarks in camera axes about their weighted mean, all of one size, (c, k,
+    3), metres.
+    """
     focal: Float[np.ndarray, " c"]
+    """Focal lengths to begin with, (c,), pixels."""
     focal_std: Float[np.ndarray, " c"]
+    """Standard deviations of the logarithms of the focal lengths, (c,)."""
     kinds: Int[np.ndarray, " c"]
+    """Kind of each camera, (c,), from 0: cameras of one kind keep the ratio of their focal lengths.
+    """
     bones: Int[np.ndarray, "b 2 2"]
+    """Landmarks at the ends of left bones and of their right partners, (b, 2, 2): bone, side, end.
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rig:
-    """c cameras about a person. landmarks: (k, 3) metres. rotations: (c, 3, 3) and places: (c, 3)
-    take them to camera axes.
-
-    focal: (c,) pixels.
-    """
+    """c cameras about a person."""
 
     landmarks: Float[np.ndarray, "k 3"]
+    """Landmarks of the person, (k, 3), metres."""
     rotations: Float[np.ndarray, "c 3 3"]
+    """Rotations from the landmarks' axes to those of the cameras, (c, 3, 3)."""
     places: Float[np.ndarray, "c 3"]
+    """Positions of the landmarks' origin in the cameras, (c, 3), metres."""
     focal: Float[np.ndarray, " c"]
+    """Focal lengths, (c,), pixels."""
 
 
 # The start
@@ -172,16 +178,14 @@ def place_person(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rows:
-    """Residuals of a rig.
-
-    seen: (c, k, 5) pixels and world, of a landmark in a view. tied: (t,) size and bones, which tie
-    landmarks to each other.
-    focal: (g,) the logarithms of the kinds' factors, standard deviations.
-    """
+    """The residuals of a rig, in standard deviations."""
 
     seen: Float[np.ndarray, "c k 5"]
+    """Pixels (2) and 3D landmarks (3) of a landmark in a view, (c, k, 5)."""
     tied: Float[np.ndarray, " t"]
+    """Size and bones, which tie landmarks to each other, (t,)."""
     focal: Float[np.ndarray, " g"]
+    """The y of each kind of camera, (g,)."""
 
     @property
     def cost(self) -> float:
@@ -191,17 +195,19 @@ class Rows:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Of the residuals; see `moved` for the unknowns.
+    """The derivatives of `Rows` by the unknowns of a `Step`.
 
-    by_landmark: of `seen`, by their landmark. by_view: by turn, place and mean of their view.
-    by_focal: by the y of its kind.
-    tied: (t, k, 3) of `tied`, by all landmarks. Those of `focal` by y are 1.
+    Those of `Rows.focal` by y are 1.
     """
 
     by_landmark: Float[np.ndarray, "c k 5 3"]
+    """Derivatives of `seen` by their landmark, (c, k, 5, 3)."""
     by_view: Float[np.ndarray, "c k 5 9"]
+    """Derivatives of `seen` by turn, place and mean of their view, (c, k, 5, 9)."""
     by_focal: Float[np.ndarray, "c k 5"]
+    """Derivatives of `seen` by the y of their camera's kind, (c, k, 5)."""
     tied: Float[np.ndarray, "t k 3"]
+    """Derivatives of `tied` by all landmarks, (t, k, 3)."""
 
 
 def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "c k 2"]:
@@ -259,6 +265,7 @@ def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
     )
     by_error /= evidence.noise[:, None, None, None]
 
+    # a view's mean is an unknown, so the world residual depends on turn and mean, and not on place
     pixels = by_error @ by_point
     world = np.broadcast_to(root * np.eye(3) / WORLD, (c, k, 3, 3))
     none = np.zeros((c, k, 2, 3))
@@ -331,14 +338,16 @@ def _cross(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Step:
-    """A change of a rig. landmarks: (k, 3) metres. views: (c, 9): turn (radians), place (sideways
-    over the depth, twice, and the logarithm of the depth), and the mean of the view, which follows
-    from the rest. focal: (g,) of the y of each kind.
-    """
+    """A change of a rig."""
 
     landmarks: Float[np.ndarray, "k 3"]
+    """Shifts of the landmarks, (k, 3), metres."""
     views: Float[np.ndarray, "c 9"]
+    """Changes of the views, (c, 9): turn (3, radians), place (3: sideways over the depth, twice,
+    and the logarithm of the depth), and the mean of the view (3), which follows from the rest.
+    """
     focal: Float[np.ndarray, " g"]
+    """Changes of the y of each kind of camera, (g,)."""
 
 
 def moved(evidence: Evidence, rig: Rig, step: Step) -> Rig:
@@ -407,21 +416,27 @@ def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tu
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """J^T J and J^T r in blocks, of `seen` and `focal`: landmarks (k, 3, 3), cameras (m, m) with m
-    = 9 c + g, and between them.
+    """J^T J and J^T r in blocks, of the rows `seen` and `focal`; rows that tie landmarks stay rows.
 
-    tied: (t, k, 3) derivatives of the rows that tie landmarks, and their residuals (t,), which stay
-    rows.
+    The cameras have m = 9 c + g unknowns.
     """
 
     landmarks: Float[np.ndarray, "k 3 3"]
+    """Blocks of J^T J of each landmark, (k, 3, 3)."""
     cameras: Float[np.ndarray, "m m"]
+    """Block of J^T J of the cameras, (m, m)."""
     between: Float[np.ndarray, "k 3 m"]
+    """Blocks of J^T J between each landmark and the cameras, (k, 3, m)."""
     by_landmarks: Float[np.ndarray, "k 3"]
+    """J^T r of the landmarks, (k, 3)."""
     by_cameras: Float[np.ndarray, " m"]
+    """J^T r of the cameras, (m,)."""
     tied: Float[np.ndarray, "t k 3"]
+    """Derivatives of the rows that tie landmarks, (t, k, 3)."""
     tied_rows: Float[np.ndarray, " t"]
+    """Residuals of these rows, (t,)."""
     kinds: int
+    """Number of kinds of cameras, g."""
 
 
 def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalEquations:
@@ -479,6 +494,7 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     With F = (E, U^T) and K = diag(C, -1), l = -D^-1 (a + F (q, t)) leaves (K - F^T D^-1 F) (q, t) =
     F^T D^-1 a - (b, r).
     """
+    # the damped blocks, named as above
     k, ties, m = len(normal.landmarks), len(normal.tied_rows), len(normal.by_cameras)
     diagonal = np.einsum("kaa->ka", normal.landmarks)
     damped = damping * diagonal + STILL
@@ -489,6 +505,7 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     K[:m, :m] = normal.cameras + np.diag(damped_cameras)
     K[m:, m:] = -np.eye(ties)
 
+    # the landmarks are eliminated, the cameras solved for, and put back
     solved = np.linalg.solve(
         D, np.concatenate([F, normal.by_landmarks[..., None]], axis=2)
     ).reshape(3 * k, -1)
@@ -497,6 +514,7 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     cameras = np.linalg.solve(K - F.T @ solved[:, :-1], right)
     landmarks = -(solved[:, -1] + solved[:, :-1] @ cameras).reshape(k, 3)
 
+    # decrease of the cost in the model with the rows linearised, for the gain ratio
     q = cameras[:m]
     a = normal.by_landmarks + np.einsum("tka,t->ka", normal.tied, normal.tied_rows)
     expected = 0.5 * (

@@ -50,20 +50,23 @@ STATURE = 1.52
 class PersonCameras:
     """Cameras around a person who stands on y = 0 at x = z = 0, facing +z.
 
-    views: photos that are used. The rest is of these: cameras: one of each. landmarks: (c, k, 3)
-    metres, of the person in each.
-    moments: 1, or as many as photos: then each camera stands in a world of its own. mirrored: (c,)
-    whether the detector exchanged left and right. errors: (c,) median distance of landmarks from
-    their pixels, pixels. warnings: what a user should know.
+    All but `views` is of the c photos that are used.
     """
 
     views: tuple[int, ...]
+    """Indices of the photos that are used."""
     cameras: tuple[Camera, ...]
+    """One camera of each photo."""
     landmarks: Float[np.ndarray, "c k 3"]
+    """Landmarks of the person in each photo, (c, k, 3), metres."""
     mirrored: Bool[np.ndarray, " c"]
+    """Whether the detector exchanged left and right, (c,)."""
     moments: int
+    """1, or as many as photos: then each camera stands in a separate world."""
     errors: Float[np.ndarray, " c"]
+    """Median distance of the landmarks from their pixels, (c,), pixels."""
     warnings: tuple[str, ...]
+    """What a user should know, a line each."""
 
 
 def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> PersonCameras:
@@ -130,6 +133,7 @@ def _check(seen: PersonViews, height: float | None) -> None:
     views = len(seen.points)
     if not views:
         raise ValueError("no photo of the person: expected one or more")
+    # arrays of one length
     counts = {len(x) for x in (seen.visibility, seen.world, seen.sizes, seen.focal, seen.photos)}
     if counts != {views} or {len(seen.names)} != {
         x.shape[1] for x in (seen.points, seen.visibility, seen.world)
@@ -139,6 +143,7 @@ def _check(seen: PersonViews, height: float | None) -> None:
         )
     if height is not None and not 0.3 < height < 3:
         raise ValueError(f"height {height:g}: expected metres between 0.3 and 3")
+    # enough of the person in every photo: landmarks, pixels and depth
     for photo, points, visible in zip(seen.photos, seen.points, known_landmarks(seen), strict=True):
         if visible.sum() < FEWEST:
             raise ValueError(
@@ -175,14 +180,17 @@ def _in_world(
         middle_of(points, names, part) for part in ("hip", "shoulder", "ankle")
     )
     body = (shoulders - ankles) / np.linalg.norm(shoulders - ankles)
+    # y up: across the images' x axes, and along the body; least squares of both
     level = rotations[:, 0]  # images' x axes: horizontal if the cameras are level
     precision = level.T @ level / LEVEL**2 + np.eye(3) / UPRIGHT**2
     up = np.linalg.solve(precision, body)
     up /= np.linalg.norm(up)
+    # x to the person's left, horizontal; z is then to the front
     left = across(points, names)
     left -= (left @ up) * up
     left /= np.linalg.norm(left)
     world_from_rig = np.stack([left, up, np.cross(left, up)])
+    # metres: the stature is estimated from the lengths of trunk and legs
     scale = 1.0
     if height is not None:
         part = lambda a, b: np.mean(
@@ -195,6 +203,7 @@ def _in_world(
             STATURE
             * (np.linalg.norm(shoulders - hips) + part("hip", "knee") + part("knee", "ankle"))
         )
+    # the origin under the hips, on the lowest landmark
     turned = scale * points @ world_from_rig.T
     middle = scale * world_from_rig @ hips
     origin = np.asarray([middle[0], turned[:, 1].min(), middle[2]])
@@ -255,6 +264,8 @@ def scaled_to_height(capture: Capture, height: float) -> Capture:
     ]
     betas = betas + np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
     after = shape_body(capture.body, jnp.asarray(betas, jnp.float32))
+    # positions of the root and the cameras scale about the world's origin, so that photos show the
+    # same
     roots = scale * (before.joints[0] + capture.poses.translation)
     matrices = capture.cameras.cam_from_world
     return dataclasses.replace(

@@ -73,22 +73,24 @@ BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "a
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PersonViews:
-    """What a detector sees of one person in c photos of one moment.
-
-    points: (c, k, 2) pixels, centres at +0.5. visibility: (c, k) in [0, 1]; 0: not seen. world: (c,
-    k, 3) metres about the middle of the hips in the camera's axes (x right, y down, z away), as if
-    the camera looked straight at the person. names: of the landmarks, see `KeypointSet`. sizes:
-    (width, height) of the photos, pixels. focal: (c,) pixels, NaN where unknown.
-    photos: their names.
-    """
+    """What a detector sees of one person in c photos of one moment."""
 
     points: Float[np.ndarray, "c k 2"]
+    """Detections, (c, k, 2), pixels, the centre of the first pixel at (0.5, 0.5)."""
     visibility: Float[np.ndarray, "c k"]
+    """Visibility of the landmarks, (c, k), in [0, 1]; 0: not seen."""
     world: Float[np.ndarray, "c k 3"]
+    """3D landmarks about the middle of the hips in the camera's axes (x right, y down, z away), as
+    if the camera looked straight at the person, (c, k, 3), metres.
+    """
     names: tuple[str, ...]
+    """Names of the landmarks, see `KeypointSet`."""
     sizes: tuple[tuple[int, int], ...]
+    """(width, height) of the photos, pixels."""
     focal: Float[np.ndarray, " c"]
+    """Focal lengths, (c,), pixels; NaN where unknown."""
     photos: tuple[str, ...]
+    """Names of the photos."""
 
     def select(self, views: Sequence[int]) -> "PersonViews":
         """Some of the photos, in this order."""
@@ -122,17 +124,20 @@ def cleaned(seen: PersonViews) -> PersonViews:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """Cameras if these views are mirrored. cost: of the adjustment. error: see
-    `_relative_error`.
-    """
+    """The cameras of photos if left and right are exchanged in some of them."""
 
     mirrored: Bool[np.ndarray, " c"]
+    """Whether left and right of a view are exchanged, (c,)."""
     rig: Rig
+    """Cameras and landmarks."""
     cost: float
+    """Half the square sum of the adjustment's residuals."""
     evidence: Evidence
+    """Landmarks with the exchanges made."""
 
     @property
     def error(self) -> float:
+        """The rms distance of the landmarks from their pixels, see `_relative_error`."""
         return _relative_error(self._shares, self.evidence.weights)
 
     def of_view(self, view: int) -> float:
@@ -152,15 +157,14 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Explanation:
-    """What explains the landmarks of photos. trial: cameras of `views` about one person; None: each
-    photo stands alone.
-
-    views: all photos, or all but one. warnings: what a user should know of it.
-    """
+    """What explains the landmarks of photos."""
 
     trial: Trial | None
+    """Cameras of `views` about one person; None: each photo stands alone."""
     views: tuple[int, ...]
+    """Indices of all photos, or of all but one."""
     warnings: tuple[str, ...] = ()
+    """What a user should know of it, a line each."""
 
 
 def explain(seen: PersonViews) -> Explanation:
@@ -353,6 +357,7 @@ def _focal_lengths(
 
 def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
     """Evidence with left and right of some views exchanged, and cameras to start from."""
+    # the landmarks of mirrored views, in the order of their mirror images
     focal, std, kinds = _focal_lengths(seen)
     mirror = [seen.names.index(mirrored_name(name)) for name in seen.names]
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
@@ -366,6 +371,7 @@ def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Ev
             flipped and handedness(own, seen.names) < 0
         ):  # the detector saw the body turned round as well
             own[:, 2] *= -1
+    # 3D landmarks in the axes of their camera, centred, and of one size in all views
     K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
     hips = np.asarray([name in ("left_hip", "right_hip") for name in seen.names])
     middle = np.where((weights * hips).all(1, where=hips, keepdims=True), weights * hips, weights)
@@ -375,6 +381,7 @@ def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Ev
     )
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]
+    # cameras to start from: the views turned together, each placed where its pixels are
     shape, rotations = align_views(world, weights)
     size = lambda p, w: float(np.ptp(np.quantile(p[w > 0], OUTER, axis=0), axis=0).max())
     noise = np.asarray([size(p, w) * NOISE for p, w in zip(points, weights, strict=True)])
@@ -407,6 +414,7 @@ def middle_of(
 
 
 def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
+    """The direction to the person's front: that of toes and nose; not a unit vector."""
     ends = [
         (f"{side}_{toe}", f"{side}_heel")
         for toe in ("foot_index", "big_toe")

@@ -87,26 +87,29 @@ BARE = 5.0
 
 @dataclasses.dataclass(frozen=True)
 class CaptureRefineConfig:
-    """Static settings of a refinement.
-
-    std: how far off the start is expected to be. coefficients: of the shape, where the capture has
-    fewer. fixed_cameras: only shape and poses move. iterations: number of matchings. points: of a
-    silhouette. independent: number of independent equations that all points of a view count for.
-    robust_scales: multiples of the reach, outwards and inwards of the mask. keypoints_worse: a
-    result whose keypoints' error is more than this multiple of the start's is not kept; a fit to
-    them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
-    by_joint: (word, factor) of joints whose names hold the word: multiples of `std.body_pose`.
-    """
+    """Static settings of a refinement."""
 
     std: StateStd = dataclasses.field(default_factory=StateStd)
+    """How far off the start is expected to be."""
     coefficients: int = 10
+    """Least number of shape coefficients; a capture with fewer gets more."""
     fixed_cameras: bool = False
+    """Whether only shape and poses move."""
     iterations: int = 10
+    """Number of matchings."""
     points: int = 300
+    """Points of a silhouette."""
     independent: float = 30.0
+    """Number of independent equations that all points of a view count for."""
     robust_scales: tuple[float, float] = (1.0, 0.5)
+    """Robust scales outwards and inwards of the mask, multiples of the reach."""
     keypoints_worse: float = 1.3
+    """A result whose keypoint error is more than this multiple of the start's is not kept. A fit to
+    the keypoints made that error small: right results have 0.8 to 1.07 of it, wrong bodies that
+    fill clothes 1.8.
+    """
     by_joint: tuple[tuple[str, float], ...] = ()
+    """(word, factor): multiples of `std.body_pose` for joints whose names hold the word."""
 
 
 FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
@@ -221,16 +224,18 @@ def _moved(
 
 @pytree_dataclass
 class Evidence:
-    """What v views show. points: of the body's silhouette, and matches: their equations, batches of
-    v. noise: () pixels; scales: (2,) robust scales, pixels, outwards and inwards. keypoints: a
-    batch of v, each with one view (c = 1), or None.
-    """
+    """What v views show."""
 
     points: SurfacePoints
+    """Points of the body's silhouettes, a batch of v."""
     matches: silhouettes.Matches
+    """Equations of these points, a batch of v."""
     noise: Float[Array, ""]
+    """Standard deviation of silhouettes, (), pixels."""
     scales: Float[Array, "2"]
+    """Robust scales outwards and inwards, (2,), pixels."""
     keypoints: Observations | None
+    """Keypoints, a batch of v with one view each (c = 1); None without."""
 
 
 def evidence_residuals(
@@ -239,6 +244,7 @@ def evidence_residuals(
     """Residuals of the views, in standard deviations, by kind: silhouettes (v, e) and keypoints (v,
     1, k, 2).
     """
+    # all frames of the state, whose poses the views share
     K, cam_from_world = cameras_of(origin, state)
     betas, poses, frame = betas_of(origin, state), pose_of(origin, state), origin.views.frame
     transforms, joints = jax.vmap(lambda pose: pose_joints(model, betas, pose))(poses)
@@ -262,6 +268,7 @@ def evidence_residuals(
             evidence.points, evidence.matches, frame, K, cam_from_world
         )
     }
+    # keypoints of each view alone, under the camera of the state
     if evidence.keypoints is not None:
 
         def landmarks(features, transforms, joints):
@@ -322,15 +329,16 @@ def solve_round(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Score:
-    """ious: (v,) of silhouettes, NaN without a mask. iou: their mean; None without any mask.
-    keypoints: median error, pixels; None without. loss: 1 - iou plus the keypoints' error as a
-    share of the person's height.
-    """
+    """How well the body of a capture agrees with its photos."""
 
     ious: Float[np.ndarray, " v"]
+    """Intersection over union of body and mask in each view, (v,); NaN without a mask."""
     iou: float | None
+    """Mean of these; None without any mask."""
     keypoints: float | None
+    """Median error of the keypoints, pixels; None without any."""
     loss: float
+    """1 - iou plus the keypoints' error as a share of the person's height."""
 
 
 class Scene:
@@ -347,6 +355,7 @@ class Scene:
     ) -> None:
         self.capture, self.config = capture, config
         self.memory = None if memory is None else jnp.asarray(memory, jnp.float32)
+        # photos at the size that is looked at
         small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
         looked_at = capture if small else capture.resized(LONGEST_SIDE)
         empty = np.zeros(looked_at.images.shape[:3], np.float32)
@@ -354,6 +363,7 @@ class Scene:
             looked_at.cameras,
             empty if looked_at.masks is None else looked_at.masks,
         )
+        # silhouettes: the mesh's edges, and the masks' boundaries away from whoever stands in front
         self.faces = np.asarray(capture.body.faces)
         self.edges = silhouettes.body_edges(self.faces)
         self.unknown = looked_at.unknown
@@ -362,6 +372,7 @@ class Scene:
             silhouettes.mask_boundary(mask, config.points, hidden)
             for mask, hidden in zip(self.masks, self.hidden, strict=True)
         ]
+        # keypoints: in pixels of the photos for scores, in those that are looked at for the solver
         kind = None if keypoints is None else keypoints.set
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
@@ -559,10 +570,12 @@ DEFAULT_CONFIG = CaptureRefineConfig()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RefinedCapture:
-    """capture: the better one of start and result; the very start if `report.kept` is False."""
+    """The result of a refinement."""
 
     capture: Capture
+    """The better one of start and result; the very start if `report.kept` is False."""
     report: FitReport
+    """What was fitted, and how well."""
 
 
 def refine_capture(
@@ -591,12 +604,14 @@ def refine_capture(
             "masks",
             "none shows anybody, and there are no keypoints: refinement needs one or the other",
         )
+    # the start stays unless the result is clearly better
     scene = Scene(capture, keypoints, config, memory)
     state, move = scene.run()
     tried = moved_capture(capture, scene.origin, state)
     before, found = scene.score(capture), scene.score(tried)
     kept = _better(found, before, config.keypoints_worse)
     best, score = (tried, found) if kept else (capture, before)
+    # what happened, in one line
     kinds = {"silhouettes": before.iou, "keypoints": before.keypoints}
     kinds = " and ".join(name for name, value in kinds.items() if value is not None)
     verdict = "kept" if kept else "no sufficient improvement, the start is kept"
@@ -616,12 +631,14 @@ def _better(found: Score, before: Score, most_worse: float) -> bool:
 
 def _report(start: Capture, best: Capture, before: Score, after: Score, note: str) -> FitReport:
     kept = best is not start
+    # errors and silhouettes before and after
     names = {"silhouette_iou": "iou", "keypoint_error_px": "keypoints", "loss": "loss"}
     pairs = {name: (getattr(before, key), getattr(after, key)) for name, key in names.items()}
     errors = {name: Change(b, a) for name, (a, b) in pairs.items() if b is not None}
     ious = zip(
         start.names, start.frames.tolist(), before.ious.tolist(), after.ious.tolist(), strict=True
     )
+    # how far the result is from the start
     moved = how_far(start, best) if kept else {}
     notes = [note, f"kept: {'refined' if kept else 'start'}"]
     if kept:

@@ -48,20 +48,25 @@ class Change:
 
 @dataclasses.dataclass(frozen=True)
 class ViewReport:
-    """One view. keypoints: that were compared. median, high: their median error and 90th
-    percentile, pixels (NaN: none).
-    outliers: share. iou_before, iou_after: of silhouettes, NaN without a mask, None if masks are
-    not part of the fit.
-    """
+    """How well the body agrees with one view."""
 
     name: str
+    """Name of the view."""
     frame: int
+    """Index of its frame."""
     keypoints: int = 0
+    """Number of keypoints that were compared."""
     median: float = float("nan")
+    """Median error of the keypoints, pixels; NaN without any."""
     high: float = float("nan")
+    """90th percentile of the errors, pixels; NaN without any."""
     outliers: float = 0.0
+    """Share of the keypoints that are outliers."""
     iou_before: float | None = None
+    """IoU of body and mask at the start; NaN without a mask, None if masks are not part of the fit.
+    """
     iou_after: float | None = None
+    """The same for the result."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,34 +74,41 @@ class Violation:
     """A joint that exceeds its limit about an axis of the T-pose."""
 
     frame: int
+    """Index of the frame."""
     joint: str
+    """Name of the joint."""
     axis: str
+    """"x", "y" or "z"."""
     degrees: float
+    """How far beyond the limit, degrees."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FitReport:
-    """What came of a fit.
-
-    kept: False if the start was better and stays. start: of a fit to a scan, where it came from:
-    "landmarks" or "search".
-    errors: by name, see `LABELS`. moved: how far parameters moved, by name. violations: of joint
-    limits. swaps: what seems exchanged. undetermined: joints, or groups of joints, that the views
-    do not determine.
-    notes: further results. warnings: what points to a mistake.
-    """
+    """What came of a fit."""
 
     fitted: Literal["keypoints", "refinement", "scan"]
+    """What the body was fitted to."""
     kept: bool = True
+    """False if the start was better and stays."""
     start: str = ""
+    """Where a fit to a scan began: "landmarks" or "search"."""
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
+    """Errors by name, see `LABELS`."""
     views: tuple[ViewReport, ...] = ()
+    """A row for each view."""
     moved: dict[str, float] = dataclasses.field(default_factory=dict)
+    """How far parameters moved, by name, see `how_far`."""
     violations: tuple[Violation, ...] = ()
+    """Joints beyond their limits."""
     swaps: tuple[Swap, ...] = ()
+    """What seems exchanged."""
     undetermined: tuple[str, ...] = ()
+    """Joints, or groups of joints, that the views do not determine."""
     notes: tuple[str, ...] = ()
+    """Further results, a line each."""
     warnings: tuple[str, ...] = ()
+    """What points to a mistake, a line each."""
 
     @property
     def ok(self) -> bool:
@@ -134,6 +146,7 @@ def _view_rows(views: Sequence[ViewReport]) -> list[str]:
     error = lambda view: np.nan_to_num(
         view.median if view.iou_after is None else 1 - view.iou_after, nan=np.inf
     )
+    # of many views only those that fit worst, in their order
     worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
     masks = views[0].iou_after is not None
     rows = [
@@ -153,6 +166,7 @@ def _view_rows(views: Sequence[ViewReport]) -> list[str]:
             rows.append([view.name, f"{view.iou_before:.3f}", f"{view.iou_after:.3f}"])
         else:
             rows.append([view.name, "no mask"])
+    # views that are not shown are counted
     lines = text_table(rows)
     return (
         lines if len(views) <= ROWS else [*lines, f"...  {len(views) - ROWS} more that fit better"]
@@ -241,6 +255,8 @@ def keypoint_warnings(
     found = [str(swap) for swap in swaps[:NAMED]]
     if len(swaps) > NAMED:
         found.append(f"{len(swaps) - NAMED} more views or pairs of views seem exchanged")
+    # views without keypoints, with another body or camera than the rest, and with a detector that
+    # errs
     blind = [view for view in views if not view.keypoints]
     off = [view for view in views if view.keypoints and view.median > OFF * expected[view.frame]]
     wild = [view for view in views if view not in off and view.outliers > MANY_OUTLIERS]
@@ -255,6 +271,7 @@ def keypoint_warnings(
         found.append(
             f"many keypoints are outliers in {_names(wild)}: {_span(wild, 'outliers', '{:.0%}')}"
         )
+    # joints far beyond their limits, a line for each joint and axis
     far: dict[tuple[str, str], list[Violation]] = {}
     for each in violations:
         if each.degrees > FAR_BEYOND:

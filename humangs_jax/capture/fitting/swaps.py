@@ -56,16 +56,16 @@ frames.
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
-    """One exchange that explains a disagreement; `str()` is a sentence about it.
-
-    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a
-    and b"). frames: for cameras, in how many; the views are those of the first.
-    """
+    """One exchange that explains a disagreement; `str()` is a sentence about it."""
 
     kind: Literal["sides", "cameras", "hands"]
+    """What is exchanged."""
     views: tuple[str, ...]
+    """Names of the views; for cameras those of the first frame."""
     instead: tuple[str, ...] = ()
+    """Alternatives that explain it as well: names of views; for cameras pairs ("a and b")."""
     frames: int = 1
+    """Number of frames in which the cameras are exchanged."""
 
     def __str__(self) -> str:
         if self.kind == "hands":
@@ -133,14 +133,12 @@ def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[
 
 
 class Order(NamedTuple):
-    """Which keypoints the c cameras of m frames get.
-
-    source: (m, c) camera that they come from. mirrored: (m, c) by source, whether left and right
-    are exchanged.
-    """
+    """Which keypoints the c cameras of m frames get."""
 
     source: Int[np.ndarray, "m c"]
+    """Camera that they come from, (m, c)."""
     mirrored: Bool[np.ndarray, "m c"]
+    """Whether left and right are exchanged, by source, (m, c)."""
 
     def exchanged(
         self,
@@ -188,13 +186,15 @@ class Agreement(NamedTuple):
     """How well c views agree with the points that they agree on best: confidences summed over
     keypoints, less for larger errors.
 
-    own: (c,) with the keypoints as they are. crossed: (c, c) if the first view had the second's
-    keypoints, and mirrored: (c,) with left and right exchanged, both without new triangulation.
+    Points are those of the keypoints as they are, not triangulated again for an exchange.
     """
 
     own: Float[Array, " c"]
+    """Agreement with the keypoints as they are, (c,)."""
     crossed: Float[Array, "c c"]
+    """Agreement if the first view had the second's keypoints, (c, c)."""
     mirrored: Float[Array, " c"]
+    """Agreement with left and right exchanged, (c,)."""
 
 
 @jax.jit
@@ -232,14 +232,16 @@ def _agreements(
 
 
 class _Trial(NamedTuple):
-    """An exchange in some frames, of cameras a and b, or of the sides of camera a if b is None.
-    gain: agreement that it adds.
-    """
+    """An exchange in some frames."""
 
     gain: float
+    """Agreement that it adds."""
     frames: Int[np.ndarray, " e"]
+    """Indices of the frames, (e,)."""
     a: Int[np.ndarray, " e"]
+    """Camera in each frame, (e,)."""
     b: Int[np.ndarray, " e"] | None
+    """Camera with which it is exchanged, (e,); None for the sides of camera a."""
 
 
 class _Search:
@@ -266,6 +268,7 @@ class _Search:
         found = jax.tree.map(np.asarray, _agreements(seen, mirror))
         self.confidences = np.asarray(seen.confidences)
         self.total, self.views = found.own.sum(-1), (self.confidences > 0).any(-1)
+        # with many views, only what looks better at once is worth a trial
         count, own = self.views.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
         self.sides = self.views & (count > 1) & ((count < MANY) | (found.mirrored > own))
         self.several = self.views & (count > 2)
@@ -311,6 +314,7 @@ class _Search:
 
     def exchanges(self) -> list[_Trial]:
         """Exchanges of two cameras in all of their frames together, and in each alone."""
+        # pairs of cameras that look exchanged in some frame are tried in all of their frames
         cameras = lambda frame, a, b: tuple(sorted(self.cameras[frame, [a, b]].tolist()))
         suspected = {cameras(*at) for at in np.argwhere(self.pairs)}
         tried: dict[tuple[int, ...], list[_Trial]] = {}
@@ -324,6 +328,7 @@ class _Search:
                 for row, gain in enumerate(self.gains(frames, *slots).tolist()):
                     one = _Trial(gain, frames[[row]], *(slot[[row]] for slot in slots))
                     tried.setdefault(cameras(frames[row], a, b), []).append(one)
+        # an exchange of cameras concerns all frames; one of photos a single frame
         together = [_together(trials) for trials in tried.values()]
         alone = [trial for trials in tried.values() if len(trials) > 1 for trial in trials]
         every = np.ones(len(self.mirror), bool)

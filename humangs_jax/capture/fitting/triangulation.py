@@ -252,14 +252,14 @@ SEEN, FEWEST = 0.3, 6
 
 
 class Seen(NamedTuple):
-    """People of a view. K: (3, 3). cam_from_world: (4, 4).
-
-    people: each (k, 3) pixels and visibility.
-    """
+    """The people of a view."""
 
     K: Float[np.ndarray, "3 3"]
+    """Intrinsics, (3, 3), pixels."""
     cam_from_world: Float[np.ndarray, "4 4"]
+    """Camera pose, (4, 4), metres."""
     people: tuple[Float[np.ndarray, "k 3"], ...]
+    """Landmarks of each person, (k, 3): pixels and visibility."""
 
 
 Key = tuple[int, int]
@@ -267,16 +267,18 @@ Key = tuple[int, int]
 
 
 class Match(NamedTuple):
-    """One person. members: for each view the index of its person, None where it has none. mirrored:
-    for each view whether left and right are exchanged. error: median distance of the landmarks from
-    the triangulated points over the person's size; infinite for a person of one view. center: the
-    median of the points, metres; NaN for a person of one view.
-    """
+    """One person in several views."""
 
     members: tuple[int | None, ...]
+    """Index of the person in each view; None where the view does not have it."""
     mirrored: tuple[bool, ...]
+    """Whether left and right are exchanged, for each view."""
     error: float
+    """Median distance of the landmarks from the triangulated points, a share of the person's size;
+    infinite for a person of one view.
+    """
     center: Float[np.ndarray, "3"]
+    """Median of the triangulated points, (3,), metres; NaN for a person of one view."""
 
 
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
@@ -285,6 +287,8 @@ def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
 
     Arguments: mirror: for each landmark the index of its mirror image.
     """
+    # each pair of people in two views proposes points, as they are and with sides exchanged;
+    # whoever agrees with these in other views joins
     flipped_order = np.asarray(mirror)
     left = {(v, p) for v, view in enumerate(views) for p in range(len(view.people))}
     groups = []
@@ -429,6 +433,7 @@ def in_order_of_time(
     """
     people: list[list[Match | None]] = []
     for f, matches in enumerate(frames):
+        # people are linked by their positions in space first
         last = [max(g for g in range(f) if person[g] is not None) for person in people]
         centers = [_last_center(person) for person in people]
         ways = np.asarray(
@@ -436,6 +441,7 @@ def in_order_of_time(
         )
         chosen = dict(_plainly_shortest(ways.reshape(len(people), len(matches)), FARTHEST))
         if shown is not None:
+            # those that are left are compared in the photos of one camera
             free = [j for j in range(len(people)) if j not in chosen]
             left = [i for i in range(len(matches)) if i not in chosen.values()]
             costs = np.full((len(free), len(left)), np.inf)
@@ -446,6 +452,7 @@ def in_order_of_time(
             chosen |= {free[row]: left[column] for row, column in _plainly_shortest(costs, NEAR)}
         for j, person in enumerate(people):
             person.append(matches[chosen[j]] if j in chosen else None)
+        # matches that continue nobody are new people
         new = [match for i, match in enumerate(matches) if i not in chosen.values()]
         people += [[*[None] * f, match] for match in new]
     return [[person[f] for person in people] for f in range(len(frames))]

@@ -54,21 +54,22 @@ RAYLEIGH_MEDIAN = 1.1774
 
 @pytree_dataclass
 class Observations(Batchable):
-    """Keypoints of one frame in c views; a missing view has confidence 0.
-
-    points: (c, k, 2) pixels, centres at +0.5. confidences: (c, k) in [0, 1]; 0: not seen. K: (c, 3,
-    3) pixels.
-    cam_from_world: (c, 4, 4), metres. noise: () std of the detections, pixels. world: (c, k, 3)
-    where the detector sees the landmarks in space, in the camera's axes, up to a translation and a
-    scale.
-    """
+    """Keypoints of one frame in c views; a missing view has confidence 0."""
 
     points: Float[Array, "c k 2"]
+    """Detections, (c, k, 2), pixels, the centre of the first pixel at (0.5, 0.5)."""
     confidences: Float[Array, "c k"]
+    """Confidences, (c, k), in [0, 1]; 0: not seen."""
     K: Float[Array, "c 3 3"]
+    """Intrinsics, (c, 3, 3), pixels."""
     cam_from_world: Float[Array, "c 4 4"]
+    """Camera poses, (c, 4, 4), metres."""
     noise: Float[Array, ""]
+    """Standard deviation of the detections, (), pixels."""
     world: Float[Array, "c k 3"] | None = None
+    """Where the detector sees the landmarks in space, in the camera's axes, up to a translation and
+    a scale, (c, k, 3).
+    """
 
 
 def make_observations(
@@ -107,6 +108,7 @@ def group_by_frame(
     there is none.
     """
     frames, count = np.asarray(photos.frames), photos.frame_count
+    # frames with fewer views than others have missing ones, whose keypoints have confidence 0
     members = [np.flatnonzero(frames == frame) for frame in range(count)]
     views = np.full((count, max(len(own) for own in members)), -1)
     for row, own in zip(views, members, strict=True):
@@ -118,6 +120,7 @@ def group_by_frame(
     if (
         keypoints.world is not None and views.shape[1] == 1
     ):  # several views say more than any of them alone
+        # the ray goes through the hips, or through all landmarks where no hip is seen
         hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
         middle = np.where(
             (confidences * hips).any(-1, keepdims=True), confidences * hips, confidences
@@ -268,13 +271,14 @@ def world_residuals(
 
 @pytree_dataclass
 class Targets:
-    """Triangulated landmarks: points (k, 3) metres; known: (k,) their weights; pixel: () metres per
-    pixel there.
-    """
+    """Triangulated landmarks."""
 
     points: Float[Array, "k 3"]
+    """Positions, (k, 3), metres."""
     known: Float[Array, " k"] | Bool[Array, " k"]
+    """Weights, (k,); 0: not triangulated."""
     pixel: Float[Array, ""]
+    """Metres per pixel at the person, ()."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -282,8 +286,11 @@ class KeypointProblem:
     """What stays the same in a fit to keypoints."""
 
     model: LandmarkModel
+    """Landmarks of the body."""
     prior: PosePrior
+    """Prior of poses and limits of joints."""
     origin: Origin
+    """Where the zeros of the state are."""
 
     @property
     def known(self) -> Float[np.ndarray, " k"]:

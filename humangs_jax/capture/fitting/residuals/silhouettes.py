@@ -46,36 +46,39 @@ SMOOTHING = 1.5
 
 
 class MeshEdges(NamedTuple):
-    """Edges of a triangle mesh. ends: (e, 2) vertices. faces: (e, 2) on both sides, -1: none."""
+    """The edges of a triangle mesh."""
 
     ends: Int[np.ndarray, "e 2"]
+    """Vertices at both ends, (e, 2)."""
     faces: Int[np.ndarray, "e 2"]
+    """Faces on both sides, (e, 2); -1: none."""
 
 
 class BodyView(NamedTuple):
-    """A posed body as a camera sees it. pixels: (n, 2) and depths: (n,) of its vertices. normals:
-    (n, 2) of the surface at the vertices as unit directions in the image. covered: (h, w).
-    """
+    """A posed body as a camera sees it."""
 
     pixels: Float[np.ndarray, "n 2"]
+    """Projected vertices, (n, 2), pixels."""
     depths: Float[np.ndarray, " n"]
+    """Depths of the vertices, (n,), metres."""
     normals: Float[np.ndarray, "n 2"]
+    """Unit directions in the image of the surface normals at the vertices, (n, 2)."""
     covered: Bool[np.ndarray, "h w"]
+    """Which pixels show the body, (h, w)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Boundary:
-    """Points of a silhouette, evenly spread over it. positions: (p, 2) pixels. normals: (p, 2)
-    unit, outwards.
-
-    ends: (p, 2), shares: (p,): for a body, the vertices of each point's edge and its position
-    between them in [0, 1]. A silhouette may be empty.
-    """
+    """Points of a silhouette, evenly spread over it; it may be empty."""
 
     positions: Float[np.ndarray, "p 2"]
+    """Positions, (p, 2), pixels."""
     normals: Float[np.ndarray, "p 2"]
+    """Unit normals, (p, 2), outwards."""
     ends: Int[np.ndarray, "p 2"] | None = None
+    """For a body, the vertices of each point's edge, (p, 2)."""
     shares: Float[np.ndarray, " p"] | None = None
+    """For a body, the position of each point between these, (p,), in [0, 1]."""
 
 
 def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
@@ -118,20 +121,25 @@ def body_boundary(
     view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int
 ) -> Boundary:
     """`count` points of the body's silhouette, or none if the image shows none."""
+    # faces that look at the camera, by their orientation in the image
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     towards = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
     before = (view.depths > NEAREST_EDGE)[faces].all(axis=1)
     first, second = mesh.faces.T
+    # edges between a face that looks at the camera and one that looks away, and borders of the
+    # mesh, unless they are behind the camera
     turns = (towards[first] != towards[second]) | (second < 0)
     chosen = np.flatnonzero(turns & before[first] & (before[second] | (second < 0)))
     ends = mesh.ends[chosen]
     normals = unit(view.normals[ends].sum(axis=1))
+    # of these, edges with no body beside them in the image: others are inside of the silhouette
     middles = view.pixels[ends].mean(axis=1)
     outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(
         middles, view.covered.shape
     )
     ends, normals = ends[outside], normals[outside]
+    # points evenly along the edges that are left
     lengths = np.linalg.norm(view.pixels[ends[:, 1]] - view.pixels[ends[:, 0]], axis=1)
     edge, shares = _spread(lengths, count)
     ends, shares = ends[edge], shares.astype(np.float32)
@@ -153,6 +161,7 @@ def mask_boundary(
     contours = [
         contour[:, ::-1] + 0.5 for contour in find_contours(mask, 0.5)
     ]  # rows, columns of centres -> pixels
+    # contours that are long enough, as pieces of lines
     steps = [np.linalg.norm(np.diff(contour, axis=0), axis=1) for contour in contours]
     longest = max((step.sum() for step in steps), default=0.0)
     kept = [i for i, step in enumerate(steps) if step.sum() >= SPECK * longest]
@@ -166,6 +175,7 @@ def mask_boundary(
     )
     if hidden is not None:
         lengths = lengths * ~_covered(hidden, starts)
+    # points evenly along them; normals down the slope of the blurred mask
     segment, shares = _spread(lengths, count)
     positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
     down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
@@ -216,15 +226,16 @@ FACING = 0.5
 class Matches:
     """Equations of one view: points[i] of the body's silhouette shall lie on the line normals[i] .
     x = offsets[i].
-
-    points: (e,) indices. normals: (e, 2) unit, outwards. offsets: (e,) pixels. weights: (e,) 0: no
-    equation.
     """
 
     points: Int[Array, " e"]
+    """Indices of the points, (e,)."""
     normals: Float[Array, "e 2"]
+    """Unit normals, (e, 2), outwards."""
     offsets: Float[Array, " e"]
+    """Offsets of the lines, (e,), pixels."""
     weights: Float[Array, " e"]
+    """Weights, (e,); 0: no equation."""
 
 
 def match(
