@@ -29,25 +29,31 @@ from humangs_jax.data.photos import Photos
 from humangs_jax.geometry import quaternion, transform
 
 P = TypeVar("P", Photos, Capture)
-LEAST_DEGREES, MOST_DEGREES = 0.3, 8.0
-"""Smaller errors hardly matter: a third of a degree is 1.5 cm at 3 m.
-
-Larger ones are no calibration that is a little off.
-"""
-CLEAR, LEAST_GAIN = 5.0, 25.0
-"""Standard errors, and fall of the cost, from which on a rotation is no chance. A detector that
-errs alike in all landmarks of a view imitates one: on five synthetic people in rooms with exact
-cameras the cost fell by 5 to 16, on five photos of a man whose calibration is off by 32 to 121.
+LEAST_DEGREES = 0.3
+"""Degrees: smaller errors hardly matter, a third of a degree is 1.5 cm at 3 m."""
+MOST_DEGREES = 8.0
+"""Degrees: larger errors are no calibration that is a little off."""
+CLEAR = 5.0
+"""Standard errors from which on a rotation is no chance."""
+LEAST_GAIN = 25.0
+"""Fall of the cost from which on a rotation is no chance. A detector that errs alike in all
+landmarks of a view imitates one: on five synthetic people in rooms with exact cameras the cost fell
+by 5 to 16, on five photos of a man whose calibration is off by 32 to 121.
 """
 PRIOR = np.radians(1.0)
-"""Expected size of rotations: holds what cameras and points together can do without a residual."""
+"""Expected size of rotations, radians: holds what cameras and points together can do without a
+residual.
+"""
 ALIKE = 0.9
 """Share of the cost from which on another camera explains as much."""
-ITERATIONS, FRAMES, CAMERAS = 8, 24, 64
-"""Of reweighting; moments that are looked at, at most; with more cameras than this nothing is said.
-"""
+ITERATIONS = 8
+"""Iterations that reweight the residuals."""
+FRAMES = 24
+"""Moments that are looked at, at most."""
+CAMERAS = 64
+"""With more cameras than this nothing is said."""
 ROBUST_SCALE = 3.0
-"""Of residuals, standard deviations."""
+"""Robust scale of residuals, standard deviations."""
 PARTS = (
     "nose",
     "eye",

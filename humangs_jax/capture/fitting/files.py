@@ -34,9 +34,14 @@ from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
 from humangs_jax.io.reading import reading, write_json
 
-FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
+FIT_FILE = "fit.npz"
+"""File of the input of a fit to keypoints, and of how well its result is known."""
+REPORT_FILE = "fit.json"
+"""File of the report."""
 FOUND = ("noise", "joint_std", "determined", "shape_covariance")
+"""Keys of fit.npz that are fields of `FitRecord`."""
 KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
+"""All keys of fit.npz."""
 
 
 # fit.npz

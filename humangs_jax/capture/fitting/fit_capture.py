@@ -125,8 +125,8 @@ def _determined(
 def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
-    """Of residuals and joints of each frame by its unknowns: global_orient, transl, body_pose, then
-    the shape.
+    """The derivatives of residuals and joints of each frame by its unknowns: global_orient, transl,
+    body_pose, then the shape.
     """
     problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
     poses = jnp.concatenate(

@@ -66,18 +66,22 @@ PLACED_FRAMES = 4
 """With this many frames a fit finds where the detector sees its landmarks: fewer say too little
 about both shape and places.
 """
-USUAL_COUNT, LEAST_RATIO = 16, 0.5
-"""Keypoints that what is usual counts for, and its least share, where the noise of a landmark is
-found.
-"""
+USUAL_COUNT = 16
+"""Keypoints that what is usual counts for where the noise of a landmark is found."""
+LEAST_RATIO = 0.5
+"""Least noise of a landmark, a share of what is usual."""
 ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
-"""Of keypoint errors in the stages rigid, points, body, hands and person, standard deviations."""
+"""Robust scales of keypoints in the stages rigid, points, body, hands and person, standard
+deviations.
+"""
 STARTS = (4, 2)
-"""Orientations that are followed, for one view and for several."""
-STEPS = PERSON_STEPS = 150
-"""Of the solver in a stage of one frame, and for all frames together, at most."""
+"""Numbers of orientations that are followed, for one view and for several."""
+STEPS = 150
+"""Steps of the solver in a stage of one frame, at most."""
+PERSON_STEPS = 150
+"""Steps of the solver for all frames together, at most."""
 TOLERANCE = 3e-4
-"""Of the unknowns, which are of unit size."""
+"""Tolerance of the unknowns, which are of unit size."""
 
 
 @pytree_dataclass

@@ -47,13 +47,15 @@ SIZE = 0.01
 scale.
 """
 ROBUST_SCALES = (40.0, 6.0)
-"""Of pixels, standard deviations: the start is off by tens of them."""
-STEPS = 60
-"""Of Levenberg and Marquardt for each robust scale, at most, rejected ones included."""
-EXACT, COARSE = 1e-9, 1e-3
-"""Relative decrease of the cost that ends the search: of a result, and where costs are only
-compared.
+"""Robust scales of pixels, standard deviations, one search after the other: the start is off by
+tens of them.
 """
+STEPS = 60
+"""Steps of Levenberg and Marquardt for each robust scale, at most, rejected ones included."""
+EXACT = 1e-9
+"""Relative decrease of the cost that ends the search for a result."""
+COARSE = 1e-3
+"""Relative decrease of the cost that ends the search where costs are only compared."""
 DAMPING = 1e-3
 """Share of the diagonal of the normal equations that is added to it at first."""
 STILL = 1e-6
@@ -63,7 +65,7 @@ FURTHEST = 5.0
 multiples of e.
 """
 ALTERNATIONS = 20
-"""Of turns and mean shape: a mean of ten photos is still by then."""
+"""Alternations of turns and mean shape: a mean of ten photos is still by then."""
 VIEW = 9
 """Unknowns of a view: turn, place, and the mean of its turned landmarks."""
 
@@ -236,8 +238,8 @@ def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
 
 
 def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
-    """Of `residuals`, with the mean of a view as an unknown of its own, which does not change the
-    minimum.
+    """The derivatives of `residuals`, with the mean of a view as a separate unknown, which does not
+    change the minimum.
     """
     root, turned = np.sqrt(evidence.weights)[..., None, None], _turned(rig)
     c, k = evidence.weights.shape
@@ -388,7 +390,7 @@ def adjust(
 
 
 def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tuple[Rig, float]:
-    """With one robust scale.
+    """Minimises with one robust scale.
 
     The damping follows Nielsen 1999, as Madsen, Nielsen and Tingleff 2004, algorithm 3.16.
     """
@@ -440,7 +442,7 @@ class NormalEquations:
 
 
 def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalEquations:
-    """Of all residuals."""
+    """The normal equations of all residuals."""
     c, k = evidence.weights.shape
     g = len(rows.focal)
     own = np.eye(g)[evidence.kinds]  # (c, g) 1 for the kind of a view

@@ -38,10 +38,14 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
 
-LEVEL, UPRIGHT = 4.0, 15.0
-"""Stds of the roll of a camera and of the lean of a body, degrees."""
-BONES_STD, STATURE_STD = 0.01, 0.001
-"""Metres by which joints and stature may differ from those of a scaled person."""
+LEVEL = 4.0
+"""Standard deviation of the roll of a camera, degrees."""
+UPRIGHT = 15.0
+"""Standard deviation of the lean of a body, degrees."""
+BONES_STD = 0.01
+"""Metres by which joints may differ from those of a scaled person."""
+STATURE_STD = 0.001
+"""Metres by which the stature may differ from that of a scaled person."""
 STATURE = 1.52
 """Stature over trunk, thigh and shin together, of the shipped body's mean person."""
 

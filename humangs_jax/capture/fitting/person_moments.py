@@ -32,12 +32,16 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.progress import bar, watched
 from humangs_jax.io.images import DIAGONAL_35MM
 
-USUAL_FOCAL, USUAL_STD, EXIF_STD = 29.0, 0.2, 0.03
-"""35-mm equivalent of a telephone's main camera, mm, and stds of the logarithm of focal lengths:
-supposed, and of EXIF.
-"""
-SEEN, FEWEST = 0.1, 6
-"""Least visibility of a landmark that counts, and least number of those in a photo."""
+USUAL_FOCAL = 29.0
+"""Focal length of a telephone's main camera, mm, 35-mm equivalent."""
+USUAL_STD = 0.2
+"""Standard deviation of the logarithm of a focal length that is supposed."""
+EXIF_STD = 0.03
+"""Standard deviation of the logarithm of a focal length that EXIF says."""
+SEEN = 0.1
+"""Least visibility of a landmark that counts."""
+FEWEST = 6
+"""Least number of such landmarks in a photo."""
 SMALLEST = 16.0
 """Pixels: a person who is smaller in a photo is a point."""
 LEAST_ANGLE = 4.0
@@ -55,9 +59,12 @@ DOUBTFUL = 0.012
 """The same distance above which mirrorings are also tried from the other end, all views mirrored.
 Detections of one moment with an error of 3 pixels of 900 leave 0.004 to 0.007, a mirrored view 0.02
 and more."""
-FEWEST_WITHOUT, MOMENT_WITHOUT = 4, 0.015
-"""Photos of which one may be left out because it contradicts the others, and the distance up to
-which these are of one moment: three of four photos of several moments leave 0.021 or more."""
+FEWEST_WITHOUT = 4
+"""Photos from which on one may be left out because it contradicts the others."""
+MOMENT_WITHOUT = 0.015
+"""The distance of `ONE_MOMENT` up to which the others are then of one moment: three of four photos
+of several moments leave 0.021 or more.
+"""
 FAR = 0.2
 """Share of the person's size; errors above count as this one."""
 DECIDING = 8
@@ -69,6 +76,7 @@ ANOTHER_MOMENT = 0.03
 shows another moment.
 """
 BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+"""Ends of the bones whose left and right have one length."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

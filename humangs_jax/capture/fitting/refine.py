@@ -74,8 +74,10 @@ LM_UNKNOWNS = 400
 """
 PATIENCE = 6
 """Steps of L-BFGS for one of least squares."""
-STEPS, LONGEST_SIDE = 4, 512
-"""Of the solver in a round; pixels to which larger photos are shrunk."""
+STEPS = 4
+"""Steps of the solver in a round."""
+LONGEST_SIDE = 512
+"""Pixels to which larger photos are shrunk."""
 REACH = (0.08, 0.015)
 """How far points look in the first and the last round, shares of the person's height in the image.
 """
@@ -117,8 +119,10 @@ FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pos
 keypoints hold the joints where clothes would pull them away."""
 FROM_PERSON = dataclasses.replace(FITTED, focal=0.05, camera_rotation=2.0, camera_center=0.08)
 """The same with cameras that were found from the person."""
-SKIN, TIGHT = 0.001, 0.015
-"""Metres, for `StateStd.clothing`: masks of somebody without clothes, and in tight ones."""
+SKIN = 0.001
+"""`StateStd.clothing` for masks of somebody without clothes, metres."""
+TIGHT = 0.015
+"""`StateStd.clothing` for masks of somebody in tight clothes, metres."""
 
 
 def usual_config(
@@ -553,10 +557,11 @@ def _person_height(
     return float(np.median(sizes)) if sizes else float("nan")
 
 
-LEAST_GAIN, LEAST_GAIN_OF_MASKS = 0.02, 0.2
-"""Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of
-clothes are fitted a little better by wrong bodies: for four people who started at the truth, by up
-to 0.15; keypoints show that.
+LEAST_GAIN = 0.02
+"""Share of the loss that a kept change removes where keypoints are known."""
+LEAST_GAIN_OF_MASKS = 0.2
+"""The same by masks alone. Masks of clothes are fitted a little better by wrong bodies, which
+keypoints would show: for four people who started at the truth, by up to 0.15.
 """
 LEAST_DIFFERENCE = 0.005
 """Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding

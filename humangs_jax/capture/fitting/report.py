@@ -184,13 +184,16 @@ OFF = 4.0
 """Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows
 another pose or camera.
 """
-SLIGHTLY_BEYOND, FAR_BEYOND = np.rad2deg(0.05), 10.0
-"""Degrees beyond a joint's limit that are no violation, and from which there is a warning: limits
-are rough.
+SLIGHTLY_BEYOND = np.rad2deg(0.05)
+"""Degrees beyond a joint's limit that are no violation: limits are rough."""
+FAR_BEYOND = 10.0
+"""Degrees beyond a joint's limit from which on there is a warning."""
+UNSURE = 0.03
+"""Metres: a joint whose std exceeds this is undetermined."""
+UNDECIDED = 0.1
+"""A joint of whose rotation a smaller share is determined is undetermined: a mean over axes, of
+which knees and fingers have one that turns.
 """
-UNSURE, UNDECIDED = 0.03, 0.1
-"""A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is
-determined: a mean over axes, of which knees and fingers have one that turns."""
 
 _FINGERS = {
     side: [f"{side}_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)]

@@ -31,10 +31,12 @@ from humangs_jax.capture.keypoints.keypoints import Keypoints, KeypointSet
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import replace
 
-LEAST_GAIN, CHANCE = 0.1, 0.8
-"""Agreement of n keypoints has to grow by LEAST_GAIN + CHANCE / sqrt(n) of what is attainable. By
-chance, without an exchange, 17 keypoints with 20 % of outliers and three times the expected noise
-gain up to 0.26; 67 keypoints gain nothing.
+LEAST_GAIN = 0.1
+"""Agreement of n keypoints has to grow by `LEAST_GAIN` + `CHANCE` / sqrt(n) of what is attainable.
+"""
+CHANCE = 0.8
+"""See `LEAST_GAIN`. By chance, without an exchange, 17 keypoints with 20 % of outliers and three
+times the expected noise gain up to 0.26; 67 keypoints gain nothing.
 """
 MANY = 5
 """With this many views or more the right ones outvote an exchange: only exchanges that look better

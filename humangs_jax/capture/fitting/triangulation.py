@@ -144,7 +144,7 @@ def _nearest(
 # --------------------------------------------------------------------------------------------------
 
 ITERATIONS = 10
-"""They reweight the points by their distances."""
+"""Iterations that reweight the points by their distances."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -227,28 +227,36 @@ AGREE = 0.06
 """Median distance of landmarks from the triangulated points, a share of the person's size in the
 photo, up to which a view shows the same person. Cameras that are off by a degree make 0.02 of it.
 """
-CLEARLY, RATHER = 0.5, 0.8
-"""Sides are exchanged if the distance is then less than this share of what it is without; the
-second where it does not agree without."""
+CLEARLY = 0.5
+"""Sides are exchanged if the distance is then less than this share of what it is without."""
+RATHER = 0.8
+"""The same where the views do not agree without an exchange."""
 FARTHEST = 1.0
 """Metres between a person's places in two frames that follow each other, where several views show
 where they are.
 """
-SHORTER, FAR = 0.3, 3.0
-"""Of the longest way: how much shorter the ways of people between two frames have to be than if two
-of them were exchanged; and from where on all ways count as equally long."""
+SHORTER = 0.3
+"""How much shorter the ways of people between two frames have to be than if two of them were
+exchanged, a share of the longest way.
+"""
+FAR = 3.0
+"""Multiple of the longest way from which on all ways count as equally long."""
 NEAR = 0.5
-"""A share of a person's size in the photo: how far they go in the photo of one camera from one
-frame to the next.
+"""How far people go in the photo of one camera from one frame to the next, a share of their size in
+it.
 """
 RESIZED = 1.5
 """The most by which a person's size in the photo of one camera changes from one frame to the next,
 a factor.
 """
-STILL_DEGREES, STILL_METRES = 10.0, 0.3
-"""A view that has turned and moved by no more than this since the last frame is one camera's."""
-SEEN, FEWEST = 0.3, 6
-"""Least visibility of a landmark that counts, and least number of those that two views share."""
+STILL_DEGREES = 10.0
+"""A view that has turned by no more than this since the last frame is one camera's."""
+STILL_METRES = 0.3
+"""A view that has moved by no more than this since the last frame is one camera's."""
+SEEN = 0.3
+"""Least visibility of a landmark that counts."""
+FEWEST = 6
+"""Least number of landmarks that two views share to be compared."""
 
 
 class Seen(NamedTuple):
@@ -346,8 +354,9 @@ def _gathered(
 
 
 def _is_exchanged(plain: float, exchanged: float) -> bool:
-    """From two errors. Of a small or thin person left and right hardly differ: then nothing is
-    exchanged.
+    """Whether sides are exchanged, by the errors without and with an exchange.
+
+    Left and right of a small or thin person hardly differ: then nothing is exchanged.
     """
     return exchanged < (CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain))
 

@@ -33,10 +33,10 @@ from humangs_jax.geometry.transform import EXACT
 AnyArray = Float[Array, "m c ..."] | Float[np.ndarray, "m c ..."]
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
-NOISE, LEAST_NOISE = 0.005, 0.3
-"""Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and a
-lower bound, pixels.
-"""
+NOISE = 0.005
+"""Expected std of detections, a share of the person's height in the photo: 2 pixels of 400."""
+LEAST_NOISE = 0.3
+"""Pixels: detections are expected to err by at least this."""
 OUTER = (0.03, 0.97)
 """Quantiles of the coordinates between which a person's size is measured, so that outliers do not
 count.
@@ -46,8 +46,11 @@ NOISE_RANGE = (0.5, 8.0)
 PLACE_STD = 0.02
 """Metres: how far from where they are thought to be detectors see landmarks."""
 OPTICAL_AXIS = np.asarray([0.0, 0.0, 1.0])
+"""The direction in which a camera looks, in its axes."""
 WORLD_STD = 0.15
-"""Of a detector's 3D landmarks, over the root mean square of their distances from their middle."""
+"""Standard deviation of a detector's 3D landmarks, over the root mean square of their distances
+from their middle.
+"""
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a vector whose two components have a std of 1."""
 
@@ -153,7 +156,9 @@ def in_camera_axes(
 def expected_noise(
     points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
 ) -> Float[np.ndarray, " m"]:
-    """Pixels, from the size of the person in the views of a frame; 1 where nothing is seen."""
+    """The expected noise, pixels, from the size of the person in the views of a frame; 1 where
+    nothing is seen.
+    """
 
     def of_frame(points, seen):
         sizes = [
@@ -169,8 +174,8 @@ def expected_noise(
 
 
 def found_noise(lengths: Array, expected: Array) -> Array:
-    """Pixels, from the median of errors, which outliers hardly change; NaN is none, and without any
-    it is as expected.
+    """The noise, pixels, from the median of errors, which outliers hardly change; NaN is none, and
+    without any it is as expected.
     """
     median = jnp.nanmedian(lengths)
     found = jnp.where(jnp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
