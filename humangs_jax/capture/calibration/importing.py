@@ -75,12 +75,19 @@ class ImportReport:
     """What was imported and how it was read; `str(report)` is what the command line prints."""
 
     out: Path
+    """Folder of the capture."""
     cameras: int
+    """Number of cameras."""
     frames: int
+    """Number of frames."""
     views: int
+    """Number of photos."""
     width: int
+    """Width of the photos, pixels."""
     height: int
+    """Height of the photos, pixels."""
     undistorted: int
+    """Photos of which lens distortion was removed."""
     turned: int
     """Photos that were turned upright by their EXIF orientation."""
     heic: int
@@ -88,7 +95,9 @@ class ImportReport:
     masks: bool
     """Whether it has mask files."""
     checks: Checks
+    """What was found about the calibration."""
     read_as: str
+    """How the calibration was read: format, axes, unit, and pixel centres."""
     notes: tuple[str, ...]
     """Further lines."""
     warnings: tuple[str, ...]
@@ -217,6 +226,7 @@ def import_calibration(
         scale, about_unit = likely_unit(calibration)
     photos = find_photos(calibration, images, masks)
     check_repeats(calibration.file, [photo.image for photo in photos])
+    # photos upright, of one size, with masks
     turns = find_turns(calibration, photos)
     canvas = _canvas(images, photos, turns)
     about_masks = check_masks(photos)
@@ -233,6 +243,7 @@ def import_calibration(
             calibration.file,
             camera.name,
         )
+    # what the user should know
     checks = check_calibration(calibration, converted, up)
     frames, cameras = (
         1 + max(photo.frame for photo in photos),
@@ -257,6 +268,7 @@ def import_calibration(
         warnings.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
+    # the folder, all of it or nothing
     cut: list[str] = []
 
     def write(folder: Path) -> None:
@@ -431,6 +443,7 @@ def _rewrite(
     Returns: the paths for capture.json, and whether the person reaches a rim where the photo is
     padded.
     """
+    # upright, and as a pinhole sees them
     image, alpha = read_checked(read_image, photo.image)
     image = turn.upright(image, turn.photo)
     alpha = turn.upright(alpha, turn.photo) if transparent and alpha is not None else None
@@ -445,6 +458,7 @@ def _rewrite(
             x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0)
             for x in (mask, alpha)
         )
+    # padding that cuts off the person is reported, since it is taken for background
     if photo.mask is not None and alpha is not None:
         image = np.concatenate([image, alpha[..., None]], axis=-1)
     at_rim = False
@@ -454,6 +468,7 @@ def _rewrite(
             height < canvas[1] and person[-1].any()
         )
     image, mask = _padded(image, canvas, 1.0), None if mask is None else _padded(mask, canvas, 0.0)
+    # the files
     files = {"image": f"images/{name}.png"}
     write_png(folder / files["image"], image)
     if mask is not None:

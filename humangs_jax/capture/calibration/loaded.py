@@ -31,11 +31,11 @@ class SceneCameras(Mapping[str, Camera]):
     """
 
     cameras: dict[str, Camera]
-    """By the name of the camera, or the path of its image where the format has one for each."""
+    """Cameras by name, or by the path of their image where the format has one for each."""
     points: Float[np.ndarray, "n 3"]
-    """Metres; n = 0 where the format has none."""
+    """Points that the calibration found, (n, 3), metres; n = 0 where the format has none."""
     colors: Float[np.ndarray, "n 3"]
-    """Of the points, RGB in [0, 1]; grey where the format has none."""
+    """Colors of the points, (n, 3), RGB in [0, 1]; grey where the format has none."""
 
     def __getitem__(self, name: str) -> Camera:
         """The camera of that name."""

@@ -31,13 +31,15 @@ class Moments(NamedTuple):
     """Which frame of each camera shows each moment."""
 
     times: Float[np.ndarray, " m"]
-    """Seconds after the first frames."""
+    """Seconds after the first frames, (m,)."""
     frames: dict[str, list[int | None]]
     """Numbers of frames, from 0, one for each moment; None where a camera has none."""
     counts: dict[str, int]
-    """Frames of each camera."""
+    """Number of frames of each camera."""
     notes: tuple[str, ...]
+    """How frames were paired, a line each."""
     warnings: tuple[str, ...]
+    """What cameras lack, a line each."""
 
 
 def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:

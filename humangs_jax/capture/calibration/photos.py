@@ -48,12 +48,16 @@ LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
 
 @dataclasses.dataclass(frozen=True)
 class Photo:
-    """A photo on disk: its camera and its frame (both counted from 0), and its mask or None."""
+    """A photo on disk."""
 
     image: Path
+    """File of the photo."""
     mask: Path | None
+    """File of its mask, or None."""
     camera: int
+    """Number of its camera, from 0."""
     frame: int
+    """Number of its frame, from 0."""
     key: str
     """Path relative to the folder of photos with slashes and without suffix."""
 
@@ -228,6 +232,7 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
     the photo; photos and masks are in one folder there, so that the photo itself can be what is
     found first. The function raises CaptureError where there is none.
     """
+    # each folder is listed once: names with a word for masks, by the photo they are of
     listed: dict[Path, dict[str, Path]] = {}
 
     def by_words(place: Path) -> Path | None:
@@ -243,6 +248,7 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
         known = listed[folder]
         return known.get(place.name.casefold()) or known.get(place.stem.casefold())
 
+    # a mask of the same path first, then one with a word for masks
     def find(image: Path) -> Path:
         path = image.relative_to(images)
         for place in (masks / path, masks / path.parent / "mask" / "pha" / path.name):
@@ -323,9 +329,9 @@ class Turn:
     mask: int
     """The flag by which the mask is turned."""
     quarters: int
-    """Of the camera, 0 for a calibration of the turned photo."""
+    """Clockwise quarter turns of the camera; 0 for a calibration of the turned photo."""
     size: tuple[int, int]
-    """Width and height after it."""
+    """Width and height after it, pixels."""
     certain: bool
     """Whether sizes tell what was calibrated."""
     mirrored: bool
@@ -344,7 +350,7 @@ class Turn:
 
 
 def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn, ...]:
-    """One for each photo.
+    """Finds the turn of each photo.
 
     Raises: CaptureError unless photos have the size that was calibrated, and masks that of their
     photo; and for a camera that was calibrated for pixels as stored, but whose photos have

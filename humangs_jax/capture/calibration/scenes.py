@@ -68,11 +68,13 @@ def read_colmap(source: Source, format: CameraFormat) -> Calibration:
 
     Raises: CaptureError naming the file and, of text, the line.
     """
+    # a model is text or binary; both are read into the same values
     binary = not any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
     suffix = ".bin" if binary else ".txt"
     cameras_file, file, points_file = (
         source.path / f"{name}{suffix}" for name in ("cameras", "images", "points3D")
     )
+    # an image has a pose, and shares its lens with others
     lenses = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
     cameras, seen = [], []
     for where, name, camera_id, pose, points in (_binary_images if binary else _text_images)(file):
@@ -86,6 +88,7 @@ def read_colmap(source: Source, format: CameraFormat) -> Calibration:
         seen.append(points)
     if not cameras:
         raise CaptureError(file, "", "no image is registered in this model")
+    # points that images see, for the check of the calibration
     places = (
         dict((_binary_points if binary else _text_points)(points_file))
         if points_file.is_file()
@@ -340,6 +343,7 @@ def _frame_camera(
     elif not ({"fl_x", "cx", "cy"} <= values.keys() or values.keys() & set(MATRICES)):
         size = photo_size(name)
     width, height = size or (None, None)
+    # intrinsics: a whole matrix, or focal lengths and the principal point
     whole = next((key for key in MATRICES if key in values and "fl_x" not in values), None)
     # square pixels and a centred axis where the file does not say otherwise
     focal = {axis: number(f"fl_{axis}") for axis in "xy" if f"fl_{axis}" in values}
@@ -356,6 +360,8 @@ def _frame_camera(
         K = intrinsics(*(focal.get(axis, next(iter(focal.values()))) for axis in "xy"), *center)
     else:
         raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
+    # the lens; one that cannot be undistorted carries the error, for those who ask for photos
+    # without lens distortion
     of_fisheye = model == FISHEYE_MODEL or bool(values.get("is_fisheye"))
     keys = ("k1", "k2", "k3", "k4") if of_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4")
     coefficients = [number(key) if key in values else 0.0 for key in keys]
@@ -406,6 +412,7 @@ def _find_moments(
     two images of one camera and one moment, and for several images of a camera where nothing tells
     which were taken together.
     """
+    # which moment and which camera an image is of; a camera without a name is known by its pose
     key, times = _values(frames, MOMENT_KEYS, file)
     owner, owners = _values(frames, CAMERA_KEYS, file)
     if not owner:
@@ -416,6 +423,7 @@ def _find_moments(
     first: dict[Any, int] = {}
     again = [(first.setdefault(each, i), i) for i, each in enumerate(owners)]
     repeated = next(((a, b) for a, b in again if a != b), None)
+    # without times, one camera has a moment for each image, and several cameras one moment
     if not key and len(first) == 1:
         return list(range(len(frames))), 1
     if not key and repeated is not None:
@@ -429,6 +437,7 @@ def _find_moments(
             "frames",
             f"{problem}: expected timestep_index or time in each frame to tell which are of one",
         )
+    # at most one image of a camera at a moment
     ranks = _ranks(times, key, file) if key else [0] * len(frames)
     taken: dict[Any, int] = {}
     for i, moment in enumerate(zip(owners, ranks, strict=True)):

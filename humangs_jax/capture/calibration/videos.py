@@ -66,12 +66,13 @@ class _Shown(NamedTuple):
     shape: str = ""
     """ffmpeg's filter that makes pixels square."""
     matrix: str = "auto"
+    """ffmpeg's name of the matrix from YCbCr to RGB."""
     encoding: Encoding | None = None
-    """Of colors that are not sRGB's."""
+    """Encoding of colors that are not sRGB's, or None."""
     about: str = ""
     """The colors, in words."""
     rate: float | None = None
-    """Frames a second in the mean."""
+    """Mean frames a second, or None."""
     from_zero: bool = False
     """Whether times of such files count from their beginning."""
 
@@ -80,9 +81,13 @@ class VideoPhotos(NamedTuple):
     """Folders of photos and masks, and what is to be told about how they came from videos."""
 
     images: Path
+    """Folder of photos."""
     masks: Path | None
+    """Folder of masks, or None."""
     notes: tuple[str, ...] = ()
+    """How they came from videos, a line each."""
     warnings: tuple[str, ...] = ()
+    """What videos lack, a line each."""
 
 
 @contextlib.contextmanager
@@ -100,6 +105,7 @@ def photos_of_videos(
     Raises: CaptureError naming the video, also if every or most ask something of folders that hold
     none.
     """
+    # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None
     given = {"images": images} if masks is None else {"images": images, "masks": masks}
     if not asked:
@@ -123,6 +129,7 @@ def photos_of_videos(
             lonely[0],
             "expected a video of photos and one of masks, or folders of both",
         )
+    # frames of each camera, those of one moment under one number
     beside = next(folder for folder in place.resolve().parents if folder.is_dir())
     with tempfile.TemporaryDirectory(dir=beside, prefix=f".{place.name}.video-") as temporary:
         own, mattes = Path(temporary) / "images", Path(temporary) / "masks"
@@ -449,6 +456,7 @@ def _small_frames(
     """Frames as ffmpeg's format `pixels` has them, see `grey_frames` and `color_frames`."""
     with reading(path, "video", CaptureError):
         width, height = _frame_size(path, _shown(path))
+        # frames of the size that is wanted, raw, through a pipe
         room, scale = (
             limits().video_pixels // (width * height),
             min(1.0, longer_side / max(width, height)),
@@ -463,6 +471,8 @@ def _small_frames(
             subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said) as process,
         ):
             assert process.stdout is not None
+            # a video that does not end is stopped by the clock, and one of too many pixels while it
+            # is read
             clock, count = threading.Timer(LONGEST_SECONDS, process.kill), 0
             clock.start()
             try:

@@ -60,14 +60,14 @@ window.
 
 
 class Crop(NamedTuple):
-    """A square of the photo.
-
-    center: (2,) pixels; side: pixels; angle: radians, by which its upright is turned clockwise.
-    """
+    """A square of the photo."""
 
     center: Float[np.ndarray, "2"]
+    """Middle of the square, (2,), pixels."""
     side: float
+    """Length of its sides, pixels."""
     angle: float
+    """Radians by which its upright is turned clockwise."""
 
     @property
     def turn(self) -> Float[np.ndarray, "2 2"]:
@@ -85,14 +85,14 @@ class Crop(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """A person in a window. score: in [0, 1].
-
-    hips, head: (2,) pixels; the second is a point at the body's size from the hips.
-    """
+    """A person in a window."""
 
     score: float
+    """Score of the detector, in [0, 1]."""
     hips: Float[np.ndarray, "2"]
+    """Middle of the hips, (2,), pixels."""
     head: Float[np.ndarray, "2"]
+    """Point whose distance from the hips is the body's size, (2,), pixels."""
 
     def crop(self) -> Crop:
         """The square that the landmark network looks at."""
@@ -103,23 +103,27 @@ class Detection(NamedTuple):
 
 
 class Landmarks(NamedTuple):
-    """What the landmark network says of a crop.
-
-    pixels: (33, 2). visibility: (33,) probability that a landmark is seen and not hidden. world:
-    (33, 3) metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
-    person of average size. presence: probability of a person.
-    mask: (256, 256) probability, of the crop. again: where the detector's points are. covered:
-    somebody else was painted over before this person was found, and may stand in front.
-    """
+    """What the landmark network finds in a crop."""
 
     pixels: Float[np.ndarray, "33 2"]
+    """Landmarks in the photo, (33, 2), pixels."""
     visibility: Float[np.ndarray, " 33"]
+    """Probability that a landmark is seen and not hidden, (33,)."""
     world: Float[np.ndarray, "33 3"]
+    """Landmarks from the middle of the hips in the camera's axes (x right, y down, z away), of a
+    person of average size, (33, 3), metres.
+    """
     presence: float
+    """Probability of a person."""
     mask: Float[np.ndarray, "256 256"]
+    """Probability of the person in the crop, (256, 256)."""
     crop: Crop
+    """The crop."""
     again: Detection
+    """The detector's points, found again by the landmark network."""
     covered: bool = False
+    """Whether somebody else was painted over before this person was found, and may stand in front.
+    """
 
 
 def available() -> bool:
@@ -344,7 +348,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _silent() -> Generator[None]:
-    """Without the line that LiteRT's C++ prints on standard error when it starts."""
+    """Silences the line that LiteRT's C++ prints on standard error when it starts."""
     sys.stderr.flush()
     try:
         kept = os.dup(2)
@@ -412,20 +416,22 @@ SEEN = 0.5
 
 
 class DetectedPerson(NamedTuple):
-    """A person in a photo.
-
-    pixels: (33, 2) landmarks, the centre of the first pixel at (0.5, 0.5). visibility: (33,) in [0,
-    1]. world: (33, 3) metres from the middle of the hips in the camera's axes, of a person of
-    average size. presence: in [0, 1]. mask: (h, w) probability.
-    side: pixels of the crop that holds the person.
-    """
+    """A person in a photo."""
 
     pixels: Float[np.ndarray, "33 2"]
+    """Landmarks, (33, 2), pixels, the centre of the first pixel at (0.5, 0.5)."""
     visibility: Float[np.ndarray, " 33"]
+    """Visibility of the landmarks, (33,), in [0, 1]."""
     world: Float[np.ndarray, "33 3"]
+    """Landmarks from the middle of the hips in the camera's axes, of a person of average size, (33,
+    3), metres.
+    """
     presence: float
+    """Probability of a person, in [0, 1]."""
     mask: Float[np.ndarray, "h w"]
+    """Probability of the person, (h, w)."""
     side: float
+    """Side of the crop that holds the person, pixels."""
 
 
 def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[DetectedPerson]:
@@ -627,10 +633,12 @@ def _on_mask(
 
 
 def _shared(person: Landmarks, other: Landmarks, width: int, height: int) -> float:
+    """Returns the share of a person's mask that another person's covers too."""
     own = person.crop.to_photo(np.argwhere(person.mask > SEEN)[:, ::-1] / LANDMARK_SIZE)
     own = own[_inside(own, width, height)]
     return float(np.mean(mask_at(other, own) > SEEN)) if len(own) else 0.0
 
 
 def _inside(pixels: Float[np.ndarray, "n 2"], width: int, height: int) -> Bool[np.ndarray, " n"]:
+    """Returns which pixels lie in the photo."""
     return np.all((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5), axis=-1)

@@ -34,12 +34,14 @@ def sharpened(
     rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     if not len(rows):
         return mask
+    # the window around the mask, with what the filter sees of its surroundings
     margin = filter_margin(pixel)
     window = tuple(
         slice(max(int(each[0]) - margin, 0), int(each[-1]) + 1 + margin) for each in (rows, columns)
     )
     guide, own = photo[window], np.clip(mask[window] * 0.5 / LEVEL, 0, 1)
     height, width = own.shape
+    # the filter's coefficients, of the reduced photo
     reduced = min(1.0, MOST / pixel)
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
     small = (resized(guide, *size), resized(own, *size)) if reduced < 1 else (guide, own)

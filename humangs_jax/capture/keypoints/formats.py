@@ -334,7 +334,8 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
             entry[key], file, f"{field}.{key}", (count, 3), nulls=True
         )
         person = points("keypoints", None) if entry["keypoints"] else np.zeros((0, 3))
-        if len(person) == 25:  # BODY_25, perhaps with hands
+        # BODY_25, perhaps with hands
+        if len(person) == 25:
             hands = [
                 points(key, 21) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS
             ]
@@ -406,10 +407,12 @@ def _result_images(entries: list[Any], file: Path) -> list[DetectedImage]:
 def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage]:
     """Crowds, and annotations without keypoints, are ignored."""
     described, annotations = members(content, file, images=list, annotations=list)
+    # images first: annotations name them by their id
     images: dict[str | int, tuple[dict[str, Any], list[Float[np.ndarray, "k 3"]]]] = {}
     for i, image in enumerate(described):
         expect(image, dict, file, f"images[{i}]")
         images[_image_label(image.get("id"), file, f"images[{i}].id")] = (image, [])
+    # people of each image
     whole = _whole_body(annotations)
     for i, entry in enumerate(annotations):
         field = f"annotations[{i}]"

@@ -52,32 +52,34 @@ _BODY_25 = (
 
 @dataclasses.dataclass(frozen=True)
 class KeypointSet:
-    """The points of a detector: their names in its order, and for each the index of its mirror
-    image.
-
-    A point in the middle of the body is its own mirror image. places: on the body, of points that
-    may lie elsewhere than `body.landmarks` has them: where the detector is known to see them, or a
-    fit has found that it does. certainty: (k,) of the points, the reciprocal of their noise over
-    that of all, if a fit has found it; none: as usual.
-    """
+    """The points of a detector, in its order."""
 
     name: str
+    """Name of the set, as our npz files have it."""
     names: tuple[str, ...]
+    """Names of the k points."""
     mirror: tuple[int, ...]
+    """Index of each point's mirror image; a point in the middle of the body is its own."""
     places: tuple[Place, ...] = ()
+    """Places on the body of points that may lie elsewhere than `body.landmarks` has them: where the
+    detector is known to see them, or a fit has found that it does.
+    """
     certainty: tuple[float, ...] = ()
+    """Certainty of the points, (k,), the reciprocal of each one's noise over that of all, if a fit
+    has found it; empty: as usual.
+    """
 
     @property
     def offsets(self) -> Float[np.ndarray, "k 3"]:
-        """Of the places of the points, metres; 0 for points without."""
+        """The offsets of the points' places, metres; 0 for points without a place."""
         known = {place.name: place.offset for place in self.places}
         return np.asarray([known.get(name, (0.0, 0.0, 0.0)) for name in self.names])
 
     def adapted(
         self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]
     ) -> "KeypointSet":
-        """The set as a detector is found to use it: with these offsets of the places, metres, and
-        this certainty.
+        """Returns the set as a detector is found to use it: with these offsets of the places,
+        metres, and this certainty.
         """
         own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
         places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
@@ -250,55 +252,56 @@ HALF_PIXEL = 0.5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Keypoints:
-    """One person's keypoints in each of v views (numpy on the host).
-
-    points: (v, k, 2) float32 pixels, x right and y down, the centre of the first pixel at (0.5,
-        0.5); finite, and to be ignored where the confidence is 0.
-    confidences: (v, k) float32 in [0, 1]; 0: the point is missing.
-    set: what the k points are. world: (v, k, 3) metres, where the detector has said it: a person of
-        average size, in axes whose z is the ray to the person, up to a translation. missing: names
-        of the views that the file has nothing for.
-    warnings: problems of a file that could be read, a line each.
-    """
+    """One person's keypoints in each of v views (numpy on the host)."""
 
     points: Float[np.ndarray, "v k 2"]
+    """Detections, (v, k, 2), float32 pixels, x right and y down, the centre of the first pixel at
+    (0.5, 0.5); finite, and to be ignored where the confidence is 0.
+    """
     confidences: Float[np.ndarray, "v k"]
+    """Confidences, (v, k), float32 in [0, 1]; 0: the point is missing."""
     set: KeypointSet
+    """What the k points are."""
     missing: tuple[str, ...] = ()
+    """Names of the views that the file has nothing for."""
     world: Float[np.ndarray, "v k 3"] | None = None
+    """The detector's 3D landmarks, (v, k, 3), metres, if it gives any: a person of average size, in
+    axes whose z is the ray to the person, up to a translation.
+    """
     warnings: tuple[str, ...] = ()
+    """Problems of a file that could be read, a line each."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DetectedImage:
-    """The people in one image.
-
-    image: its name or path as the file has it, or a number where the file has no more.
-    file: that the people are from. size: (width, height) in pixels where the file states it.
-    people: each (k, 3): x and y in pixels of the tool, confidence; not yet checked, so that NaN and
-        null are NaN. Or (k, 6), with `Keypoints.world`.
-    """
+    """The people in one image."""
 
     image: str | int
+    """Name or path of the image as the file has it, or a number where the file has no more."""
     file: Path
+    """File that the people are from."""
     people: tuple[Float[np.ndarray, "k columns"], ...]
+    """Points of each person: (k, 3), x and y in pixels of the tool and confidence, not yet checked,
+    so that NaN and null are NaN; or (k, 6), with `Keypoints.world`.
+    """
     size: tuple[int, int] | None = None
+    """(width, height) in pixels, where the file states it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Detections:
-    """The images of a file or folder. offset: pixels to add to x and y so that pixel centres are at
-    +0.5.
-
-    set: None if no image has a person. warnings: what is to be said, a line each. tool: that has
-    written the files, where they say so.
-    """
+    """The images of a file or folder."""
 
     set: KeypointSet | None
+    """What the points are; None if no image has a person."""
     images: tuple[DetectedImage, ...]
+    """The images."""
     offset: float = HALF_PIXEL
+    """Pixels to add to x and y so that pixel centres are at +0.5."""
     warnings: tuple[str, ...] = ()
+    """Problems of the files, a line each."""
     tool: str = ""
+    """Tool that has written the files, where they say so."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -308,7 +311,7 @@ class Source:
     path: Path
     """The file."""
     name: str
-    """Of the image or video that it may be of: the path in its folder without the suffix."""
+    """Name of the image or video that it may be of: the path in its folder without the suffix."""
     alone: bool
     """Whether no other file is read with it: the frames of a video are known by their number, else
     by name/number.

@@ -28,11 +28,12 @@ class Order(NamedTuple):
     """Points of the body in the order of a model, and what it is called."""
 
     name: str
+    """What the order is called."""
     points: tuple[str, ...]
+    """Names of the points, in this order."""
     set: KeypointSet
-    """What they become, with hands.
-
-    It has the same points of the body, perhaps in its own order.
+    """The set that they become, with hands. It has the same points of the body, perhaps in another
+    order.
     """
 
 

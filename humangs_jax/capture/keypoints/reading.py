@@ -150,10 +150,12 @@ def _read(
     detections = read_detections(path)
     if (kind := detections.set) is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
+    # the image of each view; scores of another scale are divided by the largest
     images = _images_of_views(path, detections, names, width, height)
     scores = np.concatenate([each[:, 2] for image in detections.images for each in image.people])
     largest = float(scores[np.isfinite(scores)].max(initial=0.0))
     largest = largest if largest > OVERSHOOT else 1.0
+    # the person of each view, or the only one; several need an answer from the user
     body = np.asarray([name in TRUNK_AND_LIMBS for name in kind.names])
     columns = max(each.shape[1] for image in detections.images for each in image.people)
     raw, values = np.zeros((2, len(names), len(kind.names), columns))
@@ -181,6 +183,7 @@ def _read(
             f"person {person}",
             f"no view has this many people: expected 0 to {max(most - 1, 0)}",
         )
+    # what cannot be used is counted, and refused if nothing is left
     points, confidences = values[..., :2].astype(np.float32), values[..., 2].astype(np.float32)
     missing = tuple(name for name, row in zip(names, confidences, strict=True) if not row.any())
     finite = np.isfinite(raw).all(axis=-1)
@@ -198,6 +201,7 @@ def _read(
         problem = f"no coordinate exceeds {NORMALIZED:g}: expected pixels, not shares of the image"
         hint = " (OpenPose: --keypoint_scale 0)" if detections.tool else ""
         raise CaptureError(path, "", problem + hint)
+    # what the user should know
     shifted = _shifted(images, names)
     lines = (
         (missing, f"no keypoints of {len(missing)} views: {few(missing)}"),
@@ -331,6 +335,7 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     Raises: ValueError if two images are of one view, or a number could mean two views.
     """
     find = _finder(names)
+    # mere numbers in order, if there is one for every view
     numbers = sorted({image for image in images if isinstance(image, int)})
     of_names = sorted(int(found[-1]) for name in names if (found := re.findall(r"\d+", name)))
     one_for_each = (
@@ -338,12 +343,14 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     )
     shift = of_names[0] - numbers[0] if one_for_each else 0
     found = {image: find(image + shift if isinstance(image, int) else image) for image in images}
+    # a number that could be of two views is refused
     for image, views in found.items():
         if len(views) > 1:
             both = " and ".join(repr(names[view]) for view in views[:2])
             raise ValueError(
                 f"image number {image} could be view {both}: expected file names instead of numbers"
             )
+    # frames of a video that are counted from the other number
     videos: dict[str, list[tuple[int, str | int]]] = {}
     for image in found:
         prefix, number = _split_number(str(_stem(image))) if isinstance(image, str) else ("", None)
@@ -364,6 +371,7 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
         all_of_one = all(len(views) == 1 for views in moved.values()) and len(prefixes) == 1
         if all_of_one and sum(each in prefixes for each in of_view) == len(frames):
             found |= moved
+    # at most one image for a view
     owner: dict[int, str | int] = {}
     matched = [found[image][0] if found[image] else None for image in images]
     for image, view in zip(images, matched, strict=True):
