@@ -14,8 +14,9 @@ from humangs_jax.core.array_types import Float, Int, UInt
 from humangs_jax.io.reading import Refused
 
 PHOTOS = 8
-"""A person from all sides."""
+"""Photos of a video in which nobody was found: a person from all sides."""
 WINDOWS = 64
+"""Windows of time, of which each offers its sharpest frame."""
 LONGER_SIDE = 480
 """Pixels of the frames that are looked at: blur that does not show there does not hurt."""
 CELLS = 24
@@ -103,7 +104,7 @@ USUAL = 0.15
 half.
 """
 WORTHLESS = 0.1
-"""Of a frame in which the person strikes another pose than in most."""
+"""Least worth of a frame in which the person strikes another pose than in most."""
 
 
 def directions_of(

@@ -62,12 +62,14 @@ from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
 from humangs_jax.io.reading import check_limit, reading, write_json
 
 SIZES_SHOWN = 5
-"""In a report."""
+"""Sizes of photos that a report lists."""
 NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with a pose of its own"
+"""Warning about a file with a camera for each image."""
 NO_COMMON_FRAME = (
     "no two cameras have a photo of the same frame: photos of one frame must have the same file"
     " name"
 )
+"""Warning about a folder of photos by camera."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,9 +20,12 @@ GAP = 1.5
 """Steps between two frames, beyond which frames are missing between them."""
 SAME_RATE = 0.01
 """Share by which the steps of cameras of one rate differ."""
-LATE, MOST_LATE = 0.1, 3.0
-"""Seconds after the first frames of others, between which a camera lacks its first ones: encoders
-shift them by less, and what counts time from elsewhere by more."""
+LATE = 0.1
+"""Seconds after the first frames of others from which on a camera lacks its first ones: encoders
+shift them by less.
+"""
+MOST_LATE = 3.0
+"""Seconds up to which this holds: a video that begins later counts time from elsewhere."""
 USUAL_STEP = 1 / 30
 """Seconds between two frames, where no video tells."""
 

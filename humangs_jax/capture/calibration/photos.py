@@ -44,6 +44,7 @@ SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO
 do.
 """
 LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
+"""How photos of named cameras are stored, for errors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,8 +317,10 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
 
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
 """Clockwise quarter turns that a flag asks for."""
-MIRRORED, MIRROR = {2: 1, 4: 3, 5: 6, 7: 8}, 2
-"""Flags that mirror besides, and those that only turn; and the one that only mirrors."""
+MIRRORED = {2: 1, 4: 3, 5: 6, 7: 8}
+"""Flags that mirror besides turning, and those that only turn so."""
+MIRROR = 2
+"""The flag that only mirrors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -502,10 +505,13 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
 AROUND = 0.8
 """Share of a photo's border that no person covers: a mask that does is inverted."""
 EMPTY = "the mask is empty, the photo will be left out"
+"""Warning about a mask without a person."""
 FULL = "the mask covers the whole photo: is nothing of it background?"
+"""Warning about a mask that is all person."""
 INVERTED = (
     "the mask covers the border of the photo: is it inverted? expected 255 where the person is"
 )
+"""Warning about a mask whose border is person."""
 
 
 def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:

@@ -190,9 +190,11 @@ def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------------------
 
 MATRIX = "opencv-matrix"
+"""The tag of matrices."""
 YAML_TAG = "tag:yaml.org,2002:"
 """What `!!` stands for."""
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
+"""How a number is written."""
 TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
 """A key of a flow map with its value right behind the colon."""
 
@@ -303,6 +305,7 @@ PANOPTIC_KEYS = {
     "t": "T",
     "resolution": "imgSize",
 }
+"""Panoptic's keys -> OpenCV's."""
 
 
 def recognizes_panoptic(source: Source) -> bool:
@@ -329,8 +332,8 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
 # -------------------------------------------
 
 RELATIVE = "_to_"
-"""Between the names of two cameras: the pose of the first, in the axes of the second, as X_first =
-R X_second + T.
+"""What stands between the names of two cameras: the key is the pose of the first, in the axes of
+the second, as X_first = R X_second + T.
 """
 
 
@@ -406,6 +409,7 @@ TOML_KEYS = {
     "size": "imgSize",
     "fisheye": "fisheye",
 }
+"""Keys of a table -> OpenCV's."""
 
 
 def recognizes_toml(source: Source) -> bool:
@@ -450,8 +454,11 @@ def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
 # ------------------------------------------------------------------------------------------
 
 SUBPIXELS = 64.0
+"""Units of intrinsics per pixel."""
 METRES = 1e-3
+"""Metres per unit of places."""
 LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
+"""Attributes of Brown and Conrady's coefficients k1, k2, p1, p2."""
 
 
 def recognizes_qualisys(source: Source) -> bool:

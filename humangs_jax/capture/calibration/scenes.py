@@ -42,8 +42,8 @@ from humangs_jax.data.formats import CameraFormat
 from humangs_jax.io.reading import Refused, read_bytes, reading, shown
 
 Registered = tuple[str, str, str, Sequence[float], np.ndarray]
-"""Of an image: where it stands, its name, the number of the camera, quaternion and translation, (n,
-3) points as x y id.
+"""An image: where it stands, its name, the number of the camera, quaternion and translation, (n, 3)
+points as x y id.
 """
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -60,7 +60,7 @@ PARAMETERS = {
 NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), PARAMETERS, strict=True))
 """Camera models by their numbers in cameras.bin."""
 UNDISTORTED = tuple(PARAMETERS)[:5]
-"""Those whose photos `import_cameras` undistorts."""
+"""Camera models whose photos `import_cameras` undistorts."""
 
 
 def read_colmap(source: Source, format: CameraFormat) -> Calibration:
@@ -154,7 +154,7 @@ def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, 
 
 
 GREY = (128.0, 128.0, 128.0)
-"""Of points whose line has no color."""
+"""Color of points whose line has none, of 255."""
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
@@ -280,11 +280,13 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
 # --------------------------------------------------------------------------------------------------
 
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+"""Values of `camera_model` for lenses that are read."""
 FISHEYE_MODEL = "OPENCV_FISHEYE"
+"""The value for a fisheye."""
 MASK_KEYS = ("fg_mask_path", "mask_path")
-"""Of VHAP and of nerfstudio."""
+"""Keys of a mask's path, of VHAP and of nerfstudio."""
 MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
-"""Keys of a whole K, of a frame or of the file."""
+"""Keys of a whole K, in a frame or in the file."""
 
 
 def recognizes_transforms(source: Source) -> bool:
@@ -397,10 +399,13 @@ MOMENT_KEYS = (
     "time_id",
     "timestep_id",
 )
+"""Keys of the time of an image, the first that is there is taken."""
 CAMERA_KEYS = ("camera_index", "camera_id", "cam_id", "camera_label")
+"""Keys of the camera of an image, the first that is there is taken."""
 SAME_TIME = 1e-6
 """Times that differ by less are one moment written twice."""
 SAME_POSE = 1e-9
+"""Poses are rounded to multiples of this to be compared."""
 
 
 def _find_moments(

@@ -39,7 +39,7 @@ CONTAINERS = "mov,matroska,avi,mpegts"
 playlists).
 """
 LONGEST_SECONDS = 3600
-"""After which ffmpeg is stopped."""
+"""Seconds after which ffmpeg is stopped."""
 
 
 def find_videos(folder: Path) -> dict[str, Path]:
@@ -328,20 +328,25 @@ def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
 # ---------------------------------------------------------------------------------------
 
 STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
+"""ffmpeg's line about the stream of pictures."""
 COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
 """Matrix, primaries and curve, behind the format of pixels: yuv420p10le(tv,
 bt2020nc/bt2020/arib-std-b67, progressive).
 """
 PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
+"""Sides of a pixel, width to height."""
 RATE = re.compile(r", ([\d.]+)(k?) fps\b")
+"""Frames a second, perhaps in thousands."""
 PRIMARIES = {"bt2020": 9, "smpte432": 12}
+"""ffmpeg's names of primaries -> numbers of H.273; videos of others are shown as sRGB."""
 TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
-"""ffmpeg's names of what H.273 numbers; videos of all others are shown as sRGB."""
+"""ffmpeg's names of transfer curves -> numbers of H.273; videos of others are shown as sRGB."""
 WIDEST_PIXEL = 4
 """Sides of a pixel that is not square, over each other; the widest in use is 2."""
 SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
-"""Only makes frames larger: nothing is lost."""
+"""Filter that makes pixels square. It only makes frames larger: nothing is lost."""
 TABLE = "colors.cube"
+"""Temporary file of a table of colors."""
 
 
 def _shown(path: Path) -> _Shown:

@@ -8,8 +8,10 @@ from humangs_jax.io.images import resized
 
 LONGEST = 512
 """Pixels: longest side of the photo in which colors are spread; the detector sees no more."""
-NEAR, FAR = 1 / 32, 1 / 8
-"""Of the longest side: standard deviations over which colors spread, and where none is so near."""
+NEAR = 1 / 32
+"""Standard deviation over which colors spread, a share of the longest side."""
+FAR = 1 / 8
+"""The same where no color is so near."""
 LEAST_NEAR = 1e-3
 """Weight of the colors nearby below which those far away count."""
 

@@ -35,28 +35,32 @@ import numpy as np
 from humangs_jax.capture.detection.painting import painted_over
 from humangs_jax.core.array_types import Bool, Float
 
-DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_heavy.tflite"
-"""Files of `assets/blazepose`.
-
-The lite and full landmark networks exchange left and right often, heavy hardly ever.
+DETECTOR = "pose_detection.tflite"
+"""File of the detector in `assets/blazepose`."""
+LANDMARKS = "pose_landmark_heavy.tflite"
+"""File of the landmark network. The lite and full ones exchange left and right often, heavy hardly
+ever.
 """
-DETECTOR_SIZE, LANDMARK_SIZE = 224, 256
-"""Pixels a side of the two networks' inputs."""
+DETECTOR_SIZE = 224
+"""Pixels a side of the detector's input."""
+LANDMARK_SIZE = 256
+"""Pixels a side of the landmark network's input."""
 LANDMARK_COUNT = 33
+"""Landmarks of a person."""
 ALIGNMENT = 6
 """The landmark network's further points; the first two are the detector's, found again."""
 STRIDES = ((8, 2), (16, 2), (32, 6))
-"""Of the detector's grids, and how many anchors a cell has."""
+"""Strides of the detector's grids, pixels, and how many anchors a cell has."""
 LEAST_SCORE = 0.5
-"""Of a detection."""
+"""Least score of a detection."""
 SAME_BOX = 0.3
 """Intersection over union from which on detections of one window are one person."""
 ENLARGED = 1.25
 """Side of the crop over the diameter of the circle through the detector's second point."""
-PEAK, WINDOW = 0.5, 7
-"""Least height of the heatmap around a landmark that is moved to the centroid, and side of the
-window.
-"""
+PEAK = 0.5
+"""Least height of the heatmap around a landmark that is moved to the centroid."""
+WINDOW = 7
+"""Side of the window of the centroid, pixels of the heatmap."""
 
 
 class Crop(NamedTuple):
@@ -367,44 +371,51 @@ def _silent() -> Generator[None]:
 # All people of a photo
 # -------------------------------------------------------------------------------------------------
 
-SHARES, SMALL_SHARES = (1.0, 0.5), (0.25,)
-"""Sides of the windows over the photo's longer side; the second, most of all windows, where nobody
-is large.
-"""
+SHARES = (1.0, 0.5)
+"""Sides of the windows over the photo's longer side."""
+SMALL_SHARES = (0.25,)
+"""Sides of further windows where nobody is large; these are most of all windows."""
 LARGE = 0.4
-"""Of the photo's longer side. Windows of a half find people from a sixth of it on, whose crops are
-a fifth: whoever needs smaller windows has at most a quarter of the pixels of a person with a crop
-of two fifths, and is not the one who is meant."""
+"""Side of a large person's crop over the photo's longer side. Windows of a half find people from a
+sixth of it on, whose crops are a fifth: whoever needs smaller windows has at most a quarter of the
+pixels of a person with a crop of two fifths, and is not the one who is meant.
+"""
 SMALLEST = 0.06
-"""Of the photo's longer side: a person whose crop is smaller is somebody in the background, or
-nobody.
+"""Side of a crop over the photo's longer side below which the person is somebody in the background,
+or nobody.
 """
 MOST_CROPS = 16
-"""The landmark network looks at, best detections first."""
-SAME_HIPS, SAME_SIZE = 0.15, 1.6
-"""Two detections are one person if their hips are nearer than this share of the larger crop, and
-the sides of the crops differ by at most this factor."""
-LEAST_PRESENCE, LEAST_ON_MASK, MOST_SHARED = 0.95, 0.8, 0.5
-"""Of a person: presence; share of the landmarks in the photo that lie on the mask; share of the
-smaller mask that both have. Measured on 8 photos of a laboratory with 2 to 3 people each: legs,
-lamps and chairs that the detector takes for people have 0.69 to 0.88, 0.33 to 0.76 or 0.77 to 0.94;
-people 0.999, 0.94 and 0.02 at the worst."""
+"""Crops that the landmark network looks at, best detections first."""
+SAME_HIPS = 0.15
+"""Two detections are one person if their hips are nearer than this share of the larger crop."""
+SAME_SIZE = 1.6
+"""Factor by which the sides of the crops of one person differ, at most."""
+LEAST_PRESENCE = 0.95
+"""Least presence of a person. Measured on 8 photos of a laboratory with 2 to 3 people each: legs,
+lamps and chairs that the detector takes for people have 0.69 to 0.88, people 0.999 at the worst.
+"""
+LEAST_ON_MASK = 0.8
+"""Least share of the landmarks in the photo that lie on the mask: there 0.33 to 0.76, people 0.94.
+"""
+MOST_SHARED = 0.5
+"""Largest share of the smaller mask that two people both have: there 0.77 to 0.94, people 0.02."""
 LARGER = 1.25
 """Side of the second crop over the first, at the most: the mask has 256 pixels a side, whatever the
 side.
 """
-MOST_LOOKS, SETTLED = 4, 0.05
-"""Looks of the landmark network at a person, at most, and the drift of the crop (see `_settled`)
-below which it has found it.
-"""
+MOST_LOOKS = 4
+"""Looks of the landmark network at a person, at most."""
+SETTLED = 0.05
+"""Drift of the crop (see `_settled`) below which it has found the person."""
 LEAST_ON_REST = 0.6
 """`LEAST_ON_MASK` for a person who is partly painted over, whose mask then has holes."""
 PAINTED = 0.4
 """Probability from which on a pixel of a mask is painted over; the detector's masks end there."""
 MARGINS = (1 / 150, 1 / 100)
-"""Of the longest side: how far what is painted reaches beyond a mask; the second is tried where the
-first shows nobody. Too little leaves a rim that looks like a person, too much hides who stands
-behind."""
+"""How far what is painted reaches beyond a mask, shares of the longest side; the second is tried
+where the first shows nobody. Too little leaves a rim that looks like a person, too much hides who
+stands behind.
+"""
 MOST_PAINTINGS = 8
 """Times that a photo is painted over, at most."""
 LEAST_SIZE = 0.4

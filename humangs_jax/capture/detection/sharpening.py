@@ -12,13 +12,13 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.io.images import resized
 
 LEVEL = 0.4
-"""Of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands
+"""Value of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands
 and feet.
 """
-RADIUS, EPSILON = 2.0, 1e-4
-"""Of the filter: half side of its windows in pixels of the detector's mask, and variance of
-colors that is no edge.
-"""
+RADIUS = 2.0
+"""Half side of the filter's windows, pixels of the detector's mask."""
+EPSILON = 1e-4
+"""Variance of colors that is no edge."""
 STEEPER = 2.0
 """The filter's masks rise more slowly than true ones by this factor."""
 MOST = 2.0

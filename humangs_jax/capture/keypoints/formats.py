@@ -47,9 +47,12 @@ from humangs_jax.data.formats import SourceFormat
 from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.reading import check_limit, limits, shown, write_json
 
-FORMAT, VERSION = "humangs-people", 1
+FORMAT = "humangs-people"
+"""Name of the format in its files."""
+VERSION = 1
+"""Version of the format that is written and read."""
 DECIMALS = 4
-"""Of numbers in the file: a ten-thousandth of a pixel, a tenth of a millimetre."""
+"""Decimals of numbers in the file: a ten-thousandth of a pixel, a tenth of a millimetre."""
 
 
 def recognizes_own(source: Source) -> bool:
@@ -224,11 +227,13 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
 SUFFIX = "_keypoints"
 """What OpenPose adds to the name of the image."""
 HANDS_OF_OPENPOSE = {"hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
-"""The face, if it is there, is not read."""
-BODY, BODY_POINTS = "pose_keypoints_2d", (25, 18)
-"""Of the body: the models BODY_25 and BODY_25B, and COCO."""
+"""Keys of the hands, and how many points they have. The face, if it is there, is not read."""
+BODY = "pose_keypoints_2d"
+"""Key of the body."""
+BODY_POINTS = (25, 18)
+"""Points of the body in the models BODY_25 and BODY_25B, and in COCO."""
 OTHER_MODELS = {15: "MPI", 135: "BODY_135", 20: "an animal of ControlNet"}
-"""What has other numbers of points."""
+"""Models with other numbers of points, which are refused by name."""
 
 
 def recognizes_openpose(source: Source) -> bool:
@@ -313,6 +318,7 @@ def _parts(
 # --------------------------------------------------------------------------------------------------
 
 EASYMOCAP_HANDS = ("handl2d", "handr2d")
+"""Keys of the left and the right hand."""
 MOST_PEOPLE = 64
 """People are in the order of their IDs; beyond this many an ID is no count."""
 
@@ -371,8 +377,9 @@ COCO_PARTS = {
 }
 """COCO-WholeBody's, in the order of its 133 points."""
 HIDDEN_CONFIDENCE = 0.5
-"""For points that an annotator guessed behind something else."""
+"""Confidence of points that an annotator guessed behind something else."""
 LARGEST_VISIBILITY = 2
+"""COCO's visibility of a point that is seen; 1 is hidden, 0 not annotated."""
 
 
 def recognizes_coco(source: Source) -> bool:

@@ -32,9 +32,13 @@ from humangs_jax.data.capture_checks import CaptureError, checked_json, file_num
 from humangs_jax.data.formats import KEYPOINTS
 
 SIDES = ("left", "right")
+"""The person's left and right."""
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+"""Fingers in the order of OpenPose's hands."""
 FINGER_JOINTS = ("1", "2", "3", "tip")
+"""Points of a finger, from the palm to the tip."""
 FACE_POINTS = 68
+"""Number of 300-W's landmarks of the face."""
 
 _FOOT = ("big_toe", "small_toe", "heel")
 _FEET = tuple(f"{side}_{part}" for side in SIDES for part in _FOOT)

@@ -69,8 +69,9 @@ CLEARLY_SHORTER = 1.15
 """How much longer the bones must be on average in any other order. 99 % of single people in random
 poses, seen from anywhere, with errors of 1 % of their height, have more."""
 LONGEST_BONES = 0.36
-"""Of the size of a person on average. Of people in random poses it is 0.13 to 0.3, where only the
-trunk is seen 0.25 to 0.35; of points without an order 0.52."""
+"""Mean length of bones above which no order is known, sizes of a person. Of people in random poses
+it is 0.13 to 0.3, where only the trunk is seen 0.25 to 0.35; of points without an order 0.52.
+"""
 FEWEST_BONES = 6
 """Bones of all people together below which no order is known."""
 CONFIDENT = 0.1

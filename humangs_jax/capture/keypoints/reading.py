@@ -32,17 +32,23 @@ NORMALIZED = 2.0
 """If no coordinate of any view reaches this many pixels, they are no pixels but shares of the
 image.
 """
-OVERSHOOT, LARGEST_SCORE = 1.1, 20.0
+OVERSHOOT = 1.1
 """Heat maps overshoot 1 a little (1.02 is common) and undershoot 0. Larger scores are of another
 scale, such as the maxima of SimCC heads (RTMPose, RTMW, DWPose), and are divided by the largest of
-the file; those beyond that are no scores."""
+the file.
+"""
+LARGEST_SCORE = 20.0
+"""Numbers beyond this are no scores."""
 SMALLEST_CONFIDENCE = -1.0
-CLEAR_CONFIDENCE, CLEAR_SHARE = 0.3, 0.25
-"""A detection of more than this mean confidence and share of the points of `TRUNK_AND_LIMBS` is a
-person, others are a detector's ghosts. Hands, face and feet do not count: detectors leave them out
+"""Numbers below this are no confidences, see `OVERSHOOT`."""
+CLEAR_CONFIDENCE = 0.3
+"""Mean confidence above which a detection is a person; others are a detector's ghosts."""
+CLEAR_SHARE = 0.25
+"""Share of the points of `TRUNK_AND_LIMBS` that a person has more of."""
+TRUNK_AND_LIMBS = frozenset(COCO_17.names)
+"""Points that tell people from ghosts. Hands, face and feet do not count: detectors leave them out
 where they are small, or were not asked for them.
 """
-TRUNK_AND_LIMBS = frozenset(COCO_17.names)
 FAR_OUTSIDE = 0.5
 """Detectors extrapolate a little beyond the image.
 
