@@ -46,9 +46,20 @@ from humangs_jax.rendering.projection import ProjectedGaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists, blocks_by_length, expand
 
-X, Y, R00, R01, R11, LOG_OPACITY = range(6)
+X = 0
+"""Column of a splat's row with the x of its centre, pixels."""
+Y = 1
+"""Column with the y of the centre, pixels."""
+R00 = 2
+"""Column with the entry 00 of r, 1 / pixels."""
+R01 = 3
+"""Column with the entry 01 of r, 1 / pixels."""
+R11 = 4
+"""Column with the entry 11 of r, 1 / pixels."""
+LOG_OPACITY = 5
+"""Column with the logarithm of the opacity."""
 FEATURES = slice(6, None)
-"""Red, green, blue, z, and any others: their number is static, XLA unrolls them."""
+"""Columns of red, green, blue, z, and any others: their number is static, XLA unrolls them."""
 Z = 9
 """The column of z."""
 HALF = 0.5
@@ -205,7 +216,9 @@ def take_chunk(
 def largest_weights(
     weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid
 ) -> Float[Array, "b k"]:
-    """Of each splat on the pixels of its tile that lie inside the image."""
+    """Returns the largest weight of each splat on those pixels of its tile that lie inside the
+    image.
+    """
     place = tiles % grid.tiles
     x, y = (0.5 * grid.tile_size + offset for offset in grid.offsets())
     left = jnp.minimum(grid.width - place % grid.columns * grid.tile_size, grid.tile_size)
@@ -287,10 +300,10 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                 item, row, _, raw = take_chunk(
                     splats, items, start + i * k, count - i * k, tile, grid, k
                 )
-                raw = lax.optimization_barrier(
-                    raw
-                )  # one exp per pair: XLA would fuse it into each of its consumers
+                # one exp per pair: XLA would fuse it into each of its consumers
+                raw = lax.optimization_barrier(raw)
                 alpha = lax.optimization_barrier(visible_alpha(raw, config))
+                # features, weights and medians in one chain: `before` is T in front of splat j
                 before, weights = transmittance[:, None], []
                 for j in range(k):
                     after = before * (1 - alpha[:, None, j])
@@ -302,18 +315,22 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                         reached = (weight[:, 0] > 0) & (after[:, 0] <= HALF)
                         nearer = jnp.minimum(medians, row[:, j, Z, None])
                         medians = jnp.where(reached, nearer, medians)
+                # the largest weight of each splat on the pixels of this block
                 if config.visibility:
                     highest = largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
                     peaks = peaks.at[item].max(highest, mode="drop")
+                # T itself in a second chain; from the stop on its sign is negative
                 for j in range(k):
                     after = transmittance * (1 - alpha[:, j])
                     transmittance = jnp.where(
                         after > stop, after, jnp.minimum(transmittance, -transmittance)
                     )
+                # a list is alive while it has items left and some pixel of its tile has not ended
                 lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
                 live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
                 return i + 1, transmittance, features, lengths, live, peaks, medians
 
+            # every pixel of the block starts with T = 1 and no features
             ones = jnp.ones((block, grid.pixels), dtype)
             zeros = jnp.zeros((block, splats.shape[1] - FEATURES.start, grid.pixels), dtype)
             medians = jnp.full_like(ones, jnp.inf) if config.depth_median else None
@@ -321,6 +338,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             _, transmittance, features, lengths, _, peaks, medians = lax.while_loop(
                 lambda carry: jnp.any(carry[4]), body, carry
             )
+            # the block's tiles take their places among all tiles; padding is dropped
             results = features, jnp.abs(transmittance), lengths
             drawn = (
                 o.at[tile].set(r, mode="drop", unique_indices=True)
@@ -347,7 +365,8 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
     """(splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over pixels for each splat,
     (g, 6 + n).
 
-    They are those of e (1, dx, dy, dx^2, dx dy, dy^2), d from the splat's centre, and of w g.
+    Columns: the moments of e = dL/d log alpha about the splat's centre (1, dx, dy, dx^2, dx dy,
+    dy^2), then the gradient of the features, the sums of w g.
     """
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
@@ -368,9 +387,9 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
                 item, row, offset, raw = take_chunk(
                     splats, items, start + i * k, count - i * k, tile, grid, k
                 )
-                raw = lax.optimization_barrier(
-                    raw
-                )  # one exp per pair: XLA would fuse it into each of its consumers
+                # one exp per pair: XLA would fuse it into each of its consumers
+                raw = lax.optimization_barrier(raw)
+                # the chain of T front to back, with the decisions of the forward pass
                 weights, slopes = [], []
                 for j in range(k):
                     if j > 0 and j % LINK == 0:
@@ -445,16 +464,18 @@ not NaN.
 class Chunks(NamedTuple):
     """All lists cut into chunks of at most `CHUNK`, list by list; chunks that are not needed have
     tile t and count 0.
-
-    tiles, starts, counts: of each chunk. ends: how far into its list it reaches. steps: of B chunks
-    that hold any.
     """
 
     tiles: Int[Array, " s"]
+    """Tile of each chunk, (s,)."""
     starts: Int[Array, " s"]
+    """Place of each chunk's first item in the array of items, (s,)."""
     counts: Int[Array, " s"]
+    """Number of items in each chunk, (s,), 0 to `CHUNK`."""
     ends: Int[Array, " s"]
+    """How many items of its list come up to the end of each chunk, (s,)."""
     steps: Int[Array, ""]
+    """Number of steps of B chunks each that hold any item."""
 
 
 def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step: int) -> Chunks:
@@ -487,18 +508,22 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
 
         def draw(i, carry):
             sums, lengths, peaks, medians, tail = carry
+            # log(1 - alpha) of all pairs of this step, and log T in front of each
             c = _slice(chunks, i, step)
             item, row, _, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
             alpha, fading = _fading(raw, config)
             before, since = _sums_before(fading, c.tiles, tail)
+            # a pair counts while T behind it is above the stop
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * jnp.exp(before[:, None] + since), 0.0)
             features = [
                 jnp.sum(weights * row[..., f, None], axis=1)
                 for f in range(FEATURES.start, splats.shape[1])
             ]
+            # sums of the features and of log(1 - alpha), added to those of the tile's other chunks
             parts = jnp.stack([*features, jnp.sum(jnp.where(live, fading, 0.0), axis=1)], axis=1)
             sums = sums.at[c.tiles].add(parts, mode="drop", indices_are_sorted=True)
+            # how far the lists were used: up to the last chunk that some pixel reached
             reached = jnp.where(jnp.max(before, axis=1) > log_stop, c.ends, 0)
             lengths = lengths.at[c.tiles].max(reached, mode="drop", indices_are_sorted=True)
             if config.visibility:
@@ -509,10 +534,9 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                 medians = medians.at[c.tiles].min(nearest, mode="drop", indices_are_sorted=True)
             return sums, lengths, peaks, medians, _tail(c.tiles, before, since + fading)
 
-        sums, lengths = (
-            jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype),
-            jnp.zeros(t, jnp.int32),
-        )
+        # the last of the sums is log T; everything starts empty
+        sums = jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype)
+        lengths = jnp.zeros(t, jnp.int32)
         peaks = jnp.zeros(splats.shape[0], dtype)
         medians = jnp.full((t, p), jnp.inf, dtype) if config.depth_median else None
         carry = sums, lengths, peaks, medians, _no_tail(t, p, dtype)
@@ -536,6 +560,7 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
 
         def draw(i, carry):
             sums, faded_tail, seen_tail = carry
+            # alpha and T of all pairs of this step, as in the forward pass
             c = _slice(chunks, i, step)
             item, row, centre, raw = take_chunk(
                 splats, items, c.starts, c.counts, c.tiles, grid, CHUNK
@@ -546,6 +571,7 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             transmittance = jnp.exp(before[:, None] + since)
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * transmittance, 0.0)
+            # g . f of each pair, and dL/d log alpha with what the splats behind it add
             along = sum(
                 row[..., FEATURES][..., f, None] * g[:, None, f]
                 for f in range(splats.shape[1] - FEATURES.start)
@@ -556,9 +582,11 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             slopes = (along * transmittance - behind / (1 - alpha)) * raw
             slopes = jnp.where((weights > 0) & (raw < config.alpha_max), slopes, 0.0)
 
+            # sums over pixels, moved from the tile's centre to the splat's
             moments = product(slopes.reshape(-1, p), powers).reshape(step, CHUNK, 6)
             features = product(weights, jnp.moveaxis(g, 1, 2))
             rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
+            # the list that runs on into the next step hands on its two sums
             tails = (
                 _tail(c.tiles, b, s + own)
                 for b, s, own in ((before, since, fading), (seen_before, seen_since, gained))

@@ -29,29 +29,32 @@ THINNEST = 1e-5
 
 @pytree_dataclass
 class Gaussians(Batchable):
-    """A set of 3D Gaussians, or a batch of sets (leading axes on every field).
-
-    means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard
-    deviations, metres.
-    opacities: (g,) in [0, 1]. colors: (g, 3) RGB in [0, 1], as images have them (sRGB-encoded).
-    deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the
-    mean.
-    low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales
-    contain (`avatar.animate`). Renderers add no more than `MIP_EPS2D` pixels^2 then, and dim what
-    this makes larger in images of larger pixels.
-    harmonics: (g, k, 3) or None; spherical harmonics of degrees 1 (k = 3), 1 to 2 (8) or 1 to 3
-    (15) in the frame of the means: what they add to the colors by the direction of sight, see
-    below. `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its T-pose.
-    """
+    """A set of 3D Gaussians, or a batch of sets (leading axes on every field)."""
 
     means: Float[Array, "g 3"]
+    """Centres, (g, 3), metres."""
     quats: Float[Array, "g 4"]
+    """Rotations, (g, 4), quaternions wxyz, normalised where they are used."""
     scales: Float[Array, "g 3"]
+    """Standard deviations along the Gaussians' axes, (g, 3), metres."""
     opacities: Float[Array, " g"]
+    """Opacities at the centres, (g,), in [0, 1]."""
     colors: Float[Array, "g 3"]
+    """RGB, (g, 3), in [0, 1], as images have them (sRGB-encoded)."""
     deformations: Float[Array, "g 3 3"] | None = None
+    """Linear maps that are applied to the covariances after the rotation, never to the means, (g,
+    3, 3), or None.
+    """
     low_pass: Float[Array, " g"] | None = None
+    """Side of the pixels of the images whose low-pass the scales contain (`avatar.animate`), (g,),
+    metres, or None. Renderers then add no more than `MIP_EPS2D` pixels^2, and dim what this makes
+    larger in images of larger pixels.
+    """
     harmonics: Float[Array, "g k 3"] | None = None
+    """What the direction of sight adds to the colors, see below: spherical harmonics of degrees 1
+    (k = 3), 1 to 2 (8) or 1 to 3 (15) in the frame of the means, (g, k, 3), or None.
+    `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its T-pose.
+    """
 
 
 def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Values]]:
@@ -121,7 +124,7 @@ def skin_gaussians(
     mode: Literal["affine", "rotation"] = "affine",
 ) -> Gaussians:
     """Move each Gaussian by its (blended) transform; scales, opacities and colors stay, harmonics
-    turn with it: by the rotation that the quaternion of the linear part stands for.
+    are rotated by the rotation part of the transform.
 
     affine: the covariance is transformed by the full linear part, which is appended to
     `deformations`.
@@ -154,26 +157,32 @@ def skin_gaussians(
 
 SMALLEST_SCALE = 1e-6
 """Metres; keeps the logarithm finite for flat Gaussians."""
-COLOR_MARGIN, OPACITY_MARGIN = 0.005, 0.001
-"""How far both are pulled inside (0, 1), where the gradient of the sigmoid does not vanish;
-opacities less than the smallest that is drawn, 1/255, so that what is hidden stays hidden."""
+COLOR_MARGIN = 0.005
+"""How far colors are pulled inside (0, 1), where the gradient of the sigmoid does not vanish."""
+OPACITY_MARGIN = 0.001
+"""The same of opacities: less than the smallest that is drawn, 1/255, so that what is hidden stays
+hidden.
+"""
 
 
 @pytree_dataclass
 class UnconstrainedGaussians(Batchable):
-    """Parameters of Gaussians, or a batch of them, for optax.
-
-    means: (g, 3) metres. quats: (g, 4), of any length. log_scales: (g, 3) of metres.
-    opacity_logits: (g,). color_logits: (g, 3).
-    harmonics: (g, k, 3) or None, as they are.
+    """Parameters of Gaussians, or of a batch of sets, that an optimizer of optax may move
+    freely.
     """
 
     means: Float[Array, "g 3"]
+    """Centres, (g, 3), metres."""
     quats: Float[Array, "g 4"]
+    """Rotations, (g, 4), quaternions wxyz of any length."""
     log_scales: Float[Array, "g 3"]
+    """Natural logarithms of the scales in metres, (g, 3)."""
     opacity_logits: Float[Array, " g"]
+    """Logits of the opacities, (g,)."""
     color_logits: Float[Array, "g 3"]
+    """Logits of the colors, (g, 3)."""
     harmonics: Float[Array, "g k 3"] | None = None
+    """The harmonics as they are, (g, k, 3), or None."""
 
 
 @checked_arguments
@@ -248,7 +257,7 @@ def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
 # = -c y, Y_2 = c z, Y_3 = -c x).
 
 COUNTS = (0, 3, 8, 15)
-"""Of the functions of degrees 1 to l, by l."""
+"""Number of functions of degrees 1 to l, by l."""
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = [math.sqrt(n / (16 * math.pi)) for n in (60, 5, 15)]
 _C3 = [math.sqrt(n / (64 * math.pi)) for n in (70, 1680, 42, 28, 420)]

@@ -58,29 +58,38 @@ Planes = list[Array]
 
 
 class ProjectedGaussians(NamedTuple):
-    """2D Gaussians on the image, planes of (g,). In gsplat's arrays: `means2d`, `depths`, `conics`.
-
-    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2,
-    eps2d included.
-    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic
-    / 2, 1 / pixels, finite where not drawn. visible: whether it is drawn. dimming: factor of the
-    opacity in (0, 1], None where nothing is dimmed.
-    added_colors: what harmonics add to the colors from here, None without.
+    """2D Gaussians on the image, planes of (g,). In gsplat's arrays: `means2d`, `depths`,
+    `conics`.
     """
 
     x: Float[Array, " g"]
+    """x of the centres, (g,), pixels."""
     y: Float[Array, " g"]
+    """y of the centres, (g,), pixels."""
     depths: Float[Array, " g"]
+    """z in the camera's frame, (g,), metres."""
     xx: Float[Array, " g"]
+    """Variance along x, (g,), pixels^2, eps2d included."""
     xy: Float[Array, " g"]
+    """Covariance of x and y, (g,), pixels^2."""
     yy: Float[Array, " g"]
+    """Variance along y, (g,), pixels^2, eps2d included."""
     determinant: Float[Array, " g"]
+    """Determinant of the covariance, (g,), pixels^4."""
     r00: Float[Array, " g"]
+    """Entry 00 of the upper triangular r of r^T r = conic / 2, (g,), 1 / pixels; finite where not
+    drawn.
+    """
     r01: Float[Array, " g"]
+    """Entry 01 of r, as r00."""
     r11: Float[Array, " g"]
+    """Entry 11 of r, as r00."""
     visible: Bool[Array, " g"]
+    """Whether each Gaussian is drawn, (g,)."""
     dimming: Float[Array, " g"] | None = None
+    """Factor of the opacity, (g,), in (0, 1]; None where nothing is dimmed."""
     added_colors: Float[Array, "g 3"] | None = None
+    """What harmonics add to the colors as seen from here, (g, 3), RGB; None without harmonics."""
 
     def dimmed(self, opacities: Float[Array, " g"]) -> Float[Array, " g"]:
         """Opacities as they are drawn."""
@@ -111,12 +120,11 @@ def project_gaussians(
     half field of view beyond the border, for cameras without lens.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
-    eps2d, jacobian_margin = (
-        added_variance(gaussians.low_pass, config.eps2d),
-        config.jacobian_margin,
-    )
+    eps2d = added_variance(gaussians.low_pass, config.eps2d)
+    jacobian_margin = config.jacobian_margin
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    # means in the frame of the camera; those behind it are moved to its axis, where all is finite
     means = _planes(gaussians.means)
     X, Y, Z = (_dot(rotation[i], means) + translation[i] for i in range(3))
     in_front = config.near < Z
@@ -128,6 +136,7 @@ def project_gaussians(
         in_front &= reached
         u, v = jnp.where(reached, u, 0.0), jnp.where(reached, v, 0.0)
 
+    # the rows of J W: where the Jacobian is taken, then its product with the rotation
     ju, jv = u, v
     if jacobian_margin is not None:
         ju = _clamp_to_view(u, fx, cx, camera.width, jacobian_margin)
@@ -137,6 +146,7 @@ def project_gaussians(
         [zx * (rotation[0, j] - ju * rotation[2, j]) for j in range(3)],
         [zy * (rotation[1, j] - jv * rotation[2, j]) for j in range(3)],
     ]
+    # lenses put the centre elsewhere and have another J
     x, y = u, v
     if camera.lens == "orthographic":
         x, y, zx = X, Y, fx
@@ -151,15 +161,18 @@ def project_gaussians(
         ]
     m = _times_factors(jw, gaussians, config.normalize_quats)
 
+    # footprints, without those whose squares overflow
     small = _all([jnp.abs(entry) < LARGEST_FOOTPRINT for row in m for entry in row])
     m0, m1 = ([jnp.where(small, entry, 0.0) for entry in row] for row in m)
     xx, xy, yy, determinant = _covariance(m0, m1, eps2d)
+    # opacity is dimmed by what the added variance enlarges
     dimming = None
     if gaussians.low_pass is not None and eps2d > 0:
         dimming = _dimming(m0, m1, determinant, eps2d, gaussians.low_pass * zx)
     elif config.antialiased and eps2d > 0:
         dimming = _dimming(m0, m1, determinant, eps2d, jnp.zeros_like(determinant))
     r00, r01, r11 = _conic_factor(m0, m1, eps2d)
+    # harmonics along the line of sight
     colors = None
     if gaussians.harmonics is not None:
         if camera.lens == "orthographic":

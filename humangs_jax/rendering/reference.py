@@ -165,6 +165,7 @@ def _project(
     slopes = jnp.where(visible[:, None], p[:, :2], 0.0) / depths[:, None]
     focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
 
+    # J, where the configuration evaluates it
     at = slopes
     if config.jacobian_margin is not None:
         size = jnp.asarray([camera.width, camera.height], slopes.dtype)
@@ -175,6 +176,7 @@ def _project(
         axis=-1,
     )
     jacobian = focal[:, None] * jacobian / depths[:, None, None]
+    # the axes of each Gaussian on the image, M = J W A R diag(s)
     product = functools.partial(jnp.matmul, precision=transform.EXACT)
     image_from_world = product(jacobian, camera.cam_from_world[:3, :3])
     axes = product(image_from_world, covariance_factors(gaussians, config.normalize_quats))

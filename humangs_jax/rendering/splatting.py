@@ -67,31 +67,41 @@ __all__ = [
 class Rendering(Batchable):
     """One image of a set of Gaussians; with leading axes, a batch of images.
 
-    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is
-    seen, weighted as the colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that
-    did not fit in the buffers and were not drawn. visibility: (g,) the largest weight alpha T of
-    each Gaussian on any pixel, 0 if it is hidden; not differentiable; None unless
-    `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
-    over 0; None without. The others are None unless the field of `SplatConfig` of their name asks
-    for them:
-    means2d: (g, 2) centres on the image, pixels. radii: (g, 2) half the width and height of the
-    footprints, pixels, 0 where nothing is drawn; not differentiable. depth_sum: (h, w) z summed by
-    weight, depth times alpha. depth_median: (h, w) z of the Gaussian at which half of the light is
-    left, 0 where more passes; not differentiable. distortion: (h, w) sum over pairs of w_i w_j (z_i
-    - z_j)^2, squared metres (2DGS, https://arxiv.org/abs/2403.17888, eq. 13, with squares).
+    Fields of `SplatConfig` ask for most of those that may be None.
     """
 
     rgb: Float[Array, "h w 3"]
+    """Image over the background, (h, w, 3)."""
     alpha: Float[Array, "h w"]
+    """Share of the light that the Gaussians stop, (h, w), in [0, 1)."""
     depth: Float[Array, "h w"]
+    """Mean z of what is seen, weighted as the colors are, (h, w), metres; 0 where alpha is 0."""
     overflow: Int[Array, ""]
+    """Number of (splat, tile) pairs that did not fit in the buffers and were not drawn."""
     visibility: Float[Array, " g"] | None = None
+    """Largest weight alpha T of each Gaussian on any pixel, (g,), 0 if it is hidden; not
+    differentiable; None unless `SplatConfig.visibility`.
+    """
     features: Float[Array, "h w n"] | None = None
+    """Sums of the features by the weights of the colors, over 0, (h, w, n); None without features.
+    """
     means2d: Float[Array, "g 2"] | None = None
+    """Centres on the image, (g, 2), pixels; None unless `SplatConfig.means2d`."""
     radii: Float[Array, "g 2"] | None = None
+    """Half the width and height of the footprints, (g, 2), pixels, 0 where nothing is drawn; not
+    differentiable; None unless `SplatConfig.radii`.
+    """
     depth_sum: Float[Array, "h w"] | None = None
+    """z summed by weight, (h, w), metres: depth times alpha; None unless `SplatConfig.depth_sum`.
+    """
     depth_median: Float[Array, "h w"] | None = None
+    """z of the Gaussian at which half of the light is left, (h, w), metres, 0 where more passes;
+    not differentiable; None unless `SplatConfig.depth_median`.
+    """
     distortion: Float[Array, "h w"] | None = None
+    """Sum over pairs of w_i w_j (z_i - z_j)^2, (h, w), squared metres (2DGS,
+    https://arxiv.org/abs/2403.17888, eq. 13, with squares); None unless `SplatConfig.distortion`.
+    """
 
     def _repr_png_(self) -> bytes:
         """The image, or those of a batch side by side, for notebooks."""
@@ -232,17 +242,19 @@ def _render(
             f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with"
             " jax.vmap"
         )
+    # everything in the form that drawing expects
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     features = features_of(features, len(gaussians.opacities))
     more = (features,) if shifts is None else (features, _shifts_of(shifts, gaussians))
-    if any(
-        isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background, more))
-    ):
+    # under a transformation values are unknown: buffers come from the configuration
+    leaves = jax.tree.leaves((gaussians, cameras, background, more))
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
         config = with_default_buffers(gaussians, cameras, config)
         rendering = draw(gaussians, cameras, background, config, *more)
         warn_of_overflow(rendering.overflow, config)
         return rendering
+    # values are known here: they are checked, and the buffers made to fit
     check_values(
         "render",
         gaussian_values(gaussians)
@@ -431,6 +443,7 @@ def _draw(
     nearest = jnp.min(depths)
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
     behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
+    # what is blended: colors, depth, other features, and the powers of the depth
     seen = [
         projected.seen_from_here(gaussians.colors),
         behind[:, None],
@@ -438,6 +451,7 @@ def _draw(
         *([_powers(behind, projected.visible)] if config.distortion else []),
     ]
     seen = jnp.concatenate(seen, axis=-1)
+    # rows in depth order, their tiles, and the image
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
     assert config.max_pairs is not None  # callers have fitted the buffers

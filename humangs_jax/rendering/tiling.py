@@ -51,8 +51,11 @@ class TileGrid:
     """An image cut into squares of `tile_size` pixels, numbered row by row. Static (hashable)."""
 
     width: int
+    """Width of the image, pixels."""
     height: int
+    """Height of the image, pixels."""
     tile_size: int
+    """Side of a tile, pixels."""
 
     @property
     def columns(self) -> int:
@@ -87,40 +90,38 @@ class TileGrid:
 
 
 class Expansion(NamedTuple):
-    """Slots divided among items, item by item.
-
-    source: (capacity,) item of each slot; of slots >= needed, the last item.
-    first: (n,) first slot of each item, so that slot - first[source] counts the slots of one item.
-    needed: slots asked for, whatever the capacity (saturates at `SUM_LIMIT`). Slot s is used if s <
-    needed.
-    """
+    """Slots divided among items, item by item."""
 
     source: Int[Array, " capacity"]
+    """Item of each slot, (capacity,); of slots >= `needed`, the last item."""
     first: Int[Array, " n"]
+    """First slot of each item, (n,), so that slot - first[source] counts the slots of one item."""
     needed: Int[Array, ""]
+    """Number of slots that were asked for, whatever the capacity (saturates at `SUM_LIMIT`). Slot s
+    is used if s < needed.
+    """
 
 
 class TileLists(NamedTuple):
-    """For each tile a list of items: items[starts[t] : starts[t] + counts[t]], ascending.
-
-    items: (capacity,). starts, counts: (t,).
-    """
+    """For each tile a list of items: items[starts[t] : starts[t] + counts[t]], ascending."""
 
     items: Int[Array, " capacity"]
+    """The items of all lists, (capacity,)."""
     starts: Int[Array, " t"]
+    """Place of each tile's first item in `items`, (t,)."""
     counts: Int[Array, " t"]
+    """Length of each tile's list, (t,)."""
 
 
 class TileBlocks(NamedTuple):
-    """Tiles by falling list length, padded to whole blocks.
-
-    tiles: (blocks * block,) tile numbers; the padding has the number "no tile" (t), which is out of
-    bounds on purpose: gather with a fill value, scatter with mode="drop". used: how many blocks
-    hold a tile whose list is not empty.
-    """
+    """Tiles by falling list length, padded to whole blocks."""
 
     tiles: Int[Array, " t_padded"]
+    """Tile numbers, (blocks * block,). The padding has the number "no tile" (t), which is out of
+    bounds on purpose: gather with a fill value, scatter with mode="drop".
+    """
     used: Int[Array, ""]
+    """How many blocks hold a tile whose list is not empty."""
 
 
 def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
@@ -286,17 +287,22 @@ least this.
 
 
 class Footprints(NamedTuple):
-    """Ellipses on the image, planes of (g,), named as in `ProjectedGaussians`; reach is 0 where
-    nothing is drawn.
-    """
+    """Ellipses on the image, planes of (g,), named as in `ProjectedGaussians`."""
 
     x: Float[Array, " g"]
+    """x of the centres, (g,), pixels."""
     y: Float[Array, " g"]
+    """y of the centres, (g,), pixels."""
     xx: Float[Array, " g"]
+    """Variance along x, (g,), pixels^2."""
     xy: Float[Array, " g"]
+    """Covariance of x and y, (g,), pixels^2."""
     yy: Float[Array, " g"]
+    """Variance along y, (g,), pixels^2."""
     determinant: Float[Array, " g"]
+    """Determinant of the covariance, (g,), pixels^4."""
     reach: Float[Array, " g"]
+    """d^T cov2d^-1 d on the border of the ellipse, (g,); 0 where nothing is drawn."""
 
     def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First row of tiles of each splat, and how many."""
@@ -325,18 +331,24 @@ class Footprints(NamedTuple):
 
 
 class _Bands(NamedTuple):
-    """What a row of tiles needs of an ellipse, planes of (g,): centre, half its height, how high
-    above the centre its rightmost point is, xy / yy, D / yy, 1 / yy and the squared reach.
-    """
+    """What a row of tiles needs of an ellipse, planes of (g,)."""
 
     x: Float[Array, " g"]
+    """x of the centre, pixels."""
     y: Float[Array, " g"]
+    """y of the centre, pixels."""
     height: Float[Array, " g"]
+    """Half the height of the ellipse, pixels."""
     tip: Float[Array, " g"]
+    """How high above the centre the rightmost point is, pixels."""
     slope: Float[Array, " g"]
+    """xy / yy."""
     ratio: Float[Array, " g"]
+    """D / yy, pixels^2."""
     inverse: Float[Array, " g"]
+    """1 / yy, 1 / pixels^2."""
     reach: Float[Array, " g"]
+    """The squared reach."""
 
     def columns(
         self, row: Int[Array, " g"], grid: TileGrid
@@ -357,13 +369,14 @@ class _Bands(NamedTuple):
 class Squares(NamedTuple):
     """INRIA's footprints, planes of (g,): the tiles that meet a square, as its rasterizer counts
     them.
-
-    radius: half a side, whole pixels; 0 where nothing is drawn.
     """
 
     x: Float[Array, " g"]
+    """x of the centres, (g,), pixels."""
     y: Float[Array, " g"]
+    """y of the centres, (g,), pixels."""
     radius: Float[Array, " g"]
+    """Half a side, (g,), whole pixels; 0 where nothing is drawn."""
 
     def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First row of tiles of each splat, and how many."""
@@ -392,16 +405,16 @@ class Squares(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """(tile, splat) pairs; unused ones have the tile number "no tile".
-
-    tiles, splats: (capacity,). needed: how many there are in all. overflow: how many of them are
-    missing here.
-    """
+    """(tile, splat) pairs, splat by splat."""
 
     tiles: Int[Array, " capacity"]
+    """Tile of each pair, (capacity,); unused pairs have the tile number "no tile"."""
     splats: Int[Array, " capacity"]
+    """Splat of each pair, (capacity,)."""
     needed: Int[Array, ""]
+    """How many pairs there are in all."""
     overflow: Int[Array, ""]
+    """How many of them are missing here."""
 
 
 def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
@@ -503,11 +516,13 @@ def emit_pairs(
     """
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
+    # from splats to the rows of tiles that they meet
     rows = expand(counts, max_rows)
     slot = jnp.arange(max_rows, dtype=jnp.int32)
     row = take(first - rows.first, rows.source) + slot
     table = take(jnp.stack(bands, axis=-1), rows.source)
     column0, column1 = type(bands)(*(table[:, i] for i in range(len(bands)))).columns(row, grid)
+    # from rows to the tiles of their spans
     pairs = expand(
         jnp.where(slot < rows.needed, jnp.maximum(column1 - column0 + 1, 0), 0), max_pairs
     )

@@ -39,25 +39,28 @@ CELLS = 128
 """Cells a side of the square as it is packed."""
 SHRINKING = 0.97
 """Factor on the scale after a failed attempt to pack."""
-VERTEX_STEP, FACE_STEP = 32768, 32768
-"""Charts are padded to multiples of these for the rasterizer: few shapes are compiled."""
+VERTEX_STEP = 32768
+"""The rasterizer gets a multiple of so many vertices: few shapes are compiled."""
+FACE_STEP = 32768
+"""The rasterizer gets a multiple of so many faces: few shapes are compiled."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Atlas:
-    """uvs: (u, 2) in [0, 1], v up. faces: (f, 3) indices into uvs. vertices: (u,) the mesh vertex
-    of each uv.
-
-    charts: (f,) chart of each face. size: texels a side. texel: metres of (flat) chart per texel
-    where the density is 1.
-    """
+    """The charts of a mesh on one square texture."""
 
     uvs: Float[np.ndarray, "u 2"]
+    """Texture coordinates, (u, 2), in [0, 1], v up."""
     faces: Faces
+    """Indices into `uvs` of the corners of each face, (f, 3)."""
     vertices: Int[np.ndarray, " u"]
+    """Vertex of the mesh that each texture coordinate belongs to, (u,)."""
     charts: Int[np.ndarray, " f"]
+    """Chart of each face, (f,)."""
     size: int
+    """Side of the texture, texels."""
     texel: float
+    """Metres of (flat) chart per texel where the density is 1."""
 
 
 def unwrap(

@@ -47,23 +47,23 @@ AREA_ROUNDING = 2
 """A face whose area is below this many roundings of the area's own computation has none."""
 
 NO_FACE = jnp.iinfo(jnp.int32).max
-
+"""Face number of a pixel without a face: the least number wins, so any face beats it."""
 
 Slice = Annotated[int, Range(64, 1 << 24)]
 
 
 @configuration
 class RasterConfig:
-    """Settings of the rasterizer; the image depends on `near` alone.
-
-    near: faces with a corner at z <= near are dropped, in the units of the vertices.
-    rows_per_step, fragments_per_step: slots per step of the two loops. Large steps spend
-    time on empty slots, small ones on the overhead of more steps.
-    """
+    """Settings of the rasterizer; the image depends on `near` alone."""
 
     near: Spread = 0.01
+    """Faces with a corner at z <= near are dropped, in the units of the vertices."""
     rows_per_step: Slice = 1 << 15
+    """Slots for rows of pixels per step of the outer loop. Large steps spend time on empty slots,
+    small ones on the overhead of more steps.
+    """
     fragments_per_step: Slice = 1 << 16
+    """Slots for pixels per step of the inner loop; the same trade."""
 
 
 DEFAULT_CONFIG = RasterConfig()
@@ -71,20 +71,22 @@ DEFAULT_CONFIG = RasterConfig()
 
 @pytree_dataclass
 class Fragments(Batchable):
-    """What a camera sees of a mesh.
-
-    face_ids: (h, w) index of the face, -1 where there is none.
-    barycentrics: (h, w, 3) perspective-correct weights of the face's corners, >= 0, of sum 1; 0
-    where there is no face.
-    depth: (h, w) z in the camera, in the units of the vertices; -1 where there is no face.
-    overflow: faces that may be missing from the image: they cross the near plane, are not finite
-        numbers of pixels, or come after the first 2^30 rows of pixels.
-    """
+    """What a camera sees of a mesh."""
 
     face_ids: Int[Array, "h w"]
+    """Index of the face that is seen, (h, w); -1 where there is none."""
     barycentrics: Float[Array, "h w 3"]
+    """Perspective-correct weights of the face's corners, (h, w, 3), >= 0, of sum 1; 0 where there
+    is no face.
+    """
     depth: Float[Array, "h w"]
+    """z in the frame of the camera, (h, w), in the units of the vertices; -1 where there is no
+    face.
+    """
     overflow: Int[Array, ""]
+    """Number of faces that may be missing from the image: they cross the near plane, are not finite
+    numbers of pixels, or come after the first 2^30 rows of pixels.
+    """
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -100,12 +102,15 @@ def rasterize_mesh(
     if faces.shape[0] == 0 or vertices.shape[0] == 0:  # a face without area stands for no face
         vertices, faces = jnp.ones((1, 3), vertices.dtype), jnp.zeros((1, 3), jnp.int32)
     width, height = camera.width, camera.height
+    # from faces to rows of pixels
     corners = _project(vertices, camera)[faces.astype(jnp.int32)].reshape(-1, 9)
     drawn, overflow = _drawn(corners, config.near)
     first_row, rows = _rows(corners, drawn, width, height)
     row_end = cumsum(rows)
+    # from rows to fragments, which the z-buffer decides between
     depth, face_ids = _z_buffer(corners, first_row, row_end - rows, row_end, width, height, config)
     covered = face_ids != NO_FACE
+    # weights only of the winners
     weights = _weights_by_pixel(
         corners, jnp.where(covered, face_ids, 0), width, config.fragments_per_step
     )
@@ -356,12 +361,21 @@ def sample_texture(
 # through a Gouraud shader with a point light.
 
 BACKGROUND = 1.0
+"""Each coordinate of the position beside the body, normalised units."""
 BACKGROUND_DEPTH = -1.0
+"""Depth beside the body."""
 LIGHT = (0.0, 1.0, 0.0)
 """Place of the point light, normalised units; the default of PyTorch3D, whose shader the release
 used.
 """
-AMBIENT, DIFFUSE, SPECULAR, SHININESS = 0.5, 0.3, 0.2, 64
+AMBIENT = 0.5
+"""Share of the albedo that is seen without light."""
+DIFFUSE = 0.3
+"""Share of the albedo that full light adds."""
+SPECULAR = 0.2
+"""Brightness of the highlight."""
+SHININESS = 64
+"""Exponent of the highlight: its width."""
 
 
 def plain_position_map(
