@@ -50,11 +50,24 @@ WIDER = (
     "{:.0%} of the body is outside the mask: it is wider than the person, or the pose is off; "
     "`humangs fit CAPTURE --refine{}` fits {}shape and pose to the masks"
 )
-FIXED, FREE = (" --fixed-cameras", ""), ("", "cameras, ")
-LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
-BOUNDARY, DISPLACED = (0.1, 0.85, 0.2), (1.0, 0.85, 0.0)
+FIXED = (" --fixed-cameras", "")
+"""What `WIDER` says where cameras are right."""
+FREE = ("", "cameras, ")
+"""What `WIDER` says where cameras may be off."""
+LEFT = (0.15, 0.45, 1.0)
+"""Color of the person's left side."""
+RIGHT = (1.0, 0.35, 0.15)
+"""Color of the right side."""
+MIDDLE = (0.85, 0.85, 0.85)
+"""Color of the middle."""
+BOUNDARY = (0.1, 0.85, 0.2)
+"""Color of the body's outline."""
+DISPLACED = (1.0, 0.85, 0.0)
+"""Color of the displaced body's outline."""
 AMBIENT = 0.35
+"""Share of the light that comes from everywhere."""
 OPACITY = 0.55
+"""Opacity of the body over the photo."""
 
 
 @pytree_dataclass
@@ -314,9 +327,16 @@ VIEWS = 24
 """Most views on a sheet."""
 FINE = 2
 """Factor by which sheets are drawn larger and then shrunk, for smooth lines."""
-RADIUS, SMALL = 4, 2
-"""Radii of discs on the body, and on hands and face, pixels of a tile."""
-WHITE, BLACK, CROSS = (255, 255, 255), (0, 0, 0), (255, 0, 230)
+RADIUS = 4
+"""Radius of discs on the body, pixels of a tile."""
+SMALL = 2
+"""Radius of discs on hands and face, pixels of a tile."""
+WHITE = (255, 255, 255)
+"""Color of points of the middle, of 255."""
+BLACK = (0, 0, 0)
+"""Color of outlines, of 255."""
+CROSS = (255, 0, 230)
+"""Color of crosses where the body has a point, of 255."""
 
 
 def fit_sheet(

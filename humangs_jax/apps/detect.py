@@ -59,7 +59,14 @@ from humangs_jax.io.images import (
 )
 from humangs_jax.io.reading import write_json
 
-KEYPOINTS_FILE, SHEET_FILE, MASKS, UNKNOWN = "keypoints.json", "people.png", "masks", "unknown"
+KEYPOINTS_FILE = "keypoints.json"
+"""File of the keypoints."""
+SHEET_FILE = "people.png"
+"""Picture of all photos with their people."""
+MASKS = "masks"
+"""Folder of the masks."""
+UNKNOWN = "unknown"
+"""Folder of what the masks leave open."""
 THUMBNAIL = 480
 """Pixels of the longest side of a photo on the sheet."""
 COLORS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))

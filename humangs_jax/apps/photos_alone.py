@@ -37,10 +37,10 @@ from humangs_jax.io.images import (
     write_png,
 )
 
-LONGEST, LEAST_PERSON = 2048, 700
-"""Pixels: longest side to which photos are reduced, and size of the person there below which they
-stay as they are.
-"""
+LONGEST = 2048
+"""Pixels: longest side to which photos are reduced."""
+LEAST_PERSON = 700
+"""Pixels: size of the person there below which photos stay as they are."""
 
 
 @dataclasses.dataclass(frozen=True)

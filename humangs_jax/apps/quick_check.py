@@ -30,10 +30,10 @@ pose or camera.
 """
 SURELY_IOU = 0.6
 """Intersection over union above which a mistake that was undone explains a view."""
-LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
-"""Share of the points in the frame: below the first it is a warning, the second is asked of an
-explanation.
-"""
+LEAST_INSIDE = 0.5
+"""Share of the points in the frame below which there is a warning."""
+SURELY_INSIDE = 0.9
+"""Share of the points in the frame that is asked of an explanation."""
 LEAST_HEIGHT = 0.05
 """Share of the image's height: a body smaller than this has its lengths in another unit."""
 GRID = 64
@@ -48,10 +48,10 @@ degrees are far beyond.
 """
 BETTER = 0.1
 """IoU by which an exchange has to explain each view better than the capture does."""
-DARKEST, BURNT = 0.12, 0.98
-"""A photo is too dark if 98 % of the person's values are below the first, and burnt out if 60 % are
-above the second.
-"""
+DARKEST = 0.12
+"""A photo is too dark if 98 % of the person's values are below this."""
+BURNT = 0.98
+"""A photo is burnt out if 60 % of the person's values are above this."""
 
 Matrix = Float[np.ndarray, "4 4"]
 Cells = Bool[np.ndarray, "rows columns"]

@@ -282,7 +282,10 @@ def _scan(folder: Path) -> FolderScan:
 READ = 8
 """Photos that the network reads where cameras were found from the person: more are no sharper, and
 take their time. All serve poses and refinement."""
-LEAST_PHOTOS, SIZE = 4, 512
+LEAST_PHOTOS = 4
+"""Photos below which none is held out to compare bodies."""
+SIZE = 512
+"""Pixels a side of the crop in which bodies are compared."""
 LONGEST = 1024
 """Pixels: larger photos are reduced, whose crops around the person would be all the same."""
 CLEARLY = 0.1

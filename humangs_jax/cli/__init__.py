@@ -19,8 +19,14 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from humangs_jax import __version__
 
-BAD_DATA, BAD_USAGE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
-"""The last two: 128 and the number of the signal, as in shells."""
+BAD_DATA = 1
+"""Exit status where files or data are wrong."""
+BAD_USAGE = 2
+"""Exit status where the command line is wrong."""
+INTERRUPTED = 130
+"""Exit status after Ctrl-C: 128 and the number of the signal, as in shells."""
+BROKEN_PIPE = 141
+"""Exit status where the reader of the output has closed it: 128 and the number of the signal."""
 
 
 @runtime_checkable

@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from humangs_jax.body.model import BodyPose
     from humangs_jax.geometry.camera import Camera
 
-RATE, FINITE = Range(0.01, 1000.0), at_least(-LARGEST)
-"""Ranges of frames per second, and of any number."""
+RATE = Range(0.01, 1000.0)
+"""Range of frames per second."""
+FINITE = at_least(-LARGEST)
+"""Range of any number."""
 VIDEO = Place(VIDEOS.suffixes, folder=True)
 _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
 FROM_THE_SIDE = Shot(azimuth=20.0)

@@ -42,12 +42,13 @@ NO_RATE_AT_ALL = (
     "missing: how many frames are a second? expected --motion-fps (in Python fps=), or this key"
 )
 SOMA_JOINTS = 77
-"""Of Kimodo's skeleton that is not SMPL-X's."""
+"""Joints of Kimodo's skeleton, which is not SMPL-X's."""
 NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
 
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     """The poses of one person. Raises: MotionError, naming the key."""
+    # the person that is asked for, and the format by its keys
     person = _chosen(path, read_people(path), options.person)
     form = format_of(person.values)
     assert form is not None
@@ -56,6 +57,7 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
             values=frames_first(person.values, form.poses["all"], form.moves[0])
         )
     file = _MotionFile(path, person, options.fps)
+    # points in space are a skeleton; all others are rotations of a body
     if form.kind == "points":
         return clip_of_points(file, file.rate(form))
     rotations = (
@@ -315,12 +317,15 @@ def _cameras(
     """Rotations and places of the cameras in the world for each frame, where files tell; None: they
     do not.
     """
+    # one camera, or one of each frame
     if "cam2world" in file.values:
         matrices = file.numbers(
             "cam2world", (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)
         ).reshape(-1, 4, 4)
         turns, places = matrices[:, :3, :3], matrices[:, :3, 3]
     elif "pred_rotmat" in file.values:
+        # cameras are in a file beside that of the person, for the frames in which the person was
+        # seen
         folders = (file.path, *file.path.parents[:2])
         beside = next(
             (each / "camera.npy" for each in folders if (each / "camera.npy").is_file()), None

@@ -210,11 +210,13 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     nodes, animations = content.get("nodes", []), content.get("animations", [])
     if not animations:
         raise Refused("a GLB file without an animation: expected a skeleton in motion")
+    # the animation; one that moves a face alone has no skeleton
     animation, said = _chosen(animations, options.clip if options else None)
     alone = face_alone(content, binary, animation, said)
     if alone is not None:
         return alone
     parents = node_parents(nodes)
+    # the joints of the skin, and the nodes above them, in motion
     joints, binding = _joints(content, binary, nodes)
     order = with_ancestors(joints, parents)
     check_limit("joints", len(order), "joints")
@@ -223,10 +225,12 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     check_unpacked(len(data), 3 * bytes_of_clip(len(times), len(order)))
     posed = world_matrices(nodes, parents, order, tracks, times)
     rest = world_matrices(nodes, parents, order, {}, np.zeros(1))
+    # turns are from the pose in which the skin was bound to that of a frame
     index = {joint: i for i, joint in enumerate(joints)}
     bind = np.stack([binding.get(joint, rest[joint][0]) for joint in joints])
     matrices = np.stack([posed[joint] for joint in joints], axis=1)
     turns = _rotations(matrices) @ np.swapaxes(_rotations(bind), -1, -2)
+    # names by the humanoid extension, where there is one
     bones = _humanoid(content)
     names = tuple(bones.get(joint, str(nodes[joint].get("name", ""))) for joint in joints)
     above = tuple(index.get(_next_joint(parents, joint, index), -1) for joint in joints)

@@ -63,6 +63,7 @@ DEEPEST = 5
 
 def read_table(path: Path, options: Reading) -> Poses:
     """A face in a table. Raises: MotionError or Refused, naming the column or the line."""
+    # the line of names tells which columns are shapes
     rows = csv.reader(io.StringIO(read_text(path)))
     try:
         lines = [row for row in rows if any(word.strip() for word in row)]
@@ -76,6 +77,7 @@ def read_table(path: Path, options: Reading) -> Poses:
             "expected a line with names of ARKit's shapes such as EyeBlinkLeft, got"
             f" {', '.join(names[:4]) or 'nothing'}"
         )
+    # a line for each frame; some programs repeat the names
     lines = [row for row in lines[1:] if [word.strip() for word in row] != names]
     if not lines:
         raise Refused("expected a line of numbers for each frame, got none")
@@ -87,6 +89,7 @@ def read_table(path: Path, options: Reading) -> Poses:
     values = np.zeros((len(lines), len(ARKIT)))
     for name, i in shapes.items():
         values[:, ARKIT.index(str(name))] = column(i)
+    # the turn of the head, and the times, where the table has them
     turns = [column(plain[name]) if name in plain else 0.0 for name in HEAD_TURNS]
     head = np.stack([np.broadcast_to(turn, len(lines)) for turn in turns], axis=1)
     codes = [row[plain["timecode"]] for row in lines] if "timecode" in plain else []

@@ -27,6 +27,7 @@ from humangs_jax.motion.rules import (
 )
 
 SHOWN = 12
+"""Names of joints in an error."""
 Places = Float[np.ndarray, "s 3"]
 Pair = tuple[list[int], list[int]]
 
@@ -39,10 +40,12 @@ def matched(
 
     Raises: Refused if neither names nor the tree tell where those are that are needed.
     """
+    # by names first
     plain = _plain(names)
     source = _named(plain)
     if hips := [source[name] for name in ("left_hip", "right_hip") if name in source][1:]:
         _place_pelvis(source, parents, (source["left_hip"], *hips))
+    # where names do not tell, the tree tells which joints are arms and legs
     if any(name not in source for name in NEEDED) or not _descends(source, parents):
         lengths = np.asarray(
             [0.0 if p < 0 else np.linalg.norm(rest[i] - rest[p]) for i, p in enumerate(parents)]
@@ -65,6 +68,7 @@ def matched(
         source = {
             name: i for name, i in source.items() if name not in body | {"pelvis", "neck", "head"}
         } | limbs
+    # toes, head and spine follow from the rest
     _match_toes(source, parents, rest)
     _match_head(source, plain, parents)
     _match_spine(source, parents)
@@ -158,6 +162,7 @@ def _limbs(
     for i, p in enumerate(parents):
         if p >= 0:
             children[p].append(i)
+    # length of the longest way down from each joint
     reach = lengths.copy()
     for i in reversed(range(len(parents))):
         reach[i] += max((reach[child] for child in children[i]), default=0.0)
@@ -180,6 +185,7 @@ def _limbs(
             pairs, key=lambda pair: bones(pair[0]).sum() + bones(pair[1]).sum(), default=None
         )
 
+    # the pelvis carries two limbs, and above it, but not below its legs, the chest carries two more
     above = [_ancestors(parents, joint) for joint in range(len(parents))]
     found = [
         (joint, pair) for joint in range(len(parents)) if (pair := pair_below(joint)) is not None

@@ -46,7 +46,10 @@ OTHER_FILES = {
     "these are keypoints, which `humangs fit` makes poses of": {"points", "confidences", "set"},
 }
 """What other files of ours are, by keys that they have."""
-DEEPEST, SHOWN = 6, 12
+DEEPEST = 6
+"""Levels of lists and maps in which people are looked for."""
+SHOWN = 12
+"""Keys of a file in an error."""
 NEARLY_ORTHONORMAL = 0.1
 """3 x 3 matrices this close to rotations are those of one person, not vectors of three people;
 `ORTHONORMAL` is checked later.
@@ -54,14 +57,16 @@ NEARLY_ORTHONORMAL = 0.1
 
 
 class Person(NamedTuple):
-    """A person of a file. name: as the file has it. frames: in which the person was seen, None for
-    all.
-    """
+    """A person of a file."""
 
     name: str
+    """Name of the person as the file has it."""
     values: Mapping[str, Any]
+    """The file's values of the person by key."""
     frames: np.ndarray | None = None
+    """Numbers of the frames in which the person was seen; None for all."""
     pickled: tuple[str, ...] = ()
+    """Keys whose values were pickled, which are not read."""
 
 
 def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
@@ -150,6 +155,7 @@ def _found(content: Any, name: str, depth: int) -> list[Person]:
     content = objects(content)
     if depth > DEEPEST:
         return []
+    # a list of people, a person, a person one level deeper, or people by name
     if isinstance(content, list | tuple):
         found = [
             p for i, each in enumerate(content) for p in _found(each, _id_of(each, i), depth + 1)

@@ -102,12 +102,14 @@ def retargeted(
             f" {len(joints)}"
         )
     source = matched(clip.names, clip.parents, clip.rest, clip.places[0])
+    # whether the rest pose stands, how large the body is, and which axis is up
     standing, said = _stands(clip, source), ""
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.places[0], source), 1e-9)
     if up == "auto":
         up, said = (clip.up, "") if clip.up else _up_of(clip, source, scale, standing)
     turn = upright_matrix(up)
     turns, places = turn @ clip.turns, clip.places @ turn.T
+    # rotations of each joint in the axes of the one above it
     world = _body_turns(clip, source, joints, turns, places, by_motion=not standing)
     rotations = np.stack(
         [
@@ -116,6 +118,7 @@ def retargeted(
         ],
         axis=1,
     )
+    # the pelvis follows the file's, and the soles stand as high as the file's do
     moves = scale * places[:, source["pelvis"]]
     soles = _soles(clip, source, joints) if standing else None
     moves[:, 1] += _steps(scale * places[..., 1], source, soles) - _steps_of_body(
@@ -230,6 +233,7 @@ def _pelvis_turns(
         return np.arctan2(np.sum(np.cross(a, b) * axis, axis=-1), np.sum(a * b, axis=-1))
 
     own, top = meeting(turns[:, pelvis]), source[_top(source)]
+    # hips that hang on joints other than the pelvis: their mean, if it agrees better with the trunk
     carriers = {clip.parents[left], clip.parents[right]}
     if min(carriers) >= 0 and carriers != {pelvis}:
         a, b = (
@@ -239,6 +243,7 @@ def _pelvis_turns(
         other = meeting((a * Rotation.from_rotvec(0.5 * (a.inv() * b).as_rotvec())).as_matrix())
         own_tilt, tilt = (np.abs(tilts(x, top)).mean() for x in (own, other))
         return other if tilt < own_tilt - rules.BETTER_TILT else own
+    # a pelvis that does not turn with the trunk is turned after the lowest joint of the spine
     spine = [top]
     while clip.parents[spine[0]] not in (-1, pelvis):
         spine.insert(0, clip.parents[spine[0]])

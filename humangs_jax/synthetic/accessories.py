@@ -35,9 +35,12 @@ from humangs_jax.synthetic.surfaces import (
     unit,
 )
 
-RING, COLUMNS = 40, 32
-"""Points of a ring around neck or head; of a ring of a shoe."""
+RING = 40
+"""Points of a ring around neck or head."""
+COLUMNS = 32
+"""Points of a ring of a shoe."""
 AZIMUTH = circle(RING)
+"""Azimuths of the points of a ring, radians."""
 SIDEWAYS, UP, FORWARD = np.eye(3)
 
 

@@ -47,6 +47,7 @@ LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST 
 LEFT_EYE, RIGHT_EYE, LEFT_HAND, RIGHT_HAND, JOINTS = 23, 24, 25, 40, 55
 
 FINGER_LIMIT = 1.5
+"""Largest rotation angle of a joint of a finger in the prior, radians."""
 LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
                      0.9, 0.5, 0.35, 0.35, 0.5, 2.3, 2.3, 2.4, 2.4, 0.8, 0.8,
                      0, 0, 0, *[FINGER_LIMIT] * 30])  # fmt: skip
@@ -54,10 +55,12 @@ LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation (left and right exchanged)."""
-BALL_HEIGHT, HEEL_BACK = 0.0112, 0.064
-"""Height of the joint at the ball of the foot above the sole, and distance of the heel behind the
-ankle, of the shipped body, in lengths of a leg.
+BALL_HEIGHT = 0.0112
+"""Height of the joint at the ball of the foot above the sole, of the shipped body, in lengths of a
+leg.
 """
+HEEL_BACK = 0.064
+"""Distance of the heel behind the ankle, of the shipped body, in lengths of a leg."""
 REACH = 0.998
 """Largest stretch of a leg as a share of its length: a straight leg leaves the knee's direction
 undefined.
@@ -264,15 +267,28 @@ def _frame(direction: Vector, across: Vector) -> Matrix:
 
 BODY = ("makehuman", 13380)
 """The body that the cuts below were measured on: its name and number of vertices."""
-WAIST, CROTCH, ANKLE, FLOOR = -0.2, -0.425, -1.159, -1.2285
-ARM_HEIGHT, SHOULDER, WRIST = 0.096, 0.171, 0.651
-"""Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template
-coordinates.
-"""
+WAIST = -0.2
+"""Height (y) of the waist, template coordinates."""
+CROTCH = -0.425
+"""Height of the crotch."""
+ANKLE = -1.159
+"""Height of the ankles."""
+FLOOR = -1.2285
+"""Height of the soles."""
+ARM_HEIGHT = 0.096
+"""Height of the arms."""
+SHOULDER = 0.171
+"""Distance of the shoulders from the middle (|x|), template coordinates."""
+WRIST = 0.651
+"""Distance of the wrists from the middle."""
 ARMHOLE = 0.185
 """Distance from the middle at which sleeves are sewn on."""
-TRUNK_GIRTH, LEG_GIRTH, ARM_GIRTH = 0.16, 0.08, 0.06
-"""Radii that turn angles around trunk, legs and arms into metres of cloth."""
+TRUNK_GIRTH = 0.16
+"""Radius that turns angles around the trunk into metres of cloth."""
+LEG_GIRTH = 0.08
+"""The same for legs."""
+ARM_GIRTH = 0.06
+"""The same for arms."""
 SAME_GIRTH = 1e-4
 """Tolerance for comparing girths."""
 

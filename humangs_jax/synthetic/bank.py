@@ -60,12 +60,16 @@ JOINTS_PER_VERTEX = 6
 """Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a
 millimetre in any pose.
 """
-SLOPE_STEP, SLOPE_ZERO = 1 / 100, 128
-"""One step of the slope texture's bytes: slopes up to 1.27; byte of no slope."""
+SLOPE_STEP = 1 / 100
+"""One step of the slope texture's bytes: slopes up to 1.27."""
+SLOPE_ZERO = 128
+"""The byte of no slope."""
 FACE_DENSITY = 2.0
 """Texels per metre of skin and eyes of the head, relative to everything else."""
-HEAD_JOINTS, SKIN_AND_EYES = (HEAD, 22, 23, 24), (0, 1)
-"""Head, jaw and eyes; the materials of a subject that `make_subject` puts first."""
+HEAD_JOINTS = (HEAD, 22, 23, 24)
+"""Head, jaw and eyes."""
+SKIN_AND_EYES = (0, 1)
+"""The materials of a subject that `make_subject` puts first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,8 +129,10 @@ def strongest_joints(
     return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)
 
 
-SCAN, PARAMETERS = "scan", "scan.json"
-"""Names in a scan's folder: of the meshes (without ending), and what is known of the person."""
+SCAN = "scan"
+"""Name of the meshes in a scan's folder, without ending."""
+PARAMETERS = "scan.json"
+"""Name of the file of what is known of the person."""
 
 
 def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 2048) -> None:
@@ -183,18 +189,27 @@ def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "
 # --------------------------------------------------------------------------------------------------
 
 
-FORMAT, VERSION = "humangs-people", 2
+FORMAT = "humangs-people"
+"""Name of the format in its files."""
+VERSION = 2
+"""Version of the format that is written and read."""
 POSE_STREAM = 20
 """Stream of a seed that draws the poses of the bank; others than the ones of written sets."""
-SILHOUETTES, SILHOUETTE_SIDE, SILHOUETTE_STREAM = 4, 960, 23
-"""Views that a body is displaced to, their pixels a side, and the stream of a seed that places
-their cameras.
-"""
+SILHOUETTES = 4
+"""Views that a body is displaced to."""
+SILHOUETTE_SIDE = 960
+"""Pixels a side of these views."""
+SILHOUETTE_STREAM = 23
+"""Stream of a seed that places their cameras."""
 UV_STEPS = 65535
 """Texture coordinates are stored in steps of one part of this."""
-PAD_VERTICES, PAD_FACES = 1024, 2048
-"""Meshes are padded to the largest of the bank, rounded up to a multiple of these."""
+PAD_VERTICES = 1024
+"""Meshes are padded to the vertices of the largest of the bank, rounded up to a multiple of this.
+"""
+PAD_FACES = 2048
+"""The same of faces."""
 MOST_MATERIALS = 32
+"""Materials of a person, at most: arrays have room for as many."""
 
 
 @pytree_dataclass

@@ -12,8 +12,14 @@ from humangs_jax.synthetic.hair import LONG_CUTS, SHORT_LINE, Haircut, above_lin
 from humangs_jax.synthetic.outfits import drawn
 from humangs_jax.synthetic.surfaces import Field, Points, Ripples, lattice
 
-EYE_X, EYE_Y, MOUTH_Y, HAND_Y = 0.029, 0.330, 0.2629, 0.085
-"""Places in template coordinates; the last parts the backs of the hands from the palms."""
+EYE_X = 0.029
+"""Distance of the eyes from the middle, template coordinates."""
+EYE_Y = 0.330
+"""Height of the eyes."""
+MOUTH_Y = 0.2629
+"""Height of the mouth."""
+HAND_Y = 0.085
+"""Height that parts the backs of the hands from the palms."""
 HAIR = {
     "black": (0.07, 0.3, (0.05, 0.12)),
     "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
@@ -25,10 +31,10 @@ HAIR = {
 """Hue, saturation and value of hair, or their ranges."""
 Face = tuple[Field, Field, Field, Points]
 """Distances from the middle, heights, how far in front they are in [0, 1], and the points."""
-FAIR_ODDS, DARK_ODDS = np.asarray(
-    [[0.2, 0.35, 0.22, 0.08, 0.06, 0.05], [0.80, 0.12, 0.01, 0.0, 0.03, 0.03]]
-)
-"""Odds of the colors of hair above, of fair and of dark skin."""
+FAIR_ODDS = np.asarray([0.2, 0.35, 0.22, 0.08, 0.06, 0.05])
+"""Odds of the colors of `HAIR` with fair skin."""
+DARK_ODDS = np.asarray([0.80, 0.12, 0.01, 0.0, 0.03, 0.03])
+"""Odds of the colors of `HAIR` with dark skin."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -137,7 +137,10 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
 
 SKULL = np.asarray([0.0, 0.345, 0.02])
 """Middle of the skull in template coordinates."""
-CROWN, NECK_HEIGHT = 0.4356, 0.189
+CROWN = 0.4356
+"""Height of the crown, template coordinates."""
+NECK_HEIGHT = 0.189
+"""Height of the neck, template coordinates."""
 
 SHORT_LINE = (
     [0.0, 0.55, 0.95, 1.2, 1.36, 1.42, 1.86, 1.95, 2.3, 3.15],

@@ -39,19 +39,28 @@ from humangs_jax.synthetic.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleB
 from humangs_jax.synthetic.subject import APPEARANCES, SPLITS, SUPERSAMPLING, subject_key
 from humangs_jax.synthetic.surroundings import pick
 
-POSES, MIXING = 2, 0.5
-"""Poses of an example; largest share of the way to the nearest pose: the other half of the way is
-reached from that pose.
+POSES = 2
+"""Poses of an example."""
+MIXING = 0.5
+"""Largest share of the way to the nearest pose: the other half of the way is reached from that
+pose.
 """
-DYED_SHARE, CLOSE_SHARE = 0.7, 0.2
-"""Share of examples whose clothes get other colors; share of close cameras among the targets."""
-DISPLACED, COUNTED = 1, 2
-"""Numbers that are folded into the key of an example: the new keys decide whether the body is
-displaced, and how many views there are.
+DYED_SHARE = 0.7
+"""Share of examples whose clothes get other colors."""
+CLOSE_SHARE = 0.2
+"""Share of close cameras among the targets."""
+DISPLACED = 1
+"""Number that is folded into the key of an example: the new key decides whether the body is
+displaced.
 """
+COUNTED = 2
+"""The same for how many views there are."""
 Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
 """Numbers for the cameras of views, azimuths, poses, and shares of close cameras."""
-BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
+BACKGROUND = 1.0
+"""Color behind the person, linear."""
+DARKEST_ALBEDO = 0.01
+"""Least albedo of a point."""
 
 
 @configuration

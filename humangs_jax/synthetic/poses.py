@@ -19,11 +19,12 @@ from humangs_jax.synthetic.surfaces import choice
 TRIES = 20
 """Stances tried until one is within the limits of the joints; after that the person stands upright.
 """
-BOTH_ARMS, ATTEMPTS = 0.45, 3
-"""Share of people whose arms have the same goal; how many goals are tried for an arm that cannot
-keep clear of the body.
-"""
+BOTH_ARMS = 0.45
+"""Share of people whose arms have the same goal."""
+ATTEMPTS = 3
+"""Goals that are tried for an arm that cannot keep clear of the body."""
 CANDIDATES = 400
+"""Poses of an arm that are drawn for a goal."""
 HAND_LENGTH = 0.6
 """Length from the wrist to a little beyond the knuckles, in lengths of the forearm."""
 HEAD_RADIUS = 0.14

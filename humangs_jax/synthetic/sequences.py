@@ -28,20 +28,24 @@ from humangs_jax.synthetic.poses import (
 )
 from humangs_jax.synthetic.surfaces import choice
 
-FPS, LONG_STEP = 30.0, 0.75
-"""Frames a second; a long step in lengths of a leg."""
-STANCE_SHARE, FLAT_FROM, FLAT_UNTIL = 0.62, 0.15, 0.55
-"""Share of a stride during which a foot is on the ground; shares of that between which the sole is
-flat.
-"""
-HEEL_STRIKE, TOE_OFF = 0.28, 0.85
-"""Pitch of the foot, radians, when it comes down on the heel and leaves from the toes, at a long
-stride.
-"""
-SMOOTHING, SPARE = 4, 0.995
-"""Frames to both sides over which the pelvis's height is smoothed; share of the legs' reach that it
-uses.
-"""
+FPS = 30.0
+"""Frames a second."""
+LONG_STEP = 0.75
+"""A long step, in lengths of a leg."""
+STANCE_SHARE = 0.62
+"""Share of a stride during which a foot is on the ground."""
+FLAT_FROM = 0.15
+"""Share of that from which on the sole is flat."""
+FLAT_UNTIL = 0.55
+"""Share of that until which the sole is flat."""
+HEEL_STRIKE = 0.28
+"""Pitch of the foot when it comes down on the heel at a long stride, radians."""
+TOE_OFF = 0.85
+"""Pitch of the foot when it leaves from the toes at a long stride, radians."""
+SMOOTHING = 4
+"""Frames to both sides over which the pelvis's height is smoothed."""
+SPARE = 0.995
+"""Share of the legs' reach that the pelvis's height uses."""
 TRIES = 12
 """Goals tried for an arm until the way to one is clear."""
 

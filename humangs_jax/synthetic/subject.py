@@ -125,9 +125,16 @@ twice that.
 """
 HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
 """Mean and standard deviation of the stature in metres of men (True) and women."""
-HEIGHT_RANGE, TALLEST_WOMAN = (1.42, 2.08), 1.95
-YEARS, YOUNG, OLD = (15.0, 85.0), 25.0, 90.0
-"""Range of ages; years at which the body's age coefficient is 0 and 1."""
+HEIGHT_RANGE = (1.42, 2.08)
+"""Range of statures, metres."""
+TALLEST_WOMAN = 1.95
+"""Largest stature of a woman, metres."""
+YEARS = (15.0, 85.0)
+"""Range of ages, years."""
+YOUNG = 25.0
+"""Years at which the body's age coefficient is 0."""
+OLD = 90.0
+"""Years at which the body's age coefficient is 1."""
 LENGTHS = ("height", "leg_length", "torso_length")
 """Coefficients that share what is missing to the wanted stature."""
 
@@ -361,10 +368,12 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
 
 
 SUPERSAMPLING = 2
-VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
-"""Sizes of meshes are padded to multiples of these, and points are colored in steps of that length:
-few shapes are compiled.
-"""
+VERTEX_STEP = 4096
+"""Vertices of meshes are padded to a multiple of this: few shapes are compiled."""
+FACE_STEP = 8192
+"""Faces of meshes are padded to a multiple of this."""
+POINT_STEP = 1 << 15
+"""Points that are colored at once."""
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 

@@ -382,8 +382,10 @@ def around(
     )
 
 
-ANGLES, EMPTY = 48, 1e-3
-"""Directions of a silhouette; radius (metres) of a slice without points."""
+ANGLES = 48
+"""Directions of a silhouette."""
+EMPTY = 1e-3
+"""Radius of a slice without points, metres."""
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)

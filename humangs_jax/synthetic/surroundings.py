@@ -24,21 +24,29 @@ from humangs_jax.synthetic.anatomy import Vector
 from humangs_jax.synthetic.fabrics import ALBEDO_LIMIT
 from humangs_jax.synthetic.surfaces import Points, choice
 
-VERTICAL_FOV, ELEVATION = np.deg2rad(60.0), np.deg2rad(np.asarray([-5.0, 15.0]))
-DISTANCE_FACTOR, CLOSE_FACTOR = (1.8, 2.2), (0.8, 1.7)
-"""Distance in bounding radii: nearer than 1.7 the frame cuts heads and feet.
-
-Close views show parts of the person.
-"""
-CLOSE_SPREAD, CLEARANCE = 0.85, 0.3
+VERTICAL_FOV = np.deg2rad(60.0)
+"""Vertical field of view, radians."""
+ELEVATION = np.deg2rad(np.asarray([-5.0, 15.0]))
+"""Range of elevations of cameras, radians."""
+DISTANCE_FACTOR = (1.8, 2.2)
+"""Range of distances in bounding radii: nearer than 1.7 the frame cuts heads and feet."""
+CLOSE_FACTOR = (0.8, 1.7)
+"""Range of distances of close views, which show parts of the person."""
+CLOSE_SPREAD = 0.85
 """Close cameras look at points up to this share of the way from the middle of the person to its
-surface, and come no nearer to a point of it than this (metres)."""
+surface.
+"""
+CLEARANCE = 0.3
+"""Metres: close cameras come no nearer to a point of the surface than this."""
 FRAME = 0.98
 """Share of the half frame that the person may reach; a camera that is too near for it steps back.
 """
 POINT_STEP = 4096
 """Points are padded to a multiple of this: few shapes are compiled."""
-JITTER, CAMERA_NUMBERS = 0.3, 5
+JITTER = 0.3
+"""Share of a step by which an azimuth is moved from even spread."""
+CAMERA_NUMBERS = 5
+"""Random numbers of a camera."""
 UP = (0.0, 1.0, 0.0)
 Angles = Float[np.ndarray, " v"]
 Number = Float[Array, ""] | float
@@ -227,25 +235,36 @@ def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]
 # --------------------------------------------------------------------------------------------------
 
 
-CELL, GRID, MARGIN = 0.025, (112, 104, 80), 6
-"""Edge of a voxel of the occupancy grid, metres; voxels along x, y and z, more than any pose takes
-(what lies outside casts no shadow); empty voxels around the person."""
-REACH, LIFT = (0.045, 0.11), 0.03
-"""Distances from the surface at which the grid is sampled for openness; height above it at which
-the way to the light begins.
-"""
+CELL = 0.025
+"""Edge of a voxel of the occupancy grid, metres."""
+GRID = (112, 104, 80)
+"""Voxels along x, y and z, more than any pose takes: what lies outside casts no shadow."""
+MARGIN = 6
+"""Empty voxels around the person."""
+REACH = (0.045, 0.11)
+"""Distances from the surface at which the grid is sampled for openness, metres."""
+LIFT = 0.03
+"""Height above the surface at which the way to the light begins, metres."""
 STRIDES = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
 """Distances towards the key light at which the grid is sampled for shadows, metres."""
-SHADOW_DENSITY, DARKEST = 2.2, 0.4
-"""Extinction per unit of what the samples find, and the least share of the key light that arrives.
-"""
-SHOULDER, WHITEST = 0.72, 0.97
-"""Brightness from which highlights are compressed, and the one that they approach."""
-WRAP, GLOSS, INSIDE_SHADE = 0.25, 0.12, 0.45
-"""Cosine by which a wide light reaches beyond the terminator; strength of highlights on the
-glossiest material; brightness of the inner side of cloth."""
+SHADOW_DENSITY = 2.2
+"""Extinction per unit of what the samples find."""
+DARKEST = 0.4
+"""Least share of the key light that arrives."""
+SHOULDER = 0.72
+"""Brightness from which highlights are compressed."""
+WHITEST = 0.97
+"""Brightness that they approach."""
+WRAP = 0.25
+"""Cosine by which a wide light reaches beyond the terminator."""
+GLOSS = 0.12
+"""Strength of highlights on the glossiest material."""
+INSIDE_SHADE = 0.45
+"""Brightness of the inner side of cloth."""
 LIGHT_NUMBERS = 28
+"""Random numbers of a scene of lights."""
 WARM = np.asarray([1.0, 0.0, -1.0])
+"""Direction of a warm color in RGB."""
 
 SCENES = {
     "studio": (0.34, (-0.8, 0.8), (0.5, 1.0), (0.5, 0.75), (0.18, 0.34), (0.68, 0.82), 0.0, 0.68),

@@ -51,7 +51,10 @@ HEM_MARGIN = 0.012
 """Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
 UNDER_A_HEM = 0.009
 """How much narrower a skirt is below a top that hangs over it, metres."""
-TUBE_COLUMNS, TUBE_STEP = 72, 0.035
+TUBE_COLUMNS = 72
+"""Columns of a tube of cloth."""
+TUBE_STEP = 0.035
+"""Largest height of a row of a tube, metres."""
 
 
 def neckline(template: Points, style: str, depth: float) -> Field:

@@ -21,8 +21,10 @@ QUILT = 0.075
 PADDED = ("puffer", "vest")
 """Kinds of garments that are quilted."""
 
-ROWS, ADVANCE = 7, 6
-"""Cells of a letter: rows, and columns from one letter to the next."""
+ROWS = 7
+"""Rows of cells of a letter."""
+ADVANCE = 6
+"""Columns of cells from one letter to the next."""
 
 _ALPHABET = {
     "A": "0E11111F111111", "B": "1E11111E11111E", "C": "0E11101010110E",

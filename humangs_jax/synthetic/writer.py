@@ -66,8 +66,16 @@ from humangs_jax.synthetic.surroundings import (
 
 HELD_OUT = "held_out"
 """Sub-folder of a subject's folder."""
-POSE_STREAM, CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM, MOTION_STREAM = 1, 2, 3, 4, 5
-"""Independent random streams of a seed; stream 0 makes the person."""
+POSE_STREAM = 1
+"""Random stream of a seed that draws poses; stream 0 makes the person."""
+CAMERA_STREAM = 2
+"""Stream of the cameras."""
+HELD_OUT_STREAM = 3
+"""Stream of the held-out cameras."""
+CLOSE_STREAM = 4
+"""Stream of the close cameras."""
+MOTION_STREAM = 5
+"""Stream of the motion."""
 GROUNDED_EVERY = 5
 """Every how many frames the height of a motion above the ground is measured."""
 CAPTURE = "capture.json"
