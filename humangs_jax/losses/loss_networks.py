@@ -68,7 +68,9 @@ class LossNetworks:
     """
 
     perceptual: Vgg19 | None = None
+    """VGG-19, for the perceptual loss."""
     lpips: Lpips | None = None
+    """A backbone and the heads of LPIPS."""
 
     @property
     def vgg16(self) -> Lpips | None:
@@ -203,6 +205,7 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
     tensors, _ = read_tensors(
         checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (is_layer(key) or is_head(key))
     )
+    # each network by the name of the module that keeps it
     part = lambda module: {
         key: x for key, x in tensors.items() if key.startswith(LOSS_PREFIX + module)
     }
@@ -213,6 +216,7 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
                 f"no loss networks ({LOSS_PREFIX}{PERCEPTUAL_MODULE}* or"
                 f" {LOSS_PREFIX}{LPIPS_MODULE}*)"
             )
+        # under the names of torchvision and lpips
         if perceptual:
             found |= {
                 f"vgg19.features.{key}": x for key, x in find_layers(perceptual, "VGG-19").items()

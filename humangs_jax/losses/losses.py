@@ -37,6 +37,7 @@ class LossConfig:
     structural: Weight = 0.2
     """Structural dissimilarity at `structural_scales` sizes."""
     structural_scales: Annotated[int, Range(1, 16)] = 3
+    """Number of sizes, each half the one before."""
     silhouette: Weight = 0.1
     """Squared error of the coverage."""
     tightness: Weight = 0.1
@@ -81,6 +82,7 @@ def loss_terms(
     structural = functools.partial(
         multiscale_structural_dissimilarity, scales=config.structural_scales
     )
+    # terms that are always computed
     losses: dict[str, Array] = {
         "squared": squared_error(rgb, images),
         "structural": jax.vmap(structural)(rgb, images),
@@ -90,6 +92,7 @@ def loss_terms(
         losses["tightness"] = (
             jnp.zeros(()) if drawn.tight_offsets is None else tightness(drawn.tight_offsets)
         )
+    # terms with a weight alone; those of opacities only where Gaussians were drawn
     if config.absolute:
         losses["absolute"] = jnp.abs(rgb - images)
     if opacities is not None and config.boundary:
@@ -101,6 +104,7 @@ def loss_terms(
     if opacities is not None and config.depth:
         true = _needed(depths, "depth", "depth of the targets")
         losses["depth"] = surface_distance(drawn.rendering.depth, alpha, true, masks)
+    # terms of networks
     if config.perceptual:
         losses["perceptual"] = _each(
             perceptual_loss, _needed(networks.perceptual, "perceptual", "VGG-19"), rgb, images
@@ -260,13 +264,14 @@ cancellation.
 
 @dataclasses.dataclass(frozen=True)
 class SsimWindow:
-    """size: pixels a side, odd. sigma: standard deviation of the weights in pixels; None: all
-    equal. sample: covariances over N - 1 instead of N.
-    """
+    """The window over which SSIM takes means and variances."""
 
     size: int = 11
+    """Side, pixels, odd."""
     sigma: float | None = 1.5
+    """Standard deviation of the weights, pixels; None: all weights are equal."""
     sample: bool = True
+    """Whether covariances are over N - 1 instead of N."""
 
     @property
     def weights(self) -> np.ndarray:

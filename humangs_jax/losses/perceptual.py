@@ -25,10 +25,12 @@ from humangs_jax.network.maps import convolve
 
 @pytree_dataclass
 class Convolution:
-    """kernel (rows, columns, in, out) and bias of one convolution."""
+    """The parameters of one convolution."""
 
     kernel: Float[Array, "y x i o"]
+    """Kernel, (rows, columns, in, out)."""
     bias: Float[Array, " o"]
+    """Bias, (out,)."""
 
 
 Weights = dict[str, Convolution]
@@ -39,11 +41,17 @@ class Conv(NamedTuple):
     """A convolution with `padding` zeros on each side, and its ReLU."""
 
     name: str
+    """Name of the layer in weights files."""
     inputs: int
+    """Number of input channels."""
     outputs: int
+    """Number of output channels."""
     size: int = 3
+    """Side of the kernel, pixels."""
     stride: int = 1
+    """Step between outputs, pixels."""
     padding: int = 1
+    """Zeros on each side, pixels."""
 
 
 class Pool(NamedTuple):
@@ -52,18 +60,26 @@ class Pool(NamedTuple):
     """
 
     size: int = 3
+    """Side of the window, pixels."""
     stride: int = 2
+    """Step between windows, pixels."""
     average: bool = False
+    """Whether it takes the mean instead of the largest value."""
     ceil: bool = False
+    """Whether windows that reach over the border count too."""
 
 
 class Fire(NamedTuple):
-    """SqueezeNet's module: `outputs` is that of both expanding convolutions together."""
+    """SqueezeNet's module: a narrow convolution, then two expanding ones side by side."""
 
     name: str
+    """Name of the module in weights files."""
     inputs: int
+    """Number of input channels."""
     squeezed: int
+    """Channels of the narrow convolution."""
     outputs: int
+    """Channels of both expanding convolutions together."""
 
     @property
     def convolutions(self) -> tuple[Conv, Conv, Conv]:
@@ -254,13 +270,14 @@ EPSILON = 1e-10
 
 @pytree_dataclass
 class Lpips:
-    """A backbone's convolutions, the weight of each channel of its compared maps, and which of
-    `BACKBONES` it is.
-    """
+    """One network of LPIPS."""
 
     backbone: Weights
+    """The backbone's convolutions."""
     heads: tuple[Float[Array, " _"], ...]
+    """Weight of each channel of the compared maps, one array a map."""
     net: str = static_field()
+    """Which of `BACKBONES` it is."""
 
 
 def _scaled(image: Array) -> Array:
@@ -344,11 +361,10 @@ DIVISORS = (1.0, 2.6, 4.8, 3.7, 5.6, 0.15)
 
 @pytree_dataclass
 class Vgg19:
-    """The convolutions of VGG-19 that the perceptual loss looks at (14 of 16), by torchvision's
-    numbers.
-    """
+    """The convolutions of VGG-19 that the perceptual loss looks at (14 of 16)."""
 
     weights: Weights
+    """The convolutions, by the numbers of torchvision's layers."""
 
 
 def perceptual_errors(

@@ -26,8 +26,11 @@ class Architecture:
     """
 
     encoder: Encoder = PatchTransformer()
+    """Makes features of the photos."""
     reader: Reader = PixelAlignedReader()
+    """Reads the features at the body's vertices."""
     decoder: Decoder = VertexDecoder()
+    """Makes Gaussians of the features."""
     driver: Driver | None = None
     """Draws every target anew; None: skinning alone moves the Gaussians."""
 
@@ -89,8 +92,11 @@ class HumanGSConfig:
     """
 
     architecture: Architecture = dataclasses.field(default_factory=Architecture)
+    """What the weights are."""
     conventions: Conventions = dataclasses.field(default_factory=Conventions)
+    """What the weights were trained with."""
     runtime: Runtime = dataclasses.field(default_factory=Runtime)
+    """How the network runs here."""
 
     def __post_init__(self):
         """Raises ValueError for photos that the encoder cannot cut into patches, and for fields of

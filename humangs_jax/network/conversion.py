@@ -51,23 +51,25 @@ StateDict = dict[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """Variables and their configuration; skinning_weights: (n, j) of the body that the checkpoint
-    was made for.
-
-    skipped: how many tensors of the frozen loss networks were left out.
-    """
+    """What a released checkpoint holds, in the forms of this package."""
 
     variables: Variables
+    """Parameters and running statistics of the network."""
     config: HumanGSConfig
+    """The configuration that these variables have."""
     skinning_weights: np.ndarray
+    """Skinning weights of the body that the checkpoint was made for, (n, j)."""
     skipped: int
+    """How many tensors of the frozen loss networks were left out."""
 
 
 class Layout(NamedTuple):
     """How a tensor lies in the release and here; the two undo each other."""
 
     from_release: Callable[[np.ndarray], np.ndarray]
+    """Turns an array of the release into ours."""
     to_release: Callable[[np.ndarray], np.ndarray]
+    """Turns an array of ours into the one of the release."""
 
 
 SAME = Layout(lambda x: x, lambda x: x)
@@ -195,6 +197,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     shape = functools.partial(_shape, state)
     has = lambda prefix: any(key.startswith(prefix) for key in state)
     base = published()
+    # sizes of the texture, the tokens and their patches
     resolution, channels = shape("neural_texture", 4)[2:]
     token_width, patch_numbers = shape("image_tokenizer.1.weight", 2)
     width = statistics.mode(
@@ -207,6 +210,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
             f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of"
             f" {per_pixel} channels"
         )
+    # optional parts are there if their tensors are
     upsampler, output_width = None, None
     if has("upsampler."):
         upsampler = UpsamplerConfig(hidden=shape("upsampler.proj.0.weight", 4)[0])
@@ -215,6 +219,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     joints = None
     if has("vertex_decoder.lbs_head."):
         joints = shape("vertex_decoder.lbs_head.2.weight", 2)[0] // gaussians
+    # the parts of these sizes; photos of whole patches
     encoder = PatchTransformer(
         patch_size=patch,
         texture=TriplaneConfig(resolution, channels),

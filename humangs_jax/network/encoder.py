@@ -89,8 +89,11 @@ class Tokenizer(nn.Module):
     """
 
     width: int
+    """Features of a token, d."""
     texture: TriplaneConfig
+    """Size of the neural texture."""
     dtype: Any = None
+    """Type of the matrix product; None: that of the parameters."""
 
     @nn.compact
     def __call__(self, patches: Float[Array, "l pixels 12"]) -> Float[Array, "l d"]:
@@ -117,7 +120,9 @@ class PatchTransformer(Encoder):
     """What a pixel knows besides its color: its ray and the canonical position seen there, or only
     its place in the photo, for systems whose photos have neither cameras nor poses."""
     texture: TriplaneConfig = TriplaneConfig()
+    """Size of the neural texture that every pixel looks up."""
     transformer: TransformerConfig = TransformerConfig()
+    """Sizes of the transformer over the tokens of all views."""
     upsampler: UpsamplerConfig | None = knob(
         UpsamplerConfig(),
         cost="vertices read maps of one feature vector per patch",
@@ -140,6 +145,7 @@ class PatchTransformer(Encoder):
 
         Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
         """
+        # every patch of every view
         see = encoder_pixels if self.geometry == "rays_and_positions" else photo_pixels
         patches = patchify(see(inputs, run), self.patch_size)
         views, height, width = (
@@ -152,6 +158,8 @@ class PatchTransformer(Encoder):
             jnp.zeros((), jnp.int32),
             None if present is None else present * height * width,
         )
+        # only patches that the person touches, packed to the front; the rest of the capacity is
+        # padding
         if run.tokens == "foreground":
             touched = touched_patches(inputs.foreground, present, self.patch_size)
             packing = pack_patches(
@@ -159,6 +167,7 @@ class PatchTransformer(Encoder):
             )
             dropped, count = jnp.sum(touched, dtype=jnp.int32) - packing.count, packing.count
             patches = patches.at[packing.indices].get(mode="fill", fill_value=0)
+        # tokens, and one more for the whole subject
         features, class_token = self.transformer.width, self.transformer.class_token
         tokens = Tokenizer(features, self.texture, dtype, name="tokenizer")(patches)
         if class_token:
@@ -168,6 +177,7 @@ class PatchTransformer(Encoder):
             tokens = jnp.concatenate([first.astype(tokens.dtype), tokens])
             count = None if count is None else count + 1
 
+        # maps of the layers that are read; patches without a token are 0
         depths = Transformer(self.transformer, run.runtime, name="transformer")(tokens, count)
         global_token = depths[-1][0] if class_token else None
         depths = [x[int(class_token) :] for x in depths]

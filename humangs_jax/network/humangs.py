@@ -44,8 +44,11 @@ class HumanGS(nn.Module):
     """
 
     encoder: Encoder
+    """Makes features of the photos."""
     reader: Reader
+    """Reads the features at the vertices."""
     decoder: Decoder
+    """Makes Gaussians of the features."""
     keeps_features: bool = False
     """Whether a driver works from the features."""
 

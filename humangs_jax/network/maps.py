@@ -200,8 +200,11 @@ class Convolution(nn.Module):
     """
 
     features: int
+    """Number of output channels."""
     kernel_init: nn.initializers.Initializer
+    """Initializer of the kernel."""
     dtype: Any = None
+    """Type of the arithmetic; None: that of input and parameters."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w d"]:

@@ -48,33 +48,42 @@ TARGET_HEIGHT = 1.8
 
 @pytree_dataclass
 class HumanGSInputs:
-    """The photos of one subject, and the posed body in each of them.
-
-    images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices:
-    (v, n, 3) metric, the body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose.
-    position_maps: (v, h, w, 3) canonical position of each pixel, normalised units, 1 on background.
-    depth_maps: (v, h, w) rasterized z, normalised units, -1 on background. foreground: (v, h, w)
-    pixels of the person (used where tokens are "foreground"). view_count: the number of real views,
-    which come first; the others are padding and change nothing. None: all are real. posed_normals:
-    (v, n, 3) unit, used with shells. canonical_normals: (n, 3) unit, used where the decoder's frame
-    is "normal". spacing: (n,) distance between vertices relative to the mesh that the weights were
-    trained with; None: 1. skinning_weights: (n, j) of the body, and
-    texels: the map of its surface, for decoders whose Gaussians are not those of vertices.
-    """
+    """The photos of one subject, and the posed body in each of them."""
 
     images: Float[Array, "v h w 3"]
+    """Photos, (v, h, w, 3), in [0, 1], on a white background."""
     cameras: Camera
+    """A batch of v cameras, metres."""
     posed_vertices: Float[Array, "v n 3"]
+    """The body in the pose of each photo, (v, n, 3), metres."""
     canonical_vertices: Float[Array, "n 3"]
+    """The body in the T-pose, (n, 3), metres."""
     position_maps: Float[Array, "v h w 3"]
+    """Canonical position that each pixel shows, (v, h, w, 3), normalised units; 1 on background."""
     depth_maps: Float[Array, "v h w"]
+    """Rasterized z of the body, (v, h, w), normalised units; -1 on background."""
     foreground: Bool[Array, "v h w"]
+    """Pixels of the person, (v, h, w), used where tokens are "foreground"."""
     view_count: Int[Array, ""] | None = None
+    """Number of real views, which come first; the others are padding and change nothing. None: all
+    are real.
+    """
     posed_normals: Float[Array, "v n 3"] | None = None
+    """Unit normals of the posed vertices, (v, n, 3), used with shells."""
     canonical_normals: Float[Array, "n 3"] | None = None
+    """Unit normals of the canonical vertices, (n, 3), used where the decoder's frame is
+    "normal".
+    """
     spacing: Float[Array, " n"] | None = None
+    """Distance between vertices relative to the mesh that the weights were trained with, (n,);
+    None: 1.
+    """
     skinning_weights: Float[Array, "n j"] | None = None
+    """Skinning weights of the body, (n, j), for decoders whose Gaussians are not those of
+    vertices.
+    """
     texels: Texels | None = None
+    """The map of the body's surface, for parts that work on one."""
 
     @property
     def present(self) -> Bool[Array, " v"]:
@@ -90,17 +99,18 @@ def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
 
 
 class Pass(NamedTuple):
-    """How one pass of the network runs: all that a part knows besides its own fields. See
+    """How one pass of the network runs: all that a part knows besides its fields. See
     `HumanGSConfig.run`.
-
-    train: batch norms use this subject's statistics and update the running ones. axis_name: vmap
-    axes over which those are shared.
     """
 
     conventions: Conventions
+    """What the weights were trained with."""
     runtime: Runtime
+    """How the network runs here."""
     train: bool = False
+    """Whether batch norms use this subject's statistics and update the running ones."""
     axis_name: str | tuple[str, ...] | None = None
+    """Axes of `vmap` over which those statistics are shared."""
 
     @property
     def tokens(self) -> TokenSelection:
@@ -110,90 +120,97 @@ class Pass(NamedTuple):
 
 @pytree_dataclass
 class Packing:
-    """Which patches became tokens.
-
-    indices: (l,) of the kept patches, in their order; the number of patches itself where a token is
-    padding.
-    count: number of real tokens, which come first; the rest is padding.
-    """
+    """Which patches became tokens."""
 
     indices: Int[Array, " l"]
+    """Patch of each token, (l,), in the order of the patches; the number of patches itself where a
+    token is padding.
+    """
     count: Int[Array, ""]
+    """Number of real tokens, which come first; the rest is padding."""
 
 
 @pytree_dataclass
 class Encoding:
-    """What an encoder makes of the photos.
-
-    maps: (v, h', w', d) features. global_token: (e,), or None. dropped_tokens: foreground patches
-    for which the token capacity had no room. packing: the patches of which the maps know something;
-    None: all. patch_size: side of a patch, pixels.
-    """
+    """What an encoder makes of the photos."""
 
     maps: Float[Array, "v h w d"]
+    """Features, (v, h', w', d)."""
     global_token: Float[Array, " e"] | None
+    """Features of the whole subject, (e,), or None."""
     dropped_tokens: Int[Array, ""]
+    """Number of foreground patches for which the token capacity had no room."""
     packing: Packing | None = None
+    """The patches of which the maps know something; None: all."""
     patch_size: int = static_field(default=1)
+    """Side of a patch, pixels."""
 
 
 @pytree_dataclass
 class Shells:
     """What the photos show at the s points along the normal of each vertex.
 
-    distances: (s,). colors: (n, s, 3) mean photo color over the views in which the point is visible
-    and in the foreground, weighted by how much the posed normal faces them; grey without such a
-    view. seen: (n, s) the sum of those weights over the number of views. inside: (n, s) mean mask
-    at the point over the views that contain it. hull: (n, s) the minimum of the same, 0 outside of
-    the visual hull. A view that does not contain the point is ignored; without any view both are 1.
+    A view that does not contain a point is ignored.
     """
 
     distances: Float[Array, " s"]
+    """Distances of the points from the surface, (s,), normalised units."""
     colors: Float[Array, "n s 3"]
+    """Mean photo color over the views in which the point is visible and in the foreground, weighted
+    by how much the posed normal faces them, (n, s, 3); grey without such a view.
+    """
     seen: Float[Array, "n s"]
+    """The sum of those weights over the number of views, (n, s)."""
     inside: Float[Array, "n s"]
+    """Mean mask at the point over the views that contain it, (n, s); 1 if there is none."""
     hull: Float[Array, "n s"]
+    """Least mask at the point over the same views, (n, s): 0 outside of the visual hull; 1 if there
+    is none.
+    """
 
 
 @pytree_dataclass
 class VertexFeatures:
-    """What the photos show of each vertex.
-
-    local: (n, d) pooled feature. global_token: (e,) or None. photo_colors: (n, 3) and
-    visible_fraction: (n,), or None.
-    shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
-    """
+    """What the photos show of each vertex."""
 
     local: Float[Array, "n d"]
+    """Pooled feature of each vertex, (n, d)."""
     global_token: Float[Array, " e"] | None = None
+    """Features of the whole subject, (e,), or None."""
     photo_colors: Float[Array, "n 3"] | None = None
+    """Mean photo color over the views that see the vertex, (n, 3), or None."""
     visible_fraction: Float[Array, " n"] | None = None
+    """Share of the views that see the vertex, (n,), or None."""
     shells: Shells | None = None
+    """What the photos show off the surface, or None."""
     normals: Float[Array, "n 3"] | None = None
+    """Unit normals of the canonical body, (n, 3), or None."""
 
 
 @pytree_dataclass
 class HumanGSOutputs:
-    """Canonical Gaussians of one subject.
-
-    gaussians: metric. Without `skinning_weights` g = n * k of them, vertex-major, k fastest.
-    tight_offsets: (n, k_tight, 3) from the vertex, or of each Gaussian from where it belongs,
-    normalised units (for the tightness loss, which is 0 for None).
-    skinning_offsets: (n * k, j) logits of the skinning head, or None (see
-    `vertex_decoder.corrected_skinning_weights`).
-    dropped_tokens: foreground patches for which the token capacity had no room. skinning_weights:
-    (g, j), rows of sum 1, of Gaussians that do not belong to one vertex each; None: the body's.
-    scene: what a driver works from for every target: the features, unless a decoder sets it.
-    """
+    """Canonical Gaussians of one subject."""
 
     gaussians: Gaussians
+    """The Gaussians, metres. Without `skinning_weights` there are g = n * k, vertex by vertex."""
     tight_offsets: Float[Array, "n t 3"] | None = None
+    """Offsets of the tight Gaussians from the vertex, or of each Gaussian from where it belongs,
+    (n, t, 3), normalised units, for the tightness loss, which is 0 for None.
+    """
     skinning_offsets: Float[Array, "g j"] | None = None
+    """Logits of the skinning head, (n * k, j), or None (see
+    `vertex_decoder.corrected_skinning_weights`).
+    """
     dropped_tokens: Int[Array, ""] = dataclasses.field(
         default_factory=lambda: jnp.zeros((), jnp.int32)
     )
+    """Number of foreground patches for which the token capacity had no room."""
     skinning_weights: Float[Array, "g j"] | None = None
+    """Rows of sum 1, (g, j), of Gaussians that do not belong to one vertex each; None: the body's
+    weights.
+    """
     scene: PyTree = None
+    """What a driver works from for every target: the features, unless a decoder sets it."""
 
     @property
     def is_empty(self) -> bool:
@@ -202,40 +219,40 @@ class HumanGSOutputs:
 
 
 class Target(NamedTuple):
-    """What a driver knows of a target.
-
-    vertices: (n, 3) of the posed body, metres. pixels: (h, w, 9) of every pixel the ray (moment,
-    direction) and the canonical position of the body there (1 on background), normalised units, for
-    drivers that make images; else None.
-    """
+    """What a driver knows of a target."""
 
     pose: BodyPose
+    """The pose of the target."""
     vertices: Float[Array, "n 3"]
+    """Vertices of the posed body, (n, 3), metres."""
     pixels: Float[Array, "h w 9"] | None = None
+    """Of every pixel the ray (moment, direction) and the canonical position of the body there (1 on
+    background), (h, w, 9), normalised units, for drivers that make images; else None.
+    """
 
 
 class Drawn(NamedTuple):
-    """Images of the v targets of one subject, and what losses compare besides.
-
-    spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight. opacities:
-    (g,), tight_offsets: of the Gaussians that were drawn; opacities None: there were none, and no
-    alpha or depth either.
-    """
+    """Images of the v targets of one subject, and what losses compare besides."""
 
     rendering: Rendering
+    """The images of all targets."""
     spread: Float[Array, "v h w"] | None = None
+    """`losses.ray_spread`, (v, h, w), square metres; None unless it has a weight."""
     opacities: Float[Array, " g"] | None = None
+    """Opacities of the Gaussians that were drawn, (g,). None: there were none, and no alpha or
+    depth either.
+    """
     tight_offsets: Float[Array, "n t 3"] | None = None
+    """Tight offsets of the Gaussians that were drawn, (n, t, 3), normalised units, or None."""
 
 
 class Encoder(Part, nn.Module):
     """Photos -> `Encoding`. Alone among parts it may have running statistics, in the collection
     "batch_stats".
-
-    patch_size: field; the side of photos is a multiple of it, pixels.
     """
 
     patch_size: Patch = 1
+    """The side of photos is a multiple of it, pixels."""
 
     def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
         """The encoding."""
@@ -302,11 +319,10 @@ class Driver(Part, nn.Module):
 
 
 class Watched(nn.Module):
-    """What `stage` calls: each entry of the dict that it returns is a stage of its own if
-    `apart`.
-    """
+    """What `stage` calls."""
 
     apart: bool = False
+    """Whether each entry of the dict that the function returns is a stage by itself."""
 
     def __call__(self, function: Callable[..., T], *learned: Any) -> T:
         """function(*learned)."""

@@ -41,6 +41,7 @@ def small() -> HumanGSConfig:
     It has no upsampler, for its cost on a CPU (docs/training.md).
     """
     return HumanGSConfig(
+        # sizes that a CPU trains in days, and all that reads the photos directly
         Architecture(
             PatchTransformer(
                 texture=TriplaneConfig(resolution=64, channels=8),
@@ -58,6 +59,7 @@ def small() -> HumanGSConfig:
                 residual_color=True,
             ),
         ),
+        # the data that it was trained on
         Conventions(
             image_size=256,
             tokens="foreground",

@@ -90,6 +90,7 @@ class PixelAlignedReader(Reader):
             subject_unit(inputs.canonical_vertices),
             encoding.maps,
         )
+        # where each view sees each vertex, and whether it counts
         cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
         pixels, visible = project_and_test(
             cameras, vertices, inputs.depth_maps, inputs.present, grid
@@ -101,6 +102,7 @@ class PixelAlignedReader(Reader):
         read = sample_bilinear if self.output_width is None else sample_neighborhoods
         counts = jnp.sum(weights, axis=0) + COUNT_EPSILON
         mean = lambda sums: jnp.einsum("n...,n->n...", sums, 1 / counts, precision=transform.EXACT)
+        # the mean over views of what the maps hold there
         local = jax.tree.map(mean, sum_over_views(read, maps, indices, weights))
         if self.output_width is not None:
             kernel = self.param(
@@ -108,6 +110,7 @@ class PixelAlignedReader(Reader):
             )
             bias = self.param("bias", nn.initializers.zeros, (self.output_width,))
             local = convolve_neighborhoods(*local, kernel, bias, run.runtime.compute_dtype)
+        # what photos show at the vertices and along their normals
         colors = fraction = shells = None
         if self.sample_rgb:
             colors = photo_colors(inputs.images, pixels, visible, grid)

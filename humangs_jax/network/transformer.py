@@ -117,9 +117,13 @@ class Attention(nn.Module):
     """Multi-head self-attention without biases; tokens (l, d) -> (l, d)."""
 
     head_width: int
+    """Features of a head."""
     qk_norm: bool
+    """Whether queries and keys are normalised."""
     runtime: Runtime
+    """How the network runs here."""
     kernel_init: Any
+    """Initializer of the matrices."""
 
     @nn.compact
     def __call__(
@@ -181,8 +185,11 @@ class Block(nn.Module):
     """One pre-norm block; tokens (l, d) -> (l, d)."""
 
     config: TransformerConfig
+    """Sizes of the transformer."""
     runtime: Runtime
+    """How the network runs here."""
     index: int
+    """Number of the block, from 0: deeper ones start smaller."""
 
     @nn.compact
     def __call__(
@@ -208,7 +215,9 @@ class Transformer(nn.Module):
     """
 
     config: TransformerConfig
+    """Sizes of the transformer."""
     runtime: Runtime
+    """How the network runs here."""
 
     @nn.compact
     def __call__(

@@ -52,7 +52,9 @@ class UpConvolution(nn.Module):
     """
 
     features: int
+    """Number of output channels."""
     dtype: Any = None
+    """Type of the arithmetic; None: that of input and parameters."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v 2*h 2*w features"]:
@@ -73,14 +75,14 @@ class UpConvolution(nn.Module):
 
 
 class Upsampler(nn.Module):
-    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of the last convolution.
-
-    axis_name: vmap axis to share batch statistics over.
-    """
+    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of the last convolution."""
 
     config: UpsamplerConfig
+    """Sizes of the upsampler."""
     dtype: Any = None
+    """Type of the arithmetic; None: that of input and parameters."""
     axis_name: str | tuple[str, ...] | None = None
+    """Axes of `vmap` over which batch statistics are shared."""
 
     @nn.compact
     def __call__(

@@ -152,7 +152,9 @@ class VertexDecoder(Decoder):
             )
             return last(hidden_layer(x, f"{name}_hidden")).reshape(x.shape[0], k, len(bias))
 
+        # a trunk that all heads share
         x = hidden_layer(hidden_layer(x, "trunk_0"), "trunk_1")
+        # what the heads give before training: small kernels, and biases that mean something
         small = nn.initializers.normal(LAST_STD)
         thin = THINNER if self.frame == "normal" else 0.0
         scales = [self.initial_log_scale] * 2 + [self.initial_log_scale - thin]
@@ -169,31 +171,32 @@ class VertexDecoder(Decoder):
 
 @pytree_dataclass
 class RawGaussians:
-    """Heads before their activations.
-
-    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) color, opacity. skinning:
-    (n, k, j) logits or None. shells: (n, k, s) logits or None.
-    """
+    """Outputs of the heads before their activations."""
 
     geometry: Float[Array, "n k 10"]
+    """Offset, quaternion and scale, (n, k, 10)."""
     appearance: Float[Array, "n k 4"]
+    """Color and opacity, (n, k, 4)."""
     skinning: Float[Array, "n k j"] | None
+    """Logits of the joints, (n, k, j), or None."""
     shells: Float[Array, "n k s"] | None = None
+    """Logits of the points along the normal, (n, k, s), or None."""
 
 
 @pytree_dataclass
 class VertexGaussians:
-    """K Gaussians of every vertex, lengths in normalised units.
-
-    offsets: (n, k, 3) from the vertex. quats: (n, k, 4) wxyz, unit. scales: (n, k, 3). opacities:
-    (n, k). colors: (n, k, 3).
-    """
+    """K Gaussians of every vertex, lengths in normalised units."""
 
     offsets: Float[Array, "n k 3"]
+    """Offsets from the vertex, (n, k, 3)."""
     quats: Float[Array, "n k 4"]
+    """Rotations, (n, k, 4), unit quaternions wxyz."""
     scales: Float[Array, "n k 3"]
+    """Standard deviations, (n, k, 3)."""
     opacities: Float[Array, "n k"]
+    """Opacities, (n, k), in [0, 1]."""
     colors: Float[Array, "n k 3"]
+    """RGB, (n, k, 3), in [0, 1]."""
 
 
 def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
