@@ -105,18 +105,20 @@ Millimetres = tuple[float | int, float | int, float | int]
 
 
 class Place(NamedTuple):
-    """Where a detector sees one of its landmarks.
-
-    name: of the landmark. base: the landmark of `body.landmarks` that it is measured from. offset:
-    from there, metres in T-pose: x to the person's left, y up, z to the front. joints: whose
-    turning carries the offset along, by equal shares; none: what carries the base, which then is a
-    vertex.
-    """
+    """Where a detector sees one of its landmarks."""
 
     name: str
+    """Name of the landmark."""
     base: str
+    """The landmark of `body.landmarks` that it is measured from."""
     offset: tuple[float, float, float]
+    """From there to the landmark, metres in T-pose: x to the person's left, y up, z to the
+    front.
+    """
     joints: tuple[str, ...] = ()
+    """Joints whose turning carries the offset along, by equal shares; none: what carries the base,
+    which then is a vertex.
+    """
 
 
 def place(name: str, base: str, joints: tuple[str, ...], millimetres: Millimetres) -> Place:
@@ -200,29 +202,36 @@ FOOT = {
 class LandmarkModel:
     """What of a body its landmarks depend on: k landmarks from j joints and p points of the
     surface.
-
-    joints, joint_directions: (j, 3) rest joints of the mean shape and (j, 3, s) their change,
-    metres. points: p of the surface.
-    regressor: (k, j + p) landmarks from posed joints and points; rows sum to 1, or are 0 where the
-    body lacks a landmark.
-    certainty: (k,) weights of errors, see `LESS_CERTAIN`. Static: names; known, which of them the
-    body has; parents, joint_names; movers, the joints whose turning moves a landmark; placed, of
-    the last points, which are those of `places`, the rows; groups: (group, side) of these: of a
-    pair, and of what is in the middle; side 1, and -1 for what is mirrored.
     """
 
     joints: Float[Array, "j 3"]
+    """Rest joints of the mean shape, (j, 3), metres."""
     joint_directions: Float[Array, "j 3 s"]
+    """Change of the rest joints per unit of a shape coefficient, (j, 3, s), metres."""
     points: SurfacePoints
+    """The points of the surface that landmarks need; those of `places` come last."""
     regressor: Float[Array, "k jp"]
+    """Landmarks from posed joints and points, (k, j + p); rows sum to 1, or are 0 where the body
+    lacks a landmark.
+    """
     certainty: Float[Array, " k"]
+    """Weights of errors, (k,), see `LESS_CERTAIN`."""
     names: tuple[str, ...] = static_field(default=())
+    """Names of the landmarks, k of them."""
     known: tuple[bool, ...] = static_field(default=())
+    """Whether the body has each landmark, k of them."""
     parents: tuple[int, ...] = static_field(default=())
+    """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field(default=())
+    """Names of the j joints."""
     movers: tuple[int, ...] = static_field(default=())
+    """The joints whose turning moves a landmark."""
     placed: tuple[int, ...] = static_field(default=())
+    """Landmark of each of the last points, which are those of `places`."""
     groups: tuple[tuple[int, int], ...] = static_field(default=())
+    """(group, side) of each of these points: a group is a pair, or what is in the middle; side 1,
+    and -1 for what is mirrored.
+    """
 
     def moved(self, offsets: Float[Array, "g 3"]) -> "LandmarkModel":
         """The model with more offsets of its places, metres, one for each group; x of a mirrored
@@ -272,6 +281,7 @@ def landmark_model(
     Raises: ValueError if it has none of them, which is so when its joints have other names than
     SMPL-X's.
     """
+    # sources of each landmark: joints and vertices, or a place that the caller gives
     finder = _Finder(body)
     moved = {
         place.name: place
@@ -285,12 +295,15 @@ def landmark_model(
             f"body '{body.name}' has none of these landmarks: are its joints named like SMPL-X's"
             f" (left_hip, ...)? They are {', '.join(body.joint_names[:4]) or 'not named'}"
         )
+    # points of the surface: vertices that are sources, then the places; left and right share a
+    # group
     vertices = sorted({source for found in sources for source in found if source >= 0})
     joints, placed = len(body.parents), [moved[name] for name in names if name in moved]
     pairs = [
         place.name if side_of(place.name) > 0 else mirrored_name(place.name) for place in placed
     ]
     numbers = sorted(set(pairs))
+    # each landmark is the mean of its sources, or its place
     regressor = np.zeros((len(names), joints + len(vertices) + len(placed)), np.float32)
     for row, name, found in zip(regressor, names, sources, strict=True):
         for source in found:
@@ -433,10 +446,12 @@ class _Finder:
     def _find(self, name: str) -> list[int]:
         joint = lambda x: -1 - self.index[x]
         match name.split("_"):
+            # the middle between two joints
             case ["neck"]:
                 return [joint(f"{side}_shoulder") for side in SIDES]
             case ["mid", "hip"]:
                 return [joint(f"{side}_hip") for side in SIDES]
+            # the face, by where the surface is foremost, lowest or at the height of the eyes
             case ["nose"] | ["face", "30"]:
                 low, high = self.joints[self.index["jaw"], 1], self._eyes()[1]
                 return [self._best(self._head(low, high), lambda p: p[:, 2])]
@@ -447,6 +462,7 @@ class _Finder:
             case ["face", "27"]:
                 height = self._eyes()[1]
                 return [self._on_midline(lambda p: -np.abs(p[:, 1] - height) + p[:, 2])]
+            # joints themselves
             case ["jaw"] | [
                 "left" | "right",
                 "shoulder" | "elbow" | "wrist" | "hip" | "knee" | "ankle" | "eye",
@@ -454,6 +470,7 @@ class _Finder:
                 return [joint(name)]
             case ["left" | "right" as side, "hand", "root"]:
                 return [joint(f"{side}_wrist")]
+            # parts of one side: the outermost vertex in a direction
             case ["left" | "right" as side, "ear"]:
                 eyes = self._eyes()[1]
                 return [

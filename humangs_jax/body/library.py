@@ -184,6 +184,7 @@ def read_body(path: str | Path) -> BodyModel:
             raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
         if missing := sorted(KEYS - set(arrays)):
             raise Refused(f"key '{missing[0]}' is missing")
+        # the parts that every body has
         parents, joint_names = (
             arrays["parents"].tolist(),
             [str(name) for name in arrays["joint_names"]],
@@ -195,6 +196,7 @@ def read_body(path: str | Path) -> BodyModel:
             "shape_directions", arrays["shape_directions"], (shapes, vertices, 3), -LARGEST, LARGEST
         )
         check_indices("faces", arrays["faces"], (None, 3), vertices)
+        # small numbers are stored as integers
         directions = np.moveaxis(arrays["shape_directions"], 0, -1)
         if directions.dtype == np.int16:
             directions = directions * DIRECTION_STEP
@@ -203,6 +205,7 @@ def read_body(path: str | Path) -> BodyModel:
             check_array("uvs", uvs, (None, 2))
             check_indices("uv_faces", arrays["uv_faces"], (len(arrays["faces"]), 3), len(uvs))
             uvs = uvs / UV_STEPS if uvs.dtype == np.uint16 else uvs
+        # parts that a body may lack
         for name in {"collapse_order", "collapse_into"} & set(arrays):
             check_indices(name, arrays[name], (vertices,), vertices)
         expressions = read_expressions(arrays, vertices, joints)
@@ -262,6 +265,7 @@ def read_expressions(
         return None
     if missing := [name for name in ("vertices", "directions", "names") if name not in found]:
         raise Refused(f"key '{EXPRESSION}{missing[0]}' is missing")
+    # sizes of everything follow from the vertices and the names
     count, moved = len(np.atleast_1d(found["names"])), len(np.atleast_1d(found["vertices"]))
     shapes = {
         "directions": (moved, 3, count),
@@ -285,21 +289,23 @@ def read_expressions(
 # --------------------------------------------------------------------------------------------------
 
 
-SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100
-"""Columns of `shapedirs` in current files; older ones have 10 + 10."""
+SHAPE_COLUMNS = 300
+"""Columns of `shapedirs` that are directions of shape, in current files."""
+EXPRESSION_COLUMNS = 100
+"""Columns of `shapedirs` behind them that are directions of expression."""
 OLD_COLUMNS = 10
+"""Columns of each kind in older files."""
 JOINTS = len(JOINT_NAMES)
 
 
 @pytree_dataclass
 class HandBasis:
-    """The hand pose space of a model file, left hand first.
-
-    means: (2, 45) axis-angle, radians. components: (2, 45, 45), rows are principal components.
-    """
+    """The hand pose space of a model file, left hand first."""
 
     means: Float[Array, "2 45"]
+    """Mean poses, (2, 45), axis-angle, radians."""
     components: Float[Array, "2 45 45"]
+    """Principal components in rows, (2, 45, 45)."""
 
 
 def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int = 10) -> BodyModel:
@@ -314,6 +320,7 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
     """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
+        # what the file must have
         template = file.numbers("v_template", (None, 3), LARGEST)
         n = len(template)
         weights = file.numbers("weights", (n, JOINTS), LARGEST)
@@ -322,6 +329,7 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
         has_uvs = "vt" in file and "ft" in file
         uvs = file.numbers("vt", (None, 2)) if has_uvs else None
         number = lambda x: jnp.asarray(x, jnp.result_type(float))
+        # the expressions of the face, also as a change of the joints
         regressor = number(file.numbers("J_regressor", (JOINTS, n), LARGEST))
         components = number(directions[..., shape_count:])
         expressions = Expressions(
@@ -350,6 +358,7 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
 def _shape_directions(
     file: ArrayFile, n: int, shape_count: int, expression_count: int
 ) -> tuple[Float[np.ndarray, "n 3 s"], tuple[str, ...]]:
+    # how many columns of each kind the file has
     stored = file.numbers("shapedirs", (n, 3, None), LARGEST)
     columns = stored.shape[-1]
     if columns >= SHAPE_COLUMNS + EXPRESSION_COLUMNS:
@@ -367,6 +376,7 @@ def _shape_directions(
             raise FileError(
                 file.path, "shapedirs", f"has {limit} {kind} directions, asked for {asked}"
             )
+    # the first columns of each kind
     shape, expression = (
         stored[..., :shape_count],
         stored[..., available[0] : available[0] + expression_count],

@@ -153,18 +153,18 @@ def spread_weights(
 
 @pytree_dataclass
 class SurfacePoints:
-    """p points of a body with j joints; batches and concatenations of them are again such points.
-
-    rest: (p, 3) of the mean shape in T-pose, metres. directions: (p, 3, s) metres per unit of a
-    shape coefficient.
-    corrections: (p, 3, q) of the pose's features, see `pose_features`, or None. weights: (p, j) of
-    the skinning.
+    """p points of a body with j joints; batches and concatenations of them are again such
+    points.
     """
 
     rest: Float[Array, "p 3"]
+    """The points of the mean shape in T-pose, (p, 3), metres."""
     directions: Float[Array, "p 3 s"]
+    """Their change per unit of a shape coefficient, (p, 3, s), metres."""
     corrections: Float[Array, "p 3 q"] | None
+    """Their change by the pose's features, (p, 3, q), see `pose_features`, or None."""
     weights: Float[Array, "p j"]
+    """Skinning weights, (p, j)."""
 
 
 def surface_points(body: "BodyModel") -> SurfacePoints:
@@ -202,14 +202,12 @@ def pose_points(
 
 @pytree_dataclass
 class Texels:
-    """Which point of the body's surface each texel of a map shows; row 0 on top.
-
-    corners: (h, w, 3) vertices of the texel's face. weights: (h, w, 3) of these vertices, of sum 1;
-    0 where it shows nothing.
-    """
+    """Which point of the body's surface each texel of a map shows; row 0 on top."""
 
     corners: Int[Array, "h w 3"]
+    """Vertices of the texel's face, (h, w, 3)."""
     weights: Float[Array, "h w 3"]
+    """Weights of these vertices, (h, w, 3), of sum 1; 0 where the texel shows nothing."""
 
     @property
     def covered(self) -> Bool[Array, "h w"]:
@@ -243,8 +241,9 @@ class BodyModel:
     uv_faces: Int[Array, "f 3"] | None = None
     """Indices into `uvs`."""
     collapse_order: Int[Array, " n"] | None = None
-    """Of progressive decimation, with `collapse_into`: `body.resolution`."""
+    """Order in which vertices vanish in progressive decimation, (n,): `body.resolution`."""
     collapse_into: Int[Array, " n"] | None = None
+    """Vertex that each of them is merged with, (n,)."""
     spacing: Float[Array, " n"] | None = None
     """Distance to neighboring vertices relative to the mesh that was subdivided: `body.resolution`.
     """
@@ -255,9 +254,11 @@ class BodyModel:
     parents: tuple[int, ...] = static_field(default=())
     """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field(default=())
+    """Names of the j joints."""
     shape_names: tuple[str, ...] = static_field(default=())
-    """Of the shape directions."""
+    """Names of the s shape directions."""
     name: str = static_field(default="body")
+    """Name of the body in messages."""
     made_for: tuple | None = static_field(default=None)
     """What `data.views.gaussian_body` has made it for; None: a body as it was read."""
 
@@ -278,24 +279,24 @@ class BodyPose(Batchable):
 
 @pytree_dataclass
 class RestBody(Batchable):
-    """A shaped body in T-pose (theta = 0). vertices: (n, 3) metres. joints: (j, 3) metres."""
+    """A shaped body in T-pose (theta = 0)."""
 
     vertices: Float[Array, "n 3"]
+    """Vertices, (n, 3), metres."""
     joints: Float[Array, "j 3"]
+    """Joints, (j, 3), metres."""
 
 
 @pytree_dataclass
 class PosedBody(Batchable):
-    """A posed body.
-
-    vertices: (n, 3) metres. joint_transforms: (j, 4, 4) from rest to posed space, translation
-    included.
-    joints: (j, 3) metres.
-    """
+    """A posed body."""
 
     vertices: Float[Array, "n 3"]
+    """Vertices, (n, 3), metres."""
     joint_transforms: Float[Array, "j 4 4"]
+    """Transforms from rest to posed space, (j, 4, 4), translation included."""
     joints: Float[Array, "j 3"]
+    """Joints, (j, 3), metres."""
 
 
 @checked_arguments

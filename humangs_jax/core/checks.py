@@ -61,6 +61,7 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     Raises: TypeError, one line, for another class or a name that the function does not have;
     ValueError for shapes, and for a batch of what functions take one of (`one_at_a_time`).
     """
+    # annotations are read once, when the function is defined
     signature = inspect.signature(function)
     expected = {
         name: found for name, p in signature.parameters.items() if (found := _classes(p.annotation))
@@ -78,6 +79,7 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
             raise TypeError(
                 f"{call}: {_of_a_field(kwargs, signature, expected) or error}"
             ) from None
+        # classes first, then whether one or many are expected, then shapes
         for name, classes in expected.items():
             if name not in given:
                 continue
@@ -190,13 +192,14 @@ def _of_a_field(
 
 
 class Values(NamedTuple):
-    """What the entries of an array may be: finite numbers in [low, high]. words: how an error
-    message says it.
-    """
+    """What the entries of an array may be: finite numbers in [low, high]."""
 
     words: str
+    """The same in the words of an error message."""
     low: float = -math.inf
+    """Least number."""
     high: float = math.inf
+    """Largest number."""
 
 
 FINITE = Values("finite numbers")

@@ -31,14 +31,16 @@ LARGEST, LARGEST_INTEGER = sys.float_info.max, 1 << 63
 
 
 MOST_ITEMS = 256
-"""Of a list in a configuration."""
+"""Most items of a list in a configuration."""
 
 
 class Range(NamedTuple):
-    """Of the numbers of a field, both ends included."""
+    """The range of the numbers of a field, both ends included."""
 
     low: float
+    """Least number."""
     high: float
+    """Largest number."""
 
     def __str__(self) -> str:
         if self.high < LARGEST:
@@ -163,6 +165,7 @@ def _fits(value: Any, annotation: Any) -> bool:
         return any(_fits(value, option) for option in arguments)
     if origin is Literal:
         return isinstance(value, str | int | None) and value in arguments
+    # True is no number, and numbers are finite
     if annotation in (int, float):
         if isinstance(value, bool) or not isinstance(
             value, numbers.Integral if annotation is int else numbers.Real
@@ -173,6 +176,7 @@ def _fits(value: Any, annotation: Any) -> bool:
             if isinstance(value, numbers.Integral)
             else math.isfinite(value)
         )
+    # a tuple has an item for each argument, or any number of the same
     if origin is tuple:
         items = (
             arguments[:1] * len(value)
@@ -392,14 +396,17 @@ def config_from_json(cls: type[T], text: str) -> T:
 def _build(annotation: Any, value: Any, path: str) -> Any:
     """A JSON value as its annotation has it, if it fits."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    # a part names its class, a dataclass is known by the annotation
     if _is_part(annotation) and isinstance(value, dict):
         cls = _find_part(value.get(KIND), annotation, path)
         return _build_dataclass(cls, {name: x for name, x in value.items() if name != KIND}, path)
     if dataclasses.is_dataclass(annotation):
         return _build_dataclass(annotation, value, path)
+    # None, or the only other option
     if origin in (typing.Union, types.UnionType):
         options = [option for option in arguments if option is not type(None)]
         return _build(options[0], value, path) if value is not None and len(options) == 1 else value
+    # lists become tuples, whose items are built and checked one by one
     if origin is tuple and isinstance(value, list):
         items = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
         if len(value) > MOST_ITEMS:

@@ -75,24 +75,26 @@ CLEAR = "\r\033[K"
 
 @dataclasses.dataclass
 class Progress:
-    """What is shown, and what was measured.
-
-    ticking: a line on stderr counts the seconds of a stage while it runs. naming: without a
-    terminal, a `LONG` stage leaves its name there. lines: each stage leaves a line with its
-    seconds. quiet: neither stages nor bars are shown. seconds: of the finished outermost stages by
-    name, since `started`. names: of the stages that run; paused: a bar has the line. next: what the
-    user may do next, for whoever began.
-    """
+    """What is shown, and what was measured."""
 
     ticking: bool = False
+    """Whether a line on stderr counts the seconds of a stage while it runs."""
     naming: bool = False
+    """Whether a stage longer than `LONG` leaves its name on stderr, where that is no terminal."""
     lines: bool = False
+    """Whether each stage leaves a line with its seconds."""
     quiet: bool = False
+    """Whether neither stages nor bars are shown."""
     started: float = dataclasses.field(default_factory=time.perf_counter)
+    """When it began, seconds of `time.perf_counter`."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Seconds of the finished outermost stages by name, since `started`."""
     names: list[str] = dataclasses.field(default_factory=list)
+    """Names of the stages that run, the outermost first."""
     next: list[str] = dataclasses.field(default_factory=list)
+    """What the user may do next, a line each, for whoever began."""
     paused: bool = False
+    """Whether a bar has the line."""
 
 
 _current = Progress()

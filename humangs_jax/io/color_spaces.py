@@ -330,6 +330,7 @@ def _curve(tag: bytes) -> Curve:
     """The curve of a tag "curv" (a table, or an exponent) or "para" (numbers g, a to f of a
     formula).
     """
+    # "curv": no entry is the identity, one is an exponent, more are a table
     if tag[:4] == b"curv":
         count = int.from_bytes(tag[8:12], "big")
         table = np.frombuffer(tag[12 : 12 + 2 * count], ">u2")
@@ -340,6 +341,7 @@ def _curve(tag: bytes) -> Curve:
         return lambda levels: np.interp(levels, np.linspace(0, 1, count), table / 65535)
     if tag[:4] != b"para":
         raise Refused("it has a curve of an unknown kind")
+    # "para": later kinds have more of the numbers; those that a kind lacks are neutral
     kind = int.from_bytes(tag[8:10], "big")
     g, *rest = (each / 65536 for each in struct.unpack_from(f">{(1, 3, 4, 5, 7)[kind]}i", tag, 12))
     a, b, c, d, e, f = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)

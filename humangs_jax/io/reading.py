@@ -310,6 +310,7 @@ def walk(
     followed, unless the limit `photos_outside` allows it; the first of them is logged. Raises:
     Refused beyond the limit `entries`; OSError.
     """
+    # what links lead to comes last: a folder is found at its proper place
     seen: set[tuple[int, int]] = set()
     waiting, links, count, told = [Path(folder)], [], 0, False
     while waiting or links:

@@ -45,6 +45,7 @@ class Call(NamedTuple):
     """
 
     function: Callable[..., Any]
+    """What is called with the arguments of the pickle."""
 
 
 class StandIn:

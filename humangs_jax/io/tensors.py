@@ -237,6 +237,7 @@ def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
 
 def _of_stream(file: Any, size: int, names: Mapping) -> Any:
     """What a stream holds; its tensors are read as long as the file is open."""
+    # three pickles say what the stream is
     if _TorchUnpickler(file).load() != MAGIC_NUMBER:
         raise Refused("a pickle, but neither of the formats that torch.save writes")
     if (version := _TorchUnpickler(file).load()) != STREAM_VERSION:
@@ -251,6 +252,7 @@ def _of_stream(file: Any, size: int, names: Mapping) -> Any:
         file.seek(start)
         return file.read(length)
 
+    # the content with its tensors still unread, and the order of the storages
     unpickler = _TorchUnpickler(file, names, read)
     content, stored = unpickler.load(), _TorchUnpickler(file).load()
     if not (
@@ -258,6 +260,7 @@ def _of_stream(file: Any, size: int, names: Mapping) -> Any:
         and all(isinstance(name, str) and name in unpickler.kinds for name in stored)
     ):
         raise Refused("its list of storages names one that no tensor has")
+    # where in the file each storage is
     for name in stored:
         (count,) = struct.unpack("<q", file.read(8))
         start, length = file.tell(), count * STORAGE_DTYPES[unpickler.kinds[name]].itemsize

@@ -128,11 +128,13 @@ def fit_scene(
         >>> hg.save_gaussians("garden.ply", fit.gaussians)
     """
     require_concrete("fit_scene", "reads photos and measures buffers", cameras, points)
+    # photos and cameras
     began, config = time.perf_counter(), config or SceneConfig()
     views = list(cameras.values()) if isinstance(cameras, Mapping) else list(cameras)
     photos, extent = read_photos(images, views, config), extent_of(views)
     color = named_color(background) if isinstance(background, str) else background
     color = jnp.asarray(color, jnp.float32)
+    # where it begins: the points, or where the checkpoint stopped
     step, relocate = _programs()
     state = begin_scene(first_gaussians(points, views, config), config.capacity)
     about = _about(config, photos, views, state) if checkpoint is not None else ""
@@ -141,14 +143,17 @@ def fit_scene(
     key, interrupted, saved = jax.random.key(config.seed), False, time.perf_counter()
     steps = range(int(state.step), config.steps)
     try:
+        # one photo a step
         for i in bar(steps, shown=progress, desc="fit", unit="step", first=COMPILING):
             which = _photo_of_step(i, len(photos), config.seed)
             how, one = plans[_kind(views[which])], jax.random.fold_in(key, i)
             state = step(state, views[which], photos[which], color, one, extent, config, how)
+            # Gaussians grow: buffers that overflowed are measured anew
             last = i + 1 == config.steps
             if ((i + 1) % CHECK_EVERY == 0 or last) and int(state.overflow):
                 plans = _plans(_drawn(state.parameters, state.used), views, config)
                 state = replace(state, overflow=jnp.zeros_like(state.overflow))
+            # hidden Gaussians move to where they are needed
             moving = i + 1 <= config.relocate_until * config.steps
             if moving and (i + 1) % config.relocate_every == 0:
                 state = relocate(state, jax.random.fold_in(one, 1), config.growth)
@@ -159,6 +164,7 @@ def fit_scene(
                 saved = time.perf_counter()
     except KeyboardInterrupt:
         interrupted = True
+    # what is left is kept, also after Ctrl-C
     if checkpoint is not None:
         _save(checkpoint, state, about)
     gaussians = scene_gaussians(state)
@@ -220,6 +226,7 @@ def scene_step(
     """One photo, one step of Adam, and noise."""
     target = photo.astype(jnp.float32) / (255 if photo.dtype == jnp.uint8 else 1)
 
+    # the error of the image, and what MCMC charges for opaque and large Gaussians
     def loss(parameters):
         drawn = render(_drawn(parameters, state.used), camera, splat, background)
         absolute = jnp.mean(jnp.abs(drawn.rgb - target))
@@ -230,6 +237,8 @@ def scene_step(
         )
         return error + penalty, drawn.overflow
 
+    # Adam, whose rates fall with the steps; those of positions are relative to the extent of the
+    # scene
     gradient, overflow = jax.grad(loss, has_aux=True)(state.parameters)
     updates, moments = ADAM.update(gradient, state.moments)
     done = state.step / config.steps

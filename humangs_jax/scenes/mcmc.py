@@ -48,15 +48,16 @@ number to take logarithms of.
 
 
 class Relocated(NamedTuple):
-    """A scene after `mcmc_relocate`.
-
-    moved: of each slot, whether its Gaussian is another one than before; the optimizer forgets what
-    it knew of it.
-    """
+    """A scene after `mcmc_relocate`."""
 
     parameters: UnconstrainedGaussians
+    """Parameters of all slots."""
     used: Bool[Array, " g"]
+    """Which slots hold a Gaussian, (g,)."""
     moved: Bool[Array, " g"]
+    """Whether the Gaussian of each slot is another one than before, (g,); the optimizer forgets
+    what it knew of it.
+    """
 
 
 def divided(
