@@ -5,18 +5,23 @@
 Every section `<!-- table: NAME -->` ... `<!-- end -->` becomes what docs/results/NAME.json holds
 (format: `experiments/results.py`). --check writes nothing; exit status 1 if a page differs from its
 JSON files, if a section has no file, or if a file is shown nowhere. `<!-- formats: NAME -->` ...
-`<!-- end -->` becomes the formats that the package reads, or its limits.
+`<!-- end -->` becomes what the code has: one of `TABLES`.
 """
 
 import argparse
+import inspect
 import re
 import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from experiments.results import REPOSITORY, SECTION, pages, rendered, write_text
 
 FORMATS = re.compile(r"(?<=<!-- formats: )(?P<name>\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
+
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""A header and rows of cells."""
 
 
 def main() -> int:
@@ -64,53 +69,124 @@ def render_pages(repository: Path, write: bool) -> list[str]:
 
 
 def format_table(name: str) -> str:
-    """The "cameras", "keypoints" or "motions" that are read, or the "limits", as a table in
-    Markdown.
+    """What the package or the experiments have, as a table in Markdown: "cameras", "keypoints" or
+    "motions" that are read, "limits", "protocols" or "systems".
     """
-    from humangs_jax.data.formats import CAMERAS, KEYPOINTS, MOTIONS
-    from humangs_jax.io.reading import Limits
+    header, rows = TABLES[name]()
+    return "".join(f"| {' | '.join(row)} |\n" for row in (header, ["---"] * len(header), *rows))
+
+
+def _quoted(words: Iterable[str]) -> str:
+    """Joins words as code."""
+    return ", ".join(f"`{word}`" for word in words)
+
+
+def _cameras() -> Table:
+    """The formats of calibrations."""
+    from humangs_jax.data.formats import CAMERAS
 
     centers = {"half": "+0.5", "integer": "whole numbers"}
-    quoted = lambda files: ", ".join(f"`{file}`" for file in files)
-    if name == "cameras":
-        header = ("format", "usual names", "content", "pixel centres", "up", "one camera for each")
-        rows = [
-            (
-                each.about,
-                quoted(each.names),
-                each.content,
-                centers[each.pixel_centers],
-                each.up,
-                ("camera", "image")[each.per_image],
-            )
-            for each in CAMERAS.values()
-        ]
-    elif name == "motions":
-        header = ("of", "keys that tell it", "up", "frames per second, where the file has none")
-        arrays = [(each.about, each.arrays) for each in MOTIONS.values() if each.arrays is not None]
-        rows = [
-            (
-                about,
-                quoted(each.keys),
-                each.up
-                if each.fixed or not each.also
-                else f"{each.up}, or {', '.join(each.also)} where people stand so",
-                "must be given" if each.fps is None else f"{each.fps:g}",
-            )
-            for about, each in arrays
-        ]
-    elif name == "limits":
-        from experiments.knobs import docstrings
+    header = ("format", "usual names", "content", "pixel centres", "up", "one camera for each")
+    return header, [
+        (
+            each.about,
+            _quoted(each.names),
+            each.content,
+            centers[each.pixel_centers],
+            each.up,
+            ("camera", "image")[each.per_image],
+        )
+        for each in CAMERAS.values()
+    ]
 
-        header = ("limit", "default", "of")
-        rows = [
-            (f"`{field}`", f"{int(getattr(Limits(), field)):,}", " ".join(text.split()))
-            for field, text in docstrings(Limits).items()
-        ]
-    else:
-        header = ("format", "usual names", "content")
-        rows = [(each.about, quoted(each.names), each.content) for each in KEYPOINTS.values()]
-    return "".join(f"| {' | '.join(row)} |\n" for row in (header, ["---"] * len(header), *rows))
+
+def _keypoints() -> Table:
+    """The formats of keypoints."""
+    from humangs_jax.data.formats import KEYPOINTS
+
+    rows = [(each.about, _quoted(each.names), each.content) for each in KEYPOINTS.values()]
+    return ("format", "usual names", "content"), rows
+
+
+def _motions() -> Table:
+    """The layouts of arrays of poses."""
+    from humangs_jax.data.formats import MOTIONS
+
+    header = ("of", "keys that tell it", "up", "frames per second, where the file has none")
+    rows = []
+    for each in MOTIONS.values():
+        if each.arrays is None:
+            continue
+        arrays, up = each.arrays, each.arrays.up
+        if arrays.also and not arrays.fixed:
+            up += f", or {', '.join(arrays.also)} where people stand so"
+        rate = "must be given" if arrays.fps is None else f"{arrays.fps:g}"
+        rows.append((each.about, _quoted(arrays.keys), up, rate))
+    return header, rows
+
+
+def _limits() -> Table:
+    """What a file or a command may cost."""
+    from experiments.knobs import docstrings
+    from humangs_jax.io.reading import Limits
+
+    return ("limit", "default", "of"), [
+        (f"`{field}`", f"{int(getattr(Limits(), field)):,}", " ".join(text.split()))
+        for field, text in docstrings(Limits).items()
+    ]
+
+
+def _protocols() -> Table:
+    """How images are compared."""
+    from humangs_jax.evaluation import scores
+    from humangs_jax.losses.losses import GAUSSIAN, TORCHMETRICS, UNIFORM
+
+    windows = {GAUSSIAN: "Gaussian 11", UNIFORM: "uniform 7", TORCHMETRICS: "torchmetrics"}
+
+    def seen(crop: scores.Crop) -> str:
+        if isinstance(crop, scores.SquareBox):
+            return f"mask box + {crop.margin} px, squared, {crop.side}"
+        if isinstance(crop, scores.CentredWindow):
+            return f"{crop.height} x {crop.width} around the person, at {crop.side}"
+        return "mask box" if isinstance(crop, scores.MaskBox) else "the frame"
+
+    header = (
+        *("`--protocol`", "background", "PSNR and SSIM see", "LPIPS sees"),
+        *("prediction cut out by the true mask", "LPIPS", "SSIM window", "published at, px"),
+    )
+    return header, [
+        (
+            *(name, "the photos'" if each.background == "dataset" else each.background),
+            *(seen(each.crops[0]), seen(each.crops[-1])),
+            "yes: hides errors of the silhouette" if each.masked else "no",
+            *(", ".join(each.lpips), windows[each.ssim]),
+            "" if each.published_side is None else str(each.published_side),
+        )
+        for name, each in scores.PROTOCOLS.items()
+    ]
+
+
+def _systems() -> Table:
+    """The networks that the paper is compared with."""
+    from experiments.systems import ONE_PHOTO, SYSTEMS
+
+    rows = []
+    for name, system in SYSTEMS.items():
+        first = " ".join((inspect.getdoc(system) or "").partition("\n\n")[0].split())
+        photos = {"animatable": "none", "gps": "2"}.get(name, "any")
+        rows.append((f"`{name}`", "1" if name in ONE_PHOTO else photos, first))
+    return ("system", "photos", "what makes it that system"), rows
+
+
+TABLES: dict[str, Callable[[], Table]] = {
+    "cameras": _cameras,
+    "keypoints": _keypoints,
+    "limits": _limits,
+    "motions": _motions,
+    "protocols": _protocols,
+    "systems": _systems,
+}
+"""By the name in `<!-- formats: NAME -->`."""
 
 
 if __name__ == "__main__":
