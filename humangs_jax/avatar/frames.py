@@ -50,10 +50,10 @@ WIDEST = 2
 """The largest width of the Gaussian that smooths, over the length of the path: wider ones leave
 less than 1e-8 of anything but a straight line.
 """
-TRACKED, TRACKED_OPACITY = 1024, 0.5
-"""A person's extent is measured on this number of Gaussians, evenly spread, of at least this
-opacity.
-"""
+TRACKED = 1024
+"""A person's extent is measured on this number of Gaussians, evenly spread."""
+TRACKED_OPACITY = 0.5
+"""Least opacity of a Gaussian that the extent is measured on."""
 MOST_TRACKED = 1 << 25
 """In all frames together, 400 MB: a motion of more than 32,768 frames is measured on fewer
 Gaussians.
@@ -444,10 +444,10 @@ def without_unseen(
 # of a calibration ---
 
 
-SHOWN, NEARLY_ALL = 0.9, 0.999
-"""The share of the opaque Gaussians that a circle of cameras is made to show: outliers are far
-away.
-"""
+SHOWN = 0.9
+"""Share of the opaque Gaussians that a circle of cameras is made to show: outliers are far away."""
+NEARLY_ALL = 0.999
+"""Share of the opaque Gaussians whose distance is taken for that of all."""
 COMPACT = 3.0
 """Where nearly all are within so many times the distance of `SHOWN`, as of a person, there are no
 outliers: all are shown.

@@ -34,9 +34,12 @@ from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs, subject_uni
 from humangs_jax.network.reader import project_and_test
 from humangs_jax.rendering.gaussians import Gaussians
 
-UNSEEN, SEEN = 0.15, 0.45
-"""Cosine between a vertex's normal and the line of sight of the photo that shows it best. Below the
-first nothing is known of it, above the second nothing is guessed; between them both are mixed."""
+UNSEEN = 0.15
+"""Cosine between a vertex's normal and the line of sight of the photo that shows it best; below,
+nothing is known of the vertex.
+"""
+SEEN = 0.45
+"""The same cosine, above which nothing is guessed; between the two both are mixed."""
 SPREAD = 0.015
 """Metres in the space of the features, over which sources are averaged."""
 LEAST_HIDDEN = 1 / 3
@@ -55,10 +58,10 @@ FARTHEST = 0.5
 """Metres in the space of the features: beyond them a source says nothing."""
 APART = 10.0
 """Metres between the head and the rest in the space of the features."""
-CROWN, FACE = 0.93, 0.5
-"""Shares of the head's height and depth: what is in front of the second and below the first is
-the face, which stays.
-"""
+CROWN = 0.93
+"""Share of the head's height above which the crown begins."""
+FACE = 0.5
+"""Share of the head's depth in front of which the face begins, which stays."""
 NAPE = (0.35, 0.55)
 """Shares of the head's depth and height: what is behind the first and above the second is hair,
 as the crown is.

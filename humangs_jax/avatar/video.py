@@ -335,8 +335,12 @@ LARGEST_ERROR = 0.25
 """Mean absolute difference of the channels that gets the last of `ERROR_COLORS`."""
 GAP = 4
 """Pixels of white between tiles."""
-TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 14, 10, 22
-"""Height of the letters: a share of the width of a tile, within limits, pixels."""
+TEXT_SHARE = 1 / 14
+"""Height of the letters as a share of the width of a tile."""
+SMALLEST_TEXT = 10
+"""Least height of the letters, pixels."""
+LARGEST_TEXT = 22
+"""Largest height of the letters, pixels."""
 ERROR_COLORS = ((1, 1, 1), (1, 0.87, 0.35), (0.93, 0.38, 0.13), (0.6, 0.04, 0.2), (0.12, 0, 0.12))
 """Colors of errors from none to the largest, evenly spaced: white first, like the background, then
 darker at every step, so that the order is also visible in grey."""

@@ -26,8 +26,10 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 T = TypeVar("T")
 KIND = "kind"
 """Key of the class of a part."""
-LARGEST, LARGEST_INTEGER = sys.float_info.max, 1 << 63
-"""Numbers and integers beyond these have no place in any configuration."""
+LARGEST = sys.float_info.max
+"""Numbers beyond it have no place in any configuration."""
+LARGEST_INTEGER = 1 << 63
+"""Integers beyond it have no place in any configuration."""
 
 
 MOST_ITEMS = 256

@@ -190,7 +190,10 @@ def _wait(sentinel: int) -> None:
 # How XLA compiles: a program of this package takes seconds to a minute. JAX has the cache; here is
 # where it lies, and how large it may grow.
 
-VARIABLE, OF_JAX = "HUMANGS_COMPILE_CACHE", "JAX_COMPILATION_CACHE_DIR"
+VARIABLE = "HUMANGS_COMPILE_CACHE"
+"""Environment variable that names the folder of compiled programs."""
+OF_JAX = "JAX_COMPILATION_CACHE_DIR"
+"""JAX's environment variable for the same."""
 LARGEST = 2 << 30
 """Bytes; the files that were not used for longest are deleted beyond.
 

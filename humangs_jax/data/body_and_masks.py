@@ -196,19 +196,30 @@ WEAKNESS = 0.002
 HELD = 20.0
 """The same, for hands and head."""
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
-NEAR, PROBE, LEAVES = 2.5, 0.012, 0.6
-"""A vertex is on the body's silhouette if it is within this many pixels of the edge, and if a move
-by PROBE metres along its normal leaves the silhouette by this share of it."""
+NEAR = 2.5
+"""A vertex may be on the body's silhouette if it is within so many pixels of the edge."""
+PROBE = 0.012
+"""Metres by which such a vertex is moved along its normal, to see whether it leaves the
+silhouette.
+"""
+LEAVES = 0.6
+"""It is on the silhouette if that move leaves it by this share of PROBE."""
 DRAWN = 0.5
 """Pixels by which polygons are drawn larger than they are."""
-WRAP, WRAP_ROUNDS = 0.07, 6
-"""At last, vertices outside a mask move inwards up to the first, metres, until all masks contain
-them by the inset; the moves are averaged over the neighbours this often."""
-OUTSIDE, MISFIT = 0.01, 0.025
-"""Metres, and a share. A body does not fit its masks if more than this share of its vertices (no
-head, no hands) lies more than OUTSIDE outside of a mask. Clothes never cause that: of true bodies
-the share is 0. It was at least 0.03 for bodies that are a centimetre off, 0.02 to 0.06 for a real
-man fitted to keypoints alone, and at most 0.02 for his fits refined by the masks."""
+WRAP = 0.07
+"""At last, vertices outside a mask move inwards by up to so many metres, until all masks contain
+them by the inset.
+"""
+WRAP_ROUNDS = 6
+"""How often these moves are averaged over the neighbours."""
+OUTSIDE = 0.01
+"""Metres outside of a mask from which on a vertex counts as outside."""
+MISFIT = 0.025
+"""A body does not fit its masks if more than this share of its vertices (no head, no hands) lies
+more than OUTSIDE outside of a mask. Clothes never cause that: of true bodies the share is 0. It was
+at least 0.03 for bodies that are a centimetre off, 0.02 to 0.06 for a real man fitted to keypoints
+alone, and at most 0.02 for his fits refined by the masks.
+"""
 LONGEST = 480
 """Pixels of the window around the person in which silhouettes are compared."""
 MARGIN = 0.12

@@ -43,11 +43,14 @@ ROTATION_TO_Y_UP = {
 """For each axis that can be up in the source, the proper rotation that takes it to +y."""
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """y down and z forward -> y up and z backwards; its own inverse."""
-CAM_FROM_WORLD, WORLD_FROM_CAM = "cam_from_world, OpenCV axes", "world_from_cam, OpenCV axes"
-CAM_FROM_WORLD_OPENGL, WORLD_FROM_CAM_OPENGL = (
-    "cam_from_world, OpenGL axes",
-    "world_from_cam, OpenGL axes",
-)
+CAM_FROM_WORLD = "cam_from_world, OpenCV axes"
+"""Matrices take points of the world to the camera, x right, y down, z forward."""
+WORLD_FROM_CAM = "world_from_cam, OpenCV axes"
+"""Matrices take points of the camera, x right, y down, z forward, to the world."""
+CAM_FROM_WORLD_OPENGL = "cam_from_world, OpenGL axes"
+"""Matrices take points of the world to the camera, x right, y up, z backward."""
+WORLD_FROM_CAM_OPENGL = "world_from_cam, OpenGL axes"
+"""Matrices take points of the camera, x right, y up, z backward, to the world."""
 CONVENTIONS = {
     CAM_FROM_WORLD: lambda matrix: matrix,
     WORLD_FROM_CAM: np.linalg.inv,

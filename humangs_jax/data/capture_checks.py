@@ -23,10 +23,14 @@ instance 0 to 255.
 """
 
 
-LARGEST_TURN, LARGEST_DISTANCE, LARGEST_BETA, LARGEST_DISPLACEMENT = 1e3, 1e4, 100.0, 0.5
-"""Radians of a rotation; metres from the origin (farther, float32 loses millimetres, and the
-numbers are no metres); shape coefficients, of which bodies that exist have less than 10; metres
-that clothes put between a body and its surface."""
+LARGEST_TURN = 1e3
+"""Radians of a rotation."""
+LARGEST_DISTANCE = 1e4
+"""Metres from the origin: farther, float32 loses millimetres, and the numbers are no metres."""
+LARGEST_BETA = 100.0
+"""Size of a shape coefficient; bodies that exist have less than 10."""
+LARGEST_DISPLACEMENT = 0.5
+"""Metres that clothes put between a body and its surface."""
 
 
 class CaptureError(FileError):

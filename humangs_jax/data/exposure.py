@@ -37,21 +37,26 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 EXPOSURE_SIZE = 256
 """Pixels a side of the crops around the person that are compared."""
-FACING, THICKNESS = 0.5, 0.02
-"""A photo shows a point where the cosine between normal and ray is at least the first, and where it
-lies at most the second, metres, behind the nearest surface.
-"""
-INSIDE, WHOLE, BLUR = 5, 0.99, 3
-"""Side of the square of pixels around each point that lies in the mask, least value of the mask in
-it; and side of the one over which colors are averaged."""
+FACING = 0.5
+"""A photo shows a point where the cosine between normal and ray is at least this."""
+THICKNESS = 0.02
+"""A photo shows a point that lies at most so many metres behind the nearest surface."""
+INSIDE = 5
+"""Side of the square around each point that must lie in the mask, pixels."""
+WHOLE = 0.99
+"""Least value of the mask in this square."""
+BLUR = 3
+"""Side of the square over which colors are averaged, pixels."""
 USABLE = (0.06, 0.95)
 """Darker and brighter values say nothing about a gain."""
-LEAST_POINTS, ALIKE = 50, 50
-"""Points that two photos share, at least; and how many neighbours err alike."""
-NOISE, EXPECTED = 0.03, 0.15
-"""Standard deviations of a median of log ratios, whatever the number of points, and of the
-logarithm of a gain.
-"""
+LEAST_POINTS = 50
+"""Points that two photos must share to be compared."""
+ALIKE = 50
+"""How many neighbouring points err alike."""
+NOISE = 0.03
+"""Standard deviation of a median of log ratios, whatever the number of points."""
+EXPECTED = 0.15
+"""Standard deviation of the logarithm of a gain."""
 CLEAR = 1.0
 """Root mean square of the medians over their standard errors, below which all photos stay as they
 are: loose clothes and shadows make 0.3 to 0.9 in photos of equal exposure (eight test people)."""
@@ -176,9 +181,14 @@ PARTS = (
 """What names of joints contain, part by part of the body: left and right are one part."""
 LEAST_OF_PART = 20
 """Points of a part that a group of photos shows, at least."""
-TINT, BRIGHTNESS = 0.03, 0.2
-"""Standard deviations of the logarithms of a part's tint and brightness, in front against behind,
-in one light (16 synthetic people: 0.02 to 0.04, without open coats, and 0.1 to 0.3)."""
+TINT = 0.03
+"""Standard deviation of the logarithm of a part's tint, in front against behind, in one light (16
+synthetic people: 0.02 to 0.04, without open coats).
+"""
+BRIGHTNESS = 0.2
+"""Standard deviation of the logarithm of a part's brightness, in front against behind, in one light
+(16 synthetic people: 0.1 to 0.3).
+"""
 OFFSET = 0.01
 """Standard deviation of a color, of stray light, that makes the tint of dark parts uncertain."""
 OTHER_LIGHT = 0.04
@@ -186,9 +196,12 @@ OTHER_LIGHT = 0.04
 for differently balanced: in one light at most 0.03 is found (16 synthetic people)."""
 OTHER_DAYS = 0.4
 """Standard deviation of the logarithm of a gain between photos that may be of other days."""
-FITS, REDESCENDING = 16, 8
-"""How often the rows are weighted by their residuals, and how many of these times parts that differ
-lose all weight: before they would hang on where the search begins."""
+FITS = 16
+"""How often the rows are weighted by their residuals."""
+REDESCENDING = 8
+"""In how many of these fits, the last ones, parts that differ lose all weight: earlier they would
+hang on where the search begins.
+"""
 
 
 def linked_views(

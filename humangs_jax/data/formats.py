@@ -108,10 +108,10 @@ class SourceFormats(Formats[F]):
         return "; ".join(map(str, self.values()))
 
 
-_CAMERAS, _KEYPOINTS = (
-    "humangs_jax.capture.calibration.",
-    "humangs_jax.capture.keypoints.formats:read_",
-)
+_CAMERAS = "humangs_jax.capture.calibration."
+"""How the names of functions that read cameras begin."""
+_KEYPOINTS = "humangs_jax.capture.keypoints.formats:read_"
+"""How the names of functions that read keypoints begin."""
 _MODELS = ("", "sparse/0/", "sparse/")
 CAMERAS = SourceFormats(
     colmap=CameraFormat(

@@ -23,12 +23,15 @@ from humangs_jax.io.images import resized
 
 PERSON_HEIGHT = 200
 """Lengths below are in pixels of a person who is that high."""
-REACH, STEP = 4.0, 0.5
-"""Largest distance that a silhouette is moved, and the steps that are tried."""
-NEIGHBORHOOD, SMOOTHING = 4.0, 2.0
-"""Standard deviations: of the part of the silhouette whose colors decide about a point, and of the
-distances found.
+REACH = 4.0
+"""Largest distance that a silhouette is moved, such pixels."""
+STEP = 0.5
+"""Distance between the moves that are tried, such pixels."""
+NEIGHBORHOOD = 4.0
+"""Standard deviation of the part of the silhouette whose colors decide about a point, such pixels.
 """
+SMOOTHING = 2.0
+"""Standard deviation of the smoothing of the distances found, such pixels."""
 LEAST = 0.75
 """Masks whose silhouette is off by less on average stay as they are: exact ones would only lose
 (docs/stability.md).
@@ -45,22 +48,25 @@ WHITE = 0.98
 """A photo with nothing darker around the mask, beyond `REACH`, shows no background: there is
 nothing to find.
 """
-SECTORS, SECTOR_POINTS = 16, 8
-"""Parts of the silhouette, of equal numbers of points, by the angle about its middle; fewer where
-points are few.
+SECTORS = 16
+"""Parts of the silhouette, of equal numbers of points, by the angle about its middle."""
+SECTOR_POINTS = 8
+"""Least number of points of a part: where points are few, there are fewer parts."""
+AGREE = 0.7
+"""Share of the sectors, of all views that would be moved alike, that must find the edge at one
+distance.
 """
-AGREE, AGREE_ALONE = 0.7, 0.5
-"""Shares of the sectors that must find the edge at one distance: of all views that would be moved
-alike, and of the view.
+AGREE_ALONE = 0.5
+"""Share of the sectors of the view that must find it there."""
+EDGE = 0.06
+"""At an edge, colors change more than beside it by this share of the strongest change of the sector.
 """
-EDGE, OF_TEXTURE = 0.06, 1.0
-"""There is an edge where colors change more than beside it, by these shares of the strongest change
-and of that beside it.
-"""
-SEEN_APART, CLEAR = 1.5, 1.3
-"""Pixels: an edge that is nearer than the first to the mask's is not told from it; a blurred edge
-ends within the second.
-"""
+OF_TEXTURE = 1.0
+"""They also change more by this share of the change beside it."""
+SEEN_APART = 1.5
+"""Pixels within which an edge is not told from the mask's."""
+CLEAR = 1.3
+"""Pixels within which a blurred edge ends."""
 THIN = 0.0007
 """Area of the parts of a mask that are too thin for one that is too large, over the area that it
 would lose.
@@ -305,17 +311,20 @@ def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 RIM_HEIGHT = 440
 """Lengths below are in pixels of a person who is that high."""
-DEPTH, SPREAD = 2.0, 1.5
-"""Pixels that are nearer to the edge than the first are cleaned, by the means of what lies further
-inside and further outside, weighted by a Gaussian of the second."""
+DEPTH = 2.0
+"""Pixels that are nearer to the edge than this are cleaned, by the means of what lies further
+inside and further outside.
+"""
+SPREAD = 1.5
+"""Standard deviation of the Gaussian that weights these means, pixels."""
 LEAST_WEIGHT = 1e-3
 """Weight of what lies further inside below which there is nothing: of fingers, which are thinner,
 the rim stays as it is.
 """
-CONTRAST, CERTAIN = 0.02, 0.15
-"""A pixel is taken for a mixture where the means differ by more than the first, if the room's share
-exceeds the second.
-"""
+CONTRAST = 0.02
+"""A pixel is taken for a mixture where the two means differ by more than this."""
+CERTAIN = 0.15
+"""It is cleaned if the room's share in the mixture exceeds this."""
 
 
 def clean_rims(

@@ -59,10 +59,12 @@ OFF_CENTER = 0.05
 """Share of a side by which a principal point has to be nearer to the middle of the turned photo to
 be one of that.
 """
-LARGEST_LABEL, NEARLY_WHITE, LEAST_LABELLED = 20 / 255, 0.9, 1e-3
-"""Masks with nothing above the first are labels (0 and 1, or parts of a person), as are those of 0
-and one other value below the second; with fewer pixels than the third share they are the rim of
-someone outside the photo."""
+LARGEST_LABEL = 20 / 255
+"""Masks with nothing above it are labels: 0 and 1, or parts of a person."""
+NEARLY_WHITE = 0.9
+"""Masks of 0 and one other value below it are labels as well."""
+LEAST_LABELLED = 1e-3
+"""With a smaller share of pixels, labels are the rim of someone outside the photo."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

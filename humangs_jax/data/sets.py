@@ -18,7 +18,10 @@ from humangs_jax.data.capture_checks import CaptureError, checked_json
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.reading import shown, write_json
 
-MANIFEST, SETTINGS = "manifest.json", "settings"
+MANIFEST = "manifest.json"
+"""File that says what a folder is."""
+SETTINGS = "settings"
+"""Its key of what the folder was made with."""
 K = TypeVar("K")
 
 
@@ -31,8 +34,14 @@ class SetFormat(NamedTuple):
     """Its version."""
 
 
-SYNTHETIC, DATA_SET = SetFormat("humangs-synthetic", 2), SetFormat("humangs-dataset", 1)
-AVATARS, SCORES = SetFormat("humangs-avatars", 2), SetFormat("humangs-scores", 1)
+SYNTHETIC = SetFormat("humangs-synthetic", 2)
+"""People that the package made."""
+DATA_SET = SetFormat("humangs-dataset", 1)
+"""Scans or videos of a data set."""
+AVATARS = SetFormat("humangs-avatars", 2)
+"""Avatars of an evaluation."""
+SCORES = SetFormat("humangs-scores", 1)
+"""Scores of an evaluation."""
 LOOK = 1 << 16
 """Bytes at the beginning of each file of a data set that `files_key` looks at."""
 

@@ -36,26 +36,32 @@ from humangs_jax.geometry.mesh import vertex_areas
 
 LEGS = (("left_hip", "left_knee", "left_ankle"), ("right_hip", "right_knee", "right_ankle"))
 TRUNK = ("pelvis", "spine1")
-TOP, BOTTOM = 0.08, 0.97
-"""Where a skirt may begin and end: 0 at the hips, 0.5 at the knees, 1 at the ankles.
-
-Above, the body is around both legs.
+TOP = 0.08
+"""Where a skirt may begin: 0 at the hips, 0.5 at the knees, 1 at the ankles. Above, the body is
+around both legs.
 """
-ROWS, GAP, HALF = 28, 11, 13
-"""Rows of a skirt; vertices of a row in each gap, and on the outer half of each leg.
-
-All skirts share one program.
-"""
+BOTTOM = 0.97
+"""Where a skirt may end, in the same measure."""
+ROWS = 28
+"""Rows of a skirt. All skirts share one program."""
+GAP = 11
+"""Vertices of a row in each of the gaps between the legs."""
+HALF = 13
+"""Vertices of a row on the outer half of each leg."""
 BESIDE = 0.02
 """Metres beside the legs: trousers reach as far."""
-SHOWN, VOTES = 0.8, 4
-"""A row is part of a skirt if this share of its points is inside the masks; rows with fewer points
-say nothing.
+SHOWN = 0.8
+"""A row is part of a skirt if this share of its points is inside the masks."""
+VOTES = 4
+"""Rows with fewer points say nothing."""
+LEAST_ROWS = 4
+"""Wide trousers look worse with a skirt. To tell them apart, at least so many rows must have a
+point inside the masks beside both legs.
 """
-LEAST_ROWS, CLEAR, LONG_CLEAR = 4, 0.06, 0.1
-"""Wide trousers look worse with a skirt. To tell them apart, at least `LEAST_ROWS` rows must have a
-point inside the masks that is `CLEAR` metres beside both legs, or `LONG_CLEAR` where no photo shows
-the legs apart below the hem."""
+CLEAR = 0.06
+"""Metres that such a point is beside both legs."""
+LONG_CLEAR = 0.1
+"""The same where no photo shows the legs apart below the hem."""
 REACH = Reach(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
 """Weight of no displacement of the body, in the fit of the skirt."""

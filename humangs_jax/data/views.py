@@ -406,10 +406,10 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
 # Which photos of many
 # -------------------------------------------------------------------------------------------------
 
-SELECTION_SIZE, SELECTION_VERTICES = 128, 2000
-"""Pixels a side of the depth maps, and vertices of the body: enough to know which side of it a
-photo shows.
-"""
+SELECTION_SIZE = 128
+"""Side of the depth maps, pixels: enough to know which side of the body a photo shows."""
+SELECTION_VERTICES = 2000
+"""Vertices of the body for them."""
 LEAST_GAIN = 0.03
 """A further photo has to add this share to what the chosen ones show.
 

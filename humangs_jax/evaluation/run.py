@@ -61,8 +61,10 @@ from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 
-SIDE, INPUT_SIDE = 320, 128
+SIDE = 320
 """Longest side of the images on the page, pixels."""
+INPUT_SIDE = 128
+"""Longest side of the input photos on the page, pixels."""
 QUALITY = 88
 """The quality of the JPEGs."""
 LARGEST_ERROR = 0.25

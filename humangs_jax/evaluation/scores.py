@@ -218,8 +218,10 @@ table.
 Row = dict[str, float | None]
 """Scores by name; None for what is missing."""
 CONFIDENCE = 0.95
-RESAMPLES, BLOCKS = 2000, 20
-"""Resamples of the bootstrap, and in how many parts they are computed, for memory."""
+RESAMPLES = 2000
+"""Resamples of the bootstrap."""
+BLOCKS = 20
+"""In how many parts they are computed, for memory."""
 
 
 class Scored(NamedTuple):
@@ -324,8 +326,10 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, flo
 # --------------------------------------------------------------------------------------------------
 
 
-PATCH, STRIDE = 64, 32
-"""Side and distance of the patches, pixels."""
+PATCH = 64
+"""Side of the patches, pixels."""
+STRIDE = 32
+"""Distance between the patches, pixels."""
 LEAST_FOREGROUND = 0.5
 """Share of a patch that must be foreground, exceeded."""
 PATCHES_AT_ONCE = 16

@@ -95,7 +95,10 @@ def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 # Primaries
 # --------------------------------------------------------------------------------------------------
 
-D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
+D65 = (0.3127, 0.3290)
+"""Chromaticity x, y of the white of sRGB."""
+D50 = (0.3457, 0.3585)
+"""Chromaticity x, y of the white of ICC profiles."""
 BRADFORD = np.asarray(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
 )
@@ -116,7 +119,10 @@ CURVES: dict[int, Curve] = {
     18: _hlg_to_light,
 }
 """By their code point (H.273). Files of BT.709 and its kin are shown as sRGB by all programs."""
-PQ, HLG = 16, 18
+PQ = 16
+"""Number of the transfer function PQ in H.273."""
+HLG = 18
+"""Number of the transfer function HLG in H.273."""
 
 
 def _xyz(xy: tuple[float, float]) -> np.ndarray:
@@ -146,8 +152,10 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
     return Encoding((CURVES.get(transfer, srgb_to_light),), matrix, bright, camera=transfer == HLG)
 
 
-GAMMA_OF_SRGB, GAMMA_SLACK = 1 / 2.2, 0.06
-"""What PNG files say of sRGB; and within it what programs write of videos (1 / 1.96), which are
+GAMMA_OF_SRGB = 1 / 2.2
+"""What PNG files say of sRGB."""
+GAMMA_SLACK = 0.06
+"""Difference that is still taken for sRGB: what programs write of videos (1 / 1.96), which are
 shown as sRGB, too.
 """
 

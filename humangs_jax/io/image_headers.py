@@ -35,7 +35,10 @@ JPEG_MARKER = re.compile(rb"\xff([^\x00\xff])")
 """FF 00 is a byte FF of the compressed data, and before the last FF there may be any number of
 others.
 """
-END, SCAN = 0xD9, 0xDA
+END = 0xD9
+"""Marker of JPEG files that ends the image."""
+SCAN = 0xDA
+"""Marker of JPEG files that begins a scan."""
 WITH_LENGTH = frozenset(
     (*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE)
 )

@@ -60,7 +60,12 @@ HEAD = 256
 GREY_SLACK = 16 / 255
 """Channels of a grey image that was compressed differ by less."""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
-ORIENTATION_TAG, EXIF_TAGS, FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
+ORIENTATION_TAG = 0x0112
+"""Number of the orientation in EXIF."""
+EXIF_TAGS = 0x8769
+"""Number of the table of EXIF tags in the first table."""
+FOCAL_LENGTH_35MM_TAG = 0xA405
+"""Number of the focal length on 35 mm film in EXIF."""
 DIAGONAL_35MM = 43.27
 """Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle
 along the diagonal.
@@ -84,10 +89,10 @@ PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
 reads in full).
 """
 MARK_KEY = "Software"
-DRAWN, MASK = "humangs_jax", "humangs_jax mask"
-"""Values of the text `Software` in PNG files: of pictures that show results, which are never
-photos, and of masks.
-"""
+DRAWN = "humangs_jax"
+"""Value of the text `Software` in PNG files that show results, which are never photos."""
+MASK = "humangs_jax mask"
+"""Value of the same text in masks."""
 MARK_HEAD = 1024
 """Bytes of a PNG file in which the text stands: it is written before the pixels."""
 GREY_AND_ALPHA = 4

@@ -34,12 +34,19 @@ from humangs_jax.io.reading import (
 
 logger = logging.getLogger(__name__)
 
-GLB_START, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+GLB_START = 0x46546C67
+"""First word of a GLB file, "glTF"."""
+JSON_CHUNK = 0x4E4F534A
+"""Kind of the chunk with the JSON text."""
+BINARY_CHUNK = 0x004E4942
+"""Kind of the chunk with the numbers."""
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#accessor-data-types"""
-VERTICES, INDICES = 34962, 34963
-"""Targets of views of a buffer: what a graphics card reads it as."""
+VERTICES = 34962
+"""Target of a view of a buffer that a graphics card reads as vertices."""
+INDICES = 34963
+"""Target of one that it reads as indices."""
 
 
 def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, Any], bytes]:

@@ -36,8 +36,10 @@ OUTSIDE = f"{ENVIRONMENT}=photos_outside=1 allows it"
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 """No path in a file needs these."""
 NO_PERMISSION = "no permission to read it"
-LONGEST_LINE, LONGEST_REASON = 1000, 300
-"""Characters of an error, in which values of files are quoted, and of what a library says."""
+LONGEST_LINE = 1000
+"""Most characters of an error, in which values of files are quoted."""
+LONGEST_REASON = 300
+"""Most characters of what a library says in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,8 +187,10 @@ def shown(value: object) -> str:
     return _SHOWN.repr(value)
 
 
-LARGEST_AMOUNT, SHOWN_INTEGER = 10**15, 10**40
-"""Larger ones are not written out."""
+LARGEST_AMOUNT = 10**15
+"""Larger amounts are not written out in errors."""
+SHOWN_INTEGER = 10**40
+"""Larger integers are not written out in errors."""
 _SHOWN = _Shown()
 
 

@@ -262,8 +262,10 @@ def _larger(x: Float[Array, "*b"], y: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where((y > x) | jnp.isnan(y), y, x)
 
 
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Mean and scale of colors in [-1, 1] that the backbones of LPIPS expect."""
+SHIFT = (-0.030, -0.088, -0.188)
+"""Mean of colors in [-1, 1] that the backbones of LPIPS expect."""
+SCALE = (0.458, 0.448, 0.450)
+"""Scale of these colors."""
 EPSILON = 1e-10
 """Added to the length of a feature vector."""
 

@@ -18,7 +18,12 @@ from humangs_jax.core.configuration import (
 from humangs_jax.network.maps import PixelGrid
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
-MEASURED, TRADE, EVALUATION = "performance.md", "tradeoff.md", "evaluation.md"
+MEASURED = "performance.md"
+"""Page of docs with times."""
+TRADE = "tradeoff.md"
+"""Page of docs with time against quality."""
+EVALUATION = "evaluation.md"
+"""Page of docs with scores."""
 
 TokenSelection = Literal["all", "foreground"]
 AttentionKernel = Literal["xla", "cudnn", "chunked"]

@@ -43,7 +43,10 @@ COLUMNS = 14
 LARGEST_MOVES = np.asarray([0.01] * 3 + [0.1] * 4 + [0.2] * 3 + [0.5] * 4, np.float32)
 """What an output of 1 moves: metres, quaternions, log scales, logits of opacity and colors."""
 NEIGHBORS = 8
-CLUSTER_LEVELS, NEAREST_CLUSTERS = 9, 4
+CLUSTER_LEVELS = 9
+"""How often the Gaussians are halved: 2^levels clusters."""
+NEAREST_CLUSTERS = 4
+"""Clusters that each Gaussian looks at."""
 CLUSTER_BLUR = 0.01
 """Metres: what lies this close to the centre of a cluster reads mostly that cluster."""
 PERSON = 8000.0

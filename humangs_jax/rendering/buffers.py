@@ -24,9 +24,12 @@ from humangs_jax.rendering.tiling import TileGrid, count_pairs, footprints_by
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
-"""Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512
-x 512 and 15 at 1024 x 1024, where its 16,384 tiles add another 5 each."""
+PAIRS_PER_GAUSSIAN = 12
+"""Pairs for each Gaussian in the buffers of traced calls. A person of 50,000 Gaussians needs 6
+tiles per Gaussian at 512 x 512 and 15 at 1024 x 1024, where its 16,384 tiles add another 5 each.
+"""
+PAIRS_PER_TILE = 16
+"""Pairs for each tile in these buffers."""
 
 STEPS_PER_OCTAVE = 4
 """Sizes that `round_up` knows per power of two."""

@@ -38,9 +38,12 @@ DEAD = 0.005
 """Opacity at and below which a Gaussian is moved; the paper's."""
 SHARPNESS = 100.0
 """Of the sigmoid of the opacity by which noise fades around `DEAD`; the paper's."""
-STEP, REACH = 0.1, 5.0
-"""Of the integral: distance of its nodes, and where exp(-t^2) is below float32's rounding. The
-trapezoidal rule converges exponentially there: tests compare it with the double sum."""
+STEP = 0.1
+"""Distance of the nodes of the integral. The trapezoidal rule converges exponentially there: tests
+compare it with the double sum.
+"""
+REACH = 5.0
+"""Where the integral ends: exp(-t^2) is below float32's rounding."""
 MOST = 1.0 - 1e-6
 """Opacity from which on one Gaussian is split as if it had this one: (1 - o)^(1/N) of 0 is no
 number to take logarithms of.

@@ -17,9 +17,11 @@ from humangs_jax.losses.losses import GAUSSIAN
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians
 from humangs_jax.scenes.config import SceneConfig
 
-START_OPACITY, START_SHARE = 0.5, 0.5
-"""Of Gaussians at points: opacity, and scale as a share of the mean distance to the three
-nearest points.
+START_OPACITY = 0.5
+"""Opacity of Gaussians that begin at points."""
+START_SHARE = 0.5
+"""Scale of Gaussians that begin at points, as a share of the mean distance to the three nearest
+points.
 """
 PARALLEL = 1e-3
 """Squared sine of the angle between axes that meet nowhere."""

@@ -40,8 +40,10 @@ Named = dict[str, Any]
 """Arrays, or `Leaf`s of them, by their paths in a pytree; "" for a bare array."""
 FAILED = ("skipped", "nonfinite")
 """Events of a run's log that a diagnosis looks for."""
-PARTS, DEEPEST = (("encoder",), ("reader",), ("decoder",)), 3
-"""Modules of these are stages, down to this depth: encoder.transformer.block_0."""
+PARTS = (("encoder",), ("reader",), ("decoder",))
+"""Modules of these are stages."""
+DEEPEST = 3
+"""How deep modules are stages: encoder.transformer.block_0 is at 3."""
 
 
 @dataclasses.dataclass(frozen=True)

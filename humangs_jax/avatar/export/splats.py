@@ -423,7 +423,10 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
 # quaternions xyzw, linear scales.
 
 
-EXTENSION, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
+EXTENSION = "KHR_gaussian_splatting"
+"""Extension of glTF that holds Gaussians."""
+SRGB = "srgb_rec709_display"
+"""Its name of colors as sRGB images have them."""
 COEFFICIENTS = [
     f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"
     for degree in (1, 2, 3)

@@ -59,7 +59,14 @@ MORE_BEHIND = 2
 """The flag of files with records of others."""
 MOST_FRACTIONAL_BITS = 20
 """Steps of a micrometre; less where the Gaussians reach farther than 8 m."""
-COLOR_SCALE, SCALE_STEPS, SCALE_ZERO, HARMONIC_STEPS = 0.15, 16.0, 10.0, 128.0
+COLOR_SCALE = 0.15
+"""Factor on the harmonic of degree 0 before it becomes a byte."""
+SCALE_STEPS = 16.0
+"""Steps of a byte for a factor e of the scale."""
+SCALE_ZERO = 10.0
+"""What is added to the logarithm of a scale in metres, so that it becomes a byte >= 0."""
+HARMONIC_STEPS = 128.0
+"""Steps of a byte for 1 of a harmonic, which is 0 at this byte."""
 QUATERNION_STEPS = 511
 
 

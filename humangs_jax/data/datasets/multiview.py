@@ -82,7 +82,10 @@ from humangs_jax.io.reading import (
     visible,
 )
 
-PARAMETERS, MISSING = "smpl_params.npz", "missing_img_files.txt"
+PARAMETERS = "smpl_params.npz"
+"""File with the poses of a subject."""
+MISSING = "missing_img_files.txt"
+"""File that lists images that are missing."""
 ON_PERSON = 128.5 / 255
 """Least value of a mask on the person: above 128."""
 PHOTO = re.compile(r"(?:[\w-]+_(?:rgb|mask))?(\d+)\.\w+")
@@ -362,7 +365,10 @@ find_avatarrex, open_avatarrex = (
 # ActorsHQ
 # --------------------------------------------------------------------------------------------------
 
-CALIBRATION, SCALES = "calibration.csv", ("4x", "2x", "1x")
+CALIBRATION = "calibration.csv"
+"""File with the cameras of one size of images."""
+SCALES = ("4x", "2x", "1x")
+"""Folders of images, smallest first."""
 COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
 
 

@@ -40,8 +40,14 @@ from humangs_jax.io.mesh import read_obj
 from humangs_jax.io.reading import Refused, read_text, reading
 
 Kind = Literal["A", "B", "C"]
-PCA_NUMBERS, HAND_NUMBERS = 12, 45
-FIT, FIT_MESH = "smplx_param.pkl", "mesh_smplx.obj"
+PCA_NUMBERS = 12
+"""Numbers of a hand pose in principal components."""
+HAND_NUMBERS = 45
+"""Numbers of a hand pose in axis-angles: 15 joints."""
+FIT = "smplx_param.pkl"
+"""File of the body that was fitted to a scan."""
+FIT_MESH = "mesh_smplx.obj"
+"""File of that body's mesh."""
 TOLERANCE = 2e-3
 """Metres of the body, mean over vertices, up to which a fit reproduces mesh_smplx.obj. Rounding of
 OBJ files is far below; another gender moves vertices by centimetres, a wrong hand convention the

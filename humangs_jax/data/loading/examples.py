@@ -244,9 +244,18 @@ def _on_host(cls: type, **fields: Any) -> Any:
 # Order
 # --------------------------------------------------------------------------------------------------
 
-ORDER_STREAM, VIEW_STREAM, BATCH_STREAM, MIX_STREAM, SUBJECT_STREAM = range(5)
-"""First entry of the seeds: what a generator is for, so that no two purposes share random numbers.
+ORDER_STREAM = 0
+"""First entry of a seed says what a generator is for, so that no two purposes share random numbers:
+the order of an epoch.
 """
+VIEW_STREAM = 1
+"""The views of an example."""
+BATCH_STREAM = 2
+"""The number of views of a batch."""
+MIX_STREAM = 3
+"""The order of mixed sources."""
+SUBJECT_STREAM = 4
+"""The people that are made while training."""
 
 MIX_BLOCK = 256
 """Examples over which the shares of mixed sources are exact; smaller shares than one in a block are

@@ -35,7 +35,10 @@ from humangs_jax.rendering.mesh.rasterizer import (
 
 T = TypeVar("T")
 
-PELVIS, NECK = 0, 12
+PELVIS = 0
+"""Number of the joint that bodies are centred on."""
+NECK = 12
+"""Number of the joint of the neck."""
 VERTICAL_FOV = np.deg2rad(60.0)
 ELEVATIONS = (-5.0, 15.0)
 """Degrees, uniform."""
@@ -46,11 +49,24 @@ At 60 degrees below 1.7 the frame cuts heads and feet.
 """
 NEAR_FACTORS = (2.0, 2.0)
 """The paper's "near" test set; also what the release uses for all sets."""
-VIEWS, SIZE = 60, 512
-TRAIN, TEST = 2300, 145
-SPLIT_SEED, EVALUATION_SEED, CAMERA_SEED = 42, 777, 2026
-"""The last is ours: how the release drew its cameras is not known."""
-INPUT_COUNTS, TARGETS = (1, 2, 4, 6), 4
+VIEWS = 60
+"""Views of every scan."""
+SIZE = 512
+"""Side of the images, pixels."""
+TRAIN = 2300
+"""Scans to train with."""
+TEST = 145
+"""Scans to test with."""
+SPLIT_SEED = 42
+"""Seed of the split into train and test, as published."""
+EVALUATION_SEED = 777
+"""Seed of the views of an evaluation, as published."""
+CAMERA_SEED = 2026
+"""Seed of the cameras; ours, for how the release drew them is not known."""
+INPUT_COUNTS = (1, 2, 4, 6)
+"""Numbers of input views that are evaluated."""
+TARGETS = 4
+"""Number of views that are compared with each."""
 EVERY = 10
 """Every how many frames of a video are taken."""
 
@@ -164,7 +180,10 @@ def evaluation_indices(counts: Mapping[str, int], inputs: int) -> dict[str, dict
 # --------------------------------------------------------------------------------------------------
 
 
-AMBIENT, HEADLIGHT = 0.3, 0.7
+AMBIENT = 0.3
+"""Share of the light that comes from everywhere."""
+HEADLIGHT = 0.7
+"""Share of the light that comes from the camera."""
 STEP = 1 << 15
 """Vertices and faces are padded to a multiple of this: few shapes are compiled for many scans."""
 

@@ -78,7 +78,10 @@ from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import write_json
 
 SKIPPED = "skipped"
-SCENE, CAPTURE = "scene.json", "capture.json"
+SCENE = "scene.json"
+"""File of a scan in the layout "scenes"."""
+CAPTURE = "capture.json"
+"""File of a scan as a capture."""
 Layout = Literal["scenes", "capture"]
 
 
