@@ -59,8 +59,7 @@ distance.
 AGREE_ALONE = 0.5
 """Share of the sectors of the view that must find it there."""
 EDGE = 0.06
-"""At an edge, colors change more than beside it by this share of the strongest change of the sector.
-"""
+"""At an edge, colors change more than beside it by this share of the strongest change there."""
 OF_TEXTURE = 1.0
 """They also change more by this share of the change beside it."""
 SEEN_APART = 1.5
