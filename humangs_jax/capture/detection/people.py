@@ -224,19 +224,17 @@ def bilinear(
     x, y = points[..., 0], points[..., 1]
     inside = (x > -1) & (x < width) & (y > -1) & (y < height)
     x, y = x.clip(0, width - 1), y.clip(0, height - 1)
-    left, top = (
-        np.minimum(x.astype(int), max(width - 2, 0)),
-        np.minimum(y.astype(int), max(height - 2, 0)),
-    )
+    left = np.minimum(x.astype(int), max(width - 2, 0))
+    top = np.minimum(y.astype(int), max(height - 2, 0))
     right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
     shape = x.shape + (1,) * (image.ndim - 2)
     u, v = (x - left).reshape(shape).astype(np.float32), (y - top).reshape(shape).astype(np.float32)
     upper = image[top, left] * (1 - u) + image[top, right] * u
     lower = image[bottom, left] * (1 - u) + image[bottom, right] * u
     values = upper * (1 - v) + lower * v
-    return (
-        values if outside is None else np.where(inside.reshape(shape), values, np.float32(outside))
-    )
+    if outside is None:
+        return values
+    return np.where(inside.reshape(shape), values, np.float32(outside))
 
 
 def refined(
@@ -252,9 +250,8 @@ def refined(
         )
         heights = heatmaps[rows[:, None], columns, i].astype(np.float64)
         if heights.max() >= PEAK:
-            moved[i] = (
-                np.asarray([heights.sum(0) @ columns, heights.sum(1) @ rows]) / heights.sum() / size
-            )
+            centroid = np.asarray([heights.sum(0) @ columns, heights.sum(1) @ rows]) / heights.sum()
+            moved[i] = centroid / size
     return moved
 
 
@@ -466,8 +463,9 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
     found = _people(networks, photo, detections)
     if not any(person.crop.side >= LARGE * longest for person in found):
         smaller = window_detections(networks, photo, SMALL_SHARES)
-        found = _people(networks, photo, detections + smaller) if smaller else found
-    margins = list(MARGINS if found else ())
+        if smaller:
+            found = _people(networks, photo, detections + smaller)
+    margins = list(MARGINS) if found else []
     for _ in range(MOST_PAINTINGS):
         if not margins:
             break
@@ -539,17 +537,17 @@ def _people(
         least = LEAST_ON_MASK if covered is None else LEAST_ON_REST
         if person.presence >= LEAST_PRESENCE and on_mask >= least:
             found.append((drift, person))
-    kept: list[Landmarks] = []
     # crops far off that still drift towards a person have wrong landmarks: the one that settled
-    # speaks for the person
-    for _, person in sorted(
-        found, key=lambda pair: pair[0] > SETTLED
-    ):  # among these the detector's best
-        if not any(
-            _shared(*pair, width, height) > MOST_SHARED
-            for o in kept
-            for pair in ((person, o), (o, person))
-        ):
+    # speaks for the person, and among these the detector's best
+    found.sort(key=lambda pair: pair[0] > SETTLED)
+    kept: list[Landmarks] = []
+    for _, person in found:
+        shares = [
+            _shared(*pair, width, height)
+            for other in kept
+            for pair in ((person, other), (other, person))
+        ]
+        if max(shares, default=0.0) <= MOST_SHARED:
             kept.append(person)
     return sorted(kept, key=lambda person: -person.crop.side)
 
@@ -593,18 +591,19 @@ def windows(
     longest, found = max(width, height), []
     for share in shares:
         side = share * longest
-        steps = [
-            1 if size <= side else int(np.ceil(2 * (size - side) / side)) + 1
-            for size in (width, height)
-        ]
-        starts = [
-            np.asarray([(size - side) / 2]) if count == 1 else np.linspace(0, size - side, count)
-            for size, count in zip((width, height), steps, strict=True)
-        ]
-        found += [
-            Crop(np.asarray([x, y]) + side / 2, side, 0.0) for y in starts[1] for x in starts[0]
-        ]
+        rows, columns = _starts(height, side), _starts(width, side)
+        found += [Crop(np.asarray([x, y]) + side / 2, side, 0.0) for y in rows for x in columns]
     return found
+
+
+def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
+    """Where windows begin along a photo: one in its middle if that covers it, else evenly spread
+    ones that overlap by half or more.
+    """
+    if size <= side:
+        return np.asarray([(size - side) / 2])
+    count = int(np.ceil(2 * (size - side) / side)) + 1
+    return np.linspace(0, size - side, count)
 
 
 def distinct(detections: list[Detection], longest: int) -> list[Detection]:

@@ -44,14 +44,20 @@ def sharpened(
     # the filter's coefficients, of the reduced photo
     reduced = min(1.0, MOST / pixel)
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
-    small = (resized(guide, *size), resized(own, *size)) if reduced < 1 else (guide, own)
-    slopes, offsets = _affine(*small, max(1, round(RADIUS * reduced * pixel)))
-    back = (
-        (lambda values: resized(values, width, height)) if reduced < 1 else (lambda values: values)
-    )
-    found, result = back(offsets).copy(), np.zeros_like(mask)
-    for color in range(3):  # one at a time: all together take gigabytes of a large photo
-        found += back(slopes[..., color]) * guide[..., color]
+    small_guide, small_mask = guide, own
+    if reduced < 1:
+        small_guide, small_mask = resized(guide, *size), resized(own, *size)
+    slopes, offsets = _affine(small_guide, small_mask, max(1, round(RADIUS * reduced * pixel)))
+
+    def enlarged(values):
+        """Values of the reduced photo at the size of the window."""
+        return resized(values, width, height) if reduced < 1 else values
+
+    # one color at a time: all together take gigabytes of a large photo
+    found = enlarged(offsets).copy()
+    for color in range(3):
+        found += enlarged(slopes[..., color]) * guide[..., color]
+    result = np.zeros_like(mask)
     result[window] = np.clip(STEEPER * (found - 0.5) + 0.5, 0, 1)
     return result
 
@@ -68,15 +74,19 @@ def _affine(
     the windows of each pixel.
     """
     side = 2 * radius + 1
-    mean = lambda x: ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
+
+    def mean(x):
+        """Means over the window of each pixel."""
+        return ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
+
+    # least squares in each window: covariance of colors and mask over that of the colors
     colors, level = mean(guide), mean(mask)
     together = mean(guide * mask[..., None]) - colors * level[..., None]
     spread = (
         mean(guide[..., :, None] * guide[..., None, :])
         - colors[..., :, None] * colors[..., None, :]
     )
-    slopes = np.linalg.solve(spread + EPSILON * np.eye(3), together[..., None].astype(float))[
-        ..., 0
-    ]
+    solved = np.linalg.solve(spread + EPSILON * np.eye(3), together[..., None].astype(float))
+    slopes = solved[..., 0]
     offsets = level - (slopes * colors).sum(-1)
     return mean(slopes).astype(np.float32), mean(offsets).astype(np.float32)
