@@ -68,14 +68,15 @@ def read_own(source: Source, format: SourceFormat) -> Detections:
         return _saved(source.path)
     kind, images = read_people(source.path, source.json)
     nobody = np.zeros((len(kind.names), 6))
-    columns = lambda each: nobody if each is None else np.column_stack([each.points, each.world])
-    found = (tuple(map(columns, image.people)) for image in images)
-    seen = tuple(
-        DetectedImage(i.image, source.path, p, i.size) for i, p in zip(images, found, strict=True)
-    )
-    return Detections(
-        kind if any(any(image.people) for image in images) else None, seen, offset=0.0
-    )
+    seen = []
+    for image in images:
+        people = tuple(
+            nobody if each is None else np.column_stack([each.points, each.world])
+            for each in image.people
+        )
+        seen.append(DetectedImage(image.image, source.path, people, image.size))
+    somebody = any(any(image.people) for image in images)
+    return Detections(kind if somebody else None, tuple(seen), offset=0.0)
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
@@ -169,7 +170,9 @@ def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
 
 
 def _described(person: SeenPerson) -> dict[str, Any]:
-    rounded = lambda values: np.round(values, DECIMALS).tolist()
+    def rounded(values):
+        return np.round(values, DECIMALS).tolist()
+
     return {
         "presence": round(person.presence, DECIMALS),
         "pixels": rounded(person.points[:, :2]),
@@ -246,11 +249,10 @@ def read_openpose(source: Source, format: SourceFormat) -> Detections:
     """The people of one image, or of the frames of a video, which programs with nodes write as a
     list. Raises: CaptureError.
     """
-    listed, frames = isinstance(source.json, list), source.json
-    frames = frames if listed else [frames]
-    own = not any("canvas_width" in frame for frame in frames) and any(
-        "version" in frame for frame in frames
-    )
+    listed = isinstance(source.json, list)
+    frames = source.json if listed else [source.json]
+    of_nodes = any("canvas_width" in frame for frame in frames)
+    own = not of_nodes and any("version" in frame for frame in frames)
     images = []
     for i, frame in enumerate(frames):
         field = f"[{i}]." if listed else ""
@@ -259,7 +261,8 @@ def read_openpose(source: Source, format: SourceFormat) -> Detections:
             _openpose_person(each, source.path, f"{field}people[{j}]", own)
             for j, each in enumerate(entries)
         )
-        people = people if any(person.any() for person in people) else ()
+        if not any(person.any() for person in people):
+            people = ()
         name: str | int = source.name.removesuffix(SUFFIX)
         if len(frames) > 1:
             name = i if source.alone else f"{name}/{i}"
@@ -271,11 +274,9 @@ def read_openpose(source: Source, format: SourceFormat) -> Detections:
 def _canvas(frame: dict[str, Any], file: Path) -> tuple[int, int] | None:
     """Width and height of the image that the points are of, where the file says so."""
     width, height = frame.get("canvas_width"), frame.get("canvas_height")
-    return (
-        None
-        if width is None or height is None
-        else _stated_size({"width": width, "height": height}, file)
-    )
+    if width is None or height is None:
+        return None
+    return _stated_size({"width": width, "height": height}, file)
 
 
 def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np.ndarray, "k 3"]:
@@ -287,8 +288,11 @@ def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np
     if not rest and count in SETS_BY_COUNT:
         return triples(body, file, f"{field}.{BODY}")
     if rest or (count and count not in BODY_POINTS):
-        model = f" of {OTHER_MODELS[count]}" if not rest and count in OTHER_MODELS else ""
-        found = f"{len(body)} numbers" if rest else f"{count} points{model}"
+        found = f"{count} points"
+        if rest:
+            found = f"{len(body)} numbers"
+        elif count in OTHER_MODELS:
+            found += f" of {OTHER_MODELS[count]}"
         known = ", ".join(map(str, sorted((*BODY_POINTS, *SETS_BY_COUNT))))
         hint = " (OpenPose: --model_pose BODY_25)" if own else ""
         raise CaptureError(
@@ -305,12 +309,12 @@ def _parts(
     """The points of the parts of a person; those that were not detected are left out, null, or
     empty lists.
     """
-    points = [
-        np.zeros((count, 3))
-        if person.get(key) in (None, [])
-        else triples(person[key], file, f"{field}.{key}", count)
-        for key, count in counts.items()
-    ]
+    points = []
+    for key, count in counts.items():
+        if person.get(key) in (None, []):
+            points.append(np.zeros((count, 3)))
+        else:
+            points.append(triples(person[key], file, f"{field}.{key}", count))
     return np.concatenate(points)
 
 
@@ -336,33 +340,34 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
     for i, entry in enumerate(content["annots"]):
         field = f"annots[{i}]"
         members(entry, file, field, keypoints=list)
-        points = lambda key, count, field=field, entry=entry: file_numbers(
-            entry[key], file, f"{field}.{key}", (count, 3), nulls=True
-        )
-        person = points("keypoints", None) if entry["keypoints"] else np.zeros((0, 3))
+        person = _part(entry, "keypoints", None, file, field)
         # BODY_25, perhaps with hands
         if len(person) == 25:
-            hands = [
-                points(key, 21) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS
-            ]
+            hands = [_part(entry, key, 21, file, field) for key in EASYMOCAP_HANDS]
             person = np.concatenate([person, *hands])
         number = entry.get("personID", i)
-        people[
-            number
-            if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people
-            else len(people)
-        ] = person
+        counted = type(number) is int and 0 <= number < MOST_PEOPLE and number not in people
+        people[number if counted else len(people)] = person
     first = next(iter(people.values()), np.zeros((0, 3)))
     found = tuple(people.get(i, np.zeros_like(first)) for i in range(max(people, default=-1) + 1))
-    name, size = content.get("filename"), (content.get("width"), content.get("height"))
+    name = content.get("filename")
+    if not (isinstance(name, str) and name):
+        name = source.name
+    size = content.get("width"), content.get("height")
     known = all(type(side) is int and side > 0 for side in size)
-    image = DetectedImage(
-        name if isinstance(name, str) and name else source.name,
-        file,
-        found,
-        size if known else None,
-    )
+    image = DetectedImage(name, file, found, size if known else None)
     return detections_of([image], OPENPOSE_67)
+
+
+def _part(
+    entry: dict[str, Any], key: str, count: int | None, file: Path, field: str
+) -> Float[np.ndarray, "k 3"]:
+    """The points of a part of a person, zeros where it is left out or empty. count: how many there
+    are, None: any number.
+    """
+    if not entry.get(key):
+        return np.zeros((count or 0, 3))
+    return file_numbers(entry[key], file, f"{field}.{key}", (count, 3), nulls=True)
 
 
 # COCO
@@ -435,12 +440,11 @@ def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage
         images[image][1].append(
             _by_visibility(_coco_person(entry, file, field, whole), file, field)
         )
-    name = lambda image, key: _image_label(image.get("file_name", key), file, f"image {key}")
-    found = images.items()
-    return [
-        DetectedImage(name(i, key), file, tuple(people), _stated_size(i, file))
-        for key, (i, people) in found
-    ]
+    found = []
+    for key, (image, people) in images.items():
+        name = _image_label(image.get("file_name", key), file, f"image {key}")
+        found.append(DetectedImage(name, file, tuple(people), _stated_size(image, file)))
+    return found
 
 
 def _image_label(value: Any, file: Path, field: str) -> str | int:
@@ -464,11 +468,9 @@ def _coco_person(
     entry: dict[str, Any], file: Path, field: str, whole: bool
 ) -> Float[np.ndarray, "k 3"]:
     (keypoints,) = members(entry, file, field, keypoints=list)
-    return (
-        _parts(entry, COCO_PARTS, file, field)
-        if whole
-        else triples(keypoints, file, f"{field}.keypoints")
-    )
+    if whole:
+        return _parts(entry, COCO_PARTS, file, field)
+    return triples(keypoints, file, f"{field}.keypoints")
 
 
 def _by_visibility(

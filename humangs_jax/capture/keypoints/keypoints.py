@@ -171,30 +171,33 @@ OPENPOSE_67B = _keypoint_set(
 Files do not say which of both they have, see `orders`.
 """
 
+
+def _both(part: str) -> tuple[str, str]:
+    """The left and the right point of a part."""
+    return f"left_{part}", f"right_{part}"
+
+
 # millimetres. The mean over 12 synthetic people (`python -m experiments landmark_places`); those of
 # hips, wrists, knees, ankles and feet are the mean of these and of a barefoot man's, since
 # synthetic people wear shoes
-_MIRRORED = lambda part: (f"left_{part}", f"right_{part}")
 _BLAZEPOSE_PLACES = (
     place("nose", "nose", ("head",), (0, 13, -12)),
     *both_sides(("face_42", "face_39"), "{side}_eye", ("head",), (-15, 9, 7)),
-    *both_sides(_MIRRORED("eye"), "{side}_eye", ("head",), (-4, 9, 0)),
+    *both_sides(_both("eye"), "{side}_eye", ("head",), (-4, 9, 0)),
     *both_sides(("face_45", "face_36"), "{side}_eye", ("head",), (6, 9, -7)),
-    *both_sides(_MIRRORED("ear"), "{side}_ear", ("head",), (-33, 1, 34)),
+    *both_sides(_both("ear"), "{side}_ear", ("head",), (-33, 1, 34)),
     *both_sides(("face_54", "face_48"), "jaw", ("head",), (15, 37, -2)),
-    *both_sides(_MIRRORED("shoulder"), "{side}_shoulder", ("{side}_collar",), (-9, 36, -4)),
-    *both_sides(
-        _MIRRORED("elbow"), "{side}_elbow", ("{side}_shoulder", "{side}_elbow"), (-1, 4, 6)
-    ),
-    *both_sides(_MIRRORED("wrist"), "{side}_wrist", ("{side}_elbow", "{side}_wrist"), (2, 9, 1)),
-    *both_sides(_MIRRORED("pinky_1"), "{side}_pinky_1", ("{side}_wrist",), (-9, -7, 24)),
-    *both_sides(_MIRRORED("index_1"), "{side}_index_1", ("{side}_wrist",), (-21, -13, -16)),
-    *both_sides(_MIRRORED("thumb_2"), "{side}_thumb_2", ("{side}_wrist",), (6, 2, -28)),
-    *both_sides(_MIRRORED("hip"), "{side}_hip", ("pelvis",), (-11, -10, 25)),
-    *both_sides(_MIRRORED("knee"), "{side}_knee", ("{side}_hip", "{side}_knee"), (0, 0, -9)),
-    *both_sides(_MIRRORED("ankle"), "{side}_ankle", ("{side}_knee", "{side}_ankle"), (2, 9, 1)),
-    *both_sides(_MIRRORED("heel"), "{side}_heel", ("{side}_ankle",), (1, -14, 17)),
-    *both_sides(_MIRRORED("foot_index"), "{side}_foot_index", ("{side}_ankle",), (-8, -4, -20)),
+    *both_sides(_both("shoulder"), "{side}_shoulder", ("{side}_collar",), (-9, 36, -4)),
+    *both_sides(_both("elbow"), "{side}_elbow", ("{side}_shoulder", "{side}_elbow"), (-1, 4, 6)),
+    *both_sides(_both("wrist"), "{side}_wrist", ("{side}_elbow", "{side}_wrist"), (2, 9, 1)),
+    *both_sides(_both("pinky_1"), "{side}_pinky_1", ("{side}_wrist",), (-9, -7, 24)),
+    *both_sides(_both("index_1"), "{side}_index_1", ("{side}_wrist",), (-21, -13, -16)),
+    *both_sides(_both("thumb_2"), "{side}_thumb_2", ("{side}_wrist",), (6, 2, -28)),
+    *both_sides(_both("hip"), "{side}_hip", ("pelvis",), (-11, -10, 25)),
+    *both_sides(_both("knee"), "{side}_knee", ("{side}_hip", "{side}_knee"), (0, 0, -9)),
+    *both_sides(_both("ankle"), "{side}_ankle", ("{side}_knee", "{side}_ankle"), (2, 9, 1)),
+    *both_sides(_both("heel"), "{side}_heel", ("{side}_ankle",), (1, -14, 17)),
+    *both_sides(_both("foot_index"), "{side}_foot_index", ("{side}_ankle",), (-8, -4, -20)),
 )
 
 MEDIAPIPE_33 = _keypoint_set(
@@ -339,7 +342,8 @@ def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detect
     people = [(len(person), image) for image in images for person in image.people]
     if not people:
         return Detections(None, tuple(images))
-    known, (count, first) = SETS_BY_COUNT | {len(each.names): each for each in more}, people[0]
+    known = SETS_BY_COUNT | {len(each.names): each for each in more}
+    count, first = people[0]
     for other, image in people:
         if other != count:
             problem = (

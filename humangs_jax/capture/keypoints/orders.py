@@ -91,16 +91,18 @@ def in_order(detections: Detections, count: int) -> Detections:
     others = min(length for i, length in enumerate(lengths) if i != best)
     known = lengths[best] <= LONGEST_BONES and others >= CLEARLY_SHORTER * lengths[best]
     order = orders[best] if known else orders[0]
-    said = () if known and best == 0 and count == 25 else (_said(order, known, count),)
-    images = tuple(
-        dataclasses.replace(
-            image, people=tuple(_sorted(person, order, count) for person in image.people)
-        )
-        for image in detections.images
-    )
-    return dataclasses.replace(
-        detections, set=order.set, images=images, warnings=(*detections.warnings, *said)
-    )
+    warnings = detections.warnings
+    usual = known and best == 0 and count == 25
+    if not usual:
+        warnings = (*warnings, _said(order, known, count))
+
+    # the points of the body in the order of the set, and the hands behind them
+    rows = [order.points.index(name) for name in order.set.names[:count]]
+    images = []
+    for image in detections.images:
+        people = tuple(np.concatenate([person[rows], person[count:]]) for person in image.people)
+        images.append(dataclasses.replace(image, people=people))
+    return dataclasses.replace(detections, set=order.set, images=tuple(images), warnings=warnings)
 
 
 def _said(order: Order, known: bool, count: int) -> str:
@@ -129,11 +131,3 @@ def _mean_bone(
             bones = np.linalg.norm(points[both[:, 0], :2] - points[both[:, 1], :2], axis=1)
             lengths += (bones / max(size, 1e-6)).tolist()
     return float(np.mean(lengths)) if len(lengths) >= FEWEST_BONES else np.inf
-
-
-def _sorted(
-    person: Float[np.ndarray, "k columns"], order: Order, count: int
-) -> Float[np.ndarray, "k columns"]:
-    """A person in the order of its set."""
-    body = [order.points.index(name) for name in order.set.names[:count]]
-    return np.concatenate([person[body], person[count:]])

@@ -85,7 +85,8 @@ def read_detections(path: Path) -> Detections:
         source = Source(file, name, alone=len(files) == 1)
         amount += _amount(source.json)
         check_limit("people", amount, "people and images")
-        if (format := KEYPOINTS.of_content(source)) is None:
+        format = KEYPOINTS.of_content(source)
+        if format is None:
             raise CaptureError(file, "", f"no keypoints: expected those of {KEYPOINTS.listed()}")
         found = format(source, format)
         images += found.images
@@ -101,7 +102,9 @@ def read_detections(path: Path) -> Detections:
         return Detections(None, tuple(images))
     detections = dataclasses.replace(known[2], images=tuple(images))
     count = UNSORTED.get(detections.set.name if detections.set else "")
-    return detections if count is None or files[0].suffix == ".npz" else in_order(detections, count)
+    if count is None or files[0].suffix == ".npz":  # ours tells which order it has
+        return detections
+    return in_order(detections, count)
 
 
 def _amount(content: Any) -> int:
@@ -154,7 +157,8 @@ def _read(
     path: Path, names: Sequence[str], width: int, height: int, person: int | None
 ) -> Keypoints:
     detections = read_detections(path)
-    if (kind := detections.set) is None:
+    kind = detections.set
+    if kind is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
     # the image of each view; scores of another scale are divided by the largest
     images = _images_of_views(path, detections, names, width, height)
@@ -193,10 +197,8 @@ def _read(
     points, confidences = values[..., :2].astype(np.float32), values[..., 2].astype(np.float32)
     missing = tuple(name for name, row in zip(names, confidences, strict=True) if not row.any())
     finite = np.isfinite(raw).all(axis=-1)
-    dropped, far = (
-        int((~finite).sum()),
-        int((finite & (raw[..., 2] > 0) & (confidences == 0)).sum()),
-    )
+    dropped = int((~finite).sum())
+    far = int((finite & (raw[..., 2] > 0) & (confidences == 0)).sum())
     if not confidences.any():
         problem = (
             f"no point has a confidence above 0 (not finite: {dropped}, far outside of the photos:"
@@ -241,13 +243,13 @@ def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> st
     1; "" if there is none.
     """
     for image, name in zip(images, names, strict=True):
-        if image is not None:
-            numbers = [
-                re.findall(r"\d+", str(_stem(each) if isinstance(each, str) else each))
-                for each in (image.image, name)
-            ]
-            if all(numbers) and int(numbers[0][-1]) != int(numbers[1][-1]):
-                return f"{image.image} is view {name}"
+        if image is None:
+            continue
+        label = image.image
+        number = label if isinstance(label, int) else _last_number(str(_stem(label)))
+        of_view = _last_number(str(_stem(name)))
+        if number is not None and of_view is not None and number != of_view:
+            return f"{label} is view {name}"
     return ""
 
 
@@ -343,7 +345,7 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     find = _finder(names)
     # mere numbers in order, if there is one for every view
     numbers = sorted({image for image in images if isinstance(image, int)})
-    of_names = sorted(int(found[-1]) for name in names if (found := re.findall(r"\d+", name)))
+    of_names = sorted(number for number in map(_last_number, names) if number is not None)
     one_for_each = (
         len(numbers) == len(of_names) == len(names) and _no_gaps(numbers) and _no_gaps(of_names)
     )
@@ -359,18 +361,16 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     # frames of a video that are counted from the other number
     videos: dict[str, list[tuple[int, str | int]]] = {}
     for image in found:
-        prefix, number = _split_number(str(_stem(image))) if isinstance(image, str) else ("", None)
+        if isinstance(image, int):
+            continue
+        prefix, number = _split_number(str(_stem(image)))
         if number is not None:
             videos.setdefault(prefix, []).append((number, image))
     of_view = [_split_number(name)[0] for name in names]
     for prefix, frames in videos.items():
         counts = sorted(number for number, _ in frames)
-        if (
-            counts[0] > 1
-            or len(counts) < 2
-            or not _no_gaps(counts)
-            or all(found[image] for _, image in frames)
-        ):
+        matched_already = all(found[image] for _, image in frames)
+        if counts[0] > 1 or len(counts) < 2 or not _no_gaps(counts) or matched_already:
             continue
         moved = {image: find(f"{prefix}{number + 1 - 2 * counts[0]}") for number, image in frames}
         prefixes = {of_view[view] for views in moved.values() for view in views}
@@ -398,12 +398,12 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
     for i, name in enumerate(names):
         plain[_plain(name)].append(i)
         parts = _plain(name).split("_")
-        for first in range(
-            1, len(parts) - 1
-        ):  # ends of one part, such as a number, could be of any camera
+        # ends of one part, such as a number, could be of any camera
+        for first in range(1, len(parts) - 1):
             ends["_".join(parts[first:])].append(i)
-        if found := re.findall(r"\d+", name):
-            numbers[int(found[-1])].append(i)
+        number = _last_number(name)
+        if number is not None:
+            numbers[number].append(i)
 
     def find(image: str | int) -> list[int]:
         if isinstance(image, int):
@@ -416,7 +416,8 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
         ]
         for key in keys:
             for table, label in ((exact, key), (plain, _plain(key)), (ends, _plain(key))):
-                if len(views := table.get(label, [])) == 1:
+                views = table.get(label, [])
+                if len(views) == 1:
                     return views
         return []
 
@@ -430,7 +431,14 @@ def _stem(image: str) -> PurePosixPath:
 
 def _split_number(name: str) -> tuple[str, int | None]:
     prefix = name.rstrip("0123456789")
-    return prefix, int(name[len(prefix) :]) if len(prefix) < len(name) else None
+    number = name.removeprefix(prefix)
+    return prefix, int(number) if number else None
+
+
+def _last_number(name: str) -> int | None:
+    """The last number in a name, None without any."""
+    found = re.findall(r"\d+", name)
+    return int(found[-1]) if found else None
 
 
 def _no_gaps(numbers: Sequence[int]) -> bool:
