@@ -33,6 +33,7 @@ from humangs_jax.evaluation.scores import score
 from humangs_jax.geometry import quaternion
 from humangs_jax.io.images import PHOTO_SUFFIXES, image_size
 from humangs_jax.io.reading import visible
+from humangs_jax.losses.alignment import ASKED, aligned_psnr, photos_agree
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine
@@ -289,7 +290,7 @@ SIZE = 512
 LONGEST = 1024
 """Pixels: larger photos are reduced, whose crops around the person would be all the same."""
 CLEARLY = 0.1
-"""Decibels by which a second body has to be better."""
+"""Decibels by which a second body has to be better in the photos that are asked."""
 
 
 class HeldOut(NamedTuple):
@@ -299,6 +300,9 @@ class HeldOut(NamedTuple):
     """Name of the photo that was held out."""
     psnr: float
     """PSNR over the person, dB."""
+    aligned: float
+    """PSNR of colors and coverage after small moves of the photo, dB, see `losses.alignment`. It
+    decides which avatar is kept."""
 
     def __str__(self) -> str:
         """One line."""
@@ -309,10 +313,15 @@ class HeldOut(NamedTuple):
 
 
 def held_out_psnr(
-    variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None
+    variables: PyTree,
+    config: HumanGSConfig,
+    capture: Capture,
+    refinement: RefineConfig | None,
+    number: int = 0,
 ) -> HeldOut | None:
-    """How well the photo that has the nearest other one is reproduced by an avatar of the others,
-    over the person, in a crop of `SIZE` pixels; None for fewer than four photos or without masks.
+    """How well a photo is reproduced by an avatar of the others, over the person, in a crop of
+    `SIZE` pixels: the one that has the nearest other one, or of higher `number` the next in this
+    order. None for fewer than four photos or without masks.
     Body and cameras are those of all photos. In its place is a second copy of the nearest photo:
     the programs for that number of photos are compiled already.
     """
@@ -324,7 +333,7 @@ def held_out_psnr(
         return None
     views = np.arange(capture.view_count)
     apart = _distances(capture)
-    view = int(apart.min(axis=1).argmin())
+    view = int(np.argsort(apart.min(axis=1), kind="stable")[number])
     others = capture.select(np.where(views == view, int(apart[view].argmin()), views))
     avatar = reconstruct(variables, config, others)
     if refinement is not None:
@@ -332,9 +341,14 @@ def held_out_psnr(
             avatar, others, dataclasses.replace(refinement, head_steps=0)
         )  # heads hardly change the number
     photo = cropped(capture.select([view]), SIZE)
-    return HeldOut(
-        capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_fg)
-    )
+    drawn = draw_views(avatar, photo)
+    assert photo.masks is not None
+    pair = [
+        np.concatenate([colors[0], coverage[0][..., None]], axis=-1)
+        for colors, coverage in ((drawn.images, drawn.alpha), (photo.images, photo.masks))
+    ]
+    psnr = float(score(drawn.images, photo).psnr_fg)
+    return HeldOut(capture.names[view], psnr, aligned_psnr(*pair))
 
 
 def photos_to_read(capture: Capture) -> Capture:
@@ -353,19 +367,27 @@ def better_body(
     second: Capture,
     refinement: RefineConfig | None,
 ) -> tuple[Capture, HeldOut | None]:
-    """The capture whose body makes the better avatar, judged by a photo that is held out of it, and
-    what that photo says.
+    """The capture whose body makes the better avatar, judged by photos that are held out of it, and
+    what the first of them says.
 
     More of the masks is covered by a body that fills clothes; the avatar is not better for it.
-    Without enough photos the first.
+    Several photos are asked, see `photos_agree`. Without enough photos the first.
     """
-    one = held_out_psnr(variables, config, first, refinement)
-    two = None if one is None else held_out_psnr(variables, config, second, refinement)
-    return (
-        (second, two)
-        if one is not None and two is not None and two.psnr > one.psnr + CLEARLY
-        else (first, one)
-    )
+    reports: list[tuple[HeldOut, HeldOut]] = []
+
+    def gains() -> Iterator[float]:
+        for number in range(ASKED):
+            one = held_out_psnr(variables, config, first, refinement, number)
+            two = one and held_out_psnr(variables, config, second, refinement, number)
+            if one is None or two is None:
+                return
+            reports.append((one, two))
+            yield two.aligned - one.aligned
+
+    better = photos_agree(gains(), CLEARLY)
+    if not reports:
+        return first, None
+    return (second, reports[0][1]) if better else (first, reports[0][0])
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:

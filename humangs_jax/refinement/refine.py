@@ -25,8 +25,10 @@ from humangs_jax.refinement.objective import avatar_of
 from humangs_jax.refinement.photos import crop_to_person
 from humangs_jax.refinement.search import (
     Clock,
+    align,
     avatar_comparison,
     comparison,
+    compile_parts,
     prepare,
     search,
 )
@@ -63,6 +65,9 @@ class Refinement:
     """Names of photos that contradict the others, and were not fitted."""
     head_steps: int = 0
     """Steps of the optimizer on the head alone; 0 if they were not kept."""
+    moved: bool = False
+    """Whether photos were moved by pixels, because the person or the pose is not the same in all of
+    them. Then `loss` and `psnr` compare with the moved photos."""
 
     def summary(self) -> str:
         """One line."""
@@ -70,6 +75,8 @@ class Refinement:
         verdict = gain if self.kept else "no improvement: the avatar is unchanged"
         if self.left_out:
             verdict += f"; without {', '.join(self.left_out)}, which contradicts the others"
+        if self.moved:
+            verdict += "; the photos differ by pixels from one another, and were moved together"
         head = f", {self.head_steps} on the head," if self.head_steps else ""
         ended = ", interrupted" if self.interrupted else ""
         took = (
@@ -158,6 +165,9 @@ def refine_with_report(
         compiler.submit(sharpened, task.avatar, best.state.trust, crops, own, Clock(own))
     interrupted = False
     try:
+        with clock.compiling():
+            best = compile_parts(task, best)
+        task, each = align(task, best, each)
         for found in search(task, best, each):
             best = found if found.kept else best
             if watch is not None:
@@ -203,6 +213,7 @@ def refine_with_report(
         planned=None if interrupted or clock.late else clock.planned,
         left_out=_without(capture, best.used) if len(best.used) < len(task.photos) else (),
         head_steps=head_steps,
+        moved=task.moved,
     )
 
 

@@ -1,13 +1,14 @@
 """The search of `refine`: which photos are fitted, by how many iterations of the learned update and
 how many steps.
 
-With `HELD_OUT_PHOTOS` photos or more, a search is made twice. The trial leaves one photo out and
-asks it whether the iterations help, whether they help without the photo that fits least, and how
-many of the steps do. Then all photos are fitted as the trial says. Iterations alone are tried only
-if one photo fits much less than the others. The photo that is asked is the one that the avatar
-explains best before it is refined: a photo that misleads is never asked.
+With `HELD_OUT_PHOTOS` photos or more, a search is made twice. Trials leave one photo out and ask it
+whether the iterations help, whether they help without the photo that fits least, and how many of
+the steps do. Then all photos are fitted as the trials say. Iterations alone are tried only if one
+photo fits much less than the others. Several photos are asked, see `photos_agree`, those first that
+the avatar explains best before it is refined: a photo that misleads is never the first.
 
-With fewer photos, blocks of pixels are held out instead, and one search is made.
+With fewer photos, blocks of pixels are held out instead, and one search is made. What is asked
+answers by its PSNR after small moves, see `losses.alignment`: photos are seldom of one moment.
 """
 
 import contextlib
@@ -29,9 +30,24 @@ from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.losses.alignment import (
+    ASKED,
+    aligned_psnr,
+    misplaced,
+    moved_photo,
+    photos_agree,
+    smooth_moves,
+)
+from humangs_jax.losses.losses import LARGEST_PSNR
+from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.learned import Graph, graph_of, learned_update
-from humangs_jax.refinement.objective import Comparison, compare, parameters_of
+from humangs_jax.refinement.objective import (
+    Comparison,
+    Image,
+    compare,
+    drawn_photo,
+    parameters_of,
+)
 from humangs_jax.refinement.photos import Photo, held_out_blocks, photo_order, photos_of
 from humangs_jax.refinement.steps import RefineState, init_state, step
 from humangs_jax.rendering.buffers import plan_buffers
@@ -47,7 +63,7 @@ views that no step sees.
 TRIAL = 1 / 3
 """Share of the steps that the trial makes."""
 ALLOWED_LOSS = 0.5
-"""Decibels that steps may lose on the photo that is held out: it lacks what they learn from it when
+"""Decibels that steps may lose on a photo that is held out: it lacks what they learn from it when
 all photos are fitted. With six validation people they lose up to 0.4 there, and gain at least 0.1
 in other views of that pose by all photos."""
 ALLOWED_LOSS_OF_ITERATIONS = 1.0
@@ -58,6 +74,10 @@ SUSPICIOUS = 1.5
 """Loss of the photo that fits least over the median, before refinement, from which on iterations
 alone are tried first. With right poses and masks eight of nine people have 1.0 to 1.3, one 1.55.
 Half a mask makes 1.6, a body that is turned by 10 degrees 2.1."""
+STILL = 2e-4
+"""Mean distance, as a share of the person's height, between a photo and what iterations on all of
+them draw, from which on photos are moved. Photos of one moment of two synthetic people leave up to
+0.00005; bodies that are off by 1 cm in the mean leave 0.0004, by 2 cm 0.0012."""
 TIMED_STEPS = 3
 """Steps that are timed to plan how many a run has."""
 OVERRUN = 1.5
@@ -187,6 +207,10 @@ class Task(NamedTuple):
     """The configuration that programs are compiled for, the same for runs of 5 s and of 15 s."""
     clock: Clock
     """The time and the number of steps of the run."""
+    first: tuple["Found", float] | None = None
+    """What iterations on all photos find, and the loss on them; None where it is not known."""
+    moved: bool = False
+    """Whether the photos were moved, see `align`."""
 
 
 class Found(NamedTuple):
@@ -238,17 +262,49 @@ def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
 # --------------------------------------------------------------------------------------------------
 
 
-def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
-    """What a run finds, one after the other: the last that is kept is its result. each:
-    comparison of the start with photos.
+def align(task: Task, start: Found, each: Comparison) -> tuple[Task, Comparison]:
+    """The task whose photos show the person where the start does, and the comparison of the start
+    with each of them; the same ones where the photos agree.
+
+    Iterations fit photos of one moment to a small part of a pixel. Where the person has moved from
+    photo to photo, or a pose or a camera is off, what they find lies between the photos. Then
+    smooth moves bring the photos to the start, so that detail is fitted instead of its mean.
     """
-    with task.clock.compiling():  # each part once, so that it is compiled
-        if task.config.steps != 0:
-            start = start._replace(
-                state=replace(start.state, splat=stepped(task, start.state, start.used[0]).splat)
-            )
-        if task.config.iterations:
-            updated(task, start, start.used, 1)
+    if task.config.iterations < ITERATIONS:  # fewer leave more than that
+        return task, each
+    first = iterated(task, start, start.used)
+    photos = [_side_by_side(photo.image, photo.mask) for photo in task.photos]
+    off = map(misplaced, images_of(task, first[0], task.photos), photos)
+    if np.median(list(off)) < STILL:
+        return task._replace(first=first), each
+    moved, seen = [], []
+    for image, photo, all, own in zip(
+        images_of(task, start, task.photos), photos, task.photos, task.seen, strict=True
+    ):
+        there = moved_photo(photo, smooth_moves(image, photo))
+        colors, mask = jnp.asarray(there[..., :3]), jnp.asarray(there[..., 3])
+        moved.append(replace(all, image=colors, mask=mask))
+        seen.append(replace(own, image=colors, mask=mask))
+    each = comparison(task, start.state.parameters, moved, start.state.splat)
+    return task._replace(photos=moved, seen=seen, moved=True), each
+
+
+def compile_parts(task: Task, start: Found) -> Found:
+    """Makes a step and an iteration, so that their programs are compiled; the start, with buffers
+    in which the step fits.
+    """
+    if task.config.iterations:
+        updated(task, start, start.used, 1)
+    if task.config.steps == 0:
+        return start
+    state = stepped(task, start.state, start.used[0])
+    return start._replace(state=replace(start.state, splat=state.splat))
+
+
+def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
+    """What a run finds, one after the other: the last that is kept is its result. each: comparison
+    of the start with photos.
+    """
     held_photo = len(task.photos) >= HELD_OUT_PHOTOS and task.config.held_out > 0
     yield from (search_by_photo if held_photo else search_by_blocks)(
         task, start, np.asarray(each.loss)
@@ -292,40 +348,57 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
         clock.planned = 0
         yield iterated(task, start, everybody)[0]
         return
-    # the photo that fits best checks the others: it is surely right
-    checked = int(np.argmin(losses))
-    asked = [task.photos[checked]]
-    best, before, began = start, psnr_of(task, start, asked), clock.elapsed()
-    # iterations on all photos, or without the one that fits least
-    for used in (
-        (everybody, np.delete(everybody, int(np.argmax(losses)))) if config.iterations else ()
-    ):
-        found, _ = iterated(task, start, used[used != checked])
-        psnr = psnr_of(task, found, asked)
-        if psnr > before - ALLOWED_LOSS_OF_ITERATIONS:
-            best, before = found._replace(used=used), psnr
+    # whether the iterations help: each photo that is asked is left out of a trial of its own
+    asked = [int(view) for view in np.argsort(losses, kind="stable")[:ASKED]]
+    best, trials, ahead = start, dict.fromkeys(asked[:2], start), 0.0
+    choices = (everybody, np.delete(everybody, int(np.argmax(losses)))) if config.iterations else ()
+    for used in choices:
+        begun, tried = clock.elapsed(), {}
+        if photos_agree(_trial_gains(task, start, used, asked, tried), -ALLOWED_LOSS_OF_ITERATIONS):
+            best, trials = tried[asked[0]]._replace(used=used), tried
+            # iterations with all photos are still to come
+            ahead = (clock.elapsed() - begun) / len(tried) * len(used) / (len(used) - 1)
             break
-        began = clock.elapsed()
-    used, others = best.used, best.used[best.used != checked]
-    ahead = (
-        (clock.elapsed() - began) * len(used) / len(others)
-    )  # iterations with all photos are still to come
+    used = best.used
     if best.iterations:
         yield best
-    # the trial: after which steps the photo that they do not see is still good
-    total = clock.plan(lambda: stepped(task, best.state, others[0]), ahead)
-    tried = round(TRIAL * total)
-    share = 0.0 if tried else 1.0
-    for found in steps(task, best, others, tried, tried, (0.0, TRIAL)):
-        if psnr_of(task, found, asked) > before - ALLOWED_LOSS:
-            share = int(found.state.done) / tried
-        yield found._replace(kept=False)
-    # the same share of the steps on all photos, from the start
+
+    # how many of the steps help: the steps of the trial are shared by the photos that were asked
+    total = clock.plan(lambda: stepped(task, best.state, used[used != asked[0]][0]), ahead)
+    length = round(TRIAL * total / len(trials))
+    gains: dict[float, list[float]] = {}
+    for number, (view, begin) in enumerate(trials.items()):
+        before = psnr_of(task, begin, [task.photos[view]])
+        shown = TRIAL * number / len(trials), TRIAL * (number + 1) / len(trials)
+        for found in steps(task, begin, used[used != view], length, length, shown):
+            gain = psnr_of(task, found, [task.photos[view]]) - before
+            gains.setdefault(int(found.state.done) / length, []).append(gain)
+            yield found._replace(kept=False)
+    helpful = [share for share, each in gains.items() if np.mean(each) > -ALLOWED_LOSS]
+    share = max(helpful, default=0.0 if length else 1.0)
     begin = start
     if best.iterations:
         begin, _ = iterated(task, start, used)
         yield begin
-    yield from steps(task, begin, used, total - tried, round(share * (total - tried)), (TRIAL, 1.0))
+    left = total - length * len(trials)
+    yield from steps(task, begin, used, left, round(share * left), (TRIAL, 1.0))
+
+
+def _trial_gains(
+    task: Task,
+    start: Found,
+    used: Int[np.ndarray, " n"],
+    asked: Sequence[int],
+    tried: dict[int, Found],
+) -> Iterator[float]:
+    """Decibels that iterations without a photo gain on it, for one photo after the other; what they
+    have found goes to `tried`.
+    """
+    for view in asked:
+        photo = [task.photos[view]]
+        before = psnr_of(task, start, photo)
+        tried[view], _ = iterated(task, start, used[used != view])
+        yield psnr_of(task, tried[view], photo) - before
 
 
 def steps(
@@ -371,6 +444,8 @@ def stepped(task: Task, state: RefineState, view: int | np.integer) -> RefineSta
 
 def iterated(task: Task, start: Found, used: Int[np.ndarray, " n"]) -> tuple[Found, float]:
     """The state after the learned update on some photos, and the loss on them."""
+    if task.first is not None and len(used) == len(task.photos):
+        return task.first
     parameters = updated(task, start, used, task.config.iterations)
     splat = start.state.splat
     found = comparison(task, parameters, [task.photos[i] for i in used], splat).together()
@@ -413,10 +488,36 @@ def avatar_comparison(
 
 
 def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:
-    """PSNR over what no step sees, dB."""
-    return float(
-        comparison(task, found.state.parameters, photos, found.state.splat).together().psnr
-    )
+    """`aligned_psnr` of what no step sees, dB: mean over the photos some pixels of which count."""
+    scores = [
+        aligned_psnr(
+            image, _side_by_side(photo.image, photo.mask), counted=np.asarray(photo.counted)
+        )
+        for image, photo in zip(images_of(task, found, photos), photos, strict=True)
+        if photo.counted.any()
+    ]
+    return float(np.mean(scores)) if scores else LARGEST_PSNR
+
+
+def images_of(
+    task: Task, found: Found, photos: Sequence[Photo]
+) -> list[Float[np.ndarray, "h w 4"]]:
+    """Colors and alpha as some photos show what was found."""
+    parameters = found.state.parameters
+
+    def drawn(splat: SplatConfig) -> tuple[list[Image], Array]:
+        splat = dataclasses.replace(splat, visibility=True)  # the program that comparisons have
+        each = [drawn_photo(parameters, task.avatar, photo, splat) for photo in photos]
+        overflow = jnp.sum(jnp.stack([rendering.overflow for _, _, rendering in each]))
+        return [image for image, _, _ in each], overflow
+
+    return [_side_by_side(*image) for image in task.clock.with_room(drawn, found.state.splat)]
+
+
+def _side_by_side(
+    colors: Float[Array, "h w 3"], alpha: Float[Array, "h w"]
+) -> Float[np.ndarray, "h w 4"]:
+    return np.concatenate([np.asarray(colors), np.asarray(alpha)[..., None]], axis=-1)
 
 
 _parameters_of = jax.jit(parameters_of)

@@ -741,6 +741,29 @@ def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
     assert better_body({}, tiny(), few, other, None) == (few, None)
 
 
+@pytest.mark.parametrize(
+    ("gains", "asked", "better"),
+    [
+        ((-3.0, 0.2, 0.3), 3, True),  # the pose of the first photo is off
+        ((0.2, -0.3, -0.3), 3, False),
+        ((0.2, 0.2), 2, True),
+        ((2.0,), 1, True),
+    ],
+)
+def test_no_photo_alone_rejects_a_body(gains, asked, better, toy, monkeypatch):
+    other, numbers = dataclasses.replace(toy, body_file="other"), []
+
+    def scored(variables, config, capture, refinement, number):
+        numbers.append(number)
+        of_other = capture is other
+        return start.HeldOut(capture.names[number], 20.0, 30.0 + of_other * gains[number])
+
+    monkeypatch.setattr(start, "held_out_psnr", scored)
+    found, estimate = better_body({}, tiny(), toy, other, None)
+    assert found is (other if better else toy) and estimate.name == toy.names[0]
+    assert sorted(set(numbers)) == list(range(asked))
+
+
 def test_the_photo_that_is_held_out_of_a_person_who_turns_is_the_one_with_the_nearest_other():
     """Turning the person before one camera is going round the person with it, whichever frame a
     view shows.

@@ -13,6 +13,7 @@ CASES = {
     "fit_keypoints": "--people 1 --frames 1 --no-curves",
     "fit_sequences": "--people 2 --smoothness 0.02 --cases",
     "paper_claims": "",
+    "misaligned": "--subjects 1 --held-out 1 --size 64 --centimetres 2",
     "people_faults": "--subjects 1 --size 64",
     "refinement": (
         f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg"

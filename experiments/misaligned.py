@@ -1,0 +1,141 @@
+"""People who move between their photos: what refinement gains where one pose stands for all."""
+
+import dataclasses
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from experiments.harness import Run, entry
+from experiments.results import markdown_table
+from experiments.subjects import (
+    RING,
+    HeldOut,
+    People,
+    Start,
+    frontal_camera,
+    make_evaluation_subject,
+    ring_positions,
+    score_tasks,
+)
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.data.capture import Capture
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.people.subject import PosedSubject, make_subject, pose_subject
+from humangs_jax.people.surroundings import cameras_around, spread_azimuths
+from humangs_jax.people.writer import CAMERA_STREAM, View, capture_views, sample_pose
+from humangs_jax.refinement import search
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.refine import refine_with_report
+
+MOVED_STREAM = 77
+"""Random stream of a seed, for the movements between photos."""
+MOVED_JOINTS = 22
+"""Joints of trunk, limbs and head, which come first in the body."""
+SMALL = 0.02
+"""Radians of the first movement whose size in centimetres is measured."""
+NEVER = float("inf")
+"""For `search.STILL`: no photo is moved."""
+SHOWN = {"psnr": 2, "psnr_fg": 2, "lpips": 3}
+"""Scores of the table, and their digits."""
+
+
+@entry
+def misaligned(
+    run: Run,
+    people: People = People(4, held_out=4, poses=0, split="validation"),
+    centimetres: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0),
+    views: int = 4,
+) -> None:
+    """What iterations gain where the person has moved between the photos, which share one pose.
+
+    The pose is the mean of those that the photos show; held-out views show the pose itself.
+    "iterations": on the photos as they are; "and moved photos": as `refine` makes them.
+
+    Options:
+    centimetres: mean distance of the vertices from where the pose has them
+    views: photos that the network and the iterations see
+    """
+    start, rows = people.start(), {}
+    for seed in start.seeds:
+        for far in centimetres:
+            rows[f"{seed} {far:g}"] = lambda seed=seed, far=far: _measured(start, seed, far, views)
+    settings = start.settings | {"views": views, "centimetres": centimetres}
+    found = run.rows(rows, settings)
+    run.show(misaligned_section(found, centimetres), found)
+
+
+def _measured(start: Start, seed: int, far: float, views: int) -> dict[str, Any]:
+    """Scores of held-out views before the iterations, and after them in both ways."""
+    photos = moved_photos(start, seed, far, views)
+    held = HeldOut(start.held_out.views, 0, 1)
+    truth = make_evaluation_subject(seed, start.body, [1], start.size, held).held_out
+    avatar = reconstruct(start.variables, start.config, photos)
+    alone = RefineConfig(steps=0, head_steps=0)
+
+    def scored(made: Any) -> dict[str, Any]:
+        drawn = draw_views(made, truth)
+        scores = score_tasks(drawn.images, truth, start.lpips, drawn.alpha)["novel"]
+        return {name: scores[name] for name in SHOWN}
+
+    with mock.patch.object(search, "STILL", NEVER):
+        still = refine_with_report(avatar, photos, dataclasses.replace(alone, held_out=0.0))
+    refined = refine_with_report(avatar, photos, alone)
+    return {
+        "none": scored(avatar),
+        "iterations": scored(still.avatar) | {"kept": still.kept},
+        "and moved photos": scored(refined.avatar)
+        | {"kept": refined.kept, "moved": refined.moved, "iterations": refined.iterations},
+    }
+
+
+def moved_photos(start: Start, seed: int, far: float, views: int) -> Capture:
+    """Photos of a person in poses around one, and the one as the pose of all."""
+    subject = make_subject(seed, start.body)
+    still = sample_pose(subject, 0)
+    rng = np.random.default_rng([seed, CAMERA_STREAM])
+    ring = cameras_around(rng, still.vertices, spread_azimuths(rng, RING), start.size)
+    front = frontal_camera(still, ring)
+    places = [
+        View(frame, f"photo_{i:02d}", ring[(front + i) % RING])
+        for frame, i in enumerate(ring_positions(views))
+    ]
+    shown = capture_views(subject, start.body, moved_poses(still, far, views), places)
+    shared = capture_views(subject, start.body, [still], [View(0, "shared", ring[front])]).poses
+    return dataclasses.replace(shown, poses=shared, frames=np.zeros(views, np.int32))
+
+
+def moved_poses(still: PosedSubject, centimetres: float, count: int) -> list[PosedSubject]:
+    """The person in as many poses around a pose; vertices are off it by this much in the mean.
+
+    Joints turn by about the same angle each. The mean of the turns is zero, so that the pose is
+    what a fit to all of them finds.
+    """
+    if not centimetres:
+        return [still] * count
+    rng = np.random.default_rng([still.subject.seed, MOVED_STREAM])
+    turns = np.zeros((count, *still.rotations.shape))
+    turns[:, :MOVED_JOINTS] = rng.normal(size=(count, MOVED_JOINTS, 3))
+    turns -= turns.mean(axis=0)
+    scale = SMALL
+    for _ in range(3):  # the size is nearly in proportion
+        poses = [(still.rotations + scale * turn).astype(np.float32) for turn in turns]
+        moved = [still.subject.posed_vertices(pose, still.translation) for pose in poses]
+        size = 100 * np.linalg.norm(np.stack(moved) - still.vertices, axis=-1).mean()
+        scale *= centimetres / size
+    poses = [(still.rotations + scale * turn).astype(np.float32) for turn in turns]
+    return [pose_subject(still.subject, pose, still.translation) for pose in poses]
+
+
+def misaligned_section(rows: dict[str, Any], centimetres: tuple[float, ...]) -> str:
+    """The table of the page: means over the people, and the least gain of any of them."""
+    lines = []
+    for far in centimetres:
+        people = [row for name, row in rows.items() if name.split()[1] == f"{far:g}"]
+        for way in people[0]:
+            means = [f"{np.mean([row[way][k] for row in people]):.{d}f}" for k, d in SHOWN.items()]
+            gains = [row[way]["psnr"] - row["none"]["psnr"] for row in people]
+            least = "" if way == "none" else f"{min(gains):.2f}"
+            lines.append([f"{far:g} cm", len(people), way, *means, least])
+    names = ["PSNR", "foreground PSNR", "LPIPS", "least gain, dB"]
+    return markdown_table(["off by", "people", "refinement", *names], lines, "lrlrrrr")

@@ -1,0 +1,186 @@
+"""How an image is compared with a photo in which the person has moved by pixels, and the rule by
+which photos decide whether something new is better.
+
+A body whose pose is off by centimetres draws everything a few pixels beside where the photo shows
+it. Pixel by pixel, detail at the wrong place is a larger error than no detail, so that PSNR prefers
+a blurred avatar. Here each window of the image first moves to where it is most like the photo, by
+at most `REACH`:
+
+    e(p) = |I(p + d(p)) - P(p)|^2,   d(p) = argmin over |d| <= r of
+           mean over q in W(p) of |I(q + d) - P(q)|^2 + `RELUCTANCE` |d|^2 / r^2.
+
+The same moves, made smooth, bring a photo to where the image has the person (`smooth_moves`,
+`moved_photo`). Images are on the host, colors and alpha side by side.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.losses.losses import LARGEST_PSNR
+
+REACH = 0.02
+"""Largest move, as a share of the person's height in the photo: 3.5 cm of a grown-up."""
+WINDOW = 0.08
+"""Side of a window, as a share of the person's height: a hand's. Smaller ones fit too much."""
+RELUCTANCE = 2e-4
+"""Squared error that the largest move has to win, so that windows without detail stay."""
+SMOOTHNESS = 0.04
+"""Standard deviation of the weights that make moves smooth, as a share of the person's height."""
+FURTHER = 1.5
+"""Smooth moves may be this many times as large as `REACH`: the mean of their neighbours is less."""
+LARGEST = 128
+"""Pixels: larger people are reduced by whole factors before the comparison, for speed."""
+NOBODY = 1e-3
+"""Weight of pixels that do not show the person, for smooth moves."""
+ASKED = 3
+"""Photos that are asked at most. Two that agree are enough."""
+CLEAR = 1.0
+"""Decibels above what is needed, from which on one photo is enough."""
+
+
+def aligned_errors(
+    image: Float[np.ndarray, "h w c"], photo: Float[np.ndarray, "h w c"], reach: int, window: int
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 2"]]:
+    """Squared errors e (means over the channels), and the moves d in pixels (y, x), see above.
+
+    Args:
+        image: what was drawn.
+        photo: what it is compared with.
+        reach: the largest move r, pixels.
+        window: the side of W, pixels.
+    """
+    h, w, _ = image.shape
+    padded = np.pad(image, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
+    lowest = np.full((h, w), np.inf, np.float32)
+    errors, moves = np.zeros((h, w), np.float32), np.zeros((h, w, 2), np.float32)
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            far = (dy * dy + dx * dx) / max(reach * reach, 1)
+            if far > 1:
+                continue
+            moved = padded[reach + dy : reach + dy + h, reach + dx : reach + dx + w]
+            differences = moved - photo
+            squared = np.mean(np.square(differences), axis=-1)
+            means = uniform_filter(differences, (window, window, 0), mode="nearest")
+            cost = uniform_filter(squared, window, mode="nearest") + RELUCTANCE * far
+            cost -= np.mean(np.square(means), axis=-1)
+            better = cost < lowest
+            lowest[better], errors[better], moves[better] = cost[better], squared[better], (dy, dx)
+    return errors, moves
+
+
+def aligned_psnr(
+    image: Float[np.ndarray, "h w 4"],
+    photo: Float[np.ndarray, "h w 4"],
+    counted: Bool[np.ndarray, "h w"] | None = None,
+) -> float:
+    """PSNR in dB of colors and alpha against a photo and its mask after moves of windows.
+
+    Args:
+        image: colors on white, and alpha.
+        photo: colors on white, and the mask.
+        counted: the pixels whose errors count, all if None; moves look at all pixels.
+
+    Returns:
+        decibels; 100 where no pixel counts.
+    """
+    counted = np.ones(photo.shape[:2], bool) if counted is None else np.asarray(counted)
+    height = person_height(photo[..., 3])
+    factor = max(1, -(-height // LARGEST))
+    image, photo = (reduced(np.clip(each, 0, 1), factor) for each in (image, photo))
+    weights = reduced(counted[..., None].astype(np.float32), factor)[..., 0]
+    if not weights.any():
+        return LARGEST_PSNR
+    errors, _ = aligned_errors(image, photo, *sizes(height / factor))
+    mean = float(np.sum(errors * weights) / np.sum(weights))
+    return min(LARGEST_PSNR, -10 * float(np.log10(max(mean, 1e-30))))
+
+
+def smooth_moves(
+    image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4"]
+) -> Float[np.ndarray, "h w 2"]:
+    """By how many pixels (y, x) to move the photo so that it shows the person where the image does.
+
+    Means of the moves around each pixel, weighted by distance and by what is the person's.
+    """
+    height = person_height(photo[..., 3])
+    factor = max(1, -(-height // LARGEST))
+    small, small_photo = (reduced(np.clip(each, 0, 1), factor) for each in (image, photo))
+    reach, window = sizes(height / factor)
+    _, moves = aligned_errors(small, small_photo, round(FURTHER * reach), window)
+    person = np.maximum(small[..., 3], small_photo[..., 3]) + NOBODY
+    spread = SMOOTHNESS * height / factor
+    total = gaussian_filter(person, spread)
+    smooth = [gaussian_filter(moves[..., axis] * person, spread) / total for axis in (0, 1)]
+    places = (np.indices(photo.shape[:2]) + 0.5) / factor - 0.5
+    return factor * np.stack([_sampled(each, places) for each in smooth], axis=-1)
+
+
+def misplaced(image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4"]) -> float:
+    """Mean length of the smooth moves over the person, as a share of the person's height."""
+    person = photo[..., 3] > 0.5
+    if not person.any():
+        return 0.0
+    lengths = np.linalg.norm(smooth_moves(image, photo), axis=-1)
+    return float(lengths[person].mean()) / person_height(photo[..., 3])
+
+
+def moved_photo(
+    photo: Float[np.ndarray, "h w c"], moves: Float[np.ndarray, "h w 2"]
+) -> Float[np.ndarray, "h w c"]:
+    """The photo with its pixels moved by (y, x), bilinear; beyond its edges it goes on as there."""
+    places = np.indices(photo.shape[:2]) - np.moveaxis(moves, -1, 0)
+    channels = [_sampled(photo[..., c], places) for c in range(photo.shape[-1])]
+    return np.stack(channels, axis=-1).astype(np.float32)
+
+
+def _sampled(
+    image: Float[np.ndarray, "rows columns"], places: Float[np.ndarray, "2 h w"]
+) -> Float[np.ndarray, "h w"]:
+    return map_coordinates(image, places, order=1, mode="nearest")
+
+
+def person_height(mask: Float[np.ndarray, "h w"]) -> int:
+    """Rows from the first to the last of a mask; those of the image if it is empty."""
+    rows = np.flatnonzero((mask > 0.5).any(axis=1))
+    return int(np.ptp(rows)) + 1 if len(rows) else len(mask)
+
+
+def sizes(height: float) -> tuple[int, int]:
+    """Largest move and side of the windows in pixels, for a person of this height in pixels."""
+    return max(1, round(REACH * height)), max(3, round(WINDOW * height))
+
+
+def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray, "rows columns c"]:
+    """Means over squares of `factor` pixels a side; what is left over at the far edges is cut."""
+    rows, columns = (size // factor for size in image.shape[:2])
+    squares = image[: rows * factor, : columns * factor]
+    squares = squares.reshape(rows, factor, columns, factor, -1)
+    return squares.mean(axis=(1, 3), dtype=np.float32)
+
+
+def photos_agree(gains: Iterable[float], least: float) -> bool:
+    """Whether photos say that something new is to be kept: most of those that are asked gain at
+    least `least`.
+
+    A photo whose pose is off loses by what is right, so that no photo alone can say no; two of
+    three can. But no photo gains a lot by what is wrong: one that gains `CLEAR` more is enough.
+    Without any gain: no.
+
+    Args:
+        gains: decibels, new score minus old one, of one photo after the other. They are computed
+            when they are asked for.
+        least: what a photo has to gain, decibels; negative where it may lose.
+    """
+    yes = no = 0
+    for gain in gains:
+        if gain >= least + CLEAR:
+            return True
+        agrees = gain >= least
+        yes, no = yes + agrees, no + (not agrees)
+        if 2 * max(yes, no) > ASKED:
+            break
+    return yes > no
