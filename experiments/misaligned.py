@@ -21,12 +21,12 @@ from experiments.subjects import (
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.cases import draw_views
-from humangs_jax.people.subject import PosedSubject, make_subject, pose_subject
-from humangs_jax.people.surroundings import cameras_around, spread_azimuths
-from humangs_jax.people.writer import CAMERA_STREAM, View, capture_views, sample_pose
 from humangs_jax.refinement import search
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
+from humangs_jax.synthetic.subject import PosedSubject, make_subject, pose_subject
+from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
+from humangs_jax.synthetic.writer import CAMERA_STREAM, View, capture_views, sample_pose
 
 MOVED_STREAM = 77
 """Random stream of a seed, for the movements between photos."""

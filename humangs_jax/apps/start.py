@@ -6,6 +6,7 @@ an avatar is where no photo was. The best frames of a video: `apps.video_photos`
 """
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -340,15 +341,24 @@ def held_out_psnr(
         avatar = refine(
             avatar, others, dataclasses.replace(refinement, head_steps=0)
         )  # heads hardly change the number
-    photo = cropped(capture.select([view]), SIZE)
+    photo = cropped(_with_unknown(capture.select([view])), SIZE)
+    assert photo.masks is not None and photo.unknown is not None
     drawn = draw_views(avatar, photo)
-    assert photo.masks is not None
-    pair = [
-        np.concatenate([colors[0], coverage[0][..., None]], axis=-1)
-        for colors, coverage in ((drawn.images, drawn.alpha), (photo.images, photo.masks))
-    ]
+    assert drawn.alpha is not None
     psnr = float(score(drawn.images, photo).psnr_fg)
-    return HeldOut(capture.names[view], psnr, aligned_psnr(*pair))
+    aligned = aligned_psnr(
+        np.concatenate([drawn.images[0], drawn.alpha[0][..., None]], axis=-1),
+        np.concatenate([photo.images[0], photo.masks[0][..., None]], axis=-1),
+        ~photo.unknown[0],
+    )
+    return HeldOut(capture.names[view], psnr, aligned)
+
+
+def _with_unknown(capture: Capture) -> Capture:
+    """The capture with unknown areas, so that a crop knows where its photo ends."""
+    if capture.unknown is not None:
+        return capture
+    return dataclasses.replace(capture, unknown=np.zeros(capture.images.shape[:3], bool))
 
 
 def photos_to_read(capture: Capture) -> Capture:

@@ -297,7 +297,8 @@ def cropped(capture: Capture, size: int) -> Capture:
     unknown = capture.unknown
     if unknown is not None:
         shares = unknown.astype(np.float32)
-        hidden = [_window(x, *box, 0.0) for x, box in zip(shares, boxes, strict=True)]
+        # nobody knows what is beyond the edge of a photo
+        hidden = [_window(x, *box, 1.0) for x, box in zip(shares, boxes, strict=True)]
         unknown = np.stack([resized(x, size, size) for x in hidden]) > 0
     return dataclasses.replace(
         capture, images=images, masks=masks, cameras=cameras, unknown=unknown
