@@ -11,7 +11,7 @@ Who of one photo is who of another: `apps.same_people`.
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +25,10 @@ from humangs_jax.apps.same_people import (
     same_people,
 )
 from humangs_jax.apps.start import photo_files, scan_photos
+from humangs_jax.capture.detection.painting import painted_over
 from humangs_jax.capture.detection.people import (
     LANDMARK_SIZE,
+    MARGINS,
     SEEN,
     Landmarks,
     Networks,
@@ -44,7 +46,14 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.folders import unused_line
 from humangs_jax.data.masks import box_of
-from humangs_jax.data.photos import Photos, load_photos, read_description
+from humangs_jax.data.photos import (
+    LEAST_UNKNOWN,
+    Photos,
+    load_photos,
+    read_description,
+    read_mask,
+    unknown_in_capture,
+)
 from humangs_jax.io.atomic import MOVE_AWAY, add_files, check_ours
 from humangs_jax.io.images import (
     MASK,
@@ -116,7 +125,7 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
     """
     photos = load_photos(folder)  # checked; these are on white where there are masks
     if photos.masks is None:
-        pictures = iter(photos.images)
+        pictures = without_others(photos.images, unknown_in_capture(folder))
     else:
         views = read_description(folder / "capture.json")["views"]
         pictures = (read_image(folder / view["image"])[0] for view in views)
@@ -124,6 +133,26 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
     if photos.masks is not None:
         found = with_masked(found, list(photos.masks), list(photos.images))
     return same_people(found, photos.cameras, photos.frames.tolist())
+
+
+def without_others(
+    pictures: Iterable[Float[np.ndarray, "h w 3"]],
+    others: Sequence[Bool[np.ndarray, "h w"] | None] | Bool[np.ndarray, "v h w"] | None,
+) -> Iterator[Float[np.ndarray, "h w 3"]]:
+    """The photos with the colors around in place of other people and of things in front, so that
+    the detector finds the person alone.
+
+    Arguments: others: where these are in each photo, or None. White that an import has added
+    around a photo, which is unknown too, stays as it is.
+    """
+    for i, picture in enumerate(pictures):
+        covered = None if others is None else others[i]
+        if covered is not None:
+            covered = covered & (picture.min(axis=-1) < 1)
+        if covered is None or not covered.any():
+            yield picture
+        else:
+            yield painted_over(picture, covered, MARGINS[0])[0]
 
 
 def with_masked(
@@ -513,7 +542,14 @@ def write_found(
             for photo, file, view in zip(photos, files, description["views"], strict=True):
                 named = {"mask": file} if masks else {}
                 given = None if masks or "mask" not in view else read_grey(folder / view["mask"])
-                if (hidden := hidden_by_others(photo, person, given)) is not None:
+                hidden = hidden_by_others(photo, person, given)
+                if "unknown" in view:  # what was known before anybody was found stays
+                    known = read_mask(folder / view["unknown"], "its photo", *photo.size)
+                    known = known >= LEAST_UNKNOWN
+                    hidden = (
+                        None if hidden is None or not (hidden & ~known).any() else hidden | known
+                    )
+                if hidden is not None:
                     named["unknown"] = f"{UNKNOWN}/{Path(file).relative_to(MASKS).as_posix()}"
                     (temporary / named["unknown"]).parent.mkdir(parents=True, exist_ok=True)
                     write_png(temporary / named["unknown"], hidden.astype(np.float32), mark=MASK)

@@ -18,6 +18,7 @@ from humangs_jax.apps import detect
 from humangs_jax.apps.same_people import PhotoPeople, exchanged, same_people
 from humangs_jax.apps.start import photo_files
 from humangs_jax.capture.calibration.importing import ImportReport, import_calibration
+from humangs_jax.capture.calibration.others import others_as_shown
 from humangs_jax.capture.calibration.photos import upright_mask
 from humangs_jax.capture.calibration.videos import named_after
 from humangs_jax.capture.fitting.person_cameras import PersonCameras, cameras_from_person
@@ -67,6 +68,7 @@ def import_photos(
     height: float | None = None,
     keypoints: Path | None = None,
     masks: Path | None = None,
+    others: Path | None = None,
     own_masks: bool = True,
     reduce: bool = False,
     also: Mapping[str, object] | None = None,
@@ -80,6 +82,7 @@ def import_photos(
         keypoints: of another program. They choose who is meant in each photo.
         masks: folder of masks of another program. They choose, too, where neither keypoints nor a
             number is given.
+        others: folder of masks of other people and of things in front, of photos that have some.
         own_masks: whether the detector's masks are written.
         reduce: whether large photos may be reduced.
         also: name and content of JSON files that appear with the capture.
@@ -87,7 +90,7 @@ def import_photos(
     `import_cameras`.
     """
     images, files = photo_files(folder)
-    choice = _Choice(person, keypoints, masks, out)
+    choice = _Choice(person, keypoints, masks, out, others)
     with tempfile.TemporaryDirectory() as place:
         if reduce and (smaller := _reduced(images, files, Path(place))):
             found = _look(Path(place), files, smaller, choice)
@@ -95,7 +98,7 @@ def import_photos(
                 with named_after(Path(place), images):
                     return _written(found, Path(place), out, height, None, own_masks, also)
     return _written(
-        _look(images, files, files, choice), images, out, height, masks, own_masks, also
+        _look(images, files, files, choice), images, out, height, choice, own_masks, also
     )
 
 
@@ -144,11 +147,16 @@ class _Choice(NamedTuple):
     """Folder of masks of another program."""
     out: Path
     """The capture folder."""
+    others: Path | None = None
+    """Folder of masks of what is in front of the person."""
 
 
 def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:
     names = [file.relative_to(images).as_posix() for file in looked_at]
-    photos = detect.detect_photos(names, map(detect.upright, looked_at))
+    pictures = map(detect.upright, looked_at)
+    if choice.others is not None:
+        pictures = detect.without_others(pictures, others_as_shown(choice.others, images, files))
+    photos = detect.detect_photos(names, pictures)
     # where nobody found fits a given mask, the detector looks at the photo cut to it
     if choice.masks is not None:
         masks = [upright_mask(choice.masks, images, file) for file in files]
@@ -223,14 +231,17 @@ def _written(
     images: Path,
     out: Path,
     height: float | None,
-    masks: Path | None,
+    choice: _Choice | None,
     own_masks: bool,
     also: Mapping[str, object] | None,
 ) -> PhotosImported:
+    """Write the capture. Arguments: choice: whose masks are imported; None: no masks are."""
     photos, number, shown, seen, cropped = looked
     found = cameras_from_person(seen, height=height)
+    masks, others = (None, None) if choice is None else (choice.masks, choice.others)
+    calibration = _calibration(seen, found, images)
     report = import_calibration(
-        _calibration(seen, found, images), images, out, masks=masks, scale=1.0, also=also
+        calibration, images, out, masks=masks, others=others, scale=1.0, also=also
     )
     views = read_description(out / "capture.json")["views"]
     written = []

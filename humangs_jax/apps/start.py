@@ -13,7 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.capture.calibration.photos import MASK_FOLDERS, is_transparent
+from humangs_jax.capture.calibration.photos import (
+    MASK_FOLDERS,
+    NO_PHOTOS,
+    OTHERS_FOLDERS,
+    is_transparent,
+)
 from humangs_jax.core.array_types import Float, PyTree
 from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.capture import Capture
@@ -72,6 +77,8 @@ class Material:
     """File or folder of keypoints; None if there are none."""
     unused: tuple[Unused, ...] = ()
     """What the folder has besides."""
+    others: Path | None = None
+    """Folder of masks of other people and of things in front; None if there is none."""
 
     def __str__(self) -> str:
         """A line for each kind of thing, and one for what is not used."""
@@ -85,6 +92,8 @@ class Material:
             "masks": masks,
             "keypoints": self.keypoints,
         }
+        if self.others is not None:
+            rows["in front"] = self.others
         lines = [
             f"{name + ':':<11}{'missing' if found is None else found}"
             for name, found in rows.items()
@@ -115,6 +124,7 @@ def look(
     cameras: Path | None = None,
     masks: Path | None = None,
     keypoints: Path | None = None,
+    others: Path | None = None,
 ) -> Material:
     """What a folder has; what the arguments name is taken from there.
 
@@ -124,17 +134,18 @@ def look(
     _expect_folder(folder)
     if (folder / "capture.json").is_file():
         raise CaptureError(folder, "", f"is a capture already: `humangs check {folder}` shows it")
-    for path in (cameras, masks, keypoints):
+    for path in (cameras, masks, keypoints, others):
         if path is not None and not path.exists():
             raise CaptureError(path, "", "no such file or folder")
     scan = scan_photos(folder)
     images, photos = scan.folder, scan.photos
     # places by their names; what the arguments name goes before them
     mask_folders = [folder / name for name in MASK_FOLDERS if has_photos(folder / name)]
+    in_front = [folder / name for name in OTHERS_FOLDERS if has_photos(folder / name)]
     named = [folder / KEYPOINT_FOLDER] if (folder / KEYPOINT_FOLDER).exists() else []
     named += [found[1]] if (found := KEYPOINTS.found(folder)) else []
     # where no name is known: whatever is called keypoints
-    others = sorted(
+    further = sorted(
         path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
     )
     return Material(
@@ -146,8 +157,9 @@ def look(
         or next((place for name in CAMERA_PLACES if CAMERAS.found(place := folder / name)), None),
         masks=masks or next(iter([*mask_folders, *([images] if scan.masks else [])]), None),
         alpha=is_transparent(photos[0]),
-        keypoints=keypoints or next(iter([*named, *others]), None),
+        keypoints=keypoints or next(iter([*named, *further]), None),
         unused=scan.unused,
+        others=others or next(iter(in_front), None),
     )
 
 
@@ -269,7 +281,7 @@ def has_photos(folder: Path) -> bool:
 def _scan(folder: Path) -> FolderScan:
     """Scan a folder without masks and without what other programs have made of photos."""
     others = (
-        *MASK_FOLDERS,
+        *NO_PHOTOS,
         KEYPOINT_FOLDER,
         *(name for each in KEYPOINTS.values() for name in each.files),
         "colmap",

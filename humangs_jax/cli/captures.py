@@ -160,6 +160,10 @@ class ImportCameras:
     """The capture folder to write."""
     masks: Path | None = None
     """Folder of masks, named like the photos."""
+    others: Path | None = None
+    """Folder of masks of other people and of things in front of the person, named like the photos
+    that show some.
+    """
     scale: float | None = None
     """Metres per unit of the source. Default: 1."""
     up: str | None = None
@@ -177,7 +181,7 @@ class ImportCameras:
     """Replace the capture folder."""
 
     def run(self) -> None:
-        inputs = (self.source, self.images, self.masks)
+        inputs = (self.source, self.images, self.masks, self.others)
         require_replaceable(self.out, self.overwrite, "capture.json", inputs)
         with stage("starting"):
             from humangs_jax.capture.calibration.importing import import_cameras

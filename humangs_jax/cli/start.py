@@ -65,6 +65,11 @@ class Start:
     ] = None
     masks: Path | None = None
     """Folder of the masks, if it is elsewhere."""
+    others: Path | None = None
+    """Folder of masks of other people and of things in front of the person, if it is elsewhere.
+
+    Nothing is concluded from these pixels.
+    """
     keypoints: Annotated[
         Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")
     ] = None
@@ -118,6 +123,7 @@ class Start:
             cameras=None if ignored else self.cameras,
             masks=self.masks,
             keypoints=self.keypoints,
+            others=self.others,
         )
         if ignored:
             material = dataclasses.replace(material, cameras=None)
@@ -155,6 +161,7 @@ class Start:
         names = (
             "cameras",
             "masks",
+            "others",
             "keypoints",
             "person",
             "height",
@@ -236,6 +243,7 @@ class Start:
             from humangs_jax.apps.detect import SHEET_FILE
             from humangs_jax.apps.photos_alone import import_photos
 
+            given = (material.keypoints, material.masks, material.alpha, material.others)
             own_masks = not (self.without_masks or material.alpha or material.masks)
             found = import_photos(
                 material.images,
@@ -244,8 +252,9 @@ class Start:
                 height=self.height,
                 keypoints=material.keypoints,
                 masks=material.masks,
+                others=material.others,
                 own_masks=own_masks,
-                reduce=not (material.keypoints or material.masks or material.alpha),
+                reduce=not any(given),
                 also=self._mark(),
             )
         tell("\n".join(found.lines))
@@ -305,7 +314,7 @@ class Start:
         finished = begun or self.overwrite or (self.out / "avatar.html").exists()
         fitted = ours and (self.out / "fit.json").exists() and not finished
         cameras = None if self.cameras == IGNORE else self.cameras
-        inputs = (self.photos, cameras, self.masks, self.keypoints)
+        inputs = (self.photos, cameras, self.masks, self.others, self.keypoints)
         require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
         return fitted
 
@@ -328,6 +337,7 @@ class Start:
                 material.images,
                 self.out,
                 masks=material.masks,
+                others=material.others,
                 scale=self.scale,
                 up=self.up,
                 overwrite=True,

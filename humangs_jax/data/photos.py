@@ -307,15 +307,25 @@ def read_photos(
         checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]")
         for i in range(len(views))
     ]
-    unknown = _read_unknown(folder, views, images.shape[1:3])
-    # what may be hidden counts as background, so that nothing is concluded from it
-    if unknown is not None:
-        if masks is None:
-            raise CaptureError(file, "views[0].unknown", "expected a mask, too")
+    # what may be hidden counts as background, so that nothing is concluded from it; without masks
+    # nothing is background, and it waits for them
+    unknown = None if masks is None else _read_unknown(folder, views, images.shape[1:3])
+    if masks is not None and unknown is not None:
         images[unknown], masks[unknown] = 1, 0
     names = names_from_paths([view["image"] for view in views])
     calibrated = is_calibrated(folder, description)
     return Photos(images, masks, stack_cameras(cameras), frames, names, calibrated, unknown)
+
+
+def unknown_in_capture(folder: Path) -> Bool[np.ndarray, "v h w"] | None:
+    """Where each photo of a capture folder may hide the person, also where it has no masks yet;
+    None: nowhere.
+
+    Raises: CaptureError.
+    """
+    views = read_description(folder / "capture.json")["views"]
+    width, height = read_checked(image_size, folder / views[0]["image"])
+    return _read_unknown(folder, views, (height, width))
 
 
 def _read_unknown(

@@ -495,3 +495,42 @@ def test_where_nobody_has_the_mask_the_detector_sees_its_pixels_alone(monkeypatc
     result = detect.with_masked(photos, masks, [np.ones((30, 40, 3))] * 2)
     assert asked == ["b"] and result[0] is photos[0]
     assert {each.corner for each in result[1].people} == {(5, 10), (15, 25)}
+
+
+def test_others_who_are_given_are_painted_over_and_stay_unknown(tmp_path, monkeypatch):
+    """Of a capture without masks: nobody is found in others' pixels, and they are kept."""
+    shutil.copytree(DEMO, tmp_path / "c")
+    whole = load_capture(tmp_path / "c")
+    unknown = np.zeros(whole.masks.shape[1:], bool)
+    unknown[200:300, 150:350] = True
+    shutil.rmtree(tmp_path / "c" / "masks")
+    (tmp_path / "c" / "unknown").mkdir()
+    name = whole.names[0]
+    write_png(tmp_path / "c" / "unknown" / f"{name}.png", unknown.astype(np.float32))
+
+    def change(description):
+        for view in description["views"]:
+            view.pop("mask")
+        description["views"][0]["unknown"] = f"unknown/{name}.png"
+
+    edit_json(tmp_path / "c" / "capture.json", change)
+    seen = []
+
+    def look(names, photos):
+        seen.extend(photos)
+        size = whole.images.shape[2:0:-1]
+        return [
+            PhotoPeople(each, size, np.ones((4, 4, 3)), (found(1, 90.0, (240, 240)),))
+            for each in names
+        ]
+
+    monkeypatch.setattr(detect, "detect_photos", look)
+    people, number = detect.person_in_capture(tmp_path / "c", load_capture(tmp_path / "c"))
+    photos = [detect.read_image(DEMO / "images" / f"{each}.png")[0] for each in whole.names]
+    changed = [np.abs(a - b).max(axis=-1) > 0.01 for a, b in zip(seen, photos, strict=True)]
+    assert changed[0][unknown].any() and not changed[0][:190].any()
+    assert not any(each.any() for each in changed[1:])
+    write_found(tmp_path / "c", people, number, to_capture=True)
+    read = load_capture(tmp_path / "c")
+    np.testing.assert_array_equal(read.unknown[0], unknown)
+    assert not read.unknown[1:].any() and not read.masks[0][unknown].any()

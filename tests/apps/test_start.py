@@ -93,6 +93,19 @@ def test_other_layouts_are_found(mine):
     assert (found.cameras, found.keypoints) == (mine / "colmap", mine / "my_keypoints")
 
 
+@pytest.mark.parametrize("name", ["others", "occluders", "unknown"])
+def test_masks_of_others_are_found_by_the_name_of_their_folder(name, mine):
+    assert look(mine).others is None and "in front" not in str(look(mine))
+    (mine / name).mkdir()
+    write_png(mine / name / "a.png", np.ones((8, 8), np.float32))
+    found = look(mine)
+    assert found.others == mine / name and f"in front:  {mine / name}" in str(found)
+    assert found.photos == look(mine, others=mine / name).photos
+    assert not any(each.path.is_relative_to(mine / name) for each in found.unused)
+    with pytest.raises(CaptureError, match="nowhere: no such file or folder"):
+        look(mine, others=mine / "nowhere")
+
+
 def test_alpha_is_a_mask(mine):
     shutil.rmtree(mine / "masks")
     for path in (mine / "images").iterdir():

@@ -15,7 +15,7 @@ from humangs_jax.capture.calibration.importing import import_cameras
 from humangs_jax.capture.keypoints.reading import read_keypoints
 from humangs_jax.data.cameras import distort
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.photos import load_photos
+from humangs_jax.data.photos import load_photos, unknown_in_capture
 from humangs_jax.io.images import orientation, oriented, read_image
 from humangs_jax.io.reading import Limits, set_limits
 from tests.capture import calibration_files as written
@@ -79,10 +79,79 @@ def test_photos_of_several_sizes_are_padded_and_cameras_stay(tmp_path):
 @pytest.mark.parametrize(
     ("reach", "named"), [((5, 0), "a.png and 1 more"), ((0, 5), "b.PNG and 1 more")]
 )
-def test_a_person_who_is_cut_off_by_a_padded_rim_is_warned_of(reach, named, tmp_path):
+def test_what_is_beyond_the_rim_that_cuts_a_person_off_is_unknown(reach, named, tmp_path):
     write_phones(tmp_path, masks=True, reach=reach)
     (warning,) = imported(tmp_path, masks=tmp_path / "masks").warnings
-    assert f"cut off where white was added to {named}" in warning
+    assert f"cut off at the border of {named}: what is beyond is unknown" in warning
+    photos = load_photos(tmp_path / "out")
+    assert photos.unknown is not None
+    for i, (width, height) in enumerate(SHOWN.values()):
+        added = np.ones((64, 64), bool)
+        added[:height, :width] = False
+        cut = (reach[0] and height < 64) or (reach[1] and width < 64)
+        np.testing.assert_array_equal(photos.unknown[i], added if cut else np.zeros_like(added))
+
+
+def test_what_was_added_to_photos_without_masks_is_unknown_once_masks_are_found(tmp_path):
+    write_phones(tmp_path)
+    imported(tmp_path)
+    out = tmp_path / "out"
+    assert load_photos(out).unknown is None  # nothing is background yet
+    unknown = unknown_in_capture(out)
+    assert unknown is not None
+    assert [64 * 64 - each.sum() for each in unknown] == [w * h for w, h in SHOWN.values()]
+    for name in "abc":
+        written.write_photos(out / "masks", [f"{name}.png"], (64, 64), grey=True)
+    masked = lambda d: [v.update(mask=v["image"].replace("images", "masks")) for v in d["views"]]
+    edit_json(out / "capture.json", masked)
+    photos = load_photos(out)
+    np.testing.assert_array_equal(photos.unknown, unknown)
+    assert photos.masks is not None and not photos.masks[unknown].any()
+
+
+def test_what_a_distorted_lens_has_not_seen_is_unknown_where_it_cuts_the_person_off(tmp_path):
+    K, poses = written.scene(2)
+    bent = [0.3, 0, 0, 0, 0]
+    written.write_calibration_full(tmp_path / "rig.json", K, poses, "ab", distCoeff=bent)
+    written.write_photos(tmp_path / "photos", ["a.png", "b.png"])
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((48, 64), np.uint8)
+    mask[20:28, 28:36] = 255
+    Image.fromarray(mask).save(tmp_path / "masks" / "a.png")
+    mask[20:, 28:36] = 255
+    Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
+    imported(tmp_path, masks=tmp_path / "masks")
+    photos = load_photos(tmp_path / "out")
+    assert photos.unknown is not None and photos.unknown[1, -1].any()
+    assert not photos.unknown[0].any() and not photos.unknown[1, 10:30, 10:50].any()
+
+
+def test_masks_of_others_are_turned_and_padded_with_their_photos(tmp_path):
+    upright, _ = write_phones(tmp_path, masks=True)
+    (tmp_path / "others").mkdir()
+    width, height = SHOWN["b.PNG"]
+    bar = np.zeros((height, width), np.uint8)
+    bar[30:40, :20] = 255
+    exif = Image.Exif()
+    exif[0x0112] = FLAG
+    Image.fromarray(np.rot90(bar)).save(tmp_path / "others" / "b.png", exif=exif)
+    imported(tmp_path, masks=tmp_path / "masks", others=tmp_path / "others")
+    photos = load_photos(tmp_path / "out")
+    assert photos.unknown is not None
+    np.testing.assert_array_equal(photos.unknown[1, :height, :width], bar > 0)
+    assert photos.unknown.sum() == (bar > 0).sum()
+    assert upright["masks", "b.PNG"][30:40, 5:20].all() and not photos.masks[1, 30:40, :20].any()
+
+
+def test_masks_of_others_that_are_named_like_no_photo_are_refused(tmp_path):
+    write_phones(tmp_path)
+    written.write_photos(tmp_path / "others", ["x.png"], (48, 64), grey=True)
+    with pytest.raises(CaptureError, match=r"others: no mask .* is named like a photo of .*photos"):
+        imported(tmp_path, others=tmp_path / "others")
+    written.write_photos(tmp_path / "others", ["a.png"], (8, 8), grey=True)
+    with pytest.raises(CaptureError, match=r"a\.png: size: 8 x 8, but its photo has 64 x 48"):
+        imported(tmp_path, others=tmp_path / "others")
+    assert not (tmp_path / "out").exists()
 
 
 def test_keypoints_of_the_photos_before_padding_fit(tmp_path):

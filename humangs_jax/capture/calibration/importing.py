@@ -15,6 +15,12 @@ from typing import get_args
 
 import numpy as np
 
+from humangs_jax.capture.calibration.others import (
+    find_others,
+    is_cut_off,
+    not_photographed,
+    others_imported,
+)
 from humangs_jax.capture.calibration.photos import (
     NO_CAMERA,
     Photo,
@@ -58,7 +64,7 @@ from humangs_jax.data.capture_checks import (
 from humangs_jax.data.folders import STILL, Unused, scan_folder, unused_line
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
+from humangs_jax.io.images import MASK, is_heic, read_grey, read_image, write_png
 from humangs_jax.io.reading import check_limit, reading, write_json
 
 SIZES_SHOWN = 5
@@ -137,6 +143,7 @@ def import_cameras(
     out: str | Path,
     *,
     masks: str | Path | None = None,
+    others: str | Path | None = None,
     scale: float | None = None,
     up: str | None = None,
     pixel_centers: str | None = None,
@@ -151,7 +158,8 @@ def import_cameras(
     Arguments:
         source: file or folder of any format in docs/cameras.md; its content decides which one.
         images: folder of the photos, or of a video of each camera (CAMERA.mp4). masks: folder of
-            their masks, named alike.
+            their masks, named alike. others: folder of masks of other people and of things in
+            front, named alike; photos that nobody covers need none.
         out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
         scale: metres per unit of the source; None: the format's unit, else the one that puts the
             cameras near a person.
@@ -167,11 +175,12 @@ def import_cameras(
     """
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
+    others = None if others is None else Path(others)
     _check_options(scale, up, pixel_centers, every, frames)
-    for folder in (images, masks):
+    for folder in (images, masks, others):
         if folder is not None and not folder.is_dir():
             raise CaptureError(folder, "", "no such folder")
-    check_place(out, overwrite, (source, images, masks))
+    check_place(out, overwrite, (source, images, masks, others))
     with photos_of_videos(images, masks, out, every, frames) as found:
         calibration = read_calibration(
             source, functools.partial(photo_size_of, found.images, source)
@@ -182,6 +191,7 @@ def import_cameras(
             found.images,
             out,
             masks=found.masks,
+            others=others,
             scale=scale,
             up=up,
             pixel_centers=pixel_centers,
@@ -216,6 +226,7 @@ def import_calibration(
     out: Path,
     *,
     masks: Path | None = None,
+    others: Path | None = None,
     scale: float | None = None,
     up: str | None = None,
     pixel_centers: str | None = None,
@@ -228,6 +239,7 @@ def import_calibration(
         scale, about_unit = likely_unit(calibration)
     photos = find_photos(calibration, images, masks)
     check_repeats(calibration.file, [photo.image for photo in photos])
+    in_front = find_others(others, images, [photo.image for photo in photos])
     # photos upright, of one size, with masks
     turns = find_turns(calibration, photos)
     canvas = _canvas(images, photos, turns)
@@ -274,15 +286,14 @@ def import_calibration(
     cut: list[str] = []
 
     def write(folder: Path) -> None:
-        cut.extend(_write(folder, converted, photos, turns, names, canvas))
+        cut.extend(_write(folder, converted, photos, turns, names, canvas, in_front))
         for name, content in (also or {}).items():
             write_json(folder / name, content)
 
     replace_folder(out, write, mark="capture.json")
     if cut:
         warnings.append(
-            f"the person is cut off where white was added to {few(cut, 1)}: it is taken for"
-            " background"
+            f"the person is cut off at the border of {few(cut, 1)}: what is beyond is unknown"
         )
     centers = "whole numbers (0.5 added to cx and cy)" if pixel_centers == "integer" else "+0.5"
     said = f"{calibration.format} ({calibration.file}): {calibration.convention}"
@@ -383,8 +394,13 @@ def _write(
     turns: Sequence[Turn],
     names: Sequence[str],
     canvas: tuple[int, int],
+    in_front: Mapping[Path, Path],
 ) -> list[str]:
-    """Returns the names of photos whose person reaches a rim where the photo is padded."""
+    """Writes photos, masks, what is unknown, and capture.json.
+
+    Arguments: in_front: the masks of others, by photo.
+    Returns: the names of photos whose person reaches what the camera has not seen.
+    """
     (folder / "images").mkdir(parents=True)
     if photos[0].mask is not None:
         (folder / "masks").mkdir()
@@ -399,11 +415,24 @@ def _write(
     views, cut = [], []
     for photo, turn, name, rewritten in zip(photos, turns, names, rewrites, strict=True):
         camera = calibration.cameras[photo.camera]
+        hidden = None
         if not changed or (straight and not rewritten and not read_checked(has_alpha, photo.image)):
             files = _copy(folder, photo, name)
         else:
-            files, at_rim = _rewrite(folder, photo, turn, name, camera, transparent, canvas)
-            cut += [photo.image.name] if at_rim else []
+            files, mask = _rewrite(folder, photo, turn, name, camera, transparent, canvas)
+            hidden = not_photographed(turn.size, camera, canvas)
+            # the person who ends before that border does not go on beyond it
+            if mask is not None and is_cut_off(mask > MASK_THRESHOLD, hidden):
+                cut.append(photo.image.name)
+            elif mask is not None:
+                hidden = None
+        if photo.image in in_front:
+            others = others_imported(in_front[photo.image], photo, turn, camera, canvas)
+            hidden = others if hidden is None else hidden | others
+        if hidden is not None and hidden.any():
+            files["unknown"] = f"unknown/{name}.png"
+            (folder / "unknown").mkdir(exist_ok=True)
+            write_png(folder / files["unknown"], hidden.astype(np.float32), mark=MASK)
         matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
         views.append({**files, "frame": photo.frame, **matrices})
     write_description(folder, views, calibrated=not calibration.estimated)
@@ -436,14 +465,13 @@ def _rewrite(
     camera: CalibratedCamera,
     transparent: bool,
     canvas: tuple[int, int],
-) -> tuple[dict[str, str], bool]:
+) -> tuple[dict[str, str], Float[np.ndarray, "h w"] | None]:
     """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it
     does not see are white and background.
 
     A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`,
     is left out.
-    Returns: the paths for capture.json, and whether the person reaches a rim where the photo is
-    padded.
+    Returns: the paths for capture.json, and the mask as it was written; None without one.
     """
     # upright, and as a pinhole sees them
     image, alpha = read_checked(read_image, photo.image)
@@ -463,12 +491,6 @@ def _rewrite(
     # padding that cuts off the person is reported, since it is taken for background
     if photo.mask is not None and alpha is not None:
         image = np.concatenate([image, alpha[..., None]], axis=-1)
-    at_rim = False
-    if mask is not None:
-        person, (height, width) = mask > MASK_THRESHOLD, mask.shape
-        at_rim = (width < canvas[0] and person[:, -1].any()) or (
-            height < canvas[1] and person[-1].any()
-        )
     image, mask = _padded(image, canvas, 1.0), None if mask is None else _padded(mask, canvas, 0.0)
     # the files
     files = {"image": f"images/{name}.png"}
@@ -477,7 +499,7 @@ def _rewrite(
         files["mask"] = f"masks/{name}.png"
         (folder / "masks").mkdir(exist_ok=True)
         write_png(folder / files["mask"], mask)
-    return files, bool(at_rim)
+    return files, mask
 
 
 def _padded(

@@ -64,7 +64,11 @@ class Photo:
 
 
 MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
-"""Folders whose pictures are no photos."""
+"""Names of folders of masks."""
+OTHERS_FOLDERS = ("others", "occluders", "unknown")
+"""Names of folders of masks of other people and of things in front of the person."""
+NO_PHOTOS = (*MASK_FOLDERS, *OTHERS_FOLDERS)
+"""Names of folders whose pictures are no photos."""
 NO_CAMERA = "without a camera in"
 """How the reason begins why a photo is not used."""
 NO_PHOTO_SHOWN = 4
@@ -153,7 +157,7 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
     }
     names = {photo.image.with_suffix("") for photo in photos}
     no_camera = Reason("photo", f"{NO_CAMERA} {calibration.file.name}")
-    scan = scan_folder(images, lambda place: place.name in MASK_FOLDERS)
+    scan = scan_folder(images, lambda place: place.name in NO_PHOTOS)
     unused = [each for each in scan.unused if each.path.resolve() not in used]
     for photo in scan.photos:
         if photo.resolve() not in used:
@@ -225,13 +229,33 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 
 def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
+    """A function that finds the mask of a photo, see `masks_named_like`. The function raises
+    CaptureError where there is none.
+    """
+    find = masks_named_like(masks, images)
+
+    def expect(image: Path) -> Path:
+        mask = find(image)
+        if mask is None:
+            raise CaptureError(
+                masks / image.relative_to(images),
+                "",
+                f"no mask ({alternatives(PHOTO_SUFFIXES)}): expected one for each photo, named"
+                " like it",
+            )
+        return mask
+
+    return expect
+
+
+def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]:
     """A function that finds the mask of a photo of `images`: at the same path in the folder of
     masks.
 
     Its name is the photo's, perhaps with one more suffix (COLMAP) or with a word for masks
     (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). AvatarReX has it in mask/pha beside
     the photo; photos and masks are in one folder there, so that the photo itself can be what is
-    found first. The function raises CaptureError where there is none.
+    found first. The function returns None where there is none.
     """
     # each folder is listed once: names with a word for masks, by the photo they are of
     listed: dict[Path, dict[str, Path]] = {}
@@ -250,17 +274,13 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
         return known.get(place.name.casefold()) or known.get(place.stem.casefold())
 
     # a mask of the same path first, then one with a word for masks
-    def find(image: Path) -> Path:
+    def find(image: Path) -> Path | None:
         path = image.relative_to(images)
         for place in (masks / path, masks / path.parent / "mask" / "pha" / path.name):
             for mask in (_any_suffix(place), by_words(place)):
                 if mask is not None and not mask.samefile(image):
                     return mask
-        raise CaptureError(
-            masks / path,
-            "",
-            f"no mask ({alternatives(PHOTO_SUFFIXES)}): expected one for each photo, named like it",
-        )
+        return None
 
     return find
 
@@ -291,7 +311,7 @@ def _may_be_frame(folder: Path) -> bool:
     return (
         folder.is_dir()
         and not folder.name.startswith(".")
-        and folder.name not in (*MASK_FOLDERS, *SYSTEM_FOLDERS)
+        and folder.name not in (*NO_PHOTOS, *SYSTEM_FOLDERS)
     )
 
 
@@ -390,7 +410,7 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
             problem += "; was it turned (an EXIF orientation that got lost)?"
         raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{told}, {problem}")
     as_stored = calibrated == stored and not upright
-    mask = 1 if photo.mask is None else _mask_flag(photo.mask, flag, stored, shown)
+    mask = 1 if photo.mask is None else mask_flag(photo.mask, flag, stored, shown)
     quarters, certain = (
         QUARTERS[MIRRORED.get(flag, flag)] if as_stored else 0,
         flag == 1 or stored != shown or upright,
@@ -398,8 +418,9 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
     return Turn(flag, mask, quarters, shown, certain, as_stored and flag in MIRRORED)
 
 
-def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
-    """A mask with a flag, or of the size of the turned photo, shows it as turned; else as stored.
+def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
+    """The flag by which a mask is turned. One with a flag, or of the size of the turned photo,
+    shows it as turned; else as stored.
 
     Where both sizes are the same it is taken to be turned: most tools that make masks obey the
     flag.
@@ -421,10 +442,14 @@ def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h
 
     Raises: CaptureError if there is none, or one of another size.
     """
-    file = _masks_of(masks, images)(image)
+    return mask_as_shown(_masks_of(masks, images)(image), image)
+
+
+def mask_as_shown(mask: Path, image: Path) -> Float[np.ndarray, "h w"]:
+    """Reads a mask as its photo is shown. Raises: CaptureError for one of another size."""
     flag, stored = read_checked(orientation, image), photo_size(image)
     shown = stored if flag < 5 else stored[::-1]
-    return oriented(read_checked(read_grey, file), _mask_flag(file, flag, stored, shown))
+    return oriented(read_checked(read_grey, mask), mask_flag(mask, flag, stored, shown))
 
 
 def turned_cameras(

@@ -1,0 +1,106 @@
+"""What of photos does not show the person: masks of other people and of things in front that are
+given, and pixels of an imported photo that the camera has not seen.
+
+A capture calls both unknown (docs/capture_format.md).
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from humangs_jax.capture.calibration.photos import (
+    Photo,
+    Turn,
+    mask_as_shown,
+    mask_flag,
+    masks_named_like,
+    photo_size,
+)
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.registry import alternatives
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
+from humangs_jax.data.cameras import CalibratedCamera, undistort
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.photos import read_checked
+from humangs_jax.io.images import PHOTO_SUFFIXES, orientation, read_grey
+
+TOUCHES = 3
+"""Pixels: a mask that ends so near to what the camera has not seen is cut off there."""
+
+
+def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> dict[Path, Path]:
+    """The masks of others by photo, of those photos that have one; empty without a folder.
+
+    Raises: CaptureError if no picture in the folder is named like a photo.
+    """
+    if folder is None:
+        return {}
+    find = masks_named_like(folder, images)
+    named = {photo: find(photo) for photo in photos}
+    found = {photo: mask for photo, mask in named.items() if mask is not None}
+    if not found:
+        raise CaptureError(
+            folder,
+            "",
+            f"no mask ({alternatives(PHOTO_SUFFIXES)}) is named like a photo of {images}: expected"
+            " some, white where somebody or something else is in front",
+        )
+    return found
+
+
+def others_as_shown(
+    folder: Path | None, images: Path, photos: Sequence[Path]
+) -> list[Bool[np.ndarray, "h w"] | None]:
+    """Where others are in front in each photo, as it is shown; None for a photo without a mask of
+    them.
+
+    Raises: see `find_others`; CaptureError for a mask of another size.
+    """
+    found = find_others(folder, images, photos)
+    return [
+        mask_as_shown(found[photo], photo) > MASK_THRESHOLD if photo in found else None
+        for photo in photos
+    ]
+
+
+def others_imported(
+    mask: Path, photo: Photo, turn: Turn, camera: CalibratedCamera, canvas: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    """Where others are in front in an imported photo: turned, undistorted and padded as it is.
+
+    Raises: CaptureError for a mask of another size.
+    """
+    stored = photo_size(photo.image)
+    shown = stored if read_checked(orientation, photo.image) < 5 else stored[::-1]
+    share = turn.upright(read_checked(read_grey, mask), mask_flag(mask, turn.photo, stored, shown))
+    return _as_imported(share, camera, canvas) > MASK_THRESHOLD
+
+
+def not_photographed(
+    size: tuple[int, int], camera: CalibratedCamera, canvas: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    """Where an imported photo has pixels that the camera has not seen: those beyond a distorted
+    lens, and those that were added to bring all photos to one size.
+
+    Arguments: size: width and height of the upright photo. canvas: those of what is written.
+    """
+    width, height = size
+    return _as_imported(np.ones((height, width), np.float32), camera, canvas) < MASK_THRESHOLD
+
+
+def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"]) -> bool:
+    """Tells whether the person reaches what the camera has not seen, and so may go on there."""
+    near = ndimage.binary_dilation(unseen, iterations=TOUCHES)
+    return bool((person & near).any())
+
+
+def _as_imported(
+    share: Float[np.ndarray, "h w"], camera: CalibratedCamera, canvas: tuple[int, int]
+) -> Float[np.ndarray, "height width"]:
+    """An upright mask as its photo is imported; 0 where the camera has not seen anything."""
+    if camera.distortion is not None:
+        share = undistort(share, camera.K, camera.distortion, fill=0.0)
+    height, width = share.shape
+    return np.pad(share, ((0, canvas[1] - height), (0, canvas[0] - width)))
