@@ -9,9 +9,11 @@ JSON files, if a section has no file, or if a file is shown nowhere. `<!-- forma
 """
 
 import argparse
+import ast
 import inspect
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -20,6 +22,8 @@ from experiments.results import REPOSITORY, SECTION, pages, rendered, write_text
 
 FORMATS = re.compile(r"(?<=<!-- formats: )(?P<name>\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
+FLOORS = "a module imports only from lower floors"
+"""The contract of `lint-imports` that orders the rooms."""
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 """A header and rows of cells."""
 
@@ -70,7 +74,7 @@ def render_pages(repository: Path, write: bool) -> list[str]:
 
 def format_table(name: str) -> str:
     """What the package or the experiments have, as a table in Markdown: "cameras", "keypoints" or
-    "motions" that are read, "limits", "protocols" or "systems".
+    "motions" that are read, "limits", "protocols", "rooms" or "systems".
     """
     header, rows = TABLES[name]()
     return "".join(f"| {' | '.join(row)} |\n" for row in (header, ["---"] * len(header), *rows))
@@ -166,6 +170,24 @@ def _protocols() -> Table:
     ]
 
 
+def _rooms() -> Table:
+    """The folders of the package from the lowest layer up, by the docstrings of their modules."""
+    contracts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]
+    (layers,) = (each for each in contracts["contracts"] if each["name"] == FLOORS)
+    (forbidden,) = (each for each in contracts["contracts"] if each["type"] == "forbidden")
+
+    rows = []
+    for module in (name for floor in layers["layers"][::-1] for name in floor.split(" | ")):
+        room = module.partition(".")[2]
+        text = (REPOSITORY / "humangs_jax" / room / "__init__.py").read_text()
+        about = ast.get_docstring(ast.parse(text)) or ""
+        kind = "wing" if module in forbidden["forbidden_modules"] else "on top"
+        kind = "core" if module in forbidden["source_modules"] else kind
+        rows.append((kind, f"`{room}/`", " ".join(about.partition("\n\n")[0].split())))
+    order = ("core", "wing", "on top")
+    return ("", "room", "contents"), sorted(rows, key=lambda row: order.index(row[0]))
+
+
 def _systems() -> Table:
     """The networks that the paper is compared with."""
     from experiments.systems import ONE_PHOTO, SYSTEMS
@@ -184,6 +206,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "limits": _limits,
     "motions": _motions,
     "protocols": _protocols,
+    "rooms": _rooms,
     "systems": _systems,
 }
 """By the name in `<!-- formats: NAME -->`."""

@@ -1,0 +1,1 @@
+"""Demo, presets and budgets, the check of a capture, photos without a calibration."""

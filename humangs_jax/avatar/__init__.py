@@ -1,0 +1,1 @@
+"""Reconstruct, animate, light, frames, layers, videos; `export`: a table of formats."""

@@ -1,0 +1,3 @@
+"""`BodyModel`, `shape_body`, `pose_body`; skinning, landmarks, the SMPL-X reader, the CC0 default
+body.
+"""

@@ -1,5 +1,5 @@
-"""The `humangs` command. Each subcommand is a frozen dataclass whose fields are its options; `run`
-does the work.
+"""The `humangs` command: a dataclass per command, whose fields are its options; `run` does the
+work.
 
 Modules here import nothing heavy, so that `--help` is fast: what a command needs is imported when
 it runs, after its options and the places that it will write to were checked. --quiet, --verbose and

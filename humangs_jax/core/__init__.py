@@ -1,0 +1,3 @@
+"""Array types and axes, configurations with ranges and JSON, registries, checks of arguments,
+compiling, processes.
+"""

@@ -1,0 +1,1 @@
+"""Protocols, cases, scores, the report."""

@@ -1,0 +1,1 @@
+"""Quaternions (wxyz), 3x3 SVD, transforms, `Camera` and its lenses, Plücker rays, meshes."""

@@ -1,0 +1,1 @@
+"""Untrusted files: read within one set of limits, refused in one line; atomic writes."""

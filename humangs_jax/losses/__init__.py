@@ -1,0 +1,1 @@
+"""Unreduced losses and their weights, SSIM, perceptual loss, LPIPS."""

@@ -1,5 +1,6 @@
-"""Motions: one body pose per frame, read from the files that people have. `load_motion` is the one
-door.
+"""Motions of files and their skeletons, by a table of readers: one body pose per frame.
+
+`load_motion` reads any of them.
 
 In memory (`body.motion.Motion`): SMPL-X's 55 joints, axis-angle in radians, metres, y up. Readers
 (`data.formats.MOTIONS` is their table): `arrays`, by key; `clips`, skeletons of other programs,

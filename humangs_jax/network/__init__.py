@@ -1,0 +1,1 @@
+"""`humangs`, one module over exchangeable `parts`; presets, weights files, conversion."""

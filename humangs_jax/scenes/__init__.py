@@ -1,0 +1,1 @@
+"""Scenes of a fixed number of Gaussians, fitted to posed photos."""
