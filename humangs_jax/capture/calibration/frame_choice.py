@@ -113,10 +113,11 @@ def directions_of(
     """Radians about the vertical by which the person is turned in each frame, from landmarks in the
     camera's axes (x right, y down, z away); 0 faces the camera.
     """
-    side = lambda part: (
-        world[:, names.index(f"left_{part}")] - world[:, names.index(f"right_{part}")]
-    )
-    across = side("shoulder") + side("hip")
+
+    def from_right_to_left(part: str) -> Float[np.ndarray, "n 3"]:
+        return world[:, names.index(f"left_{part}")] - world[:, names.index(f"right_{part}")]
+
+    across = from_right_to_left("shoulder") + from_right_to_left("hip")
     return np.arctan2(across[:, 2], across[:, 0])
 
 

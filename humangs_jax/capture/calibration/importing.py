@@ -123,17 +123,16 @@ class ImportReport:
         if self.undistorted:
             lines.append(f"lens distortion removed from {counted(self.undistorted, 'photo')}")
         if self.checks.reprojection is not None:
-            error, points = (
-                self.checks.reprojection,
-                counted(self.checks.observations, "observation"),
-            )
-            lines.append(f"mean reprojection error: {error:.3g} px ({points})")
+            points = counted(self.checks.observations, "observation")
+            lines.append(f"mean reprojection error: {self.checks.reprojection:.3g} px ({points})")
         if self.checks.distance is not None:
             lines.append(f"the cameras stand {self.checks.distance:.3g} m from where they look")
         lonely = [each for each in self.unused if each.why.because.startswith(NO_CAMERA)]
         expected = unused_line(each for each in self.unused if each not in lonely)
         warnings = [line for line in (unused_line(lonely), *self.warnings) if line is not None]
-        lines += [*self.notes, *([] if expected is None else [expected])]
+        lines += self.notes
+        if expected is not None:
+            lines.append(expected)
         return "\n".join([*lines, *(f"warning: {warning}" for warning in warnings)])
 
 
@@ -200,10 +199,11 @@ def import_cameras(
     unused = report.unused
     if found.images != images:  # frames of videos, which are all used
         unused = tuple(Unused(photo, STILL) for photo in scan_folder(images).photos)
-    notes = (*report.notes, *found.notes, *([] if left_out is None else [left_out]))
-    return dataclasses.replace(
-        report, unused=unused, notes=notes, warnings=(*report.warnings, *found.warnings)
-    )
+    notes = [*report.notes, *found.notes]
+    if left_out is not None:
+        notes.append(left_out)
+    warnings = (*report.warnings, *found.warnings)
+    return dataclasses.replace(report, unused=unused, notes=tuple(notes), warnings=warnings)
 
 
 def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
@@ -259,16 +259,16 @@ def import_calibration(
         )
     # what the user should know
     checks = check_calibration(calibration, converted, up)
-    frames, cameras = (
-        1 + max(photo.frame for photo in photos),
-        calibration.stations or len(converted.cameras),
-    )
+    frames = 1 + max(photo.frame for photo in photos)
+    cameras = calibration.stations or len(converted.cameras)
     notes, warnings = turn_notes(photos, turns)
-    if heic := sum(map(_of_phones, photos)):
+    heic = sum(map(_of_phones, photos))
+    if heic:
         notes.append(f"written as PNG: {counted(heic, 'HEIC photo')}")
     notes += _padding_notes(turns, canvas)
     warnings += about_masks
-    notes += [] if about_unit is None else [about_unit]
+    if about_unit is not None:
+        notes.append(about_unit)
     if calibration.mask_key is not None:
         named = f"{calibration.mask_key} of {calibration.file.name}"
         if masks is not None:
@@ -477,27 +477,24 @@ def _rewrite(
     image, alpha = read_checked(read_image, photo.image)
     image = turn.upright(image, turn.photo)
     alpha = turn.upright(alpha, turn.photo) if transparent and alpha is not None else None
-    mask = (
-        alpha
-        if photo.mask is None
-        else turn.upright(read_checked(read_grey, photo.mask), turn.mask)
-    )
+    mask = alpha
+    if photo.mask is not None:
+        mask = turn.upright(read_checked(read_grey, photo.mask), turn.mask)
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)
-        mask, alpha = (
-            x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0)
-            for x in (mask, alpha)
-        )
-    # padding that cuts off the person is reported, since it is taken for background
+        if mask is not None:
+            mask = undistort(mask, camera.K, camera.distortion, fill=0.0)
+        if alpha is not None:
+            alpha = undistort(alpha, camera.K, camera.distortion, fill=0.0)
     if photo.mask is not None and alpha is not None:
         image = np.concatenate([image, alpha[..., None]], axis=-1)
-    image, mask = _padded(image, canvas, 1.0), None if mask is None else _padded(mask, canvas, 0.0)
-    # the files
+
     files = {"image": f"images/{name}.png"}
-    write_png(folder / files["image"], image)
+    write_png(folder / files["image"], _padded(image, canvas, 1.0))
     if mask is not None:
         files["mask"] = f"masks/{name}.png"
         (folder / "masks").mkdir(exist_ok=True)
+        mask = _padded(mask, canvas, 0.0)
         write_png(folder / files["mask"], mask)
     return files, mask
 
@@ -509,9 +506,7 @@ def _padded(
     are opaque white.
     """
     (height, width), (right, below) = pixels.shape[:2], canvas
+    if (height, width) == (below, right):
+        return pixels
     margins = ((0, below - height), (0, right - width), *((0, 0),) * (pixels.ndim - 2))
-    return (
-        pixels
-        if pixels.shape[:2] == (below, right)
-        else np.pad(pixels, margins, constant_values=fill)
-    )
+    return np.pad(pixels, margins, constant_values=fill)

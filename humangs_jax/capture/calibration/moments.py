@@ -79,7 +79,8 @@ def _clock(
     if step is None:
         return np.arange(len(times)) * slowest
     late = times[0] - first
-    return times - times[0] + (late if LATE < late < MOST_LATE else 0.0)
+    start = late if LATE < late < MOST_LATE else 0.0
+    return times - times[0] + start
 
 
 def _all_moments(
@@ -133,14 +134,14 @@ def _notes(
             for clock, number in zip(clocks.values(), numbers, strict=True)
             if number is not None
         ]
-        apart = max(apart, float(np.ptp(seen))) if seen else apart
+        if seen:
+            apart = max(apart, float(np.ptp(seen)))
     rates = " and ".join(dict.fromkeys(f"{1 / step:.3g}" for step in sorted(steps)))
-    return (
-        (
-            f"videos of {rates} frames a second: paired by time, views of one moment are at most"
-            f" {apart:.3f} s apart"
-        ),
+    line = (
+        f"videos of {rates} frames a second: paired by time, views of one moment are at most"
+        f" {apart:.3f} s apart"
     )
+    return (line,)
 
 
 def _warnings(
@@ -161,7 +162,8 @@ def _warnings(
                 f"{camera}: no frame at {counted(len(inside), 'moment')} ({where}): left out there;"
                 " were frames dropped?"
             )
-        if len(behind := without[without >= clocks[camera][-1]]) > 1:
+        behind = without[without >= clocks[camera][-1]]
+        if len(behind) > 1:
             found.append(
                 f"{camera}: ends at {clocks[camera][-1]:.2f} s, {counted(len(behind), 'moment')}"
                 " before the last video"
@@ -175,9 +177,10 @@ def progressions(numbers: Sequence[int]) -> list[tuple[int, int, int]]:
     """
     found: list[tuple[int, int, int]] = []
     for number in numbers:
-        first, step, last = found[-1] if found else (number, -1, number)
-        if step == 0 or (step > 0 and number == last + step):
-            found[-1] = (first, number - last, number)
-        else:
-            found.append((number, 0, number))
+        if found:
+            first, step, last = found[-1]
+            if step == 0 or number == last + step:
+                found[-1] = (first, number - last, number)
+                continue
+        found.append((number, 0, number))
     return found

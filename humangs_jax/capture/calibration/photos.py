@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.registry import alternatives
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.cameras import CalibratedCamera, Calibration
@@ -136,16 +136,14 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
         found = [(i, calibration.cameras[i].frame, photo) for i, photo in enumerate(owners)]
     else:
         found = _of_cameras(calibration, images)
-    mask_of = _masks_of(masks, images) if masks is not None else lambda photo: None
-    named = (
-        {}
-        if masks is not None or calibration.mask_key is None
-        else _named_masks(calibration, images)
-    )
+    find_mask = None if masks is None else _masks_of(masks, images)
+    named: dict[int, Path] = {}
+    if masks is None and calibration.mask_key is not None:
+        named = _named_masks(calibration, images)
     photos = []
     for camera, frame, image in sorted(found, key=lambda entry: (entry[1], entry[0])):
         key = image.relative_to(images).with_suffix("").as_posix()
-        mask = named.get(camera) if masks is None else mask_of(image)
+        mask = named.get(camera) if find_mask is None else find_mask(image)
         photos.append(Photo(image, mask, camera, frame, key))
     return tuple(photos)
 
@@ -161,7 +159,8 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
     unused = [each for each in scan.unused if each.path.resolve() not in used]
     for photo in scan.photos:
         if photo.resolve() not in used:
-            unused.append(Unused(photo, SAME_NAME if photo.with_suffix("") in names else no_camera))
+            why = SAME_NAME if photo.with_suffix("") in names else no_camera
+            unused.append(Unused(photo, why))
     return unused
 
 
@@ -170,11 +169,13 @@ def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
     one around. All or none.
     """
     found: dict[int, Path] = {}
-    for i, name in (
-        (i, camera.mask) for i, camera in enumerate(calibration.cameras) if camera.mask
-    ):
+    for i, camera in enumerate(calibration.cameras):
+        if not camera.mask:
+            continue
+        name = camera.mask.replace("\\", "/")
         for folder in (calibration.file.parent, images, images.parent):
-            if (path := _any_suffix(folder / name.replace("\\", "/"))) is not None:
+            path = _any_suffix(folder / name)
+            if path is not None:
                 checked_path(folder, path.absolute(), folder)
                 found[i] = path
                 break
@@ -214,8 +215,10 @@ def _photo_at(folder: Path, name: str) -> Path | None:
 
 def _any_suffix(path: Path) -> Path | None:
     """The file, or the one of that name with another suffix of photos, or with one more."""
-    stems = [path.name, path.stem] if is_photo(path) else [path.name]
-    candidates = [path] if is_photo(path) else []
+    stems, candidates = [path.name], []
+    if is_photo(path):
+        stems.append(path.stem)
+        candidates.append(path)
     candidates += [path.with_name(stem + suffix) for stem in stems for suffix in SUFFIXES]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
@@ -321,12 +324,10 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
         if not photos:
             _refuse_missing(calibration, images, camera.name)
     numbers = {frame for photos in frames_of for frame in photos}
-    order = (
-        sorted(numbers, key=lambda f: (int(f), f))
-        if all(f.isdecimal() for f in numbers)
-        else sorted(numbers)
-    )
-    frames = {frame: i for i, frame in enumerate(order)}  # 10 after 9
+    # numbers are sorted as numbers: 10 after 9
+    numbered = all(frame.isdecimal() for frame in numbers)
+    order = sorted(numbers, key=lambda f: (int(f), f)) if numbered else sorted(numbers)
+    frames = {frame: i for i, frame in enumerate(order)}
     return [
         (i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()
     ]
@@ -404,17 +405,15 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
     if camera.width is None and flag >= 5:  # the principal point is near the middle
         calibrated = min(stored, shown, key=lambda size: np.abs(camera.K[:2, 2] / size - 0.5).max())
     if calibrated not in (stored, shown):
-        told = "" if flag == 1 else f" (EXIF orientation {flag})"
+        flagged = "" if flag == 1 else f" (EXIF orientation {flag})"
         problem = f"was calibrated with {calibrated[0]} x {calibrated[1]}: expected the same"
         if calibrated == stored[::-1]:
             problem += "; was it turned (an EXIF orientation that got lost)?"
-        raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{told}, {problem}")
+        raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{flagged}, {problem}")
     as_stored = calibrated == stored and not upright
     mask = 1 if photo.mask is None else mask_flag(photo.mask, flag, stored, shown)
-    quarters, certain = (
-        QUARTERS[MIRRORED.get(flag, flag)] if as_stored else 0,
-        flag == 1 or stored != shown or upright,
-    )
+    quarters = QUARTERS[MIRRORED.get(flag, flag)] if as_stored else 0
+    certain = flag == 1 or stored != shown or upright
     return Turn(flag, mask, quarters, shown, certain, as_stored and flag in MIRRORED)
 
 
@@ -460,7 +459,8 @@ def turned_cameras(
     """
     cameras, seen = list(calibration.cameras), calibration.observations
     pixels = None if seen is None else seen.pixels.copy()
-    for i, turn in {photo.camera: turn for photo, turn in zip(photos, turns, strict=True)}.items():
+    turn_of = {photo.camera: turn for photo, turn in zip(photos, turns, strict=True)}
+    for i, turn in turn_of.items():
         width, height = turn.size if turn.quarters % 2 == 0 else turn.size[::-1]
         camera = dataclasses.replace(cameras[i], width=width, height=height)
         for _ in range(turn.quarters):
@@ -505,11 +505,10 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
     whole = "the calibration is of the turned photos"
     if any(turn.quarters or turn.mirrored for _, turn in flagged):
         whole = "their cameras, too: the calibration is of the pixels as stored"
-    notes, warnings = (
-        [f"turned upright by the EXIF orientation: {counted(len(flagged), 'photo')} ({whole})"],
-        [],
-    )
-    if unsure := [(photo, turn) for photo, turn in flagged if not turn.certain]:
+    notes = [f"turned upright by the EXIF orientation: {counted(len(flagged), 'photo')} ({whole})"]
+    warnings = []
+    unsure = [(photo, turn) for photo, turn in flagged if not turn.certain]
+    if unsure:
         which = few([photo.image.name for photo, _ in unsure], 1)
         of_masks = ", the mask to be of the turned photo" if unsure[0][0].mask is not None else ""
         warnings.append(
@@ -517,7 +516,8 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
             f" the stored pixels{of_masks}; their sizes do not tell. If that is wrong, save the"
             " photos turned"
         )
-    if mirrored := [photo.image.name for photo, turn in flagged if turn.mirrored]:
+    mirrored = [photo.image.name for photo, turn in flagged if turn.mirrored]
+    if mirrored:
         warnings.append(
             f"EXIF asks to mirror {mirrored[0]}: turned, not mirrored, as no camera sees so"
         )
@@ -562,17 +562,7 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
         else:
             mask = read_mask(photo.mask, "its photo", *photo_size(photo.mask))
         opaque = opaque and mask.min() == 1
-        person = mask > MASK_THRESHOLD
-        border = np.concatenate([person[0], person[-1], person[1:-1, 0], person[1:-1, -1]])
-        problem = (
-            EMPTY
-            if not person.any()
-            else FULL
-            if person.all()
-            else INVERTED
-            if border.mean() > AROUND
-            else None
-        )
+        problem = _mask_problem(mask > MASK_THRESHOLD)
         if problem is not None:
             found.setdefault(problem, []).append((photo.mask or photo.image).name)
     if not masked and opaque:
@@ -583,6 +573,16 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
             first, "mask", "empty, as are all of them: expected 255 where the person is"
         )
     return tuple(f"{problem}: {few(names)}" for problem, names in found.items())
+
+
+def _mask_problem(person: Bool[np.ndarray, "h w"]) -> str | None:
+    """The fault of a mask; None for a usual one."""
+    if not person.any():
+        return EMPTY
+    if person.all():
+        return FULL
+    border = np.concatenate([person[0], person[-1], person[1:-1, 0], person[1:-1, -1]])
+    return INVERTED if border.mean() > AROUND else None
 
 
 def has_alpha(photo: Path) -> bool:
@@ -596,5 +596,7 @@ def is_transparent(photo: Path) -> bool:
 
     Raises: CaptureError.
     """
-    alpha = read_checked(read_image, photo)[1] if read_checked(has_alpha, photo) else None
+    if not read_checked(has_alpha, photo):
+        return False
+    alpha = read_checked(read_image, photo)[1]
     return alpha is not None and bool(alpha.min() < 1)

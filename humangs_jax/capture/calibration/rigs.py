@@ -49,6 +49,11 @@ Where = Callable[[str], tuple[Path, str]]
 """The file and the field of a key of a camera, for errors."""
 
 
+def _in_map(file: Path, name: str) -> Where:
+    """Where the keys of a map of that name are."""
+    return lambda key: (file, f"{name}.{key}")
+
+
 def recognizes_opencv(source: Source) -> bool:
     """Whether a file has K, R and T of cameras."""
     if not (
@@ -69,10 +74,8 @@ def read_opencv(source: Source, format: CameraFormat) -> Calibration:
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
     if not nested:
         return source.calibration(format, _flat_cameras(values, lambda key: source.path))
-    where = lambda name: lambda key: (source.path, f"{name}.{key}")
-    return source.calibration(
-        format, [_one_camera(name, each, where(name)) for name, each in nested.items()]
-    )
+    cameras = [_one_camera(name, each, _in_map(source.path, name)) for name, each in nested.items()]
+    return source.calibration(format, cameras)
 
 
 @functools.lru_cache(maxsize=1)
@@ -84,7 +87,10 @@ def _values(source: Source) -> dict[str, Any]:
 def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
     """The cameras of both files. Raises: CaptureError naming file and key."""
     inner, outer = source.path / "intri.yml", source.path / "extri.yml"
-    file_of = lambda key: outer if key.startswith(("R", "T")) else inner
+
+    def file_of(key: str) -> Path:
+        return outer if key.startswith(("R", "T")) else inner
+
     values = {}
     for file in (inner, outer):
         content = parse_file_storage(checked_text(file), file)
@@ -138,30 +144,15 @@ def _renamed_camera(
 def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> CalibratedCamera:
     if "K" not in values and {"fx", "fy", "cx", "cy", "T", "R"} <= values.keys():
         values = _of_shelf(values, where)
-    turn_key = (
-        "Rot" if "Rot" in values else "R"
-    )  # EasyMocap has both: the matrix and the rotation vector
+    # EasyMocap has both: the matrix and the rotation vector
+    turn_key = "Rot" if "Rot" in values else "R"
     for key in ("K", turn_key, "T"):
         if key not in values:
             raise CaptureError(*where(key), "missing")
-    pose = pose_matrix(
-        rotation(values[turn_key], *where(turn_key)), floats(values["T"], *where("T"), (3,))
-    )
-    K, lens, refusal = floats(values["K"], *where("K"), (3, 3)), (None, ""), None
-    for key, value in values.items():
-        named = isinstance(value, str) and value.lower() in FISHEYE
-        if named or (not isinstance(value, str) and key.lower() in FISHEYE and bool(value)):
-            refusal = CaptureError(
-                *where(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
-            )
-        if (key.lower() == "d" or key.lower().startswith("dist")) and not isinstance(value, str):
-            lens = value, key
-    coefficients, key = lens
-    if refusal is not None:
-        at = where(key) if key else where("dist")
-        fields = fisheye_lens([] if coefficients is None else coefficients, *at, refusal)
-    else:
-        fields = {} if coefficients is None else pinhole_lens(coefficients, *where(key))
+    turn = rotation(values[turn_key], *where(turn_key))
+    pose = pose_matrix(turn, floats(values["T"], *where("T"), (3,)))
+    K = floats(values["K"], *where("K"), (3, 3))
+    lens = _lens(values, where)
     sizes = {key: values[key] for key in ("imgSize", "image_size") if key in values}
     sizes |= {
         w: [values[w], values[h]]
@@ -169,17 +160,43 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
         if {w, h} <= values.keys()
     }
     size = next((image_size(value, *where(key)) for key, value in sizes.items()), (None, None))
-    return CalibratedCamera(name, K, pose, *size, **fields)
+    return CalibratedCamera(name, K, pose, *size, **lens)
+
+
+def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
+    """The fields of a camera that tell its lens. A fisheye is refused where photos without
+    distortion are asked for.
+    """
+    coefficients, at, refusal = None, "", None
+    for key, value in values.items():
+        if isinstance(value, str):
+            fisheye = value.lower() in FISHEYE
+        else:
+            fisheye = key.lower() in FISHEYE and bool(value)
+            if key.lower() == "d" or key.lower().startswith("dist"):
+                coefficients, at = value, key
+        if fisheye:
+            refusal = CaptureError(
+                *where(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
+            )
+    if refusal is not None:
+        given = [] if coefficients is None else coefficients
+        return fisheye_lens(given, *where(at or "dist"), refusal)
+    return {} if coefficients is None else pinhole_lens(coefficients, *where(at))
 
 
 def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
     """Shelf and Campus (VoxelPose): focal lengths and centres by name, a lens as k and p; T is
     where the camera stands.
     """
-    numbers = lambda key, *shape: floats(values[key], *where(key), shape)
+
+    def numbers(key: str, *shape: int) -> Float[np.ndarray, "..."]:
+        return floats(values[key], *where(key), shape)
+
     turn, lens = rotation(values["R"], *where("R")), {}
     if "k" in values:
-        k, p = numbers("k", 3), numbers("p", 2) if "p" in values else (0, 0)
+        k = numbers("k", 3)
+        p = numbers("p", 2) if "p" in values else (0, 0)
         lens = {"dist": [k[0], k[1], p[0], p[1], k[2]]}
     K = intrinsics(*(float(numbers(key)) for key in ("fx", "fy", "cx", "cy")))
     others = {key: value for key, value in values.items() if key not in ("k", "p")}
@@ -205,11 +222,10 @@ def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     Raises: CaptureError naming the line.
     """
     with reading(file, "YAML file", CaptureError):
-        values = (
-            _matrices(parse_json(text), file, "")
-            if text.lstrip().startswith("{")
-            else _yaml(text, file)
-        )
+        if text.lstrip().startswith("{"):
+            values = _matrices(parse_json(text), file, "")
+        else:
+            values = _yaml(text, file)
         if not isinstance(values, dict):
             raise Refused("expected keys with values")
         return values
@@ -222,9 +238,8 @@ def _yaml(text: str, file: Path) -> Any:
         root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        raise CaptureError(
-            file, f"line {mark.line + 1}" if mark else "", error.problem or error
-        ) from error
+        where = f"line {mark.line + 1}" if mark else ""
+        raise CaptureError(file, where, error.problem or error) from error
     return {} if root is None else _value(root, file)
 
 
@@ -271,12 +286,10 @@ def _matrix(value: Any, tag: str, file: Path, where: str) -> Float[np.ndarray, "
     if tag != MATRIX:
         raise CaptureError(file, where, f"type {tag!r} is not supported: expected {MATRIX}")
     try:
-        channels = int(
-            re.sub(r"\D.*", "", str(value["dt"])) or 1
-        )  # dt is "d", or "3d" with three channels
-        return np.asarray(value["data"], np.float64).reshape(
-            int(value["rows"]), int(value["cols"]) * channels
-        )
+        # dt is "d", or "3d" with three channels
+        channels = int(re.sub(r"\D.*", "", str(value["dt"])) or 1)
+        rows, columns = int(value["rows"]), int(value["cols"]) * channels
+        return np.asarray(value["data"], np.float64).reshape(rows, columns)
     except (KeyError, TypeError, ValueError) as error:
         raise CaptureError(
             file, where, f"not a matrix of rows, cols, dt and data: {error}"
@@ -368,7 +381,8 @@ def read_multical(source: Source, format: CameraFormat) -> Calibration:
     # a camera may be placed by one that is itself placed by another
     for base in [base for base, _ in waiting.values() if base not in waiting]:
         poses.setdefault(base, np.eye(4))
-    while ready := [name for name, (base, _) in waiting.items() if base in poses]:
+    for _ in range(len(waiting)):
+        ready = [name for name, (base, _) in waiting.items() if base in poses]
         for name in ready:
             base, pose = waiting.pop(name)
             poses.setdefault(name, pose @ poses[base])
@@ -380,9 +394,7 @@ def read_multical(source: Source, format: CameraFormat) -> Calibration:
                 file, f"camera_poses.{name}", "missing: where does this camera stand?"
             )
         values = lens | {"R": poses[name][:3, :3].tolist(), "T": poses[name][:3, 3].tolist()}
-        cameras.append(
-            _one_camera(name, values, lambda key, name=name: (file, f"cameras.{name}.{key}"))
-        )
+        cameras.append(_one_camera(name, values, _in_map(file, f"cameras.{name}")))
     return source.calibration(format, cameras)
 
 

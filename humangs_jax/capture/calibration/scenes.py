@@ -69,31 +69,29 @@ def read_colmap(source: Source, format: CameraFormat) -> Calibration:
     Raises: CaptureError naming the file and, of text, the line.
     """
     # a model is text or binary; both are read into the same values
-    binary = not any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
-    suffix = ".bin" if binary else ".txt"
+    text = any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
+    if text:
+        suffix, read_cameras, read_images = ".txt", _text_cameras, _text_images
+        read_points = _text_points
+    else:
+        suffix, read_cameras, read_images = ".bin", _binary_cameras, _binary_images
+        read_points = _binary_points
     cameras_file, file, points_file = (
         source.path / f"{name}{suffix}" for name in ("cameras", "images", "points3D")
     )
     # an image has a pose, and shares its lens with others
-    lenses = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
+    lenses = dict(read_cameras(cameras_file))
     cameras, seen = [], []
-    for where, name, camera_id, pose, points in (_binary_images if binary else _text_images)(file):
+    for where, name, camera_id, pose, points in read_images(file):
         if camera_id not in lenses:
             raise CaptureError(file, where, f"camera {camera_id} is not in {cameras_file.name}")
-        cameras.append(
-            dataclasses.replace(
-                lenses[camera_id], name=name, cam_from_world=_pose(pose, file, where)
-            )
-        )
+        pose = _pose(pose, file, where)
+        cameras.append(dataclasses.replace(lenses[camera_id], name=name, cam_from_world=pose))
         seen.append(points)
     if not cameras:
         raise CaptureError(file, "", "no image is registered in this model")
     # points that images see, for the check of the calibration
-    places = (
-        dict((_binary_points if binary else _text_points)(points_file))
-        if points_file.is_file()
-        else {}
-    )
+    places = dict(read_points(points_file)) if points_file.is_file() else {}
     rows = [
         (i, x, y, *places[int(p)])
         for i, points in enumerate(seen)
@@ -111,14 +109,10 @@ def read_colmap(source: Source, format: CameraFormat) -> Calibration:
 def _lens(
     model: str, size: Sequence[float | int], values: Sequence[float], file: Path, where: str
 ) -> CalibratedCamera:
-    p = dict(
-        zip(
-            PARAMETERS[model],
-            floats(values, file, where, (len(PARAMETERS[model]),)).tolist(),
-            strict=True,
-        )
-    )
-    K = intrinsics(p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0)), p["cx"], p["cy"])
+    names = PARAMETERS[model]
+    p = dict(zip(names, floats(values, file, where, (len(names),)).tolist(), strict=True))
+    focal = p.get("f", 0.0)
+    K = intrinsics(p.get("fx", focal), p.get("fy", focal), p["cx"], p["cy"])
     if model.endswith("FISHEYE"):
         coefficients = [p.get(f"k{i}", 0.0) for i in (1, 2, 3, 4)]
         lens = fisheye_lens(coefficients, file, where, _refusal(model, file, where))
@@ -194,7 +188,8 @@ def _text_images(file: Path) -> Iterator[Registered]:
         if len(parts) < 10:
             raise CaptureError(file, where, "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
         below, line = next(lines, (where, ""))
-        if len(words := line.split()) % 3:
+        words = line.split()
+        if len(words) % 3:
             raise CaptureError(
                 file, below, "expected X Y POINT3D_ID of each point (or an empty line)"
             )
@@ -325,7 +320,10 @@ def _frame_camera(
     values: Mapping[str, Any], file: Path, prefix: str, photo_size: Callable[[str], tuple[int, int]]
 ) -> CalibratedCamera:
     (name,) = members(values, file, prefix.rstrip("."), file_path=str)
-    number = lambda key: float(floats(values[key], file, f"{prefix}{key}", ()))
+
+    def number(key: str) -> float:
+        return float(floats(values[key], file, f"{prefix}{key}", ()))
+
     model, refusal = values.get("camera_model", "OPENCV"), None
     if model not in CAMERA_MODELS:
         expected = f"expected {', '.join(CAMERA_MODELS)}; else {UNDISTORT_BEFORE}"
@@ -339,9 +337,8 @@ def _frame_camera(
             )
     size = None
     if "w" in values or "h" in values:
-        size = image_size(
-            [required(values, key, file, prefix) for key in ("w", "h")], file, f"{prefix}w, h"
-        )
+        sides = [required(values, key, file, prefix) for key in ("w", "h")]
+        size = image_size(sides, file, f"{prefix}w, h")
     elif not ({"fl_x", "cx", "cy"} <= values.keys() or values.keys() & set(MATRICES)):
         size = photo_size(name)
     width, height = size or (None, None)
@@ -371,13 +368,10 @@ def _frame_camera(
         lens = fisheye_lens(coefficients, file, f"{prefix}k1", refusal)
     else:
         lens = pinhole_lens([*coefficients, 0.0, 0.0], file, f"{prefix}k1")
-        lens |= {} if refusal is None else {"refusal": refusal}
-    pose = floats(
-        required(values, "transform_matrix", file, prefix),
-        file,
-        f"{prefix}transform_matrix",
-        (4, 4),
-    )
+        if refusal is not None:
+            lens["refusal"] = refusal
+    matrix = required(values, "transform_matrix", file, prefix)
+    pose = floats(matrix, file, f"{prefix}transform_matrix", (4, 4))
     try:
         cam_from_world = CONVENTIONS[WORLD_FROM_CAM_OPENGL](pose)
     except np.linalg.LinAlgError:
@@ -446,7 +440,8 @@ def _find_moments(
     ranks = _ranks(times, key, file) if key else [0] * len(frames)
     taken: dict[Any, int] = {}
     for i, moment in enumerate(zip(owners, ranks, strict=True)):
-        if owner and (other := taken.setdefault(moment, i)) != i:
+        other = taken.setdefault(moment, i)
+        if owner and other != i:
             problem = (
                 f"the {owner} and {key} of frames[{other}]: expected one photo of a camera at a"
                 " moment"
@@ -483,8 +478,7 @@ def _ranks(times: Sequence[Any], key: str, file: Path) -> list[int]:
     known = sorted(set(times))
     ranks = range(len(known))
     if not isinstance(known[0], str):
-        ranks = np.cumsum(
-            np.diff(known, prepend=known[0]) > SAME_TIME * max(1.0, abs(known[-1]))
-        ).tolist()
+        tolerance = SAME_TIME * max(1.0, abs(known[-1]))
+        ranks = np.cumsum(np.diff(known, prepend=known[0]) > tolerance).tolist()
     rank = dict(zip(known, ranks, strict=True))
     return [rank[time] for time in times]

@@ -107,11 +107,9 @@ def photos_of_videos(
     """
     # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None
-    given = {"images": images} if masks is None else {"images": images, "masks": masks}
-    if not asked:
-        given = {kind: folder for kind, folder in given.items() if not _has_photos(folder)}
-    videos = {kind: find_videos(folder) for kind, folder in given.items()}
-    if not any(videos.values()):
+    photo_videos = _meant_videos(images, asked)
+    mask_videos = {} if masks is None else _meant_videos(masks, asked)
+    if not photo_videos and not mask_videos:
         if asked:
             raise CaptureError(
                 images,
@@ -120,47 +118,46 @@ def photos_of_videos(
             )
         yield VideoPhotos(images, masks)
         return
-    videos = {"images": videos.get("images", {})} | (
-        {} if masks is None else {"masks": videos.get("masks", {})}
-    )
-    if lonely := sorted(set(videos["images"]) ^ set(videos.get("masks", videos["images"]))):
+    lonely = sorted(set(photo_videos) ^ set(mask_videos))
+    if masks is not None and lonely:
         raise CaptureError(
-            masks or images,
-            lonely[0],
-            "expected a video of photos and one of masks, or folders of both",
+            masks, lonely[0], "expected a video of photos and one of masks, or folders of both"
         )
     # frames of each camera, those of one moment under one number
     beside = next(folder for folder in place.resolve().parents if folder.is_dir())
     with tempfile.TemporaryDirectory(dir=beside, prefix=f".{place.name}.video-") as temporary:
         own, mattes = Path(temporary) / "images", Path(temporary) / "masks"
-        moments, seconds = _moments(videos["images"], every, most)
+        moments, seconds = _moments(photo_videos, every, most)
         pixels = 0
-        for camera, path in videos["images"].items():
+        for camera, path in photo_videos.items():
             chosen = None if moments is None else moments.frames[camera][::every][:most]
             pixels = split_video(path, own / camera, every, most, pixels, chosen=chosen)
         pixels = 0
-        for camera, path in videos.get("masks", {}).items():
-            chosen = (
-                None
-                if moments is None
-                else _mask_frames(path, camera, moments, seconds)[::every][:most]
-            )
-            photos = videos["images"][camera]
+        for camera, path in mask_videos.items():
+            chosen = None
+            if moments is not None:
+                chosen = _mask_frames(path, camera, moments, seconds)[::every][:most]
+            photos = photo_videos[camera]
             pixels = split_video(
                 path, mattes / camera, every, most, pixels, chosen=chosen, mask_of=photos
             )
-        notes = [note for path in videos["images"].values() if (note := _color_note(path))]
-        notes += [] if moments is None else moments.notes
-        warnings = () if moments is None else moments.warnings
+        notes = [note for note in map(_color_note, photo_videos.values()) if note is not None]
+        warnings = ()
+        if moments is not None:
+            notes += moments.notes
+            warnings = moments.warnings
+        found = VideoPhotos(
+            own, None if masks is None else mattes, tuple(dict.fromkeys(notes)), warnings
+        )
         with named_after(own, images), named_after(mattes, masks or images):
-            yield VideoPhotos(
-                own, mattes if "masks" in videos else masks, tuple(dict.fromkeys(notes)), warnings
-            )
+            yield found
 
 
-def _has_photos(folder: Path) -> bool:
-    """Whether a folder or one in it holds a photo."""
-    return bool(scan_folder(folder).photos)
+def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
+    """The videos of a folder; none where it holds photos, unless frames are asked for."""
+    if not asked and scan_folder(folder).photos:
+        return {}
+    return find_videos(folder)
 
 
 @contextlib.contextmanager
@@ -192,10 +189,8 @@ def _moments(
         with reading(path, "video", CaptureError):
             rates += filter(None, [_shown(path).rate])
     seconds = None if most is None or not rates else (most * every + 1) / min(rates)
-    return (
-        find_moments({camera: frame_times(path, seconds) for camera, path in videos.items()}),
-        seconds,
-    )
+    times = {camera: frame_times(path, seconds) for camera, path in videos.items()}
+    return find_moments(times), seconds
 
 
 def _mask_frames(
@@ -222,8 +217,10 @@ def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, "
     """
     with reading(path, "video", CaptureError):
         command = _ffmpeg(path, "metadata=mode=add:key=a:value=a,metadata=mode=print:file=-")
-        command += ["-copyts"] if _shown(path).from_zero else []
-        command += [] if seconds is None else ["-t", f"{seconds:.6f}"]
+        if _shown(path).from_zero:
+            command.append("-copyts")
+        if seconds is not None:
+            command += ["-t", f"{seconds:.6f}"]
         lines = _finished(path, [*command, "-f", "null", "-"]).decode(errors="replace")
         found = re.findall(r"^frame:.*pts_time:(\S+)", lines, re.MULTILINE)
         if not found:
@@ -255,14 +252,10 @@ def split_video(
         width, height = _frame_size(path, shown)
         folder.mkdir(parents=True)
         if chosen is None:
+            # one frame more than there is room for, so that too many are noticed
             room = max(0, limits().video_pixels - before) // (width * height)
-            count = _run(
-                path,
-                folder,
-                f"not(mod(n\\,{every}))",
-                room + 1 if most is None else min(most, room + 1),
-                shown,
-            )
+            wanted = room + 1 if most is None else min(most, room + 1)
+            count = _run(path, folder, f"not(mod(n\\,{every}))", wanted, shown)
         else:
             count = sum(number is not None for number in chosen)
             _check_pixels(before + count * width * height, count, width, height)
@@ -282,9 +275,8 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
             f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it"
             " goes with"
         )
-    for i, place in reversed(
-        list(enumerate(places))
-    ):  # from the end: a name is free when it is taken
+    # from the end: a name is free when it is taken
+    for i, place in reversed(list(enumerate(places))):
         (folder / f"{i:08d}.png").rename(folder / f"{place:08d}.png")
 
 
@@ -297,14 +289,12 @@ def _expression(numbers: Sequence[int]) -> str:
 
     Raises: Refused for too many that follow no rule.
     """
-    terms = [
-        (
-            f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))"
-            if step
-            else f"eq(n\\,{first})"
-        )
-        for first, step, last in progressions(numbers)
-    ]
+    terms = []
+    for first, step, last in progressions(numbers):
+        if step:
+            terms.append(f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))")
+        else:
+            terms.append(f"eq(n\\,{first})")
     if len(terms) > MOST_RUNS:
         count = f"{len(numbers):,} frames to be paired by time with those of other rates"
         raise Refused(f"{count}: expected a larger step, or fewer frames")
@@ -361,7 +351,10 @@ def _shown(path: Path) -> _Shown:
     if line is None:
         return _Shown()  # what reads its frames says what is wrong
     rate, shape, colors = RATE.search(line[1]), PIXEL_SHAPE.search(line[1]), COLORS.search(line[1])
-    a_second = float(rate[1]) * (1000 if rate[2] else 1) if rate else None
+    a_second = None
+    if rate is not None:
+        unit = 1000 if rate[2] else 1
+        a_second = float(rate[1]) * unit
     found = _Shown(rate=a_second, from_zero="Input #0, mpegts" not in text)
     if shape is not None and shape[1] != shape[2]:
         wide, high = int(shape[1]), int(shape[2])
@@ -377,7 +370,8 @@ def _shown(path: Path) -> _Shown:
 
 def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _Shown:
     bright = transfer in TRANSFERS
-    code = PRIMARIES.get(primaries, PRIMARIES["bt2020"] if bright and primaries == "unknown" else 1)
+    usual = PRIMARIES["bt2020"] if bright and primaries == "unknown" else 1
+    code = PRIMARIES.get(primaries, usual)
     encoding = of_code_points(code, TRANSFERS.get(transfer, 1))
     if encoding is None:
         return shown
@@ -406,11 +400,9 @@ def _shown_as_mask(path: Path, photos: Path) -> _Shown:
 def _color_note(path: Path) -> str | None:
     with reading(path, "video", CaptureError):
         shown = _shown(path)
-    return (
-        None
-        if shown.encoding is None
-        else f"videos with other colors than sRGB's ({shown.about}): converted"
-    )
+    if shown.encoding is None:
+        return None
+    return f"videos with other colors than sRGB's ({shown.about}): converted"
 
 
 def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
@@ -428,9 +420,8 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
     """
     with reading(path, "video", CaptureError):
         folder.mkdir(parents=True)
-        if _run(
-            path, folder, "+".join(f"eq(n\\,{i})" for i in chosen), len(chosen), _shown(path)
-        ) != len(chosen):
+        select = "+".join(f"eq(n\\,{i})" for i in chosen)
+        if _run(path, folder, select, len(chosen), _shown(path)) != len(chosen):
             raise Refused("its frames are not the same when they are read again")
         for i, frame in enumerate(chosen):
             (folder / f"{i:08d}.png").rename(folder / f"frame_{frame:08d}.png")
@@ -462,10 +453,8 @@ def _small_frames(
     with reading(path, "video", CaptureError):
         width, height = _frame_size(path, _shown(path))
         # frames of the size that is wanted, raw, through a pipe
-        room, scale = (
-            limits().video_pixels // (width * height),
-            min(1.0, longer_side / max(width, height)),
-        )
+        room = limits().video_pixels // (width * height)
+        scale = min(1.0, longer_side / max(width, height))
         w, h = (max(1, round(side * scale)) for side in (width, height))
         select = "" if chosen is None else f"select={_expression(chosen)},"
         command = [*_ffmpeg(path, f"{select}scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
@@ -481,10 +470,12 @@ def _small_frames(
             clock, count = threading.Timer(LONGEST_SECONDS, process.kill), 0
             clock.start()
             try:
-                while len(data := process.stdout.read(size)) == size:
+                data = process.stdout.read(size)
+                while len(data) == size:
                     count += 1
                     _check_pixels(count * width * height, count, width, height)
                     yield np.frombuffer(data, np.uint8).reshape(h, w, -1)
+                    data = process.stdout.read(size)
                 if process.wait():
                     said.seek(0)
                     raise _said(path, said.read())
@@ -548,7 +539,8 @@ def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int
     ]
     _finished(path, command, folder)  # in the folder: its path may hold a % of its own
     table.unlink(missing_ok=True)
-    if not (count := sum(1 for _ in folder.iterdir())):
+    count = sum(1 for _ in folder.iterdir())
+    if not count:
         raise _said(path, b"")
     return count
 
