@@ -7,7 +7,8 @@ that go from cameras to the world in place of the other way round do not meet, a
 axis points up may meet and show a person upside down or mirrored.
 
 Where the calibration fails, the same is asked of the mistakes that are known, so that the error can
-name the one without which keypoints and cameras agree.
+name the one without which keypoints and cameras agree. Where no mistake explains it, cameras are
+found from the person, as for photos without a calibration, and asked in its place.
 """
 
 import dataclasses
@@ -16,14 +17,16 @@ from typing import NamedTuple
 import numpy as np
 
 from humangs_jax.capture.fitting.camera_errors import find_camera_errors, mended
+from humangs_jax.capture.fitting.person_cameras import cameras_from_person
+from humangs_jax.capture.fitting.person_moments import PersonViews
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.photos import Photos
 
 MOST_MISSED = 0.06
 """Median distance of landmarks from the triangulated ones over the person's size in the photo, from
-which on a calibration is wrong. It was 0.015 for four photos of a woman, 0.12 with their y axis
-upside down. A camera turned by a degree adds 0.02 in its own photo."""
+which on a calibration is wrong whatever else is known. It was 0.015 for four photos of a woman,
+0.12 with their y axis upside down. A camera turned by a degree adds 0.02 in its own photo."""
 AGREES = 0.035
 """The same, below which cameras agree."""
 BETTER = 0.5
@@ -107,12 +110,49 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
     for view in range(len(K)) if len(K) >= LEAST_VIEWS else ():
         others = dataclasses.replace(keypoints, confidences=keypoints.confidences.copy())
         others.confidences[view] = 0
-        without = agreement(K, matrices, frames, others)
-        if without is not None and _agrees(without):
+        rest = agreement(K, matrices, frames, others)
+        if rest is not None and _agrees(rest) and rest.missed <= BETTER * found.missed:
             return None
+    without = _without_calibration(photos, keypoints)
+    if without is not None and _agrees(without) and without.missed <= BETTER * found.missed:
+        return Contradiction(found, "without it", without)
+    # the person may have moved between the photos, which looks like a small contradiction
     if found.missed <= MOST_MISSED and not (found.mirrored or found.behind):
         return None
     return Contradiction(found, None, None)
+
+
+def _without_calibration(photos: Photos, keypoints: Keypoints) -> Agreement | None:
+    """How well cameras that are found from the person agree with the keypoints.
+
+    None where that cannot be known: several moments, no 3D landmarks, or cameras that do not
+    explain all photos.
+    """
+    if keypoints.world is None or len(np.unique(photos.frames)) > 1:
+        return None
+    height, width = photos.images.shape[1:3]
+    views = len(photos.names)
+    seen = PersonViews(
+        points=np.asarray(keypoints.points, np.float64),
+        visibility=np.asarray(keypoints.confidences, np.float64),
+        world=np.asarray(keypoints.world, np.float64),
+        names=keypoints.set.names,
+        sizes=((width, height),) * views,
+        focal=np.full(views, np.nan),
+        photos=tuple(photos.names),
+    )
+    try:
+        cameras = cameras_from_person(seen)
+    except ValueError:  # the person is not seen well enough
+        return None
+    if cameras.moments > 1 or len(cameras.views) < views:
+        return None
+    # the median distance over the person's size, as in `agreement`
+    pairs = zip(seen.points, seen.visibility > SEEN, strict=True)
+    sizes = [np.ptp(points[known], axis=0).max() for points, known in pairs]
+    pixels = float(np.median(cameras.errors))
+    missed = float(np.median(cameras.errors / np.maximum(sizes, 1.0)))
+    return Agreement(missed, pixels, mirrored=False, behind=False)
 
 
 def _agrees(found: Agreement) -> bool:
