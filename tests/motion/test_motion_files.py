@@ -23,7 +23,7 @@ from humangs_jax.motion.skeleton import shipped_joints
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "network"))
 from joblib_files import joblib
-from torch_writer import FakeTensor, write_checkpoint, write_stream
+from torch_writer import FakeTensor, plain_pickle, write_checkpoint
 
 FRAMES = 6
 SINGLE, MATRICES = 1e-5, 2e-5
@@ -435,7 +435,7 @@ FILES = {
         {"places": False},
     ),
     "GVHMR": (torch(write_checkpoint, gvhmr()), BODY, {}),
-    "GVHMR, older torch": (torch(write_stream, gvhmr()), BODY, {}),
+    "GVHMR, pickled tensors": (saved("a.pkl", gvhmr(), plain_pickle), BODY, {}),
     "GVHMR, pickled": (saved("a.pkl", gvhmr()), BODY, {}),
     "GVHMR, the camera alone": (
         saved("a.pkl", {"smpl_params_incam": parts(*down(ROTATIONS, PLACES))}),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-from torch_writer import tensors, write_checkpoint, write_stream
+from torch_writer import tensors, write_checkpoint
 
 from humangs_jax.io.tensors import is_safetensors, read_tensors
 
@@ -12,7 +12,6 @@ STATE = {
 WRITERS = {
     "safetensors": lambda path: save_file(STATE, path),
     "zip": lambda path: write_checkpoint(path, tensors(STATE)),
-    "stream": lambda path: write_stream(path, tensors(STATE)),
 }
 
 

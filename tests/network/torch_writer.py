@@ -12,7 +12,7 @@ from unittest import mock
 
 import numpy as np
 
-from humangs_jax.io.tensors import MAGIC_NUMBER, STORAGE_DTYPES, STREAM_VERSION
+from humangs_jax.io.tensors import MAGIC_NUMBER, STORAGE_DTYPES
 
 KINDS = {dtype: kind for kind, dtype in STORAGE_DTYPES.items() if kind != "BFloat16Storage"}
 
@@ -28,10 +28,6 @@ class FakeTensor:
     shape: tuple | None = None
     strides: tuple | None = None
     offset: int = 0
-    part: tuple | None = None
-    """(name, start, count) of the part of the storage that the tensor's own storage is; older
-    format only.
-    """
 
 
 def tensors(state):
@@ -101,67 +97,57 @@ def write_checkpoint(path, content, byteorder="little", compression=zipfile.ZIP_
     return path
 
 
-def write_stream(
-    path, content, magic=MAGIC_NUMBER, version=STREAM_VERSION, little=True, count=lambda size: size
-):
-    """The same in the older format."""
-    data, storages = pickled(content, lambda tensor: (tensor.part,))
-    machine = {
-        "protocol_version": version,
-        "little_endian": little,
-        "type_sizes": {"short": 2, "int": 4, "long": 4},
-    }
-    with open(path, "wb") as file:
-        file.write(b"".join(pickle.dumps(x, 2) for x in (magic, version, machine)) + data)
-        file.write(pickle.dumps([str(i) for i in range(len(storages))], 2))
-        for storage in storages:
-            file.write(struct.pack("<q", count(storage.size)) + storage.tobytes())
-    return path
+def stream(storage, kind="FloatStorage", little=True, count=None, first=MAGIC_NUMBER):
+    """One storage as torch puts it into a plain pickle: a file from before torch 1.6."""
+    module = types.ModuleType("torch")
+    setattr(module, kind, type(kind, (), {"__module__": "torch"}))
+    size = storage.size if count is None else count
+
+    class Reference:
+        pass
+
+    class Pickler(pickle.Pickler):
+        def persistent_id(self, value):
+            if not isinstance(value, Reference):
+                return None
+            return ("storage", getattr(module, kind), "94", "cpu", size, None)
+
+    file = io.BytesIO()
+    for value in (first, 1001, {"protocol_version": 1001, "little_endian": little}):
+        pickle.dump(value, file, 2)
+    with mock.patch.dict(sys.modules, {"torch": module}):
+        Pickler(file, 2).dump(Reference())
+    pickle.dump(["94"], file, 2)
+    return file.getvalue() + struct.pack("<q", size) + storage.tobytes()
 
 
-def write_python2_stream(path, state, device="cuda:0"):
-    """A state dict as Python 2 wrote it in the older format, instruction by instruction: the form
-    of lpips' heads.
+def plain_pickle(content, stream=stream):
+    """A pickle of arrays as those of tensors that `pickle.dump` writes."""
+    names = {"torch.storage": "_load_from_bytes", "torch._utils": "_rebuild_tensor_v2"}
+    modules = {"torch": types.ModuleType("torch")}
+    for module, name in names.items():
+        modules[module] = types.ModuleType(module)
+        function = types.FunctionType((lambda *_: None).__code__, {}, name)
+        function.__module__, function.__qualname__ = module, name
+        setattr(modules[module], name, function)
+    load = modules["torch.storage"]._load_from_bytes
+    rebuild = modules["torch._utils"]._rebuild_tensor_v2
 
-    Strings are bytes, an OrderedDict is a call with a list of [key, value] lists, and its
-    attributes follow.
-    """
-    text = lambda value: b"U" + bytes([len(value)]) + value.encode()
-    count = lambda value: b"J" + struct.pack("<i", value)
-    counts = lambda values: b"(" + b"".join(map(count, values)) + b"t"
-    metadata = (
-        text("_metadata")
-        + b"ccollections\nOrderedDict\n(](]("
-        + text("")
-        + b"}"
-        + text("version")
-        + b"K\x01seetR"
-    )
+    class Stored:
+        def __init__(self, array):
+            self.data = stream(array, KINDS[array.dtype])
 
-    def tensor(i, x):
-        kind = f"ctorch\n{KINDS[x.dtype]}\n".encode()
-        reference = (
-            b"("
-            + text("storage")
-            + kind
-            + text(str(i))
-            + text(device)
-            + b"\x8a\x03"
-            + x.size.to_bytes(3, "little")
-        )
-        view = count(0) + counts(x.shape) + counts(contiguous(x.shape))
-        return b"ctorch._utils\n_rebuild_tensor_v2\n(" + reference + b"NtQ" + view + b"\x89NtR"
+        def __reduce__(self):
+            return load, (self.data,)
 
-    pairs = (b"](" + text(key) + tensor(i, x) + b"e" for i, (key, x) in enumerate(state.items()))
-    data = (
-        b"\x80\x02ccollections\nOrderedDict\n](" + b"".join(pairs) + b"e\x85R}" + metadata + b"sb."
-    )
-    machine = (
-        b"\x80\x02}(" + text("protocol_version") + b"M\xe9\x03" + text("little_endian") + b"\x88u."
-    )
-    with open(path, "wb") as file:
-        file.write(pickle.dumps(MAGIC_NUMBER, 2) + pickle.dumps(STREAM_VERSION, 2) + machine + data)
-        file.write(b"\x80\x02](" + b"".join(text(str(i)) for i in range(len(state))) + b"e.")
-        for x in state.values():
-            file.write(struct.pack("<q", x.size) + x.tobytes())
-    return path
+    class Pickler(pickle.Pickler):
+        def reducer_override(self, value):
+            if not isinstance(value, np.ndarray):
+                return NotImplemented
+            view = (Stored(value), 0, value.shape, contiguous(value.shape), False)
+            return rebuild, (*view, collections.OrderedDict())
+
+    file = io.BytesIO()
+    with mock.patch.dict(sys.modules, modules):
+        Pickler(file, 4).dump(content)
+    return file.getvalue()

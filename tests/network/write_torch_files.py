@@ -1,5 +1,5 @@
-"""Writes data/torch_*: one state dict in both formats of `torch.save`, and its numbers as npz.
-Needs torch; tests do not.
+"""Writes data/torch_zip.pth: a state dict as `torch.save` writes it, and its numbers as npz; and
+data/torch_stream.pt, as before torch 1.6. Needs torch; tests do not.
 
 python tests/network/write_torch_files.py
 """
