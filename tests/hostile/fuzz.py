@@ -317,22 +317,22 @@ def mutated_safetensors(data, draw):
 KINDS = {
     mutated_npz: (
         "npz, smplx npz, hands, body, avatar, keypoints npz, motion npz, amass, thuman, human3r,"
-        " smplcodec, sam 3d, joints npz, fit record, bank, video poses, scene arrays"
+        " smplcodec, sam 3d, fit record, bank, video poses, scene arrays"
     ),
     mutated_json: (
         "panoptic, shelf, easymocap motion, easymocap annots, json, configuration, transforms,"
-        " opencv json, openpose, coco, coco annotations, mmpose, lhm, face scores, joints json, manifest,"
+        " opencv json, openpose, coco, coco annotations, mmpose, lhm, face scores, manifest,"
         " capture, photos, boundary, import, avatarrex, scene list, evaluation, preprocessed set,"
         " preprocessed scene, skipped subject"
     ),
-    mutated_pickle: "pickle, smplx pkl, aist, phalp, thuman fit",
+    mutated_pickle: "pickle, pickled tensors, smplx pkl, aist, phalp, thuman fit",
     mutated_text: (
-        "opencv yaml, toml, qualisys, easymocap, colmap, obj, off, log, bvh, face table, 3dgs text, missing"
+        "opencv yaml, toml, qualisys, easymocap, colmap, obj, log, bvh, face table, 3dgs text, missing"
         " photos, actorshq, thuman mesh, thuman scan"
     ),
     mutated_png: "image",
     mutated_zip: "torch zip, gvhmr",
-    mutated_glb: "glb, glb motion, glb face, vrma face, glb splats",
+    mutated_glb: "glb motion, glb face, vrma face, glb splats",
     mutated_spz: "spz, spz 4",
     mutated_safetensors: "safetensors, weights",
 }

