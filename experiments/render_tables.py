@@ -73,9 +73,7 @@ def render_pages(repository: Path, write: bool) -> list[str]:
 
 
 def format_table(name: str) -> str:
-    """What the package or the experiments have, as a table in Markdown: "cameras", "keypoints" or
-    "motions" that are read, "limits", "protocols", "rooms" or "systems".
-    """
+    """What the package or the experiments have, as a table in Markdown. name: of `TABLES`."""
     header, rows = TABLES[name]()
     return "".join(f"| {' | '.join(row)} |\n" for row in (header, ["---"] * len(header), *rows))
 
@@ -188,6 +186,34 @@ def _rooms() -> Table:
     return ("", "room", "contents"), sorted(rows, key=lambda row: order.index(row[0]))
 
 
+def _exports() -> Table:
+    """The files of other programs that an avatar becomes."""
+    from humangs_jax.avatar.export import EXPORTS
+
+    rows = []
+    for each in EXPORTS.values():
+        shared = sum(other.suffixes == each.suffixes for other in EXPORTS.values()) > 1
+        option = " --mesh" if each.mesh and shared else ""
+        what = each.about.removeprefix("with --mesh ")
+        rows.append((f"`{each.suffixes[0]}{option}`", what, each.up))
+    return ("file", "what", "up"), rows
+
+
+def _videos() -> Table:
+    """The files that a motion becomes."""
+    from humangs_jax.avatar.export import VIDEOS
+    from humangs_jax.core.registry import FOLDER
+
+    return ("name ends in", "what", "transparent"), [
+        (
+            "none: a folder" if FOLDER in each.suffixes else f"`{each.suffixes[0]}`",
+            each.about,
+            "yes" if each.transparent else "no",
+        )
+        for each in VIDEOS.values()
+    ]
+
+
 def _systems() -> Table:
     """The networks that the paper is compared with."""
     from experiments.systems import ONE_PHOTO, SYSTEMS
@@ -202,12 +228,14 @@ def _systems() -> Table:
 
 TABLES: dict[str, Callable[[], Table]] = {
     "cameras": _cameras,
+    "exports": _exports,
     "keypoints": _keypoints,
     "limits": _limits,
     "motions": _motions,
     "protocols": _protocols,
     "rooms": _rooms,
     "systems": _systems,
+    "videos": _videos,
 }
 """By the name in `<!-- formats: NAME -->`."""
 
