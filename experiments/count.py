@@ -276,6 +276,7 @@ def all_walks() -> dict[str, list[str]]:
 
     import humangs_jax as hg
     from humangs_jax.data.loading import Example
+    from humangs_jax.data.prepared import PreparedCapture
     from humangs_jax.data.views import SubjectViews, gaussian_body, standardize
     from humangs_jax.network.parts import Drawn, HumanGSInputs
     from humangs_jax.training import step
@@ -289,7 +290,9 @@ def all_walks() -> dict[str, list[str]]:
     avatar: list[hg.Avatar] = []
     photos = lambda: avatar.append(hg.reconstruct(state.variables, config.model, capture))
     found = {
-        "walk: photos through reconstruct": walked(photos, hg.Capture, SubjectViews, HumanGSInputs)
+        "walk: photos through reconstruct": walked(
+            photos, hg.Capture, PreparedCapture, SubjectViews, HumanGSInputs
+        )
     }
     gaussians = hg.animate(avatar[0], capture.pose(0))
     image = lambda: hg.render(gaussians, capture.cameras[0])

@@ -5,8 +5,6 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
 from experiments.harness import Run, entry, means
 from experiments.results import cells, markdown_table
@@ -14,10 +12,8 @@ from experiments.subjects import RING, People
 from humangs_jax.avatar import reconstruct as reconstruction
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.unseen import with_guesses
-from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.skirt import with_skirt
-from humangs_jax.data.views import gaussian_body
+from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import PROTOCOLS, mean_scores, score_views
 from humangs_jax.losses.loss_networks import load_lpips
@@ -87,12 +83,9 @@ def unseen(
 
 def both_avatars(variables: Any, config: HumanGSConfig, capture: Capture) -> dict[str, Avatar]:
     """The avatars of a capture as the network makes it, and with guesses, by one pass."""
-    body = gaussian_body(capture.body, config)
-    views, _ = reconstruction._views(capture, body, config)
-    if views.displacement is not None:
-        worn = with_skirt(body, capture, np.asarray(views.displacement))
-        if worn is not None:
-            body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
+    prepared = prepare_capture(capture, config)
+    body, views = prepared.body, reconstruction.network_views(prepared, config)
+    assert body is not None  # prepared for this network
     inputs = reconstruction._prepare(body, views, config)
     sized = reconstruction.fit_buffers(inputs.foreground, inputs.view_count, config)
     outputs = _network(variables, sized, inputs)

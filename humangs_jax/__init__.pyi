@@ -9,6 +9,8 @@ from .data.capture import Capture as Capture
 from .data.capture import load_capture as load_capture
 from .data.capture import capture_from_arrays as capture_from_arrays
 from .data.capture import save_capture as save_capture
+from .data.prepared import PreparedCapture as PreparedCapture
+from .data.prepared import prepare_capture as prepare_capture
 from .avatar.reconstruct import stack_captures as stack_captures
 from .motion import load_motion as load_motion
 

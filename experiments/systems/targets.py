@@ -20,7 +20,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_b
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import equal_exposure
+from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.data.views import (
     SubjectViews,
     gaussian_body,
@@ -174,7 +174,7 @@ def reconstructed(
     buffers that fit.
     """
     body = gaussian_body(inputs.body, config)
-    views = standardize(equal_exposure(inputs), config.image_size, config.runtime.crop)
+    views = standardize(prepare_capture(inputs).capture, config.image_size, config.runtime.crop)
     prepared = _prepare(body, views, config)
     config = fit_buffers(prepared.foreground, prepared.view_count, config)
     return _outputs(variables, prepared, config), body, views, config

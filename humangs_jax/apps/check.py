@@ -21,6 +21,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from humangs_jax.apps.crops import around_person
 from humangs_jax.apps.quick_check import faults
+from humangs_jax.avatar.attach_face import shipped_network
 from humangs_jax.avatar.video import contact_sheet
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, pose_body, shape_body
@@ -30,9 +31,11 @@ from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.progress import text_table
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.data.body_and_masks import MASK_THRESHOLD, displacement
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.skirt import with_skirt
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.prepared import PreparedCapture, prepare_capture
+from humangs_jax.data.skirt import SKIRT_VERTICES
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import to_uint8
@@ -154,14 +157,18 @@ class CheckReport:
 
 
 def check_capture(
-    capture: Capture, out: str | Path, keypoints: Keypoints | None = None
+    capture: Capture | PreparedCapture, out: str | Path, keypoints: Keypoints | None = None
 ) -> CheckReport:
     """Draw the posed body over every photo, write the sheet as a PNG, and report how well they
     agree.
 
-    Arguments: keypoints: of the views, if they are known: whether the cameras may be at fault.
+    Arguments: capture: also one that is prepared for a network; else it is prepared for the one
+    that comes with the package. keypoints: of the views, if they are known: whether the cameras may
+    be at fault.
     Raises: OSError if the sheet cannot be written.
     """
+    prepared = capture if isinstance(capture, PreparedCapture) else _prepared(capture)
+    capture = capture.given if isinstance(capture, PreparedCapture) else capture
     right = keypoints is not None and not find_camera_errors(capture, keypoints)
     # faults look at the photos as they are, the sheet at smaller ones
     found = faults(capture)
@@ -170,17 +177,13 @@ def check_capture(
         capture = capture.resized(LONGEST_SIDE)
     shown, tints = _shown(whole, capture, vertices), side_tints(capture.body)
     # the body as `reconstruct` will use it, moved to the masks and with a skirt, is drawn in yellow
-    moves, worn = capture.displacement, None
-    if capture.masks is not None:
-        moves = displacement(capture.body, capture, always=False) if moves is None else moves
-        worn = with_skirt(capture.body, capture, moves)
-    body, moves = (capture.body, moves) if worn is None else worn
-    moves = None if moves is None or not moves.any() else moves
-    displaced = (
-        None
-        if moves is None
-        else _posed_frames(dataclasses.replace(capture, body=body, displacement=None), moves)
-    )
+    body, moves = capture.body, None
+    if prepared is not None and prepared.displacement is not None and prepared.displacement.any():
+        assert prepared.body is not None
+        body, moves = prepared.body, prepared.displacement
+    displaced = None
+    if moves is not None:
+        displaced = _posed_frames(dataclasses.replace(capture, body=body), moves)
     moved_tints = side_tints(body)
     # compare each silhouette with its mask, and draw it
     overlays, views = [], []
@@ -211,15 +214,24 @@ def check_capture(
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, inside, warning))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
-    # the vertices of a skirt follow those of the body, and do not count
-    farthest = (
-        0.0
-        if moves is None
-        else float(np.linalg.norm(moves[: len(capture.body.template)], axis=1).max())
-    )
-    return CheckReport(
-        tuple(views), found.whole, farthest, capture.displacement is not None, worn is not None
-    )
+    skirt = prepared is not None and prepared.skirt
+    farthest = 0.0
+    if moves is not None:
+        # the vertices of a skirt follow those of the body, and do not count
+        own = moves[: len(moves) - SKIRT_VERTICES] if skirt else moves
+        farthest = float(np.linalg.norm(own, axis=1).max())
+    registered = capture.displacement is not None
+    return CheckReport(tuple(views), found.whole, farthest, registered, skirt)
+
+
+def _prepared(capture: Capture) -> PreparedCapture | None:
+    """The capture as `reconstruct` will use it with the network of the package; None if no view
+    shows the person.
+    """
+    try:
+        return prepare_capture(capture, shipped_network())
+    except CaptureError:
+        return None  # the sheet shows what is wrong
 
 
 def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3"]]) -> Capture:

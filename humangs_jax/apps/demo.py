@@ -28,6 +28,7 @@ from humangs_jax.avatar.video import contact_sheet, side_by_side, write_video
 from humangs_jax.core.progress import COMPILING, stage
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
+from humangs_jax.data.view_choice import select_views
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import add_files, check_ours
@@ -115,9 +116,9 @@ def _write_demo(
 ) -> dict[str, Any]:
     began, timings = time.perf_counter(), dict[str, Any]()
     with stage("loading"):
-        inputs = _timed(
-            timings, "load_capture", lambda: settings.photos(load_capture(DEMO_CAPTURE))
-        )
+        inputs = _timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE))
+        if settings.views is not None:
+            inputs = inputs.select(select_views(inputs, settings.views))
         truth, motion = load_capture(f"{DEMO_CAPTURE}/held_out"), load_motion()
         variables, config = _timed(timings, "load_weights", lambda: load_weights(weights))
         config = settings.network(config)

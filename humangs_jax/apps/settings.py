@@ -33,9 +33,8 @@ from humangs_jax.core.configuration import (
 )
 from humangs_jax.core.processes import peak_memory
 from humangs_jax.core.progress import bar
-from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import select_views
+from humangs_jax.data.prepared import PreparedCapture, prepare_capture
 from humangs_jax.io.reading import Refused, parse_json, read_text, reading, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
@@ -110,12 +109,9 @@ class Settings:
         """A network of these weights, run in this way."""
         return dataclasses.replace(config, runtime=self.runtime)
 
-    def photos(self, capture: Capture) -> Capture:
+    def photos(self, capture: Capture | PreparedCapture) -> PreparedCapture:
         """The photos that are used."""
-        capture = usable_views(capture)
-        if self.views is None or self.views >= capture.view_count:
-            return capture
-        return capture.select(select_views(capture, self.views))
+        return prepare_capture(capture, views=self.views)
 
     def shot(self, shot: Shot) -> Shot:
         """A shot, drawn in this way where it does not say how."""

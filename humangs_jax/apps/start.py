@@ -20,10 +20,8 @@ from humangs_jax.capture.calibration.photos import (
     is_transparent,
 )
 from humangs_jax.core.array_types import Float, PyTree
-from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.folders import (
     ELSEWHERE,
     VIDEO_SUFFIXES,
@@ -33,7 +31,9 @@ from humangs_jax.data.folders import (
     unused_line,
 )
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
-from humangs_jax.data.views import cropped, select_views
+from humangs_jax.data.prepared import PreparedCapture, prepare_capture
+from humangs_jax.data.view_choice import best_views
+from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.geometry import quaternion
@@ -328,7 +328,7 @@ class HeldOut(NamedTuple):
 def held_out_psnr(
     variables: PyTree,
     config: HumanGSConfig,
-    capture: Capture,
+    capture: Capture | PreparedCapture,
     refinement: RefineConfig | None,
     number: int = 0,
 ) -> HeldOut | None:
@@ -338,16 +338,14 @@ def held_out_psnr(
     Body and cameras are those of all photos. In its place is a second copy of the nearest photo:
     the programs for that number of photos are compiled already.
     """
-    capture = photos_to_read(usable_views(capture))
-    if max(capture.images.shape[1:3]) > LONGEST:
-        capture = capture.resized(LONGEST)
-    capture = equal_exposure(capture)
+    photos = _photos_to_hold_out(capture)
+    capture = photos.capture
     if capture.masks is None or capture.view_count < LEAST_PHOTOS:
         return None
     views = np.arange(capture.view_count)
     apart = _distances(capture)
     view = int(np.argsort(apart.min(axis=1), kind="stable")[number])
-    others = capture.select(np.where(views == view, int(apart[view].argmin()), views))
+    others = photos.select(np.where(views == view, int(apart[view].argmin()), views))
     avatar = reconstruct(variables, config, others)
     if refinement is not None:
         avatar = refine(
@@ -366,6 +364,13 @@ def held_out_psnr(
     return HeldOut(capture.names[view], psnr, aligned)
 
 
+def _photos_to_hold_out(capture: Capture | PreparedCapture) -> PreparedCapture:
+    """Photos of which one can be held out, prepared once."""
+    photos = photos_to_read(prepare_capture(capture))
+    large = max(photos.capture.images.shape[1:3]) > LONGEST
+    return photos.resized(LONGEST) if large else photos
+
+
 def _with_unknown(capture: Capture) -> Capture:
     """The capture with unknown areas, so that a crop knows where its photo ends."""
     if capture.unknown is not None:
@@ -373,13 +378,13 @@ def _with_unknown(capture: Capture) -> Capture:
     return dataclasses.replace(capture, unknown=np.zeros(capture.images.shape[:3], bool))
 
 
-def photos_to_read(capture: Capture) -> Capture:
+def photos_to_read(photos: PreparedCapture) -> PreparedCapture:
     """The photos of a capture that the network reads: `READ` of them that show the body best, where
     cameras were found from the person; else all.
     """
-    if capture.calibrated or capture.view_count <= READ:
-        return capture
-    return capture.select(select_views(capture, READ))
+    if photos.capture.calibrated or photos.capture.view_count <= READ:
+        return photos
+    return photos.select(best_views(photos.capture, READ))
 
 
 def better_body(
@@ -396,11 +401,13 @@ def better_body(
     Several photos are asked, see `photos_agree`. Without enough photos the first.
     """
     reports: list[tuple[HeldOut, HeldOut]] = []
+    photos = _photos_to_hold_out(first)
+    others = _photos_to_hold_out(second)
 
     def gains() -> Iterator[float]:
         for number in range(ASKED):
-            one = held_out_psnr(variables, config, first, refinement, number)
-            two = one and held_out_psnr(variables, config, second, refinement, number)
+            one = held_out_psnr(variables, config, photos, refinement, number)
+            two = one and held_out_psnr(variables, config, others, refinement, number)
             if one is None or two is None:
                 return
             reports.append((one, two))

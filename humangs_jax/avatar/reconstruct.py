@@ -5,10 +5,9 @@ few sizes (`buffers.round_up`), and padding is masked.
 """
 
 import contextlib
-import functools
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,15 +35,16 @@ from humangs_jax.core.array_types import Array, Bool, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import equal_exposure
-from humangs_jax.data.skirt import find_hem, with_skirt
+from humangs_jax.data.prepared import (
+    PreparedCapture,
+    allows_vertex_offsets,
+    prepare_capture,
+)
 from humangs_jax.data.views import (
     SubjectViews,
-    fits,
     gaussian_body,
-    on_gaussian_body,
+    has_mesh_of,
     pad_views,
     prepare_inputs,
     standardize,
@@ -75,7 +75,9 @@ BATCH = 8
 
 
 @checked_arguments
-def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -> Avatar:
+def reconstruct(
+    variables: Variables, config: HumanGSConfig, capture: Capture | PreparedCapture
+) -> Avatar:
     """Reconstruct the person of a capture.
 
     Photos are brought to the network's image size, their exposure is made equal, and views whose
@@ -92,7 +94,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
         config: of the network.
-        capture: photos, cameras, poses, and masks if there are some.
+        capture: photos, cameras, poses, and masks if there are some; or what `prepare_capture` made
+            of it.
 
     Returns:
         The avatar in the T-pose of the person's own shape.
@@ -105,40 +108,26 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
         >>> avatar = hg.reconstruct(*hg.load_weights(), hg.load_capture("demo_capture"))
     """
     _check(capture, "capture")
-    body = gaussian_body(capture.body, config)
-    views, turned = _views(capture, body, config)
-    displaced = views.displacement is not None
-    if (
-        displaced
-        and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None
-    ):
-        body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
+    prepared = prepare_capture(capture, config)
+    body, views = prepared.body, network_views(prepared, config)
+    assert body is not None  # prepared for a network
+
+    # few numbers of views are compiled, and the photos say how many tokens there are
     count = len(views.images)
-    if (bucket := round_up(count, smallest=1)) > count:
+    bucket = round_up(count, smallest=1)
+    if bucket > count:
         views = pad_views(views, bucket)
     with compiling(("reconstruct", config, views.images.shape)):
-        return _alone(variables, config, body, views, turned)
-
-
-def _alone(
-    variables: Variables,
-    config: HumanGSConfig,
-    body: BodyModel,
-    views: SubjectViews,
-    turned: bool,
-) -> Avatar:
-    """The avatar that the network makes of views. turned: they were turned for it."""
-    inputs = _prepare(body, views, config)
-    check_values("reconstruct: capture", {POSED: (inputs.posed_vertices, FINITE)})
-    avatar, _ = _reconstruct(
-        variables, fit_buffers(inputs.foreground, inputs.view_count, config), body, views, inputs
-    )
-    return replace(avatar, light=None) if turned else avatar
+        inputs = _prepare(body, views, config)
+        check_values("reconstruct: capture", {POSED: (inputs.posed_vertices, FINITE)})
+        sized = fit_buffers(inputs.foreground, inputs.view_count, config)
+        avatar, _ = _reconstruct(variables, sized, body, views, inputs)
+    return replace(avatar, light=None) if prepared.turned else avatar
 
 
 @checked_arguments
 def reconstruct_batch(
-    variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]
+    variables: Variables, config: HumanGSConfig, captures: Sequence[Capture | PreparedCapture]
 ) -> list[Avatar]:
     """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of
     views.
@@ -162,28 +151,25 @@ def reconstruct_batch(
         >>> avatars = hg.reconstruct_batch(*hg.load_weights(), captures)
     """
     _check_all(captures)
-    body = gaussian_body(captures[0].body, config)
-    alone = [displaces(config) and find_hem(body, capture) is not None for capture in captures]
-    together = [capture for capture, apart in zip(captures, alone, strict=True) if not apart]
-    batch = iter(_together(variables, config, together) if together else ())
-    return [
-        reconstruct(variables, config, capture) if apart else next(batch)
-        for capture, apart in zip(captures, alone, strict=True)
-    ]
+    everybody = [prepare_capture(capture, config) for capture in captures]
+    together = [prepared for prepared in everybody if not prepared.skirt]
+    batch = iter(())
+    if together:
+        body, views, sized = _stacked(config, together)
+        with compiling(("reconstruct_batch", sized, views.images.shape)):
+            avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(
+                variables, sized, body, views
+            )
+        batch = iter(avatars)
 
-
-def _together(
-    variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]
-) -> list[Avatar]:
-    body, views, config, turned = _stacked(config, captures)
-    with compiling(("reconstruct_batch", config, views.images.shape)):
-        avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(
-            variables, config, body, views
-        )
-    return [
-        replace(avatar, light=None) if moved else avatar
-        for avatar, moved in zip(avatars, turned, strict=True)
-    ]
+    found = []
+    for prepared in everybody:
+        if prepared.skirt:
+            found.append(reconstruct(variables, config, prepared))
+        else:
+            avatar = next(batch)
+            found.append(replace(avatar, light=None) if prepared.turned else avatar)
+    return found
 
 
 class Reconstructed(NamedTuple):
@@ -191,7 +177,7 @@ class Reconstructed(NamedTuple):
 
     name: str
     """The name of the capture."""
-    capture: Capture | None = None
+    capture: Capture | PreparedCapture | None = None
     """The capture; None if it could not be read."""
     avatar: Avatar | None = None
     """The avatar; None if there is an error."""
@@ -202,7 +188,7 @@ class Reconstructed(NamedTuple):
 def reconstruct_many(
     variables: Variables,
     config: HumanGSConfig,
-    captures: Mapping[str, Callable[[], Capture]],
+    captures: Mapping[str, Callable[[], Capture | PreparedCapture]],
     batch: int | None = None,
 ) -> Iterator[Reconstructed]:
     """Yields the avatar of each capture, in their order; `batch` captures at a time are read and
@@ -214,43 +200,36 @@ def reconstruct_many(
     """
     names, batch = list(captures), batch or BATCH
     for start in range(0, len(names), batch):
-        done = [
-            _tried(Reconstructed(name), "capture", captures[name], OSError)
-            for name in names[start : start + batch]
-        ]
+        done = [_loaded(name, captures[name]) for name in names[start : start + batch]]
         good = [each.capture for each in done if each.capture is not None]
         avatars: Iterator[Avatar] = iter(())
         if len(good) > 1:
             with contextlib.suppress(ValueError):  # of one of them: which one is found below
                 avatars = iter(reconstruct_batch(variables, config, good))
         for each in done:
-            if each.capture is None:
-                yield each
+            avatar = None if each.capture is None else next(avatars, None)
+            if avatar is not None:
+                yield each._replace(avatar=avatar)
+            elif each.capture is not None:
+                try:
+                    yield each._replace(avatar=reconstruct(variables, config, each.capture))
+                except ValueError as error:
+                    yield each._replace(error=error)
             else:
-                alone = functools.partial(reconstruct, variables, config, each.capture)
-                avatar = next(avatars, None)
-                yield (
-                    each._replace(avatar=avatar)
-                    if avatar is not None
-                    else _tried(each, "avatar", alone)
-                )
+                yield each
 
 
-def _tried(
-    each: Reconstructed, field: str, make: Callable[[], Any], *faults: type[Exception]
-) -> Reconstructed:
-    """`each` with the result of `make`, or with its error if that is a ValueError or one of
-    `faults`.
-    """
+def _loaded(name: str, load: Callable[[], Capture | PreparedCapture]) -> Reconstructed:
+    """A capture without its avatar, or what is wrong with it."""
     try:
-        return each._replace(**{field: make()})
-    except (ValueError, *faults) as error:
-        return each._replace(error=error)
+        return Reconstructed(name, capture=load())
+    except (ValueError, OSError) as error:
+        return Reconstructed(name, error=error)
 
 
 @checked_arguments
 def stack_captures(
-    config: HumanGSConfig, captures: Sequence[Capture]
+    config: HumanGSConfig, captures: Sequence[Capture | PreparedCapture]
 ) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
     """What several people are reconstructed from in one program of your own, without the skirts of
     `reconstruct`.
@@ -274,7 +253,9 @@ def stack_captures(
         >>> avatars, dropped = batched(variables, config, body, views)  # all as one batch
     """
     _check_all(captures)
-    body, views, config, turned = _stacked(config, captures)
+    everybody = [prepare_capture(capture, config) for capture in captures]
+    body, views, config = _stacked(config, everybody)
+    turned = [prepared.turned for prepared in everybody]
     if config.conventions.light and any(turned):
         if not all(turned):
             raise ValueError(
@@ -286,27 +267,29 @@ def stack_captures(
 
 
 def _stacked(
-    config: HumanGSConfig, captures: Sequence
-) -> tuple[BodyModel, SubjectViews, HumanGSConfig, list[bool]]:
-    """Body, views, configuration; and whether each world has been turned."""
-    body = gaussian_body(captures[0].body, config)
-    bucket = round_up(max(capture.view_count for capture in captures), smallest=1)
-    coefficients = max(len(capture.betas) for capture in captures)
-    subjects, turned = [], []
-    for capture in captures:
-        views, moved = _views(capture, body, config)
-        turned.append(moved)
-        views = pad_views(views, bucket)
+    config: HumanGSConfig, everybody: Sequence[PreparedCapture]
+) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
+    """The body, the views of all people, and the configuration with room for their tokens.
+
+    Skirts are left out: a batch shares one body.
+    """
+    body = gaussian_body(everybody[0].capture.body, config)
+    bucket = round_up(max(each.capture.view_count for each in everybody), smallest=1)
+    coefficients = max(len(each.capture.betas) for each in everybody)
+    subjects = []
+    for prepared in everybody:
+        views = pad_views(network_views(prepared, config), bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
-        still = (
-            jnp.zeros_like(body.template) if displaces(config) else None
-        )  # of photos without masks
-        displaced = still if views.displacement is None else views.displacement
-        subjects.append(replace(views, betas=betas, displacement=displaced))
+        displacement = views.displacement
+        if displacement is not None:
+            displacement = displacement[: len(body.template)]
+        elif allows_vertex_offsets(config):
+            displacement = jnp.zeros_like(body.template)  # of photos without masks
+        subjects.append(replace(views, betas=betas, displacement=displacement))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
     check_values("reconstruct: captures", {POSED: (inputs.posed_vertices, FINITE)})
-    return body, batch, fit_buffers(inputs.foreground, inputs.view_count, config), turned
+    return body, batch, fit_buffers(inputs.foreground, inputs.view_count, config)
 
 
 def _check_all(captures: Sequence) -> None:
@@ -316,35 +299,23 @@ def _check_all(captures: Sequence) -> None:
     if not captures:
         raise ValueError("captures: none given")
     for index, capture in enumerate(captures):
-        if not isinstance(capture, Capture):
+        if not isinstance(capture, Capture | PreparedCapture):
             raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")
         _check(capture, f"captures[{index}]")
-        if capture.body is not captures[0].body and not _equal(capture.body, captures[0].body):
+        body, first = _views_of(capture).body, _views_of(captures[0]).body
+        if body is not first and not _equal(body, first):
             raise ValueError(
                 f"captures[{index}]: its body is not the one of captures[0]; a batch shares one"
                 " body model"
             )
 
 
-def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[SubjectViews, bool]:
-    """What the network gets of a capture; and whether its world has been turned."""
-    photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
-    views = photos.upright(capture.body)
-    if displaces(config) and capture.displacement is not None:
-        views = replace(
-            views, displacement=on_gaussian_body(capture.displacement, capture.body, config)
-        )
-    elif displaces(config) and capture.masks is not None:
-        moved = displacement(body, capture, always=config.runtime.displacement is True)
-        views = replace(views, displacement=jnp.asarray(moved))
-    return views, views.cameras is not photos.cameras
-
-
-def displaces(config: HumanGSConfig) -> bool:
-    """Whether the body may be displaced and get a skirt: if the network looks at the person's
-    pixels alone.
-    """
-    return config.runtime.displacement is not False and config.conventions.pixels == "person"
+def network_views(prepared: PreparedCapture, config: HumanGSConfig) -> SubjectViews:
+    """The photos as the network wants them, and how far the body moves."""
+    views = standardize(prepared.capture, config.image_size, config.runtime.crop)
+    if prepared.displacement is not None:
+        views = replace(views, displacement=jnp.asarray(prepared.displacement))
+    return views
 
 
 def fit_buffers(
@@ -393,7 +364,7 @@ def reconstruct_views(
         raise ValueError(
             f"reconstruct_views: photos of {width} x {height}, config wants {side} x {side}; {made}"
         )
-    if not fits(body, config):
+    if not has_mesh_of(body, config):
         raise ValueError(
             f"reconstruct_views: a body of {len(body.template)} vertices that gaussian_body(body,"
             f" config) has not made; {made}"
@@ -527,7 +498,12 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
 
 
-def _check(capture: Capture, name: str) -> None:
+def _views_of(capture: Capture | PreparedCapture) -> Capture:
+    return capture.capture if isinstance(capture, PreparedCapture) else capture
+
+
+def _check(given: Capture | PreparedCapture, name: str) -> None:
+    capture = _views_of(given)
     if capture.view_count == 0:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
     check_limit("network_views", capture.view_count, f"photos in {name}")

@@ -34,7 +34,7 @@ from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.body.motion import Motion
-    from humangs_jax.data.capture import Capture
+    from humangs_jax.data.prepared import PreparedCapture
 
 
 DEMO_REFINE = "15s"
@@ -183,7 +183,7 @@ class Reconstruct:
         views = settings.views if settings is not None and self.views is None else self.views
         sources: dict[str, str] = {}
 
-        def photos_of(name: str, folder: Path) -> "Capture":
+        def photos_of(name: str, folder: Path) -> "PreparedCapture":
             if several:
                 sources[name] = capture_checksum(folder)
             return self._photos(folder, views)
@@ -214,7 +214,7 @@ class Reconstruct:
                     failed.append(name)
                     warn(f"{name}: {error}")
                     continue
-                if how is not None and photos.masks is None:
+                if how is not None and photos.capture.masks is None:
                     tell(f"{name}: no masks: the avatar is not refined")
                 file = out / f"{name}.npz" if several else out
                 # in a set a file is a finished avatar: one that was interrupted is made again
@@ -222,11 +222,11 @@ class Reconstruct:
                     avatar,
                     photos,
                     file,
-                    how if photos.masks is not None else None,
+                    how if photos.capture.masks is not None else None,
                     unfinished=not several,
                     made_from=sources.get(name),
                 )
-                guess = guess_line(photos)
+                guess = guess_line(photos.capture)
                 if guess is not None:
                     tell(f"{name}: {guess}" if several else guess)
         if not several:
@@ -251,22 +251,16 @@ class Reconstruct:
                 said[name] += f" ({file_checksum(file)[:SHORT]})"
         begin_set(out, AVATARS, {SETTINGS: said})
 
-    def _photos(self, folder: Path, views: int | str | None) -> "Capture":
+    def _photos(self, folder: Path, views: int | str | None) -> "PreparedCapture":
         """The views of a capture that are used.
 
         Raises: ValueError; UsageError for --refine without masks.
         """
-        photos = _read_capture(folder, self.check, self.fit_masks)
-        if self.refine not in (None, "0") and photos.masks is None:
+        photos = _read_capture(folder, self.check, self.fit_masks, views)
+        if self.refine not in (None, "0") and photos.capture.masks is None:
             raise UsageError(f"--refine {self.refine}: needs masks, and {folder} has none")
-        if views == "auto" or (isinstance(views, int) and views < photos.view_count):
-            from humangs_jax.data.views import select_views
-
-            with stage("choosing photos"):
-                photos = photos.select(
-                    select_views(photos, None if views == "auto" else int(views))
-                )
-            tell(f"photos: {', '.join(photos.names)}")
+        if photos.chosen:
+            tell(f"photos: {', '.join(photos.capture.names)}")
         return photos
 
 
@@ -355,38 +349,43 @@ def _check_source(avatar: Path, capture: Path) -> None:
         raise CaptureError(avatar, "made_from", problem)
 
 
-def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
-    """The views of a capture that show the person, after warnings about what looks wrong in them.
+def _read_capture(
+    path: Path, check: bool, fit_masks: bool = True, views: int | str | None = None
+) -> "PreparedCapture":
+    """The views of a capture that show the person, or the best of them, after warnings about what
+    looks wrong.
 
     Raises: ValueError for none.
     """
     with stage("reading the capture"):
-        from humangs_jax.data.body_and_masks import usable_views
         from humangs_jax.data.capture import load_capture
+        from humangs_jax.data.prepared import prepare_capture
 
         photos = load_capture(path, fit_masks=fit_masks)
-    nobody = None
-    try:
-        photos = usable_views(photos)
-    except ValueError as error:
-        nobody = error
+    prepared, nobody = None, None
+    with stage("preparing the photos"):
+        try:
+            prepared = prepare_capture(photos, views=views)
+        except ValueError as error:
+            nobody = error
     if check:
         with stage("checking it"):
             from humangs_jax.apps.quick_check import likely_mistakes
 
-            mistakes = likely_mistakes(photos)
+            mistakes = likely_mistakes(photos if prepared is None else prepared.shown)
         for mistake in mistakes:
             warn(mistake)
         if mistakes and nobody is None:
             warn(f"go on at your own risk: `humangs check {path}` draws the body over each photo")
-    if nobody is not None:
+    if prepared is None:
+        assert nobody is not None
         raise nobody
-    return photos
+    return prepared
 
 
 def _refine_and_save(
     avatar: "Avatar",
-    photos: "Capture",
+    photos: "PreparedCapture",
     out: Path,
     how: "RefineConfig | None",
     unfinished: bool = True,
@@ -400,7 +399,7 @@ def _refine_and_save(
     Raises: KeyboardInterrupt, after that, if one ended it.
     """
     if how is None:
-        _save(avatar, out, f"from {photos.view_count} photos", made_from)
+        _save(avatar, out, f"from {photos.capture.view_count} photos", made_from)
         return
     with stage("refining"):
         from humangs_jax.refinement.refine import refine_with_report
@@ -409,7 +408,7 @@ def _refine_and_save(
     if refinement.interrupted and not unfinished:
         tell(f"{out}: not written, its refinement was interrupted: the same command makes it again")
         raise KeyboardInterrupt
-    done = f"from {photos.view_count} photos, {refinement.summary()}"
+    done = f"from {photos.capture.view_count} photos, {refinement.summary()}"
     _save(refinement.avatar, out, done, made_from)
     if refinement.interrupted:
         raise KeyboardInterrupt
@@ -636,7 +635,7 @@ class Tune:
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
         with stage("measuring"):
-            tuned = tune(variables, config, photos, **budgets, size=self.size, progress=True)
+            tuned = tune(variables, config, photos.shown, **budgets, size=self.size, progress=True)
         # the file keeps what was measured beside the settings
         costs = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
         about = {

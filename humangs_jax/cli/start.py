@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from humangs_jax.capture.fitting.files import FitRecord
     from humangs_jax.capture.fitting.refine import RefinedCapture
     from humangs_jax.data.capture import Capture
+    from humangs_jax.data.prepared import PreparedCapture
+    from humangs_jax.network.config import HumanGSConfig
 
 MARK = START_MARK
 """File in a capture folder that `humangs start` imported: a later run may replace it until it has a
@@ -324,8 +326,21 @@ class Start:
         from humangs_jax.io.decoded import forget_decoded
 
         forget_decoded()  # the capture has the photos
-        self._check(capture)
-        self._reconstruct(capture, None if limits is None else estimate, limits)
+        with stage("preparing the photos"):
+            from humangs_jax.apps.start import photos_to_read
+            from humangs_jax.data.capture_checks import CaptureError
+            from humangs_jax.data.prepared import prepare_capture
+            from humangs_jax.network.weights import load_weights
+
+            weights = load_weights()
+            try:
+                photos = prepare_capture(capture)
+            except CaptureError:  # no view shows the person: the sheet shows why
+                self._check(capture)
+                raise
+            read = prepare_capture(photos_to_read(photos), weights[1])
+        self._check(read)
+        self._reconstruct(weights, photos, read, None if limits is None else estimate, limits)
 
     def _import(self, material: "Material") -> "ImportReport":
         with stage("importing photos and cameras"):
@@ -459,7 +474,7 @@ class Start:
         tell(movement_line(moved[0].capture))
         return moved, record_of_photos(record, first.frames)
 
-    def _check(self, capture: "Capture") -> None:
+    def _check(self, capture: "Capture | PreparedCapture") -> None:
         with stage("checking"):
             from humangs_jax.apps.check import check_capture
 
@@ -468,27 +483,30 @@ class Start:
         wrote(self.out / "check.png", "the body over the photos: look at it")
 
     def _reconstruct(
-        self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None
+        self,
+        weights: "tuple[Any, HumanGSConfig]",
+        photos: "PreparedCapture",
+        read: "PreparedCapture",
+        estimate: "HeldOut | None",
+        limits: dict[str, Any] | None,
     ) -> None:
+        """Make, refine and write the avatar. photos: all that show the person. read: those that the
+        network reads.
+        """
         with stage("reconstructing"):
-            from humangs_jax.apps.start import photos_to_read
             from humangs_jax.avatar.reconstruct import reconstruct
             from humangs_jax.avatar.unseen import guess_line
-            from humangs_jax.data.body_and_masks import usable_views
-            from humangs_jax.network.weights import load_weights
             from humangs_jax.viewer.page import write_page
 
-            capture = usable_views(capture)
-            weights = load_weights()
-            avatar = reconstruct(*weights, photos_to_read(capture))
+            avatar = reconstruct(*weights, read)
         # refinement compares with masks, and is left out without them
-        if limits is not None and capture.masks is not None:
+        if limits is not None and photos.capture.masks is not None:
             with stage("refining"):
                 from humangs_jax.refinement.config import RefineConfig
                 from humangs_jax.refinement.refine import refine_with_report
 
                 refinement = refine_with_report(
-                    avatar, capture, RefineConfig(**limits), progress=True
+                    avatar, photos, RefineConfig(**limits), progress=True
                 )
                 avatar = refinement.avatar
             tell(refinement.summary())
@@ -501,12 +519,12 @@ class Start:
                 from humangs_jax.refinement.config import RefineConfig
 
                 estimate = held_out_psnr(
-                    *weights, capture, None if limits is None else RefineConfig(**ITERATIONS_ALONE)
+                    *weights, photos, None if limits is None else RefineConfig(**ITERATIONS_ALONE)
                 )
         if estimate is not None:
             tell(estimate)
         # name the parts that no photo shows
-        guess = guess_line(capture)
+        guess = guess_line(photos.capture)
         if guess is not None:
             tell(guess)
         with stage("writing the page"):
@@ -515,7 +533,7 @@ class Start:
             write_page(page, avatar, title=self.photos.resolve().name)
         wrote(
             self.out / "avatar.npz",
-            f"{len(avatar.gaussians.means):,} Gaussians from {capture.view_count} photos",
+            f"{len(avatar.gaussians.means):,} Gaussians from {photos.capture.view_count} photos",
         )
         wrote(page, "the avatar in a browser")
         if self.browser:

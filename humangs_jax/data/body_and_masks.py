@@ -53,21 +53,30 @@ def usable_views(capture: Capture) -> Capture:
     """The capture with the views that show the person: all but those of `unusable_views`, which a
     warning names.
 
-    The same object where these are all, and without masks. Raises: CaptureError, one line that
-    names the views, if none is left.
+    The same object where these are all, and without masks. Raises: as `without_views`.
     """
-    found = unusable_views(capture)
-    if not found:
+    return without_views(capture, unusable_views(capture))
+
+
+def without_views(capture: Capture, reasons: dict[int, str]) -> Capture:
+    """The capture without some views, which a warning names with the reasons; the same object where
+    these are none.
+
+    Raises: CaptureError, one line that names the views, if none is left.
+    """
+    if not reasons:
         return capture
-    told = "; ".join(
-        f"{', '.join(capture.names[i] for i in found if found[i] == reason)}: {reason}"
-        for reason in dict.fromkeys(found.values())
-    )
-    if len(found) == capture.view_count:
-        raise CaptureError("capture", "masks", f"no view is left that shows the person: {told}")
-    count = f"{len(found)} of {capture.view_count} views {'is' if len(found) == 1 else 'are'}"
-    logger.warning("%s left out: %s", count, told)
-    return capture.select([i for i in range(capture.view_count) if i not in found])
+    lines = []
+    for reason in dict.fromkeys(reasons.values()):
+        names = [capture.names[view] for view in reasons if reasons[view] == reason]
+        lines.append(f"{', '.join(names)}: {reason}")
+    if len(reasons) == capture.view_count:
+        problem = f"no view is left that shows the person: {'; '.join(lines)}"
+        raise CaptureError("capture", "masks", problem)
+    verb = "is" if len(reasons) == 1 else "are"
+    count = f"{len(reasons)} of {capture.view_count} views {verb}"
+    logger.warning("%s left out: %s", count, "; ".join(lines))
+    return capture.select([view for view in range(capture.view_count) if view not in reasons])
 
 
 def unusable_views(capture: Capture) -> dict[int, str]:
@@ -357,14 +366,14 @@ def shaped(body: BodyModel, betas: Float[np.ndarray, " s"]) -> Points:
 
 
 def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
-    """Those of a capture with masks that show the person."""
+    """The views of a capture whose masks are not empty, cut to the person."""
     joints = np.asarray(body.joint_regressor, float) @ rest
     weights, views, posed = np.asarray(body.skinning_weights, float), [], {}
-    unusable = unusable_views(capture)
     assert capture.masks is not None
+    empty = empty_views(capture.masks)
     for i, frame in enumerate(np.asarray(capture.frames).tolist()):
         mask = np.asarray(capture.masks[i])
-        if i in unusable:
+        if i in empty:
             continue
         if frame not in posed:
             posed[frame] = skinned(body, joints, capture.poses, frame, weights, corrected=True)

@@ -29,7 +29,7 @@ from scipy.sparse.csgraph import connected_components
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.data.body_and_masks import unusable_views, usable_views
+from humangs_jax.data.body_and_masks import unusable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import standardize
 from humangs_jax.geometry.camera import Camera, project
@@ -64,14 +64,12 @@ NORMAL_MAD = 1.4826
 
 
 def equal_exposure(capture: Capture) -> Capture:
-    """The usable views of a capture in equal exposure, which is what network and refinement see,
-    with the gains recorded; the same object where all views are usable and gains are recorded.
+    """The capture in equal exposure, which is what network and refinement see, with the gains
+    recorded; the same object where they are recorded already.
 
-    Without masks nothing is known of the exposure, and nothing is recorded.
-
-    Raises: CaptureError if no view shows the person.
+    Without masks nothing is known of the exposure, and nothing is recorded. All masks show the
+    person.
     """
-    capture = usable_views(capture)
     if capture.masks is None or capture.gains is not None:
         return capture
     gains = camera_gains(capture)

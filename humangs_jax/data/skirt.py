@@ -48,6 +48,8 @@ GAP = 11
 """Vertices of a row in each of the gaps between the legs."""
 HALF = 13
 """Vertices of a row on the outer half of each leg."""
+SKIRT_VERTICES = ROWS * 2 * (GAP + HALF)
+"""The vertices of a skirt, the last ones of a body that has one."""
 BESIDE = 0.02
 """Metres beside the legs: trousers reach as far."""
 SHOWN = 0.8

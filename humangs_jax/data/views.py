@@ -1,6 +1,4 @@
-"""Photos of one subject with the body parameters of each, what the network computes of them, and
-which to use.
-"""
+"""Photos of one subject with the body parameters of each, and what the network computes of them."""
 
 import dataclasses
 import functools
@@ -15,26 +13,19 @@ from scipy import sparse
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.body.motion import turned_upright
-from humangs_jax.body.resolution import (
-    decimate,
-    decimate_with_kept,
-    split_with_weights,
-    vertex_areas,
-)
+from humangs_jax.body.resolution import decimate_with_kept, split_with_weights
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.data.body_and_masks import MASK_THRESHOLD, usable_views
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
 from humangs_jax.geometry.axes import nearest_axis, standing_axis, upright_matrix
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
-from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import HumanGSInputs, subject_unit
-from humangs_jax.network.reader import project_vertices, visible_vertices
 from humangs_jax.rendering.mesh.rasterizer import (
     BACKGROUND,
     BACKGROUND_DEPTH,
@@ -77,21 +68,6 @@ class SubjectViews:
     unknown: Bool[Array, "v h w"] | None = None
     """Where the person may be hidden and masks are 0, (v, h, w). None: nowhere."""
 
-    def upright(self, body: BodyModel) -> "SubjectViews":
-        """The views in a world whose y axis points up; the same object if theirs does.
-
-        See `upright_world`. On the host.
-        """
-        pelvis = lambda: np.asarray(shape_body(body, self.betas).joints[0])
-        poses, cameras = upright_world(
-            jax.vmap(BodyPose)(self.rotations, self.translations), self.cameras, pelvis
-        )
-        if cameras is self.cameras:
-            return self
-        return replace(
-            self, cameras=cameras, rotations=poses.rotations, translations=poses.translation
-        )
-
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
     """The views, then ignored copies of the last one, so that subjects with fewer views can share a
@@ -125,23 +101,29 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
             "runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of"
             " them"
         )
-    return body if fits(body, config) else _remeshed(_ByContent(body), *_wanted(config))[0]
+    if has_mesh_of(body, config):
+        return body
+    return _remeshed(_ByContent(body), *remesh_key(config))[0]
 
 
-def fits(body: BodyModel, config: HumanGSConfig) -> bool:
+def has_mesh_of(body: BodyModel, config: HumanGSConfig) -> bool:
     """Whether a body is one of `gaussian_body` for this configuration; any is if the configuration
     asks for nothing.
     """
-    return body.made_for == _wanted(config) or not any(_wanted(config))
+    key = remesh_key(config)
+    return body.made_for == key or not any(key)
 
 
-def _wanted(config: HumanGSConfig) -> tuple[Any, ...]:
+def remesh_key(config: HumanGSConfig) -> tuple[Any, ...]:
+    """All of a configuration that `gaussian_body` depends on."""
     trained, asked = config.conventions, config.runtime
-    vertices, edges = (
-        (trained.body_vertices, trained.longest_edge),
-        (asked.body_vertices, asked.longest_edge),
+    return (
+        trained.body_vertices,
+        trained.longest_edge,
+        asked.body_vertices,
+        asked.longest_edge,
+        config.architecture.surface_map,
     )
-    return *vertices, *edges, config.architecture.surface_map
 
 
 class _ByContent:
@@ -203,9 +185,9 @@ def on_gaussian_body(
     """A displacement of a body's vertices, of those of its `gaussian_body`: midpoints of edges move
     by the mean of the ends.
     """
-    if fits(body, config):
+    if has_mesh_of(body, config):
         return jnp.asarray(displacement)
-    weights = _remeshed(_ByContent(body), *_wanted(config))[1]
+    weights = _remeshed(_ByContent(body), *remesh_key(config))[1]
     return jnp.asarray(weights @ np.asarray(displacement, np.float64), body.template.dtype)
 
 
@@ -348,34 +330,54 @@ def upright_world(
     """Poses and cameras of some views in a world whose y axis points up; the same objects if theirs
     does.
 
-    Captures are to have y up. One with z up is as consistent, but the network has seen no such
-    world, and an avatar's light is that of a world with y up: it is turned, and a warning logged,
-    where the person and the cameras both stand along another axis. The person alone may lie. On the
-    host.
+    On the host. See `world_up`.
 
     Arguments: poses, cameras: batches of one length. pelvis: the root joint in T-pose, metres,
     where it is needed.
     """
-    rotations, translations = np.asarray(poses.rotations), np.asarray(poses.translation)
-    up = standing_axis(rotations[:, 0])
-    if (
-        up in (None, "y")
-        or nearest_axis(-np.asarray(cameras.cam_from_world)[:, 1, :3].mean(axis=0))[0] != up
-    ):
+    up = world_up(np.asarray(poses.rotations)[:, 0], cameras)
+    if up == "y":
         return poses, cameras
+    return turned_world(poses, cameras, up, pelvis())
+
+
+def world_up(roots: Float[np.ndarray, "v 3"], cameras: Camera) -> str:
+    """The axis that points up in the world of some views: "x", "-z" and the like; "y" where that is
+    not certain.
+
+    Captures are to have y up. One with z up is as consistent, but the network has seen no such
+    world, and an avatar's light is that of a world with y up. Another axis is up only where the
+    person and the cameras both stand along it. The person alone may lie.
+
+    roots: the rotation of the person's root joint in each view, axis-angle, radians.
+    """
+    up = standing_axis(roots)
+    if up in (None, "y"):
+        return "y"
+    camera_up = -np.asarray(cameras.cam_from_world)[:, 1, :3].mean(axis=0)
+    return up if nearest_axis(camera_up)[0] == up else "y"
+
+
+def turned_world(
+    poses: BodyPose, cameras: Camera, up: str, pelvis: Float[np.ndarray, "3"]
+) -> tuple[BodyPose, Camera]:
+    """Poses and cameras in a world turned so that the axis `up` becomes +y; a warning says so.
+
+    pelvis: the root joint in T-pose, metres.
+    """
     logger.warning(
         "the world of these views has %s up, person and cameras say: expected y up, it is turned",
         up,
     )
-    rotations, translations = turned_upright(rotations, translations, up, pelvis())
+    rotations, translations = np.asarray(poses.rotations), np.asarray(poses.translation)
+    rotations, translations = turned_upright(rotations, translations, up, pelvis)
     back = np.eye(4)
     back[:3, :3] = upright_matrix(up).T
+    matrices = jnp.asarray(cameras.cam_from_world @ back, jnp.float32)
     turned = jax.vmap(BodyPose)(
         jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32)
     )
-    return turned, replace(
-        cameras, cam_from_world=jnp.asarray(cameras.cam_from_world @ back, jnp.float32)
-    )
+    return turned, replace(cameras, cam_from_world=matrices)
 
 
 def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews:
@@ -383,10 +385,8 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     resized to `size`.
 
     Intrinsics follow the pixels. Without masks only what the posed body covers will count as
-    foreground. crop: cut to the person first, see `cropped`. Views whose mask does not show the
-    person are left out, see `usable_views`.
+    foreground. crop: cut to the person first, see `cropped`.
     """
-    capture = usable_views(capture)
     capture = cropped(capture, size) if crop else capture
     height, width = capture.images.shape[1:3]
     side = max(height, width)
@@ -402,97 +402,3 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),
     )
-
-
-# Which photos of many
-# -------------------------------------------------------------------------------------------------
-
-SELECTION_SIZE = 128
-"""Side of the depth maps, pixels: enough to know which side of the body a photo shows."""
-SELECTION_VERTICES = 2000
-"""Vertices of the body for them."""
-LEAST_GAIN = 0.03
-"""A further photo has to add this share to what the chosen ones show.
-
-Only where no number of photos is given.
-"""
-
-
-@checked_arguments
-def select_views(capture: Capture, count: int | None) -> list[int]:
-    """The numbers of `count` photos, in ascending order, that together show the body best; all of
-    them if there are no more.
-
-    count: None leaves out the photos that add less than `LEAST_GAIN` to what the others show.
-
-    Greedy: each next photo adds most to the sum, over the vertices, of area times the best
-    `view_quality`. The sum is submodular, so the choice reaches at least 63 % of the best one
-    (Nemhauser, Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971). What a photo shows outside
-    its mask does not count; photos whose mask does not show the person are never chosen
-    (`usable_views`).
-
-    Raises: ValueError for a count below 1; CaptureError if no photo shows the person.
-    """
-    if count is not None and count < 1:
-        raise ValueError(f"select_views: expected at least 1 photo, got {count}")
-    names, capture = capture.names, usable_views(capture)
-    usable = [names.index(name) for name in capture.names]
-    if count is not None and len(usable) <= count:
-        return usable
-    body = (
-        decimate(capture.body, SELECTION_VERTICES)
-        if len(capture.body.template) > SELECTION_VERTICES
-        else capture.body
-    )
-    quality = np.asarray(view_quality(body, standardize(capture, SELECTION_SIZE)))
-    area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
-    least = LEAST_GAIN if count is None else 0.0
-    chosen = greedy_cover(quality * area, capture.view_count if count is None else count, least)
-    return sorted(usable[i] for i in chosen)
-
-
-def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
-    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima
-    most; none after the first that raises it by less than the share `least`.
-    """
-    chosen, best = list[int](), np.zeros(quality.shape[1])
-    for _ in range(min(count, len(quality))):
-        sums = np.maximum(quality, best).sum(axis=1)
-        sums[chosen] = -np.inf
-        if chosen and sums.max() < (1 + least) * best.sum():
-            break
-        chosen.append(int(np.argmax(sums)))
-        best = np.maximum(best, quality[chosen[-1]])
-    return chosen
-
-
-@jax.jit
-def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
-    """How well every view shows every vertex, in [0, 1].
-
-    The cosine between normal and line of sight, times pixels per metre over the most of all views;
-    0 where the vertex is hidden or outside of the mask.
-    """
-    config = presets.small().with_conventions(pixels="person")
-    inputs = prepare_inputs(body, views, config)
-    unit = subject_unit(inputs.canonical_vertices)
-    assert inputs.posed_normals is not None  # `prepare_inputs` computes them
-
-    def quality(camera, vertices, normals, depth_map):
-        pixels, depths = project_vertices(camera, vertices)
-        seen = visible_vertices(
-            pixels, depths, depth_map, (camera.width, camera.height), "half_pixel"
-        )
-        towards = camera.center - vertices
-        facing = jnp.sum(towards * normals, -1) / jnp.maximum(
-            jnp.linalg.norm(towards, axis=-1), 1e-6
-        )
-        return jnp.where(
-            seen, jnp.maximum(facing, 0) * camera.K[0, 0] / jnp.maximum(depths, 1e-6), 0
-        )
-
-    cameras = views.cameras.in_units(unit)
-    shown = jax.vmap(quality)(
-        cameras, inputs.posed_vertices / unit, inputs.posed_normals, inputs.depth_maps
-    )
-    return shown / jnp.maximum(jnp.max(shown), 1e-6)

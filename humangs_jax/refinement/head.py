@@ -20,6 +20,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.prepared import PreparedCapture
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import project
 from humangs_jax.refinement.config import RefineConfig
@@ -161,10 +162,8 @@ def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
     )
 
 
-def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops | None:
-    """Crops of the photos around the region; None if the body has none or no photo shows it.
-    capture: of usable views.
-    """
+def head_crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) -> Crops | None:
+    """Crops of the photos around the region; None if the body has none or no photo shows it."""
     # the Gaussians that the joints of the region move; faint ones may lie outside of the crops
     columns = [
         i
@@ -176,14 +175,14 @@ def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops 
     if not sure.any():
         return None
     # photos at the size at which heads are about as large as they should be
-    longest = max(capture.images.shape[1:3])
+    longest = max(photos.capture.images.shape[1:3])
     others = min(longest, config.image_size or longest)
     size = min(others, LOOK)
-    views = crop_to_person(capture, size)
+    views = crop_to_person(photos, size)
     seen, middles, side = _squares(_pixels(avatar, views)[:, sure], views)
     wanted = min(longest, 2 * size, round(size * LARGEST_HEAD / side))
     if not 1 / SIMILAR < wanted / size < SIMILAR:
-        size, views = wanted, crop_to_person(capture, wanted)
+        size, views = wanted, crop_to_person(photos, wanted)
         seen, middles, side = _squares(_pixels(avatar, views)[:, sure], views)
     if not len(seen):
         return None

@@ -10,9 +10,8 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
-from humangs_jax.data.body_and_masks import usable_views
-from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
+from humangs_jax.data.prepared import PreparedCapture
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 
@@ -57,17 +56,16 @@ def photos_of(views: SubjectViews) -> Photo:
     return jax.vmap(Photo)(*leaves)
 
 
-def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectViews:
+def crop_to_person(photos: PreparedCapture, image_size: int | None = None) -> SubjectViews:
     """The photos, cut to the person by windows of one size, with the cameras that see the windows.
 
-    In a world with y up (`data.views.upright_world`). Photos whose longer side exceeds `image_size`
-    are reduced to it. Views whose mask does not show the person are left out, see `usable_views`.
+    Photos whose longer side exceeds `image_size` are reduced to it.
 
-    Raises: ValueError without masks; CaptureError if no view is left.
+    Raises: ValueError without masks.
     """
+    capture = photos.capture
     if capture.masks is None:
         raise ValueError("crop_to_person: the capture has no masks")
-    capture = usable_views(capture)
     if image_size is not None and max(capture.images.shape[1:3]) > image_size:
         capture = capture.resized(image_size)
     assert capture.masks is not None
@@ -78,7 +76,7 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
         hidden = windows(capture.images, capture.unknown, capture.cameras, boxes)[1]
         unknown = hidden > 0
     frames = np.asarray(capture.frames)
-    views = SubjectViews(
+    return SubjectViews(
         images=images,
         masks=masks,
         cameras=cameras,
@@ -87,7 +85,6 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
         betas=jnp.asarray(capture.betas),
         unknown=unknown,
     )
-    return views.upright(capture.body)
 
 
 def windows(

@@ -14,11 +14,9 @@ import numpy as np
 
 from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.core.array_types import Int
 from humangs_jax.core.checks import checked_arguments
-from humangs_jax.data.body_and_masks import unusable_views
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import equal_exposure
+from humangs_jax.data.prepared import PreparedCapture, prepare_capture
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.head import Crops, head_crops, sharpened, shows_heads
 from humangs_jax.refinement.objective import avatar_of
@@ -90,7 +88,7 @@ class Refinement:
 @checked_arguments
 def refine(
     avatar: Avatar,
-    capture: Capture,
+    capture: Capture | PreparedCapture,
     config: RefineConfig | None = None,
     *,
     seconds: float | None = None,
@@ -108,7 +106,7 @@ def refine(
 
     Args:
         avatar: of the person in the photos, on the body of the capture.
-        capture: photos with masks, in any poses.
+        capture: photos with masks, in any poses; or what `prepare_capture` made of it.
         config: how; None: `RefineConfig()`.
         seconds: limit, instead of the configuration's; it becomes a number of steps before the
             first one.
@@ -136,7 +134,7 @@ def refine(
 @checked_arguments
 def refine_with_report(
     avatar: Avatar,
-    capture: Capture,
+    capture: Capture | PreparedCapture,
     config: RefineConfig | None = None,
     *,
     seconds: float | None = None,
@@ -152,13 +150,13 @@ def refine_with_report(
     config = config or RefineConfig()
     if seconds is not None or steps is not None:
         config = dataclasses.replace(config, seconds=seconds, steps=steps)
-    _check(avatar, capture)
-    capture = equal_exposure(capture)
-    views = crop_to_person(capture, config.image_size)
+    _check(avatar, capture.capture if isinstance(capture, PreparedCapture) else capture)
+    photos = prepare_capture(capture)
+    views = crop_to_person(photos, config.image_size)
     clock = Clock(config, progress)
     with clock.compiling():
         task, best, each = prepare(avatar, views, config, clock)
-        crops = _crops(task.avatar, capture, config)
+        crops = _crops(task.avatar, photos, config)
     compiler = ThreadPoolExecutor(1)
     if crops is not None:  # compiled beside the programs of the search
         own = dataclasses.replace(config, head_steps=0, iterations=1)
@@ -190,7 +188,7 @@ def refine_with_report(
                 compiler.shutdown()
                 begin = with_low_pass_of(result, views)
                 if len(best.used) < len(task.photos):
-                    crops = _crops(begin, capture, config, best.used)
+                    crops = _crops(begin, photos.select(best.used), config)
             if crops is not None:
                 sharp = sharpened(begin, best.state.trust, crops, config, clock)
                 drawn = with_low_pass_of(sharp, views)
@@ -211,26 +209,18 @@ def refine_with_report(
         kept=result is not avatar,
         interrupted=interrupted,
         planned=None if interrupted or clock.late else clock.planned,
-        left_out=_without(capture, best.used) if len(best.used) < len(task.photos) else (),
+        left_out=tuple(np.delete(photos.capture.names, best.used).tolist()),
         head_steps=head_steps,
         moved=task.moved,
     )
 
 
-def _crops(
-    avatar: Avatar,
-    capture: Capture,
-    config: RefineConfig,
-    used: Int[np.ndarray, " n"] | None = None,
-) -> Crops | None:
-    """Crops of the heads in some of the usable views (None: in all); None where no steps on the
-    head are to be made.
-    """
+def _crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) -> Crops | None:
+    """Crops of the heads in the photos; None where no steps on the head are to be made."""
     unlimited = config.seconds is None or config.steps == 0
-    if not (config.head_steps and unlimited and shows_heads(capture, config)):
+    if not (config.head_steps and unlimited and shows_heads(photos.capture, config)):
         return None
-    usable = _usable(capture)
-    return head_crops(avatar, capture.select(usable if used is None else usable[used]), config)
+    return head_crops(avatar, photos, config)
 
 
 def _check(avatar: Avatar, capture: Capture) -> None:
@@ -246,13 +236,3 @@ def _check(avatar: Avatar, capture: Capture) -> None:
             f"refine: the capture's poses have {joints} joints, the avatar has"
             f" {len(avatar.parents)}"
         )
-
-
-def _without(capture: Capture, used: Int[np.ndarray, " n"]) -> tuple[str, ...]:
-    """Names of the usable views that are not among these."""
-    return tuple(capture.names[view] for i, view in enumerate(_usable(capture)) if i not in used)
-
-
-def _usable(capture: Capture) -> Int[np.ndarray, " n"]:
-    unusable = unusable_views(capture)
-    return np.asarray([i for i in range(capture.view_count) if i not in unusable])

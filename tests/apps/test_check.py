@@ -13,6 +13,7 @@ from humangs_jax.apps.check import BOUNDARY, check_capture, draw_body, overlay, 
 from humangs_jax.apps.quick_check import likely_mistakes
 from humangs_jax.body.model import BodyModel, person_vertices, rest_pose
 from humangs_jax.core.pytree import replace
+from humangs_jax.data import prepared
 from humangs_jax.data.body_and_masks import surface_points
 from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -173,7 +174,7 @@ def test_the_displacement_of_a_capture_is_drawn(tmp_path, masks):
 
 def test_a_skirt_of_the_avatar_is_said(tmp_path, monkeypatch):
     assert "skirt" not in str(check_capture(capture(), tmp_path / "check.png"))
-    monkeypatch.setattr(module, "with_skirt", lambda body, capture, moves: (body, moves))
+    monkeypatch.setattr(prepared, "with_skirt", lambda body, capture, moves: (body, moves))
     assert "reconstruct will put a skirt around the legs" in str(
         check_capture(capture(), tmp_path / "check.png")
     )

@@ -712,7 +712,8 @@ def toy(body):
 def reconstructed(monkeypatch, body, wrong):
     """wrong: by how much the avatar of a capture is off."""
     monkeypatch.setattr(start, "SIZE", 64)
-    monkeypatch.setattr(start, "reconstruct", lambda _, __, photos: toy_avatar(body, wrong(photos)))
+    made = lambda _, __, photos: toy_avatar(body, wrong(photos.capture))
+    monkeypatch.setattr(start, "reconstruct", made)
 
 
 def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, toy, monkeypatch):
@@ -766,10 +767,10 @@ def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
 def test_no_photo_alone_rejects_a_body(gains, asked, better, toy, monkeypatch):
     other, numbers = dataclasses.replace(toy, body_file="other"), []
 
-    def scored(variables, config, capture, refinement, number):
+    def scored(variables, config, photos, refinement, number):
         numbers.append(number)
-        of_other = capture is other
-        return start.HeldOut(capture.names[number], 20.0, 30.0 + of_other * gains[number])
+        of_other = photos.given is other
+        return start.HeldOut(photos.given.names[number], 20.0, 30.0 + of_other * gains[number])
 
     monkeypatch.setattr(start, "held_out_psnr", scored)
     found, estimate = better_body({}, tiny(), toy, other, None)

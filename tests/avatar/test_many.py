@@ -10,7 +10,7 @@ from command_line import save_tiny_avatar
 from humangs_jax import cli
 from humangs_jax.avatar import reconstruct as many
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.reconstruct import Reconstructed, reconstruct_many
+from humangs_jax.avatar.reconstruct import reconstruct_many
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.network import presets
 from humangs_jax.network.humangs import init_humangs
@@ -81,7 +81,7 @@ def people(capture_folder, tmp_path, monkeypatch, avatar):
     def stand_in(variables, config, captures, batch=None):
         for name, load in captures.items():
             asked.append(name)
-            done = many._tried(Reconstructed(name), "capture", load)
+            done = many._loaded(name, load)
             yield done if done.error else done._replace(avatar=avatar)
 
     monkeypatch.setattr(many, "reconstruct_many", stand_in)

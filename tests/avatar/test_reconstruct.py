@@ -7,13 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.avatar import reconstruct as reconstruction
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Light
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import (
     _reconstruct,
-    _views,
     make_avatar,
     reconstruct,
     reconstruct_batch,
@@ -29,6 +27,7 @@ from humangs_jax.data import skirt
 from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
+from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.data.views import (
     SubjectViews,
     cropped,
@@ -36,6 +35,7 @@ from humangs_jax.data.views import (
     pad_views,
     prepare_inputs,
     standardize,
+    world_up,
 )
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
 from humangs_jax.network.humangs import init_humangs
@@ -225,8 +225,10 @@ def with_z_up(photos):
 def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     photos = capture(body, SIZE, SIZE)
     turned = with_z_up(photos)
-    own, views = standardize(photos, SIZE), standardize(turned, SIZE).upright(body)
-    assert own.upright(body) is own
+    as_it_is, upright = prepare_capture(photos), prepare_capture(turned)
+    assert as_it_is.up == "y" and as_it_is.capture.cameras is photos.cameras
+    assert upright.up == "z" and upright.turned
+    own, views = (standardize(x.capture, SIZE) for x in (as_it_is, upright))
     for got, expected in zip(jax.tree.leaves(views), jax.tree.leaves(own), strict=True):
         np.testing.assert_allclose(got, expected, atol=TURNED)
     avatars = [reconstruct(*network, x).gaussians for x in (photos, turned)]
@@ -286,16 +288,18 @@ def test_light_shines_from_above_in_a_capture_of_another_world(body):
     unlit = np.asarray([r.rgb for r in capture_renderings(replace(avatar, light=None), photos)[1]])
     assert np.abs(own - unlit).max() > 0.05
     for got, expected in zip(
-        *map(jax.tree.leaves, map(crop_to_person, (turned, photos))), strict=True
+        *(jax.tree.leaves(crop_to_person(prepare_capture(x))) for x in (turned, photos)),
+        strict=True,
     ):
         np.testing.assert_allclose(got, expected, atol=TURNED)
 
 
 def test_people_who_lie_before_upright_cameras_are_left_lying(body):
     """The person alone says nothing about the world; that of captures has y up."""
-    views = standardize(capture(body, SIZE, SIZE), SIZE)
-    lying = replace(views, rotations=views.rotations.at[:, 0, 0].set(-np.pi / 2))
-    assert lying.upright(body) is lying
+    photos = capture(body, SIZE, SIZE)
+    roots = np.zeros((photos.view_count, 3))
+    roots[:, 0] = -np.pi / 2
+    assert world_up(roots, photos.cameras) == "y"
 
 
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
@@ -507,9 +511,7 @@ def test_the_body_is_displaced_by_the_capture_or_its_masks_if_the_network_looks_
         {"pixels": "all"},
     )
     full = dataclasses.replace(photos, masks=np.ones_like(photos.masks))
-    moved = lambda photos, config: (
-        _views(photos, gaussian_body(body, config), config)[0].displacement
-    )
+    moved = lambda photos, config: prepare_capture(photos, config).displacement
     assert not moved(full, config).any()  # no body sticks out of masks that are full
     assert (
         moved(dataclasses.replace(full, masks=None), on) is None
@@ -582,7 +584,6 @@ def test_a_person_in_a_skirt_has_one_alone_and_among_others(body, network, monke
     )
     shown = lambda _, capture: 0.6 if capture.images is skirted.images else None
     monkeypatch.setattr(skirt, "find_hem", shown)
-    monkeypatch.setattr(reconstruction, "find_hem", shown)
     worn, bare = (reconstruct(variables, config, x) for x in (skirted, plain))
     added = skirt.ROWS * 2 * (skirt.GAP + skirt.HALF)
     assert len(worn.rest_vertices) == len(bare.rest_vertices) + added == len(body.template) + added

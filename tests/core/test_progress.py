@@ -5,9 +5,7 @@ import re
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 import humangs_jax
@@ -185,16 +183,13 @@ def test_refinement_and_reconstruction_say_when_they_compile(capsys, monkeypatch
         assert clock.bar.postfix == "compiling, once"
     clock.stopped()
     assert "compiling, once" in capsys.readouterr().err
-    views = SimpleNamespace(images=np.zeros((1, 2, 2, 3)), displacement=None)
     names = []
 
     def stand_in(*_):
         names.extend(progress.current().names)
         raise ValueError("seen")
 
-    for name, made in {"_check": None, "gaussian_body": None, "_views": (views, False)}.items():
-        monkeypatch.setattr(reconstruct, name, lambda *_, made=made: made)
-    monkeypatch.setattr(reconstruct, "_alone", stand_in)
+    monkeypatch.setattr(reconstruct, "_prepare", stand_in)
     monkeypatch.setattr(progress, "_compiled", set())
     for _ in range(2):
         with pytest.raises(ValueError, match="seen"):

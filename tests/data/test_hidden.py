@@ -10,6 +10,7 @@ from humangs_jax.capture.fitting.refine import overlap
 from humangs_jax.capture.fitting.residuals.silhouettes import mask_boundary
 from humangs_jax.data.body_and_masks import displacement, unusable_views
 from humangs_jax.data.capture import CaptureError, load_capture, save_capture
+from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.images import read_grey, write_png
@@ -88,7 +89,7 @@ def test_agreement_of_body_and_mask_is_counted_where_it_is_known(hidden, demo):
 
 
 def test_refinement_compares_and_scores_count_what_is_seen(hidden, demo):
-    photos = photos_of(crop_to_person(hidden))
+    photos = photos_of(crop_to_person(prepare_capture(hidden)))
     counted = np.asarray(photos.counted)
     assert not counted[0].all() and counted[1:].all()
     assert not np.asarray(photos.mask)[~counted].any()

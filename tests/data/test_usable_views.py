@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 from humangs_jax.apps.settings import Settings
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
-from humangs_jax.data import views as module
+from humangs_jax.data import view_choice as module
 from humangs_jax.data.body_and_masks import _sampling, unusable_views, usable_views
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import (
@@ -27,7 +27,9 @@ from humangs_jax.data.exposure import (
     gains_of,
     multiplied,
 )
-from humangs_jax.data.views import greedy_cover, select_views, standardize
+from humangs_jax.data.prepared import prepare_capture
+from humangs_jax.data.view_choice import greedy_cover, select_views
+from humangs_jax.data.views import standardize
 from humangs_jax.refinement.photos import crop_to_person
 
 
@@ -115,18 +117,15 @@ def test_all_that_reads_photos_leaves_it_out(demo):
     expected = demo.select(usable)
     assert select_views(capture, 3) == select_views(capture, 9) == usable
     assert (
-        Settings().photos(capture).names
-        == Settings(views=9).photos(capture).names
+        Settings().photos(capture).capture.names
+        == Settings(views=9).photos(capture).capture.names
         == expected.names
     )
-    for views in (
-        standardize(capture, 64),
-        standardize(capture, 64, crop=True),
-        crop_to_person(capture),
-    ):
-        assert len(views.images) == 3
-    np.testing.assert_array_equal(standardize(capture, 64).images, standardize(expected, 64).images)
-    np.testing.assert_array_equal(crop_to_person(capture).images, crop_to_person(expected).images)
+    left, all_shown = prepare_capture(capture), prepare_capture(expected)
+    assert left.capture.names == expected.names
+    assert left.left_out == {demo.names[1]: "the mask is empty"} and not all_shown.left_out
+    cropped, wanted = crop_to_person(left), crop_to_person(all_shown)
+    np.testing.assert_array_equal(cropped.images, wanted.images)
 
 
 def test_no_view_left_is_an_error_that_names_them(demo):
@@ -134,8 +133,7 @@ def test_no_view_left_is_an_error_that_names_them(demo):
     for read in (
         usable_views,
         lambda c: select_views(c, 2),
-        lambda c: standardize(c, 64),
-        crop_to_person,
+        prepare_capture,
     ):
         with pytest.raises(
             CaptureError,

@@ -13,6 +13,7 @@ from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.capture.fitting.own_poses import with_own_poses
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
+from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.refinement import head as heads
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.config import HEAD, RefineConfig
@@ -52,7 +53,7 @@ def test_the_head_comes_closer_and_nothing_else_moves(four):
     report = refinement.refine_with_report(avatar, capture, ALONE)
     assert report.kept and report.head_steps == 20 and "20 on the head" in report.summary()
     moved = of_head(avatar)
-    start = with_low_pass_of(avatar, crop_to_person(capture))
+    start = with_low_pass_of(avatar, crop_to_person(prepare_capture(capture)))
     for name in ("means", "quats", "scales", "opacities", "colors"):
         before, after = (np.asarray(getattr(x.gaussians, name)) for x in (start, report.avatar))
         np.testing.assert_array_equal(after[~moved], before[~moved])
@@ -84,7 +85,7 @@ def test_steps_on_the_head_are_kept_only_where_the_whole_photos_are_fitted_bette
 
 def test_crops_show_the_head(four):
     avatar, capture = four
-    crops = head_crops(avatar, capture, RefineConfig())
+    crops = head_crops(avatar, prepare_capture(capture), RefineConfig())
     np.testing.assert_array_equal(crops.moved, of_head(avatar))
     assert set(np.flatnonzero(crops.moved)) <= set(crops.drawn.tolist())
     assert len(crops.views.images) == 4 and crops.views.cameras.height < HEIGHT
@@ -98,12 +99,13 @@ def test_crops_show_the_head(four):
     )
     neck = ("neck", "collar")
     np.testing.assert_array_equal(
-        head_crops(avatar, capture, RefineConfig(region=neck)).moved, of_head(avatar, neck)
+        head_crops(avatar, prepare_capture(capture), RefineConfig(region=neck)).moved,
+        of_head(avatar, neck),
     )
 
 
 def test_a_camera_that_has_the_head_behind_it_is_left_out(four):
-    avatar, views = four[0], crop_to_person(four[1])
+    avatar, views = four[0], crop_to_person(prepare_capture(four[1]))
     placed = views.cameras.cam_from_world
     turned = placed.at[0].set(jnp.diag(jnp.asarray([-1.0, 1, -1, 1])) @ placed[0])
     views = replace(views, cameras=replace(views.cameras, cam_from_world=turned))
@@ -126,7 +128,7 @@ def test_where_no_photo_shows_a_head_there_are_no_crops(four, spoil):
     else:
         away = avatar.gaussians.means + 9.0 * of_head(avatar)[:, None]
         avatar = replace(avatar, gaussians=replace(avatar.gaussians, means=away))
-    assert head_crops(avatar, capture, RefineConfig()) is None
+    assert head_crops(avatar, prepare_capture(capture), RefineConfig()) is None
 
 
 @pytest.mark.parametrize(
@@ -141,7 +143,7 @@ def test_photos_must_be_large_enough(four, longest, image_size, expected):
 
 
 def test_colors_count_in_the_mask_and_excess_alpha_costs_more(four):
-    photo = photos_of(crop_to_person(four[1]))[0]
+    photo = photos_of(crop_to_person(prepare_capture(four[1])))[0]
     outside, inside = (photo.mask == 0)[..., None], (photo.mask > 0.9)[..., None]
     loss = lambda rgb, alpha: float(head_loss((rgb, alpha), photo, ALONE))
     exact = loss(photo.image, photo.mask)

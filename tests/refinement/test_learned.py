@@ -11,6 +11,7 @@ import pytest
 from refinement_cases import STEPS, toy_avatar, toy_capture
 
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.refinement import learned, search
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.learned import (
@@ -44,7 +45,7 @@ ONE_STEP = 1e-3  # metres: five times the rate of the means
 def scene(body):
     """Avatar, one photo of the same person in other colors, parameters, splatting."""
     avatar = toy_avatar(body, 0.0)
-    views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
+    views = crop_to_person(prepare_capture(toy_capture(body, toy_avatar(body, 0.15))))
     photo = photos_of(views)[0]
     splat = dataclasses.replace(
         plan_buffers(avatar.gaussians, views.cameras, margin=2.0), visibility=True
@@ -254,7 +255,7 @@ def test_what_only_the_avatar_after_the_iterations_shows_moves_in_steps(scene, b
     )
     monkeypatch.setattr(search, "learned_update", shown)
     config = dataclasses.replace(STEPS, iterations=1)
-    views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
+    views = crop_to_person(prepare_capture(toy_capture(body, toy_avatar(body, 0.15))))
     task, start, _ = search.prepare(hidden, views, config, search.Clock(config))
     after = search.iterated(task, start, start.used)[0].state
     assert start.state.trust[0] == 0 and after.trust[0] > 0

@@ -19,6 +19,7 @@ from humangs_jax.avatar.animate import (
 from humangs_jax.avatar.frames import capture_renderings, posed
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
+from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement import search
 from humangs_jax.refinement.config import RefineConfig
@@ -98,7 +99,7 @@ def squared_error(avatar, capture):
 def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     """Also if its low-pass is that of smaller or larger pixels than theirs."""
     avatar, capture = person
-    views = crop_to_person(capture)
+    views = crop_to_person(prepare_capture(capture))
     own = with_low_pass(avatar, times * pixel_sizes(avatar, views))
     start = with_low_pass_of(own, views)
     # those of smaller pixels are dimmed where a photo shows the person smaller than another does
@@ -130,7 +131,7 @@ def test_photos_from_near_and_far_are_fitted_together(body, person):
     assert report.kept and squared_error(report.avatar, photos) < 0.8 * squared_error(
         avatar, photos
     )
-    nearest = pixel_sizes(avatar, crop_to_person(photos))
+    nearest = pixel_sizes(avatar, crop_to_person(prepare_capture(photos)))
     np.testing.assert_array_equal(report.avatar.gaussians.low_pass, nearest)
     assert jnp.median(nearest) < 0.5 * 12.0 / float(
         photos.cameras.K[0, 0, 0]
@@ -142,7 +143,7 @@ def test_what_no_photo_has_in_its_frame_has_the_pixels_of_the_rest(person):
     away = replace(
         avatar, gaussians=replace(avatar.gaussians, means=avatar.gaussians.means.at[0].add(50.0))
     )
-    sizes = pixel_sizes(away, crop_to_person(capture))
+    sizes = pixel_sizes(away, crop_to_person(prepare_capture(capture)))
     assert sizes[0] == sizes[1:].max()
 
 
@@ -168,7 +169,7 @@ def test_interruption_returns_the_best_state(person, monkeypatch):
 @pytest.mark.slow
 def test_pure_function_maps_over_people(person):
     avatar, capture = person
-    views = crop_to_person(capture)
+    views = crop_to_person(prepare_capture(capture))
     other = replace(avatar, gaussians=replace(avatar.gaussians, colors=1 - avatar.gaussians.colors))
     splat = plan_buffers(avatar.gaussians, views.cameras, margin=3.0)
     run = lambda avatar, views: refine_views(avatar, views, STEPS, splat, 4)
@@ -199,7 +200,9 @@ def test_crops_show_the_same_pixels(person):
     cameras = replace(
         capture.cameras, K=jnp.asarray(K, jnp.float32), width=WIDTH + 100, height=HEIGHT + 80
     )
-    views = crop_to_person(dataclasses.replace(capture, images=wide, masks=masks, cameras=cameras))
+    views = crop_to_person(
+        prepare_capture(dataclasses.replace(capture, images=wide, masks=masks, cameras=cameras))
+    )
     assert views.masks.shape[1] < HEIGHT + 80 and views.masks.shape[2] < WIDTH + 100
     assert views.masks.sum() == pytest.approx(masks.sum(), rel=1e-6)
     gaussians = posed(avatar, capture.pose(1))
@@ -219,8 +222,8 @@ def test_specks_of_a_mask_do_not_widen_the_crops():
     masks = capture.masks.copy()
     masks[2, :2, :3] = masks[3, -1, -1] = 1
     crops, specked = (
-        crop_to_person(capture),
-        crop_to_person(dataclasses.replace(capture, masks=masks)),
+        crop_to_person(prepare_capture(capture)),
+        crop_to_person(prepare_capture(dataclasses.replace(capture, masks=masks))),
     )
     assert crops.images.shape[1:3] != capture.images.shape[1:3]
     np.testing.assert_array_equal(specked.images, crops.images)

@@ -1,0 +1,189 @@
+"""What is decided about the photos of a person before they are used, decided once: which views show
+the person, their exposure, which way is up, and the body that carries the Gaussians.
+
+`reconstruct`, `refine` and `check_capture` take a `PreparedCapture` as well as a `Capture`, which
+they prepare themselves.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel, shape_body
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.pytree import short_repr
+from humangs_jax.data.body_and_masks import displacement, unusable_views, without_views
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import equal_exposure
+from humangs_jax.data.skirt import with_skirt
+from humangs_jax.data.view_choice import best_views
+from humangs_jax.data.views import (
+    gaussian_body,
+    on_gaussian_body,
+    remesh_key,
+    turned_world,
+    world_up,
+)
+from humangs_jax.network.config import HumanGSConfig
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class PreparedCapture:
+    """A capture with all that is decided before its use. `prepare_capture` makes it."""
+
+    given: Capture
+    """The capture as it came: all its views, in its own colors and its own world."""
+    capture: Capture
+    """The views to use: those that show the person, in equal exposure, in a world with y up."""
+    left_out: dict[str, str]
+    """Why views do not show the person, by their names; they are not in `capture`."""
+    up: str
+    """The axis that points up in the world of `given`: "y", "z", "-z" and the like."""
+    chosen: bool = False
+    """Whether further views were left out, which add little to what the others show."""
+    body: BodyModel | None = None
+    """The body that carries the Gaussians, with a skirt where the photos show one.
+
+    None: prepared without a network, as `refine` needs it.
+    """
+    displacement: Float[np.ndarray, "n 3"] | None = None
+    """How far the vertices of the shaped `body` move in the T-pose, (n, 3), metres. None: no mask
+    says anything, or the network does not allow it.
+    """
+    skirt: bool = False
+    """Whether `body` has a skirt, whose vertices are its last."""
+    network: tuple[Any, ...] | None = None
+    """All of the network's configuration that `body` and `displacement` depend on."""
+
+    __repr__ = short_repr
+
+    @property
+    def shown(self) -> Capture:
+        """The views of `given` that show the person, as they came."""
+        kept = [i for i, name in enumerate(self.given.names) if name not in self.left_out]
+        return self.given if len(kept) == self.given.view_count else self.given.select(kept)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the world of `capture` is not that of `given`."""
+        return self.up != "y"
+
+    def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "PreparedCapture":
+        """Some of the views to use, in this order. The body is to be decided by these."""
+        chosen = self.capture.select(views)
+        return PreparedCapture(self.given, chosen, self.left_out, self.up, chosen=True)
+
+    def resized(self, longest: int) -> "PreparedCapture":
+        """The same with photos whose longest side has that many pixels; the body is to be decided
+        by these.
+        """
+        smaller = self.capture.resized(longest)
+        return PreparedCapture(self.given, smaller, self.left_out, self.up, self.chosen)
+
+
+@checked_arguments
+def prepare_capture(
+    capture: Capture | PreparedCapture,
+    config: HumanGSConfig | None = None,
+    *,
+    views: int | str | None = None,
+) -> PreparedCapture:
+    """Decide which photos are used and how, once for `reconstruct`, `refine` and `check`.
+
+    What is prepared is not prepared again: a `PreparedCapture` is returned as it is, or with the
+    body for `config` if it was prepared for another network or for none.
+
+    Args:
+        capture: photos, cameras, poses, and masks if there are some.
+        config: of the network that will read the photos; None leaves the body alone.
+        views: how many photos are used at most, those that show the body best; "auto": as many as
+            add to what the others show. None: all.
+
+    Returns:
+        The prepared capture.
+
+    Raises:
+        CaptureError: one line that names the views, if none shows the person.
+
+    Examples:
+        >>> variables, config = hg.load_weights()
+        >>> photos = hg.prepare_capture(hg.load_capture("demo_capture"), config)
+        >>> avatar = hg.refine(hg.reconstruct(variables, config, photos), photos)
+    """
+    prepared = capture
+    if isinstance(prepared, Capture):
+        prepared = _prepared_photos(prepared, views)
+    elif views is not None:
+        chosen = _chosen(prepared.capture, views)
+        prepared = prepared if chosen is None else prepared.select(chosen)
+    if config is None or prepared.network == _network_key(config):
+        return prepared
+    return _with_body(prepared, config)
+
+
+def _prepared_photos(given: Capture, views: int | str | None) -> PreparedCapture:
+    """The views that show the person, or the best of them, in equal exposure and with y up."""
+    reasons = unusable_views(given)
+    capture = without_views(given, reasons)
+    chosen = _chosen(capture, views)
+    if chosen is not None:
+        capture = capture.select(chosen)
+    capture = equal_exposure(capture)
+
+    # the world with y up, if person and cameras stand along another axis
+    up = world_up(np.asarray(capture.poses.rotations)[capture.frames, 0], capture.cameras)
+    if up != "y":
+        pelvis = np.asarray(shape_body(capture.body, jnp.asarray(capture.betas)).joints[0])
+        poses, cameras = turned_world(capture.poses, capture.cameras, up, pelvis)
+        capture = dataclasses.replace(capture, poses=poses, cameras=cameras)
+    left_out = {given.names[view]: reason for view, reason in reasons.items()}
+    return PreparedCapture(given, capture, left_out, up, chosen is not None)
+
+
+def _chosen(capture: Capture, views: int | str | None) -> list[int] | None:
+    """Which photos of those that show the person are used; None: all."""
+    if views is None or (isinstance(views, int) and views >= capture.view_count):
+        return None
+    return best_views(capture, None if isinstance(views, str) else views)
+
+
+def _with_body(prepared: PreparedCapture, config: HumanGSConfig) -> PreparedCapture:
+    """The same with the body that carries the Gaussians of a network."""
+    capture = prepared.capture
+    body = gaussian_body(capture.body, config)
+    moved, skirted = None, None
+
+    # how far the body moves: as the capture says, else to the edges of the masks
+    if allows_vertex_offsets(config) and capture.displacement is not None:
+        moved = np.asarray(on_gaussian_body(capture.displacement, capture.body, config))
+    elif allows_vertex_offsets(config) and capture.masks is not None:
+        moved = displacement(body, capture, always=config.runtime.displacement is True)
+
+    # a skirt, where the masks show one
+    if moved is not None:
+        skirted = with_skirt(body, capture, moved)
+    if skirted is not None:
+        body, moved = skirted
+    return dataclasses.replace(
+        prepared,
+        body=body,
+        displacement=moved,
+        skirt=skirted is not None,
+        network=_network_key(config),
+    )
+
+
+def allows_vertex_offsets(config: HumanGSConfig) -> bool:
+    """Whether the body may be displaced and get a skirt: if the network looks at the person's
+    pixels alone.
+    """
+    return config.runtime.displacement is not False and config.conventions.pixels == "person"
+
+
+def _network_key(config: HumanGSConfig) -> tuple[Any, ...]:
+    always = config.runtime.displacement is True
+    return remesh_key(config), allows_vertex_offsets(config), always

@@ -1,0 +1,115 @@
+"""Which photos of many together show the body best."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.body.resolution import decimate, vertex_areas
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.data.body_and_masks import unusable_views, without_views
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
+from humangs_jax.network import presets
+from humangs_jax.network.parts import subject_unit
+from humangs_jax.network.reader import project_vertices, visible_vertices
+
+SELECTION_SIZE = 128
+"""Pixels a side of the depth maps: enough to know which side of the body a photo shows."""
+SELECTION_VERTICES = 2000
+"""Vertices of the body that is looked at."""
+LEAST_GAIN = 0.03
+"""A further photo has to add this share to what the chosen ones show.
+
+Only where no number of photos is given.
+"""
+
+
+@checked_arguments
+def select_views(capture: Capture, count: int | None) -> list[int]:
+    """The numbers of `count` photos, in ascending order, that together show the body best; all of
+    them if there are no more.
+
+    Photos whose mask does not show the person are never chosen. See `best_views`.
+
+    Raises: ValueError for a count below 1; CaptureError if no photo shows the person.
+    """
+    if count is not None and count < 1:
+        raise ValueError(f"select_views: expected at least 1 photo, got {count}")
+    unusable = unusable_views(capture)
+    shown = without_views(capture, unusable)
+    usable = [view for view in range(capture.view_count) if view not in unusable]
+    return [usable[view] for view in best_views(shown, count)]
+
+
+def best_views(capture: Capture, count: int | None) -> list[int]:
+    """The numbers of `count` photos, in ascending order, that together show the body best; all of
+    them if there are no more.
+
+    Greedy: each next photo adds most to the sum, over the vertices, of area times the best
+    `view_quality`. The sum is submodular, so the choice reaches at least 63 % of the best one
+    (Nemhauser, Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971). What a photo shows outside
+    its mask does not count.
+
+    Arguments:
+        capture: photos that all show the person.
+        count: None leaves out the photos that add less than `LEAST_GAIN` to what the others show.
+    """
+    if count is not None and capture.view_count <= count:
+        return list(range(capture.view_count))
+    body = capture.body
+    if len(body.template) > SELECTION_VERTICES:
+        body = decimate(body, SELECTION_VERTICES)
+    quality = np.asarray(view_quality(body, standardize(capture, SELECTION_SIZE)))
+    area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
+    least = LEAST_GAIN if count is None else 0.0
+    most = capture.view_count if count is None else count
+    return sorted(greedy_cover(quality * area, most, least))
+
+
+def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
+    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima
+    most; none after the first that raises it by less than the share `least`.
+    """
+    chosen, best = list[int](), np.zeros(quality.shape[1])
+    for _ in range(min(count, len(quality))):
+        sums = np.maximum(quality, best).sum(axis=1)
+        sums[chosen] = -np.inf
+        if chosen and sums.max() < (1 + least) * best.sum():
+            break
+        chosen.append(int(np.argmax(sums)))
+        best = np.maximum(best, quality[chosen[-1]])
+    return chosen
+
+
+@jax.jit
+def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
+    """How well every view shows every vertex, in [0, 1].
+
+    The cosine between normal and line of sight, times pixels per metre over the most of all views;
+    0 where the vertex is hidden or outside of the mask.
+    """
+    config = presets.small().with_conventions(pixels="person")
+    inputs = prepare_inputs(body, views, config)
+    unit = subject_unit(inputs.canonical_vertices)
+    assert inputs.posed_normals is not None  # `prepare_inputs` computes them
+
+    def quality(camera, vertices, normals, depth_map):
+        pixels, depths = project_vertices(camera, vertices)
+        seen = visible_vertices(
+            pixels, depths, depth_map, (camera.width, camera.height), "half_pixel"
+        )
+        towards = camera.center - vertices
+        facing = jnp.sum(towards * normals, -1) / jnp.maximum(
+            jnp.linalg.norm(towards, axis=-1), 1e-6
+        )
+        return jnp.where(
+            seen, jnp.maximum(facing, 0) * camera.K[0, 0] / jnp.maximum(depths, 1e-6), 0
+        )
+
+    cameras = views.cameras.in_units(unit)
+    shown = jax.vmap(quality)(
+        cameras, inputs.posed_vertices / unit, inputs.posed_normals, inputs.depth_maps
+    )
+    return shown / jnp.maximum(jnp.max(shown), 1e-6)
