@@ -51,7 +51,7 @@ class _Looked:
     """
 
     def __init__(self, file: Any):
-        self.file, self.seen = file, file.tell()
+        self.file, self.seen, self.frame_end = file, file.tell(), 0
         self.count, self.most = 0, limits().opcodes
         self.stack: list[int | None] = []
         self.memo: dict[int, int] = {}
@@ -82,7 +82,7 @@ class _Looked:
         """
         here = self.file.tell()
         self.file.seek(self.seen)
-        for opcode, argument, _ in pickletools.genops(self.file):
+        for opcode, argument, start in pickletools.genops(self.file):
             self.count += 1
             if self.count > self.most:
                 check_limit("opcodes", self.count, "instructions of a pickle")
@@ -90,6 +90,12 @@ class _Looked:
                 raise Refused(f"refused the instruction {opcode.name} of a pickle")
             if type(argument) is int and abs(argument) >= LARGEST_INTEGER:
                 raise Refused("refused an integer of more than 64 bits")
+            # the unpickler reads a frame at once, and what crosses its end in another way than here
+            within, end = start < self.frame_end, self.file.tell()
+            if within and (end > self.frame_end or opcode.name == "FRAME"):
+                raise Refused("refused a frame of instructions that ends within one, or holds one")
+            if opcode.name == "FRAME":
+                self.frame_end = end + argument
             self.follow(opcode, argument)
             if opcode.name in ("BUILD", "STOP"):
                 break

@@ -241,6 +241,14 @@ PICKLES = {
     "bytes of 2^62": b"\x8e" + struct.pack("<Q", 1 << 62),
     "a bytearray of 2^40": b"\x96" + struct.pack("<Q", 1 << 40),
     "text of 2^40": b"\x8d" + struct.pack("<Q", 1 << 40),
+    "a frame that ends within a word": b"\x95"
+    + struct.pack("<Q", 4)
+    + word("0" * 8 + "q\xff\xff\xff\x7f"),
+    "a frame in a frame": b"\x95"
+    + struct.pack("<Q", 40)
+    + b"\x95"
+    + struct.pack("<Q", 4)
+    + word("x" * 40),
     "a frame of 2^62": b"\x95" + struct.pack("<Q", 1 << 62),
     "an integer of 2^31 bytes": b"\x8b" + struct.pack("<i", (1 << 31) - 1),
     "an integer of 100,000 digits": b"I" + b"9" * 100_000 + b"\n",
