@@ -91,7 +91,7 @@ class _Looked:
             if type(argument) is int and abs(argument) >= LARGEST_INTEGER:
                 raise Refused("refused an integer of more than 64 bits")
             # the unpickler reads a frame at once, and what crosses its end in another way than here
-            within, end = start < self.frame_end, self.file.tell()
+            within, end = (start or 0) < self.frame_end, self.file.tell()
             if within and (end > self.frame_end or opcode.name == "FRAME"):
                 raise Refused("refused a frame of instructions that ends within one, or holds one")
             if opcode.name == "FRAME":
