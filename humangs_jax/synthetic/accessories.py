@@ -127,10 +127,8 @@ def _followed(
     """A swept tube that moves with the skin nearest to it; its template coordinates are its own,
     around its middle.
     """
-    (x, y, _), (vertices, faces) = (
-        anatomy.skin.template.T,
-        sweep(path, across, widths, columns, closed),
-    )
+    (x, y, _) = anatomy.skin.template.T
+    (vertices, faces) = sweep(path, across, widths, columns, closed)
     candidates = np.flatnonzero((np.abs(x) < 0.2) & (y > -0.35) & (y < 0.2))
     weights = tailoring.smooth_weights(
         tailoring.nearest_weights(anatomy, vertices, candidates), faces, 6
@@ -214,11 +212,9 @@ def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Su
     """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat
     outwards.
     """
-    template, size, closed = (
-        anatomy.skin.template,
-        garment.sizes["brim"],
-        garment.kind == "brim_hat",
-    )
+    template = anatomy.skin.template
+    size = garment.sizes["brim"]
+    closed = garment.kind == "brim_hat"
     # points on the ears are not of the edge of the hat
     no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
     ring, out = _ring(
@@ -277,11 +273,9 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
             ]
         )
         on_ear = vertices[ear & (template[:, 0] * side > 0)]
-        hook = (
-            np.median(on_ear, 0) + np.asarray([side * 0.004, 0.006, 0])
-            if len(on_ear)
-            else hinge - [0, 0, 0.09]
-        )
+        hook = hinge - [0, 0, 0.09]
+        if len(on_ear):
+            hook = np.median(on_ear, 0) + np.asarray([side * 0.004, 0.006, 0])
         line = hinge + np.linspace(0, 1, 6)[:, None] * (hook - hinge)
         parts.append(
             sweep(
@@ -364,11 +358,9 @@ def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) 
     own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
     points = anatomy.skin.vertices[own]
     floor = points[:, 1].min()
-    shaft = (
-        np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1))
-        if height > 0.1
-        else [height]
-    )
+    shaft = [height]
+    if height > 0.1:
+        shaft = np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1))
     low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
     levels = floor + np.concatenate([low[low < height - 0.004], shaft])
     # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices

@@ -223,10 +223,8 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
         hip, knee, ankle, ball = LEGS[side]
         target, orientation = ankle_of(build, side, foot)
         start = pelvis + turn @ (build.joints[hip] - build.joints[PELVIS])
-        thigh, shin = (
-            build.joints[knee] - build.joints[hip],
-            build.joints[ankle] - build.joints[knee],
-        )
+        thigh = build.joints[knee] - build.joints[hip]
+        shin = build.joints[ankle] - build.joints[knee]
         bend = _knee_angle(thigh, shin, float(np.linalg.norm(target - start)))
         across = (
             turn[:, 0] + orientation[:, 0]

@@ -109,10 +109,8 @@ def bake_subject(
     )
     sums = values.reshape(texture_size, samples, texture_size, samples, 7).sum((1, 3))
     filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), sums[..., 6] > 0)
-    albedo, slopes = (
-        255 * np.clip(filled[..., :3], 0, 1),
-        np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127),
-    )
+    albedo = 255 * np.clip(filled[..., :3], 0, 1)
+    slopes = np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127)
     return BakedSubject(
         atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8)
     )
@@ -321,11 +319,13 @@ def load_bank(path: str | Path) -> PeopleBank:
         arrays, _ = read_npz(path)
         if str(arrays.get("format")) != FORMAT:
             raise ValueError(f"{path}: not a bank of people")
-        if (version := int(arrays["version"])) != VERSION:
+        version = int(arrays["version"])
+        if version != VERSION:
             raise ValueError(
                 f"{path}: a bank of version {version}; this program reads version {VERSION}"
             )
-        if missing := {*_ARRAYS, *_STATIC} - set(arrays):
+        missing = {*_ARRAYS, *_STATIC} - set(arrays)
+        if missing:
             raise ValueError(f"{path}: a bank without {sorted(missing)}")
         _check_arrays(arrays)
         _check_range(arrays["seeds"].tolist(), str(arrays["split"]), f"{path}: ")
@@ -399,9 +399,11 @@ def _person(
             f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many"
         )
     u, v = np.moveaxis(atlas.uvs[atlas.faces], -1, 0)
-    pad = lambda values, kind: np.pad(
-        np.asarray(values), (0, MOST_MATERIALS - len(materials))
-    ).astype(kind)
+
+    def pad(values: Sequence[Any], kind: type) -> np.ndarray:
+        """Numbers of the materials, with zeros up to the most that there may be."""
+        return np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
+
     identities = [id(material) for material in materials]
     generators = (np.random.default_rng([seed, POSE_STREAM, i]) for i in range(pose_count))
     rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(
@@ -412,6 +414,9 @@ def _person(
         -1
     )  # of each pose from the others
     joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
+    displacements = np.zeros((0, 3), np.float16)
+    if displaced is not None:
+        displacements = to_silhouettes(subject, displaced, rotations[0])
     return {
         "seeds": np.asarray(seed, np.int32),
         "betas": subject.betas,
@@ -430,11 +435,7 @@ def _person(
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
         "nearest": np.argmin(away + 1e9 * np.eye(pose_count), axis=1).astype(np.int32),
-        "displacements": (
-            np.zeros((0, 3), np.float16)
-            if displaced is None
-            else to_silhouettes(subject, displaced, rotations[0])
-        ),
+        "displacements": displacements,
     }
 
 

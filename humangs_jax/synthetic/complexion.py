@@ -70,16 +70,13 @@ class Complexion:
 def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Complexion:
     """Random coloring; fair skin goes with any hair, dark skin with dark hair, age with grey."""
     darkness = rng.beta(1.05, 1.15)
-    fair, mid, dark = (
-        np.asarray([0.86, 0.67, 0.57]),
-        np.asarray([0.70, 0.49, 0.36]),
-        np.asarray([0.26, 0.155, 0.105]),
-    )
-    skin = (
-        fair + (mid - fair) * min(2 * darkness, 1)
-        if darkness < 0.5
-        else mid + (dark - mid) * (2 * darkness - 1)
-    )
+    fair = np.asarray([0.86, 0.67, 0.57])
+    mid = np.asarray([0.70, 0.49, 0.36])
+    dark = np.asarray([0.26, 0.155, 0.105])
+    if darkness < 0.5:
+        skin = fair + (mid - fair) * min(2 * darkness, 1)
+    else:
+        skin = mid + (dark - mid) * (2 * darkness - 1)
     undertone = rng.normal(0, 0.035)
     skin = np.clip(
         skin * (1 + rng.normal(0, 0.02, 3)) * [1 + undertone, 1, 1 - 1.3 * undertone], 0.05, 0.92
@@ -102,11 +99,10 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
     }  # all of them are drawn
     hair = color(*colors[kind])
     brown = darkness > 0.45 or rng.random() < 0.4
-    iris = (
-        color(0.07, 0.6, rng.uniform(0.1, 0.3))
-        if brown
-        else color(rng.uniform(0.25, 0.62), 0.4, 0.5)
-    )
+    if brown:
+        iris = color(0.07, 0.6, rng.uniform(0.1, 0.3))
+    else:
+        iris = color(rng.uniform(0.25, 0.62), 0.4, 0.5)
     if made_up and rng.random() < 0.5:  # nail varnish is not shown; a seed stays the same person
         color(
             rng.choice([rng.uniform(0.9, 1.05), rng.random()]),
@@ -123,10 +119,17 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
         freckles=rng.uniform(0.3, 0.8) if darkness < 0.35 and rng.random() < 0.22 else 0.0,
         wrinkles=float(np.clip((years - 35) / 40, 0, 1)),
         shadow=rng.uniform(0.2, 0.7) if made_up and rng.random() < 0.6 else 0.0,
-        liner=rng.uniform(0.4, 0.9) if made_up else 0.0 if male else rng.uniform(0.0, 0.25),
+        liner=_liner(rng, made_up, male),
         blush=rng.uniform(0.3, 0.8) if made_up else rng.uniform(0.0, 0.35),
         tan=rng.uniform(0.0, 0.12) * (darkness < 0.6),
     )
+
+
+def _liner(rng: np.random.Generator, made_up: bool, male: bool) -> float:
+    """How dark the edges of the eyelids are."""
+    if made_up:
+        return rng.uniform(0.4, 0.9)
+    return 0.0 if male else rng.uniform(0.0, 0.25)
 
 
 FEATURES = {
@@ -155,10 +158,8 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
         result = result * (1 - tones.tan * np.clip((x - 0.2) / 0.3, 0, 1) * (y > -0.1))[:, None]
         i = np.flatnonzero((x > 0.6) & (y > -0.1))
         result[i] = _hand(tones, result[i], x[i], y[i])
-        knees, elbows = (
-            _bell((y, -0.764, 0.05)) * (y < -0.5),
-            _bell((x, 0.411, 0.03)) * (y > 0) * (z < 0),
-        )
+        knees = _bell((y, -0.764, 0.05)) * (y < -0.5)
+        elbows = _bell((x, 0.411, 0.03)) * (y > 0) * (z < 0)
         result = _tinted(result, (0.96, 0.82, 0.8), 0.5 * (knees + elbows))
         i = np.flatnonzero((y > 0.19) & (z > -0.14) & (x < 0.2))
         face = x[i], y[i], np.clip((z[i] - 0.07) / 0.02, 0, 1), s.template[i]

@@ -217,11 +217,9 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
     so.
     """
     plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
-    odds = (
-        plain_ones
-        if rng.random() < plainness
-        else {name: share for name, (share, _) in PATTERNS.items() if share}
-    )
+    odds = {name: share for name, (share, _) in PATTERNS.items() if share}
+    if rng.random() < plainness:
+        odds = plain_ones
     pattern = choice(rng, odds)
     base = _dye(rng, kind)
     for kinds, usual, odds, kept in PATTERN_RULES:
@@ -377,11 +375,9 @@ def camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector
 
 def herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Zigzags of slanted threads."""
-    period, pitch, share = (
-        rng.choice([0.03, 0.045]),
-        rng.choice([0.008, 0.012]),
-        rng.uniform(0.35, 0.7),
-    )
+    period = rng.choice([0.03, 0.045])
+    pitch = rng.choice([0.008, 0.012])
+    share = rng.uniform(0.35, 0.7)
     side = np.abs((s.around / period) % 2 - 1) * period
     return mix(base, base + share * (other - base), _lines(s.along + side, pitch, 0.5 * pitch))
 

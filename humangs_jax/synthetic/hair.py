@@ -117,10 +117,8 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
     beard = drawn(rng, BEARDS) if male and years > 17 else "none"
     long = 0.35 if rng.random() < 0.8 else 1.0
     fringe, side = drawn(rng, FRINGES), float(rng.choice([-1, 1]))
-    beard_length, grain = (
-        rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016),
-        rng.uniform(0.5, 0.95),
-    )
+    beard_length = rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016)
+    grain = rng.uniform(0.5, 0.95)
     return Haircut(
         cut,
         fringe,
@@ -261,10 +259,8 @@ def scalp_shell(
     that stands off.
     """
     template = anatomy.skin.template
-    above, rim = (
-        above_line(template, CAP_LINE if hat else SHORT_LINE, shift),
-        0.011 if hat else 0.0025,
-    )
+    above = above_line(template, CAP_LINE if hat else SHORT_LINE, shift)
+    rim = 0.011 if hat else 0.0025
     # a hairline is irregular, the edge of a hat is not
     if not hat:
         above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
@@ -439,7 +435,10 @@ def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
     """
     neck = anatomy.joints[NECK, 1]
     factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
-    to_rest = lambda y: neck + (y - NECK_HEIGHT) * factor
+
+    def to_rest(y):
+        return neck + (y - NECK_HEIGHT) * factor
+
     return to_rest, np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
 
 

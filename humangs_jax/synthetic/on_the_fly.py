@@ -180,7 +180,10 @@ def on_the_fly_example(
     if config.displaced_share:
         displaced = jax.random.uniform(jax.random.fold_in(key, DISPLACED)) < config.displaced_share
         flipped &= ~displaced
-    choose = lambda a, b: jnp.where(flipped, a, b)
+
+    def choose(a, b):
+        return jnp.where(flipped, a, b)
+
     inputs, targets = (
         jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts
     )
@@ -216,10 +219,8 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
     person = pick(numbers["person"], bank.people)
     faces = bank.faces[person].astype(jnp.int32)
     which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
-    poses, nearest = (
-        bank.rotations[person, which],
-        bank.rotations[person, bank.nearest[person, which]],
-    )
+    poses = bank.rotations[person, which]
+    nearest = bank.rotations[person, bank.nearest[person, which]]
     rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
     dyes = surroundings.dyes_from(
         numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person]
@@ -247,10 +248,8 @@ def pose_person(
     transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[
         :, :3
     ].reshape(-1, 12)
-    ids, weights = (
-        bank.joint_ids[person].astype(jnp.int32),
-        bank.joint_weights[person].astype(rotations.dtype),
-    )
+    ids = bank.joint_ids[person].astype(jnp.int32)
+    weights = bank.joint_weights[person].astype(rotations.dtype)
     weights = weights / weights.sum(-1, keepdims=True)  # they are stored in few bits
     blended = jnp.asarray(
         sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1]))
@@ -306,11 +305,9 @@ def _views(
     poses = plan[2]
     batch = None if config.views_at_once == 1 else min(config.views_at_once, len(poses))
     images, masks, depths, found = lax.map(view, plan, batch_size=batch)
-    rotations, translations, betas = (
-        scene.rotations[poses],
-        scene.translations[poses],
-        bank.betas[scene.person],
-    )
+    rotations = scene.rotations[poses]
+    translations = scene.translations[poses]
+    betas = bank.betas[scene.person]
     depths = depths if config.depths else None
     return SubjectViews(images, masks, found, rotations, translations, betas, depths=depths)
 
@@ -380,10 +377,8 @@ def _light_pixels(
     def light(state):
         start, colors = state
         pixels = lax.dynamic_slice_in_dim(listed, start, step)
-        face, weight = (
-            jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0),
-            weights[pixels],
-        )
+        face = jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0)
+        weight = weights[pixels]
         lit = _color_points(bank, scene, corners[face], face, weight, behind[face])
         return start + step, colors.at[pixels].set(lit, mode="drop")
 
@@ -428,7 +423,10 @@ def _sample(
     along = at - low
     column, row = low[:, 0].astype(jnp.int32), low[:, 1].astype(jnp.int32)
     right, below = jnp.minimum(column + 1, size - 1), jnp.minimum(row + 1, size - 1)
-    texel = lambda r, c: texture[person, r, c].astype(at.dtype)
+
+    def texel(r, c):
+        return texture[person, r, c].astype(at.dtype)
+
     x, y = along[:, :1], along[:, 1:]
     upper = texel(row, column) * (1 - x) + texel(row, right) * x
     lower = texel(below, column) * (1 - x) + texel(below, right) * x
@@ -596,7 +594,10 @@ def on_the_fly_source(
     """
     if each_once:
         return EachPerson(bank, config, input_counts, on_host)
-    drawn = lambda count: dataclasses.replace(config, input_views=count)
+
+    def drawn(count: int) -> OnTheFlyConfig:
+        return dataclasses.replace(config, input_views=count)
+
     return GeneratedSource(
         make=lambda key, count: jitted_example(bank, key, config=drawn(count)),
         split=bank.split,

@@ -351,9 +351,10 @@ def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> 
     waist = rng.uniform(-0.235, -0.212)
     top = _top(rng, name, kind, male, waist, tucked, outer)
     skirted = not male and rng.random() < style.skirt
-    lower = (
-        _skirt(rng, waist, tucked) if skirted else _trousers(rng, style, male, waist, tucked, top)
-    )
+    if skirted:
+        lower = _skirt(rng, waist, tucked)
+    else:
+        lower = _trousers(rng, style, male, waist, tucked, top)
     if "open" in top.details:
         below = {
             "sleeve": rng.uniform(0.14, 0.36),
@@ -379,13 +380,12 @@ def _top(
     details = {row(rng, MENS_NECKS if male else NECKS, kind)}
     cropped = not male and not tucked and rng.random() < 0.08
     # a tucked top ends just below the waist; cropped ones are rare
-    bottom = (
-        waist - 0.03
-        if tucked
-        else rng.uniform(-0.22, -0.2)
-        if cropped
-        else rng.uniform(-0.385, -0.30)
-    )
+    if tucked:
+        bottom = waist - 0.03
+    elif cropped:
+        bottom = rng.uniform(-0.22, -0.2)
+    else:
+        bottom = rng.uniform(-0.385, -0.30)
     # only plain tops may be tight
     wide = kind not in ("tank", "tee", "longsleeve", "turtleneck")
     loose = rng.uniform(0.25, 1.0) if wide else rng.uniform(0.0, 1.0) ** 1.3
@@ -401,10 +401,8 @@ def _top(
     if tucked:
         details.add("tucked")
     # what is worn under or in something else is close to the body
-    sleeve, loose = (
-        float(min(sleeve, WRIST - 0.01) if outer else sleeve),
-        min(loose, 0.2) if outer or tucked else loose,
-    )
+    sleeve = float(min(sleeve, WRIST - 0.01) if outer else sleeve)
+    loose = min(loose, 0.2) if outer or tucked else loose
     plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
     depth = rng.uniform(0.04, 0.095)
     return _made(
@@ -421,18 +419,14 @@ def _trousers(
     end = row(rng, LEG_ENDS | {"shorts": (-0.77, -0.62)} if male else LEG_ENDS, kind)
     width, loose = row(rng, LEG_WIDTHS, kind), row(rng, LEG_LOOSENESS, kind)
     # a tucked or cropped top shows the waist; under a longer one trousers may sit lower
-    upper = (
-        waist
-        if tucked or top.sizes["bottom"] > -0.25
-        else max(top.sizes["bottom"] + 0.06, waist - 0.2)
-    )
-    details = (
-        {"pockets"}
-        if kind not in ("track", "leggings")
-        else {"side_stripe"}
-        if rng.random() < 0.6
-        else set()
-    )
+    upper = waist
+    if not tucked and top.sizes["bottom"] <= -0.25:
+        upper = max(top.sizes["bottom"] + 0.06, waist - 0.2)
+    details = set()
+    if kind not in ("track", "leggings"):
+        details.add("pockets")
+    elif rng.random() < 0.6:
+        details.add("side_stripe")
     # some trousers are cropped or turned up
     if rng.random() < 0.15 and kind in ("jeans", "chinos") and not male:
         end = rng.uniform(-1.12, -1.05)
@@ -452,11 +446,8 @@ def _trousers(
 def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
     kind = drawn(rng, {"short_skirt": 3, "pleated_skirt": 1.5, "long_skirt": 2})
     end = rng.uniform(-1.1, -0.84) if kind == "long_skirt" else rng.uniform(-0.76, -0.57)
-    flare = (
-        rng.uniform(0.0, 0.05)
-        if rng.random() < 0.35 and kind != "pleated_skirt"
-        else rng.uniform(0.05, 0.16)
-    )
+    narrow = rng.random() < 0.35 and kind != "pleated_skirt"
+    flare = rng.uniform(0.0, 0.05) if narrow else rng.uniform(0.05, 0.16)
     sizes = {
         "top": waist,
         "end": end,
@@ -469,9 +460,9 @@ def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
 
 
 def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
-    count, depth = (
-        ((14, 24), (0.008, 0.014)) if kind == "pleated_skirt" else ((4, 10), (0.004, 0.016))
-    )
+    count, depth = (4, 10), (0.004, 0.016)
+    if kind == "pleated_skirt":
+        count, depth = (14, 24), (0.008, 0.014)
     return {"pleats": float(rng.integers(*count)), "depth": rng.uniform(*depth)}
 
 
@@ -516,10 +507,11 @@ def _outer(rng: np.random.Generator, style: Style, worn: Sequence[Garment]) -> G
     if kind == "vest":
         sizes["sleeve"] = rng.uniform(0.145, 0.165)
     coat = _made(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72, details, **sizes)
-    suited = (
-        [g.fabric for g in worn if g.kind in ("chinos", "slim", "wide")] if kind == "blazer" else []
-    )
-    return dataclasses.replace(coat, fabric=suited[0]) if suited and rng.random() < 0.55 else coat
+    # a blazer and its trousers may be a suit
+    trousers = [each.fabric for each in worn if each.kind in ("chinos", "slim", "wide")]
+    if kind == "blazer" and trousers and rng.random() < 0.55:
+        return dataclasses.replace(coat, fabric=trousers[0])
+    return coat
 
 
 def _shoes(

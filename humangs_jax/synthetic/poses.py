@@ -125,19 +125,15 @@ def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
     shift = rng.uniform(0.4, 1.0) * width * sign  # the standing foot comes below the pelvis
     feet = [dataclasses.replace(foot, x=foot.x + shift) for foot in feet]
     z = feet[relaxed].z + rng.uniform(0.0, 0.28)
-    pitch, yaw = (
-        rng.choice([0.0, rng.uniform(0.1, 0.5)]),
-        feet[relaxed].yaw + sign * rng.uniform(0, 0.3),
-    )
+    pitch = rng.choice([0.0, rng.uniform(0.1, 0.5)])
+    yaw = feet[relaxed].yaw + sign * rng.uniform(0, 0.3)
     feet[relaxed] = dataclasses.replace(feet[relaxed], z=z, pitch=pitch, yaw=yaw)
     return Stance(tuple(feet), sink=rng.uniform(0.0, 0.01), roll=-sign * rng.uniform(0.03, 0.12))
 
 
 def _stride(rng: np.random.Generator, width: float) -> Stance:
-    feet, front = (
-        _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2)),
-        int(rng.integers(2)),
-    )
+    feet = _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2))
+    front = int(rng.integers(2))
     length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
     feet[front] = dataclasses.replace(
         feet[front], z=0.08 + share * length, pitch=-rng.uniform(0, 0.3) * (length > 0.4)
@@ -162,10 +158,8 @@ def _wide(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _squat(rng: np.random.Generator, width: float) -> Stance:
-    depth, feet = (
-        rng.uniform(0.08, 0.42),
-        _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6)),
-    )
+    depth = rng.uniform(0.08, 0.42)
+    feet = _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6))
     heels = rng.uniform(0.2, 0.6) if depth > 0.3 else 0.0
     feet = [dataclasses.replace(foot, pitch=heels, z=foot.z + 0.06) for foot in feet]
     return Stance(tuple(feet), sink=depth, tilt=0.6 * depth, lean=1.4 * depth)

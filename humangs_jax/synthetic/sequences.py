@@ -116,21 +116,17 @@ class Gait:
 def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
     step, curved = rng.uniform(0.3, LONG_STEP) * build.leg, rng.random() < 0.6
     cadence, bend = rng.uniform(0.75, 1.05), rng.normal(0, 0.16) if curved else 0.0
-    width, lift, turn_out = (
-        build.hip_width * rng.uniform(0.5, 0.9),
-        rng.uniform(0.04, 0.09),
-        rng.uniform(0.0, 0.18),
-    )
+    width = build.hip_width * rng.uniform(0.5, 0.9)
+    lift = rng.uniform(0.04, 0.09)
+    turn_out = rng.uniform(0.0, 0.18)
     swing = rng.uniform(0.25, 0.5) * min(1.0, step / build.leg / 0.6)
     return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
 
 
 def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
     cadence, step = rng.uniform(0.6, 0.9), rng.uniform(-0.02, 0.06)
-    bend, width = (
-        rng.choice([-1, 1]) * rng.uniform(0.25, 0.5),
-        build.hip_width * rng.uniform(0.95, 1.3),
-    )
+    bend = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)
+    width = build.hip_width * rng.uniform(0.95, 1.3)
     lift, turn_out, swing = rng.uniform(0.05, 0.09), rng.uniform(0.05, 0.2), rng.uniform(0.03, 0.15)
     return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
 
@@ -141,7 +137,10 @@ def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: G
         rng.uniform(-np.pi, np.pi) if abs(gait.step) < 0.1 * build.leg else rng.uniform(-0.7, 0.7)
     )
     phase = start + gait.cadence * (np.arange(frames) / FPS)  # strides; two steps each
-    heading = lambda p: begin_heading + 2 * gait.bend * (p - start)
+
+    def heading(p):
+        return begin_heading + 2 * gait.bend * (p - start)
+
     track = _path(heading, 2 * gait.step, start, phase[-1])
     feet = [tuple(_foot_at(build, gait, heading, track, side, p) for side in (0, 1)) for p in phase]
     planted = np.asarray([[(p + 0.5 * side) % 1 < STANCE_SHARE for side in (0, 1)] for p in phase])
@@ -188,7 +187,10 @@ def _path(heading: Heading, stride: float, first: float, last: float) -> Track:
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
     along = cumulative_trapezoid(direction, grid, axis=0, initial=0)
-    at = lambda p: np.asarray([np.interp(p, grid, along[:, k]) for k in range(3)])
+
+    def at(p):
+        return np.asarray([np.interp(p, grid, along[:, k]) for k in range(3)])
+
     origin = at(first)
     return lambda p: stride * (at(p) - origin)
 
@@ -203,10 +205,8 @@ def _foot_at(
     down = number - 0.5 * side
     here, there = (_footprint(build, gait, heading, track, side, down + k) for k in (0, 1))
     long = np.clip(gait.step / (LONG_STEP * build.leg), 0.15, 1.0)
-    strike, off = (
-        HEEL_STRIKE * long if gait.step > 0.2 * build.leg else 0.0,
-        TOE_OFF * (0.35 + 0.65 * long),
-    )
+    strike = HEEL_STRIKE * long if gait.step > 0.2 * build.leg else 0.0
+    off = TOE_OFF * (0.35 + 0.65 * long)
     if share < STANCE_SHARE:
         u = share / STANCE_SHARE
         rise = np.clip((u - FLAT_UNTIL) / (1 - FLAT_UNTIL), 0.0, 1.0)  # from rest to full motion
@@ -289,11 +289,9 @@ def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
     while times[-1] <= frames / FPS:
         times.append(times[-1] + rng.uniform(0.7, 1.4))
         keys.append(_key_pose(rng, build, heading, stance, feet, keys[-1]))
-    rotations, centers, sinks = (
-        np.zeros((frames, kin.JOINTS, 3)),
-        np.zeros((frames, 3)),
-        np.zeros(frames),
-    )
+    rotations = np.zeros((frames, kin.JOINTS, 3))
+    centers = np.zeros((frames, 3))
+    sinks = np.zeros(frames)
     for i in range(frames):
         k = int(np.searchsorted(times, i / FPS, side="right")) - 1
         a, b = keys[k], keys[k + 1]
@@ -382,8 +380,12 @@ def _ride(
         kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
         for turn, center, both in zip(turns, centers, feet, strict=True)
     ])  # fmt: skip
-    views = np.lib.stride_tricks.sliding_window_view
-    window = lambda values: views(np.pad(values, SMOOTHING, mode="edge"), 2 * SMOOTHING + 1)
+
+    def window(values):
+        """The frames around each frame."""
+        padded = np.pad(values, SMOOTHING, mode="edge")
+        return np.lib.stride_tricks.sliding_window_view(padded, 2 * SMOOTHING + 1)
+
     weights = np.hanning(2 * SMOOTHING + 3)[1:-1]
     smooth = window(window(heights).min(-1)) @ (weights / weights.sum())
     pelvis = centers.copy()

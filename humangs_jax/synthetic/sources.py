@@ -33,7 +33,11 @@ def people_of_split(
     Arguments: size: of the images, pixels: textures are as fine as these need. each_once: see
     `on_the_fly_people`.
     """
-    texture = 128 if size <= 64 else 512 if size <= 256 else 1024
+    texture = 1024
+    if size <= 64:
+        texture = 128
+    elif size <= 256:
+        texture = 512
     bank = build_bank(seeds_of(split, 0, people), body, split, texture_size=texture)
     return on_the_fly_people(bank, each_once=each_once)
 

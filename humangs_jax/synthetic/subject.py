@@ -166,10 +166,8 @@ class Person:
 def describe(seed: int, body: BodyModel) -> Person:
     """The person of a seed, unbuilt."""
     rng = np.random.default_rng([seed, 0])
-    male, years = (
-        bool(rng.random() < 0.5),
-        float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS)),
-    )
+    male = bool(rng.random() < 0.5)
+    years = float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
     betas, stature = sample_shape(rng, body, male, years)
     garments = sample_outfit(np.random.default_rng([seed, 11]), male, years)
     complexion = sample_complexion(np.random.default_rng([seed, 12]), male, years)
@@ -273,10 +271,8 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
     eyes = wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(person.complexion))
     # one mesh; the order of the pieces is that of the materials
     pieces = [wardrobe.Piece(skin, skin_material), eyes, *outfit.pieces, *hairs]
-    surface, materials = (
-        join([piece.surface for piece in pieces]),
-        tuple(piece.material for piece in pieces),
-    )
+    surface = join([piece.surface for piece in pieces])
+    materials = tuple(piece.material for piece in pieces)
     cover = np.pad(
         skin.attributes["cover"],
         (0, len(surface.vertices) - len(skin.vertices)),
@@ -377,10 +373,8 @@ POINT_STEP = 1 << 15
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 
-_shaded_vertices, _seen_from_behind = (
-    jax.jit(surroundings.shaded_vertices),
-    jax.jit(surroundings.seen_from_behind),
-)
+_shaded_vertices = jax.jit(surroundings.shaded_vertices)
+_seen_from_behind = jax.jit(surroundings.seen_from_behind)
 _light_points = jax.jit(surroundings.light_points)
 Image = Float[np.ndarray, "h w 3"]
 Map = Float[np.ndarray, "h w"]
@@ -504,10 +498,8 @@ def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Value
     folds.
     """
     material_ids = subject.face_materials[face_ids]
-    albedo, slope = (
-        np.empty((len(face_ids), 3), np.float32),
-        np.zeros((len(face_ids), 3), np.float32),
-    )
+    albedo = np.empty((len(face_ids), 3), np.float32)
+    slope = np.zeros((len(face_ids), 3), np.float32)
     for k in np.unique(material_ids):
         material, chosen = subject.materials[k], np.flatnonzero(material_ids == k)
         own = Spots(spots.cloth[chosen], spots.template[chosen])

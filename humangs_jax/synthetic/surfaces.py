@@ -213,10 +213,8 @@ def smooth(values: Values, faces: Faces, iterations: int, keep_hems: bool = Fals
     """
     count = len(values)
     edges = edges_of(faces)
-    source, target = (
-        np.concatenate([edges[:, 0], edges[:, 1]]),
-        np.concatenate([edges[:, 1], edges[:, 0]]),
-    )
+    source = np.concatenate([edges[:, 0], edges[:, 1]])
+    target = np.concatenate([edges[:, 1], edges[:, 0]])
     if keep_hems:
         hems = boundary_edges(faces)
         inner = ~np.isin(target, hems)
@@ -351,11 +349,8 @@ def sweep(
     closed: the path's end joins its start; otherwise the ends are open (let the widths run out to
     close them).
     """
-    tangent = (
-        unit(np.roll(path, -1, 0) - np.roll(path, 1, 0))
-        if closed
-        else unit(np.gradient(path, axis=0))
-    )
+    along = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
+    tangent = unit(along)
     first = unit(across - np.sum(across * tangent, -1, keepdims=True) * tangent)
     second, widths = np.cross(tangent, first), np.broadcast_to(widths, (len(path), 2))
     c, s = np.cos(circle(columns))[None, :, None], np.sin(circle(columns))[None, :, None]

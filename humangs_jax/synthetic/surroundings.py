@@ -124,9 +124,11 @@ def _orbits(
 ) -> Camera:
     """A batch of cameras that each look at a target of their own."""
     K = intrinsics_from_fov(VERTICAL_FOV, size, size)
-    one = lambda target, distance, azimuth, elevation: orbit(
-        target, distance[None], azimuth[None], elevation[None], K, size, size
-    )[0]
+
+    def one(target, distance, azimuth, elevation):
+        cameras = orbit(target, distance[None], azimuth[None], elevation[None], K, size, size)
+        return cameras[0]
+
     return jax.vmap(one)(targets, distances, azimuths, elevations)
 
 
@@ -313,11 +315,9 @@ def sample_lights(rng: np.random.Generator) -> Lights:
     power = np.asarray([rng.uniform(*key), rng.uniform(*fill), rng.uniform(0.4, 1.2) * fill[1]])
     tint = rng.uniform(-0.03, 0.03, (3, 3))
     sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * WARM)
-    exposure, balance, green = (
-        np.exp(rng.normal(0.06, 0.12)),
-        rng.normal(0, 0.045),
-        rng.normal(0, 0.012),
-    )
+    exposure = np.exp(rng.normal(0.06, 0.12))
+    balance = rng.normal(0, 0.045)
+    green = rng.normal(0, 0.012)
     gain = np.clip(exposure, 0.75, 1.3) * np.asarray([1 + balance, 1 + green, 1 - balance])
     ground = bounce * sky * (1 + rng.uniform(-0.06, 0.06, 3))
     return _lights(np, angles, elevations, power, tint, warmth, sky, ground, gain)
@@ -330,8 +330,13 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     row = jnp.asarray(_SCENES)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
     azimuth, height, key, fill, sky = row[1:11].reshape(5, 2)
     warmth, bounce = row[11], row[12]
-    within = lambda limits, share: limits[0] + (limits[1] - limits[0]) * share
-    sign = lambda number: jnp.where(number < 0.5, -1.0, 1.0)
+
+    def within(limits, share):
+        return limits[0] + (limits[1] - limits[0]) * share
+
+    def sign(number):
+        return jnp.where(number < 0.5, -1.0, 1.0)
+
     # key light, fill light, and one from the opposite side
     turns = jnp.stack(
         [jnp.zeros(()), sign(u[1]) * within((1.4, 2.4), u[2]), np.pi + within((-0.5, 0.5), u[3])]
@@ -340,17 +345,13 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
         [within(height, u[6]), within((0.1, 0.5), u[7]), within((0.4, 0.9), u[8])]
     )
     power = jnp.stack([within(key, u[9]), within(fill, u[10]), within((0.4, 1.2), u[11]) * fill[1]])
-    tint, color = (
-        within((-0.03, 0.03), u[12:21].reshape(3, 3)),
-        within(sky, u[21]) * (1 - 0.5 * warmth * WARM),
-    )
+    tint = within((-0.03, 0.03), u[12:21].reshape(3, 3))
+    color = within(sky, u[21]) * (1 - 0.5 * warmth * WARM)
     # exposure and white balance err as those of real cameras
-    normal = lambda number: ndtri(jnp.clip(number, 1e-4, 1 - 1e-4))
-    exposure, balance, green = (
-        0.12 * normal(u[22]) + 0.06,
-        0.045 * normal(u[23]),
-        0.012 * normal(u[24]),
-    )
+    normal = ndtri(jnp.clip(u[22:25], 1e-4, 1 - 1e-4))
+    exposure = 0.12 * normal[0] + 0.06
+    balance = 0.045 * normal[1]
+    green = 0.012 * normal[2]
     gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack(
         [1 + balance, 1 + green, 1 - balance]
     )
@@ -402,7 +403,11 @@ def shaded_vertices(
     x, y, z = ((points - low) / CELL).astype(jnp.int32).T
     # duplicates all write the same number: the order does not matter
     grid = _blurred(jnp.zeros(GRID, points.dtype).at[x, y, z].set(1.0, mode="drop"))
-    place = lambda points: (points - low) / CELL - 0.5
+
+    def place(points):
+        """Where points are in the grid, voxels."""
+        return (points - low) / CELL - 0.5
+
     dark = sum(_trilinear(grid, place(vertices + reach * normals)) for reach in REACH) / len(REACH)
     openness = jnp.clip(1.08 - 2.6 * dark, 0.35, 1.0)
     start = vertices + LIFT * normals
@@ -533,7 +538,7 @@ def dyes_from(
     grey = jnp.full((3, 3), 1 / 3)
     # Rodrigues' formula about (1, 1, 1) / sqrt(3)
     skew = jnp.asarray([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
-    each = lambda values: values[:, None, None]
-    rotation = each(jnp.cos(hue)) * (jnp.eye(3) - grey) + each(jnp.sin(hue)) * skew
-    matrices = each(brightness) * (grey + each(saturation) * rotation)
-    return jnp.where(each(dyeable) > 0, matrices[groups], jnp.eye(3))
+    hue, brightness, saturation = (x[:, None, None] for x in (hue, brightness, saturation))
+    rotation = jnp.cos(hue) * (jnp.eye(3) - grey) + jnp.sin(hue) * skew
+    matrices = brightness * (grey + saturation * rotation)
+    return jnp.where(dyeable[:, None, None] > 0, matrices[groups], jnp.eye(3))

@@ -318,7 +318,11 @@ def _fold_heights(
     rings = np.sin(2 * np.pi * slanted / 0.055) * (
         0.6 + 0.4 * ripples(rng, cloth[:, :3], wavelength=0.1)
     )
-    bend = lambda height, wide: np.exp(-(((along + height) / wide) ** 2))
+
+    def bend(height, wide):
+        """A bump of that width at a height."""
+        return np.exp(-(((along + height) / wide) ** 2))
+
     elbows = arm * (bend(0.14, 0.07) + 0.8 * bend(0.34, 0.06))
     knees = leg * (bend(0.79, 0.07) + 1.3 * bend(1.12, 0.07) + 0.6 * bend(0.46, 0.05))
     heights = heights + 1.3 * fit.fold * rings * (elbows + knees)

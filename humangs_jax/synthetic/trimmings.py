@@ -70,8 +70,10 @@ def random_text(rng: np.random.Generator) -> str:
         return str(rng.choice(WORDS))
     if kind < 0.6:
         return str(rng.integers(1, 100)) if rng.random() < 0.5 else str(rng.integers(1950, 2030))
-    letters = lambda: str(rng.choice(list("BDFGKLMNPRSTVZ"))) + str(rng.choice(list("AEIOU")))
-    return "".join(letters() for _ in range(rng.integers(2, 4)))
+    word = ""
+    for _ in range(rng.integers(2, 4)):
+        word += str(rng.choice(list("BDFGKLMNPRSTVZ"))) + str(rng.choice(list("AEIOU")))
+    return word
 
 
 def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
@@ -167,8 +169,12 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     shape, points = str(rng.choice(EMBLEMS)), int(rng.integers(5, 8))
     size, seed = rng.uniform(0.05, 0.085), int(rng.integers(1 << 20))
     on_back, framed = number or rng.random() < 0.25, rng.random() < 0.3
-    words = lambda x, y: written(cells, x / cell + 0.5 * width, y / cell + 0.5 * ROWS)
-    badge = lambda x, y, size: emblem(shape, x / size, y / size, points)
+
+    def words(x, y):
+        return written(cells, x / cell + 0.5 * width, y / cell + 0.5 * ROWS)
+
+    def badge(x, y, size):
+        return emblem(shape, x / size, y / size, points)
 
     # paint the print once, around its own middle
     def motif(result, x, y, where):
@@ -236,8 +242,10 @@ def quilted(colors: Points, s: Spots, _rng: np.random.Generator, _garment: Garme
 
 def buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A placket with buttons down the front."""
-    sizes, high = garment.sizes, 0.2
-    low = 0.02 if garment.kind == "polo" else sizes["end" if garment.kind in DRESSES else "bottom"]
+    high = 0.2
+    low = garment.sizes["end" if garment.kind in DRESSES else "bottom"]
+    if garment.kind == "polo":
+        low = 0.02
     dyed = rng.random() < 0.3
     ink = accent(rng, garment.fabric.base) if dyed else color(0.1, 0.1, rng.choice([0.12, 0.8]))
     pitch, size = rng.uniform(0.07, 0.1), rng.uniform(0.005, 0.0075)
@@ -249,10 +257,8 @@ def buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
 
 def zipped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A zip down the front, or its halves along the edges of an open front."""
-    ink, edge = (
-        color(0.1, 0.05, rng.choice([0.15, 0.6, 0.75])),
-        max(garment.sizes.get("gap", 0.0), 0.0),
-    )
+    ink = color(0.1, 0.05, rng.choice([0.15, 0.6, 0.75]))
+    edge = max(garment.sizes.get("gap", 0.0), 0.0)
     front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], garment.sizes["bottom"], 0.2)
     away = np.abs(np.abs(s.cloth[:, 0]) - edge)
     return mix(
@@ -345,14 +351,14 @@ def sewn(
     def colors(s):
         rng = garment.fabric.rng(1)
         result = hemmed(garment.fabric.colors(s), s, hem, sleeve)
-        result = seamed(result, s) if seams else result
-        result = (
-            ribbed(result, s, rng, garment)
-            if "ribbed" in details and sleeve is not None
-            else result
-        )
-        result = printed(result, s, rng, garment) if details & {"print", "number"} else result
-        result = side_striped(result, s, rng, garment) if "side_stripe" in details else result
+        if seams:
+            result = seamed(result, s)
+        if "ribbed" in details and sleeve is not None:
+            result = ribbed(result, s, rng, garment)
+        if details & {"print", "number"}:
+            result = printed(result, s, rng, garment)
+        if "side_stripe" in details:
+            result = side_striped(result, s, rng, garment)
         rng = garment.fabric.rng(2)
         for kinds, detail, trimming, *arguments in SEWN_ON:
             if garment.kind in kinds and (detail is None or detail in details):
@@ -367,7 +373,9 @@ def leather(s: Spots, garment: Garment) -> Points:
     rng, kind, base = garment.fabric.rng(2), garment.kind, garment.fabric.base
     white, sneakers = rng.random() < 0.75, kind == "sneakers"
     dark = base * rng.uniform(0.35, 0.6)
-    trim = color(0.1, 0.05, 0.82 if white else 0.1) if sneakers else dark
+    trim = dark
+    if sneakers:
+        trim = color(0.1, 0.05, 0.82 if white else 0.1)
     second = accent(rng, base) if rng.random() < 0.5 else trim
     laced = sneakers or (kind in ("flats", "ankle_boots") and rng.random() < 0.6)
     swoosh, toe = rng.uniform(0.2, 0.8), sneakers and rng.random() < 0.5
@@ -394,11 +402,9 @@ def leather(s: Spots, garment: Garment) -> Points:
 def buckled(s: Spots, garment: Garment) -> Points:
     """A belt with stitched edges, holes and a buckle in front."""
     width = garment.sizes["width"]
-    x, y, front = (
-        s.template[:, 0],
-        s.template[:, 1] - (garment.sizes["top"] - 0.5 * width),
-        s.cloth[:, 2] > 0,
-    )
+    x = s.template[:, 0]
+    y = s.template[:, 1] - (garment.sizes["top"] - 0.5 * width)
+    front = s.cloth[:, 2] > 0
     metal = color(0.12, 0.3, 0.62) if width > 0.035 else color(0.6, 0.05, 0.6)
     result = _darker(
         garment.fabric.colors(s), 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012)

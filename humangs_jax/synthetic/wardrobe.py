@@ -10,9 +10,9 @@ import numpy as np
 
 from humangs_jax.synthetic import accessories, tailoring, trimmings
 from humangs_jax.synthetic.anatomy import CROTCH, WAIST, Anatomy, leg_coordinates
-from humangs_jax.synthetic.fabrics import Material
+from humangs_jax.synthetic.fabrics import Material, Spots
 from humangs_jax.synthetic.outfits import BOTTOMS, DRESSES, OUTER, SHOES, SKIRTS, TOPS, Garment
-from humangs_jax.synthetic.surfaces import Field, Surface, compact
+from humangs_jax.synthetic.surfaces import Field, Points, Surface, compact
 from humangs_jax.synthetic.tailoring import HEM_MARGIN, Fit, shell, skirt
 from humangs_jax.synthetic.trimmings import PADDED, QUILT, sewn
 
@@ -106,7 +106,10 @@ class Outfit:
         """A shell where all cuts (a function of template points, and its further arguments) are
         positive, and what it hides.
         """
-        fields = lambda points: [field(points, *arguments) for field, *arguments in cuts]
+
+        def fields(points: Points) -> list[Field]:
+            return [field(points, *arguments) for field, *arguments in cuts]
+
         surface = finish(shell(self.rng, self.anatomy, fields(self.template), fit))
         self.hide(lambda points: np.min(fields(points), axis=0), margin, over)
         self.add(surface, material)
@@ -206,9 +209,15 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
     gap, spread, bottom, loose = sizes["gap"], sizes["spread"], sizes["bottom"], sizes["loose"]
     long, padded, blazer = kind == "coat", kind in PADDED, kind == "blazer"
     ease = max(outfit.trunk + 0.009 + 0.008 * loose, 0.022 if padded else 0.0)
+    if long:
+        hang = 1.5
+    elif blazer:
+        hang = 0.8
+    else:
+        hang = outfit.rng.choice([0.05, 0.3])
     fit = Fit(
         ease=ease,
-        hang=1.5 if long else 0.8 if blazer else outfit.rng.choice([0.05, 0.3]),
+        hang=hang,
         sleeve=0.01 + 0.012 * loose,
         fold=0.002 if padded or blazer else 0.002 + 0.003 * loose,
         hem=0.014,
@@ -221,7 +230,8 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         stitches, 0.15 if blazer else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05
     )
     opening = [(tailoring.front_opening, gap, spread)] if gap > 0 else []
-    neck, low = "vee" if "lapels" in details else "crew", WAIST - 0.045 if long else bottom
+    neck = "vee" if "lapels" in details else "crew"
+    low = WAIST - 0.045 if long else bottom
     _bodice(outfit, neck, (0.09, sizes["sleeve"], low), fit, material, 0.03, opening)
     if long:
         width, flare = max(outfit.legs, ease) + 0.002, sizes["flare"]
@@ -269,7 +279,10 @@ def _trousers(outfit: Outfit, garment: Garment) -> None:
         calm=9.0 if tucked else outfit.lowest + 0.02,
     )
     material = Material(sewn(garment, end + 0.018), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
-    in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.template))
+
+    def in_two_legs(surface: Surface) -> Surface:
+        return surface.with_attributes(cloth=leg_coordinates(surface.template))
+
     margin = HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts"))
     outfit.put([(tailoring.trousers, top, end)], fit, material, margin, in_two_legs, tucked)
     x, y, _ = outfit.template.T  # skin between shirt and trousers, below both
@@ -296,9 +309,10 @@ def _skirt(outfit: Outfit, garment: Garment) -> None:
     ease = outfit.trunk + 0.004 if tucked else 0.004
     cling = 0.0 if tucked else max(0.0, top - outfit.lowest + 0.02)  # as far as the top reaches
     stitches = sewn(garment, end + 0.02, seams=False)
-    waistband = lambda s: trimmings.banded(
-        stitches(s), s, garment.fabric.base * 0.8, top - 0.035, top
-    )
+
+    def waistband(s: Spots) -> Points:
+        return trimmings.banded(stitches(s), s, garment.fabric.base * 0.8, top - 0.035, top)
+
     surface = skirt(outfit.rng, outfit.anatomy, (top, end), ease, *_hem_of(sizes), cling=cling)
     outfit.hide(lambda t: tailoring.hips_and_legs(t, top, end), 0.0, tucked)
     outfit.add(surface, Material(waistband, wrinkles=0.35, sheen=0.05, draped=True))
@@ -329,8 +343,11 @@ def _dress(outfit: Outfit, garment: Garment) -> None:
 
 
 def _socks(outfit: Outfit, garment: Garment) -> None:
-    ribs = lambda s: (0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008))[:, None]
-    material = Material(lambda s: garment.fabric.colors(s) * ribs(s), wrinkles=0.1)
+    def ribbed(s: Spots) -> Points:
+        ribs = 0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008)
+        return garment.fabric.colors(s) * ribs[:, None]
+
+    material = Material(ribbed, wrinkles=0.1)
     fit = Fit(ease=0.003, fold=0.001, hem=0.003)
     outfit.put([(tailoring.shaft, garment.sizes["height"])], fit, material, 0.008)
 
@@ -387,11 +404,9 @@ def _bag(outfit: Outfit, garment: Garment) -> None:
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
     on_back, colors = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
     if on_back:
-        ease, material, straps = (
-            outfit.trunk,
-            Material(colors, 0.1),
-            tailoring.straps(outfit.template, -0.16, -0.03),
-        )
+        ease = outfit.trunk
+        material = Material(colors, 0.1)
+        straps = tailoring.straps(outfit.template, -0.16, -0.03)
     else:
         side, ease = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
         material = Material(colors, 0.0, 0.12)

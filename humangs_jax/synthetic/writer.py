@@ -143,10 +143,8 @@ def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = Non
     sequence = sample_sequence(
         np.random.default_rng([subject.seed, MOTION_STREAM]), subject.build, frames, kind
     )
-    rotations, translations = (
-        sequence.rotations.astype(np.float32),
-        sequence.translations.astype(np.float32),
-    )
+    rotations = sequence.rotations.astype(np.float32)
+    translations = sequence.translations.astype(np.float32)
     asked = range(0, frames, GROUNDED_EVERY)
     lowest = [subject.posed_vertices(rotations[i], translations[i])[:, 1].min() for i in asked]
     translations[:, 1] -= np.median(lowest)
@@ -318,7 +316,8 @@ def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ..
             return folders
         read_manifest(root, SYNTHETIC)
         for folder in folders:
-            if folder.name.isdigit() and (other := split_of(int(folder.name))) != split:
+            other = split_of(int(folder.name)) if folder.name.isdigit() else split
+            if other != split:
                 raise ValueError(
                     f"{folder}: a subject of the split '{other}', where '{split}' was expected"
                 )
