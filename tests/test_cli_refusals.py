@@ -132,17 +132,15 @@ BAD_USAGE = {
     "render me.npz --capture demo_capture --pose a": "--pose: not with --capture",
     "render me.npz --capture demo_capture --out b.mp4": "--out b.mp4: expected a folder",
     "render me.npz --camera c.json --capture someone": (
-        "--camera: not with --capture, which has cameras and poses of its own"
+        "--camera: not with --capture, which has the cameras and poses"
     ),
     "render me.npz --camera c.json --views 3": (
-        "--views: not with --camera, which has cameras of its own"
+        "--views: not with --camera, which has the cameras"
     ),
     "render splats.ply --camera c.json --azimuth 3": (
-        "--azimuth: not with --camera, which has cameras of its own"
+        "--azimuth: not with --camera, which has the cameras"
     ),
-    "animate me.npz --camera c.json --fov 40": (
-        "--fov: not with --camera, which has cameras of its own"
-    ),
+    "animate me.npz --camera c.json --fov 40": ("--fov: not with --camera, which has the cameras"),
     "animate me.npz --camera c.json --turn 40": "--turn: not with --camera",
     "animate me.npz --camera c.json --no-follow": "--no-follow: not with --camera",
     "render me.npz --capture demo_capture --height 64": "--height: not with --capture",

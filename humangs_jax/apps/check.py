@@ -3,8 +3,8 @@ that show what is wrong.
 
 Blue is the person's left side, red the right, the green line the boundary of the body; photo and
 body should coincide. A yellow line is the boundary of the body after the displacement of the
-capture, or after that to the masks where `reconstruct` makes one, with its skirt. What is wrong
-with a view is said by `apps.quick_check`.
+capture, or after that to the masks where `reconstruct` makes one, with its skirt.
+`apps.quick_check` names what is wrong with a view.
 
 On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An
 outlier is a ring. A line leads to the cross of the body's landmark; where the body fits, disc and

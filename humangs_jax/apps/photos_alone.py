@@ -294,8 +294,7 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
         which = f"{count} photos of one moment: one pose"
     else:
         which = (
-            f"{count} photos of several moments: the person has a pose of its own in each, and one"
-            " shape"
+            f"{count} photos of several moments: the person has another pose in each, and one shape"
         )
     # focal lengths over the diagonal, since photos may differ in size
     focal = np.median(

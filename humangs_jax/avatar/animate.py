@@ -206,8 +206,8 @@ def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
     """The avatar with the low-pass of the photos that it will be fitted to, unless its own is that
     of smaller pixels.
 
-    It looks as before: the excess of its own low-pass is now an ordinary part of the scales, which
-    a fit can reduce.
+    It looks as before: by how much its low-pass was larger is now part of the scales, which a fit
+    can reduce.
     """
     gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
     if gaussians.low_pass is None:

@@ -247,7 +247,7 @@ class Avatar(Batchable):
         if len(weights) % vertices:
             return None
         own = weights.reshape(vertices, -1, weights.shape[1])
-        # those between the legs may have weights of their own (`body.model.spread_weights`): most
+        # those between the legs may have other weights (`body.model.spread_weights`): most
         # of a vertex's agree
         alike = np.isclose(own, own[:, :1], atol=ALIKE).all(axis=(1, 2))
         return own.shape[1] if alike.mean() > 0.5 else None

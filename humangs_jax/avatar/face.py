@@ -7,7 +7,7 @@ stretched as the skin around it is: with p the places of vertices at rest and k 
     w_ik = (sum_k (p_k - p_i)(p_k - p_i)^T + ridge)^-1 (p_k - p_i).
 
 Gaussians that show an eye turn with the joint of the eye instead, and fade when the lids close.
-Photos hardly show teeth, tongue and closed lids: these are Gaussians with colors of their own,
+Photos hardly show teeth, tongue and closed lids: these are Gaussians with fixed colors,
 which are drawn only while an expression shows them. `avatar.attach_face.with_face` makes a face.
 """
 

@@ -82,7 +82,7 @@ def reconstruct(
 
     Photos are brought to the network's image size, their exposure is made equal, and views whose
     mask does not show the person are left out. Numbers of views and of foreground tokens are
-    rounded up to few sizes, each with a program of its own.
+    rounded up to few sizes; a program is compiled for each.
 
     Worlds that are not y-up are turned for the network; the avatar then has no light, whose
     directions would be those of another world. The body is displaced first
@@ -231,8 +231,9 @@ def _loaded(name: str, load: Callable[[], Capture | PreparedCapture]) -> Reconst
 def stack_captures(
     config: HumanGSConfig, captures: Sequence[Capture | PreparedCapture]
 ) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
-    """What several people are reconstructed from in one program of your own, without the skirts of
-    `reconstruct`.
+    """Stacks what several people are reconstructed from, for a program that you write and compile.
+
+    Skirts, which `reconstruct` adds, are left out.
 
     Args:
         config: of the network.

@@ -254,7 +254,7 @@ def attended(
     return jnp.zeros_like(values).at[order].set(found, mode="drop")
 
 
-# What is said about it
+# The line about guesses
 # ------------------------------------------------------------------------------------------------
 
 CLEARLY = 0.5

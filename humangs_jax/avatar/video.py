@@ -240,7 +240,7 @@ def _write_by_ffmpeg(
     command += ["-f", "rawvideo", "-pix_fmt", "rgba" if channels == 4 else "rgb24"]
     command += ["-s", f"{width + width % 2}x{height + height % 2}"]
     command += ["-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "-", "-an", *quality]
-    # said and done in BT.709: players guess the matrix of an untagged file by its size
+    # encoded and tagged as BT.709: players guess the matrix of an untagged file by its size
     command += ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
     command += [
         "-colorspace",

@@ -267,7 +267,7 @@ def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 class _Mesh:
-    """Triangles under collapse: who is beside whom, and the planes each vertex has gathered."""
+    """A mesh under collapse: the neighbours of each vertex, and the planes it has gathered."""
 
     def __init__(self, vertices, faces, uv_faces, importance):
         self.positions = vertices.tolist()

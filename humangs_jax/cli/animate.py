@@ -303,7 +303,7 @@ class Render:
         wrote(self.out, f"{what} of {len(gaussians.means):,} Gaussians")
 
     def _require_one_kind_of_cameras(self) -> None:
-        """With --capture or --camera nothing else is said about the cameras.
+        """Refuses other options of cameras beside --capture or --camera.
 
         Raises: UsageError naming the first option.
         """
@@ -390,7 +390,7 @@ def _require_no_circle(option: str, shot: Shot, usual: Shot, said: list[str]) ->
     said = [name for name in ON_A_CIRCLE if getattr(shot, name) != getattr(usual, name)] + said
     if said:
         own = "cameras and poses" if option == "--capture" else "cameras"
-        raise UsageError(f"--{said[0]}: not with {option}, which has {own} of its own")
+        raise UsageError(f"--{said[0]}: not with {option}, which has the {own}")
 
 
 def _counted(count: int, word: str) -> str:

@@ -191,7 +191,7 @@ class Reconstruct:
         load = {
             name: functools.partial(photos_of, name, folder) for name, folder in captures.items()
         }
-        if not several:  # what is wrong with it is said before the network is read
+        if not several:  # what is wrong with it is reported before the network is read
             (name, read), *_ = load.items()
             photos = read()
             load = {name: lambda: photos}
@@ -505,7 +505,7 @@ class Export:
             suggest("humangs animate", self.avatar, *played, "--out video.mp4")
 
     def _check(self, out: Path | None) -> None:
-        """What does not go together is said before anything is read. Raises: ValueError."""
+        """Refuses options that do not go together, before anything is read. Raises: ValueError."""
         for option, value in (("--frame", self.frame), ("--frames", self.frames)):
             if value is not None and (self.motion is None or out is None):
                 raise UsageError(f"{option} {value}: expected --motion and --out with it")

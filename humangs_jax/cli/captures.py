@@ -44,7 +44,7 @@ def keypoints_of(views: Any, file: Path | None, person: int | None) -> Any:
 
 
 def keypoints_wanted() -> tuple[str, ...]:
-    """What `humangs fit` has to be told: nothing where it finds keypoints itself."""
+    """Gives the options that `humangs fit` needs: none where it finds keypoints itself."""
     from humangs_jax.capture.detection.people import available
 
     return (

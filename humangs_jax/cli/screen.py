@@ -128,8 +128,8 @@ class _Handler(logging.Handler):
 
 
 def silence(verbose: bool) -> None:
-    """Keep what libraries log off the screen, and errors in threads of their own, for a whole
-    program (not a test). Before JAX is imported.
+    """Keep what libraries log, and errors in their threads, off the screen of a whole program (not
+    of a test). Call it before JAX is imported.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", XLA_LEVELS[verbose])
     if not verbose and not sys.warnoptions:

@@ -113,7 +113,7 @@ class Start:
             raise UsageError("--refine needs masks: leave out --without-masks")
         if self.masks is not None and self.without_masks:
             raise UsageError(f"--masks {self.masks}: does not go with --without-masks")
-        self._resumes()  # what is wrong with --out is said before the work
+        self._resumes()  # what is wrong with --out is reported before the work
         with stage("starting"):
             from humangs_jax.apps.start import look
             from humangs_jax.io.atomic import only_writer

@@ -344,8 +344,8 @@ def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
 
 
 def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
-    """What of one kind is said of an annotation or a part of it, as in `Annotated[int, Range(1, 9)]
-    | None`.
+    """Gives the marks of one kind in an annotation or a part of it, as in
+    `Annotated[int, Range(1, 9)] | None`.
     """
     if typing.get_origin(annotation) is Annotated:
         yield from (each for each in annotation.__metadata__ if isinstance(each, kind))

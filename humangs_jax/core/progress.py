@@ -270,8 +270,8 @@ def followed() -> bool:
 
 
 def watched() -> bool:
-    """Whether a program shows stages on a terminal: then long loops without a bar of their own show
-    one.
+    """Whether a program shows stages on a terminal: then long loops that have
+    no bar show one.
     """
     return _current.ticking
 

@@ -245,7 +245,7 @@ class _Field:
     """What an annotation says about a field of a pytree."""
 
     axes: tuple[str | int, ...] | None
-    """Names and sizes; None where it is no array but a pytree of its own."""
+    """Names and sizes; None where it is not an array but a pytree."""
     floating: bool
     """It holds floating-point numbers."""
     optional: bool

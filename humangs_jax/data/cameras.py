@@ -569,7 +569,7 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
 
 
 def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
-    """Metres in a unit of a calibration, and a line about it unless it is 1, or said by nothing.
+    """Gives the metres in a unit of a calibration, and a line about it unless it is 1 or unknown.
 
     The format's unit is taken where it has one, else metres. If the cameras then stand too near to
     a person or too far, it is the unit that puts them there, if one does.
@@ -582,7 +582,7 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     low, high = DISTANCES
     if distance is None or low <= known * distance <= high:
         line = (
-            f"{calibration.format} is in {UNITS.get(known, 'units of its own')}: taken (--scale"
+            f"{calibration.format} is in {UNITS.get(known, 'an unusual unit')}: taken (--scale"
             " says otherwise)"
         )
         return known, line if known != 1 else None

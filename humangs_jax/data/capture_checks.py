@@ -44,7 +44,7 @@ class CaptureError(FileError):
 
 
 def checked_text(file: Path, missing: str = "no such file") -> str:
-    """The text of a file. missing: what is said of one that does not exist."""
+    """Reads the text of a file. missing: the error text if there is no file."""
     try:
         return read_text(file)
     except FileNotFoundError:

@@ -63,7 +63,7 @@ EDGE = 0.06
 OF_TEXTURE = 1.0
 """They also change more by this share of the change beside it."""
 SEEN_APART = 1.5
-"""Pixels within which an edge is not told from the mask's."""
+"""Pixels within which an edge counts as the mask's."""
 CLEAR = 1.3
 """Pixels within which a blurred edge ends."""
 THIN = 0.0007

@@ -186,10 +186,9 @@ def write_description(
 
 
 def is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
-    """Whether the cameras of a capture are of a calibration, which is what is supposed where
-    nothing else is said.
+    """Whether the cameras of a capture are of a calibration; true where the capture does not say.
 
-    Before captures said so themselves, `humangs start` left it in a file beside them.
+    In older captures `humangs start` wrote it into a file beside them.
     """
     if "calibrated" in description:
         return description["calibrated"]

@@ -1,6 +1,6 @@
 """A skirt: a tube of vertices around both legs, where the photos show cloth between them.
 
-Each leg of a body is a tube of its own, and no vertex spans the gap between them: on a body alone,
+Each leg of a body is a tube, and no vertex spans the gap between them: on a body alone,
 a long skirt becomes a pair of ragged trousers. The vertices of the skirt are linear combinations of
 those of the legs, in shape, pose directions and skinning
 weights: where it spans the gap, of one point on each leg. So it bends smoothly between them. Its

@@ -161,7 +161,7 @@ def _unfinished(temporary: Path) -> Generator[None]:
 
 
 def _remove(path: Path) -> None:
-    """A file or a folder; what ended the write is what is said, not that this failed."""
+    """Removes a file or a folder; if that fails, the error that ended the write is raised."""
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -429,7 +429,7 @@ def _naming(path: Path, temporary: Path) -> Generator[None]:
         name = error.filename and os.fsdecode(error.filename)
         if error.errno is not None and (name is None or Path(name).is_relative_to(temporary)):
             raise OSError(error.errno, error.strerror, str(path)) from error
-        if str(temporary) in str(error):  # what a writer says in a text of its own
+        if str(temporary) in str(error):  # a text that the writer made itself
             raise OSError(str(error).replace(str(temporary), str(path))) from error
         raise
 

@@ -68,7 +68,7 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
         if kind != BINARY_CHUNK or len(data) - (28 + length + size) not in range(8):
             raise Refused("a GLB file with other chunks than JSON and one of numbers")
     if any("uri" in buffer for buffer in content.get("buffers", [])):
-        raise Refused("numbers in another file: expected a GLB file that holds all of its own")
+        raise Refused("numbers in another file: expected a GLB file that holds all of its numbers")
     accessors = content.get("accessors", [])
     check_unpacked(len(data), sum(count_of(accessor) * _width(accessor) for accessor in accessors))
     return content, binary

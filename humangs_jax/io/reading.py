@@ -216,7 +216,7 @@ def is_unread(error: BaseException) -> bool:
 
 
 class Refused(ValueError):
-    """What is wrong with the file that is being read, said by a function that does not know its
+    """Says what is wrong with the file that is being read; raised by functions that do not know its
     name.
     """
 

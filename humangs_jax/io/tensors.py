@@ -157,7 +157,7 @@ def _ordered_dict(*arguments: Any) -> PlainDict:
 
 
 def _storage_of_bytes(data: bytes) -> _Storage:
-    """The storage of a tensor in a plain pickle: a stream of its own.
+    """Reads the storage of a tensor in a plain pickle, which is a separate stream.
 
     It is a magic number, pickles of a version, the machine, the storage and a list of its name, the
     count of its numbers, and these.

@@ -46,7 +46,7 @@ OTHERS = {
         " .bvh"
     ),
 }
-"""What else is said of files that are not read, by suffix."""
+"""Hints about files that are not read, by suffix."""
 SLOWEST = 0.01
 """Frames per second: one in more than a minute and a half is no motion."""
 
@@ -191,8 +191,9 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
 
 
 def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motion, str]:
-    """The motion with the frames in which nobody was seen, between those before and after, and what
-    is to be said.
+    """Fills the frames in which nobody was seen between those before and after.
+
+    Also gives the line about them, "" for none.
     """
     steps = np.diff(np.asarray(frames, float))
     if not len(steps):

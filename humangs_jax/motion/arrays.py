@@ -90,8 +90,8 @@ EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
 
 
 def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
-    """The expressions of a person; those of other programs that fit no frames are left out, which
-    is said.
+    """The expressions of a person; those of other programs that do not fit the frames are left
+    out, with a note.
 
     Raises: MotionError for a file of ours.
     """
@@ -355,7 +355,7 @@ def _cameras(
 
 
 class _MotionFile(ArrayFile):
-    """The values of a person, and what is to be said."""
+    """The values of a person, and notes about them."""
 
     def __init__(self, path: Path, person: Person, fps: float | None):
         super().__init__(path, person.values, person.pickled, MotionError)

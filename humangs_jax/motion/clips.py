@@ -244,7 +244,7 @@ SHOWN = 12
 
 
 def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
-    """The animation of a name or number, the first if none is asked for, and what is to be said.
+    """Gives the animation of a name or number, else the first, and a note about the others.
 
     Raises: Refused.
     """

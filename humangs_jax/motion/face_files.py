@@ -108,7 +108,7 @@ def _number(row: Sequence[str], index: int, name: str, line: int) -> float:
 
 
 def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray | None, str]:
-    """Frames per second, the numbers of the frames (None: consecutive), and what is to be said."""
+    """Frames per second, the numbers of the frames (None: consecutive), and a note ("": none)."""
     parts = [re.fullmatch(r"\s*(\d+):(\d+):(\d+)[:;.](\d+(?:\.\d+)?)\s*", code) for code in codes]
     if not parts or any(part is None for part in parts):
         said = NO_RATE.format(DEFAULT_FPS) + ", which --motion-fps (in Python fps=) changes"
@@ -243,8 +243,8 @@ def animated_face(
     animation: Mapping[str, Any],
     times: Float[np.ndarray, " m"],
 ) -> tuple[FaceTrack | None, str]:
-    """The expressions in an animation of a GLB or VRMA file at some seconds, as ARKit's shapes;
-    and what is to be said.
+    """Gives the expressions in an animation of a GLB or VRMA file at some times as ARKit's shapes,
+    and a note about unknown ones.
     """
     tracks = _expression_tracks(content, binary, animation) or _weight_tracks(
         content, binary, animation

@@ -1,8 +1,8 @@
 """The people in a file or a folder of a motion, and what it says of each: arrays by name.
 
 Estimators put people into dicts by their number, into a list for each frame, along a first axis,
-into files of their own, or into one file a frame; and what they found of a person into dicts by
-coordinates. Of these those of the world are taken first.
+into a file each, or into one file a frame; and what they found of a person into dicts by
+coordinates, of which those of the world are taken first.
 """
 
 import re
@@ -333,7 +333,7 @@ MORE = ("cam2world", "pred_global_rots")
 
 
 def expected(values: Mapping[Any, Any]) -> str:
-    """What is said of a file of no format."""
+    """Gives the words for what a file of no known format was expected to have."""
     for what, needed in OTHER_FILES.items():
         if needed <= values.keys():
             return f"no motion: {what}"

@@ -2,7 +2,7 @@
 of decisions; and which way is up in the world of a motion.
 
 The page reads motions too. `page_rules` is put into it when it is assembled (viewer/page.py); it
-has no tables of its own.
+has no other tables.
 """
 
 import dataclasses
@@ -219,7 +219,7 @@ def up_axis(
     fps: float,
     also: tuple[str, ...] = (),
 ) -> tuple[str, str]:
-    """The axis that is up, and what is to be said about it ("": nothing).
+    """Gives the axis that is up, and a note about it ("": none).
 
     It is the usual one of the format. Another has to be the one along which the person stands, and
     the floor must agree: things rest on a floor, so that the lowest joint stays at one height and

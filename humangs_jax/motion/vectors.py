@@ -70,7 +70,7 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def hint_for(values: Mapping[Any, Any]) -> str:
-    """What else is said of values that are no motion; "" for nothing."""
+    """Gives a hint about values that are not a motion; "" for none."""
     return (
         f"; these are joints in space that MDM sampled: {_RENDER}"
         if values.keys() >= RESULTS

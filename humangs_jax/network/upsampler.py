@@ -45,7 +45,7 @@ class UpConvolution(nn.Module):
     """4x4 transposed convolution, stride 2, padding 1: (v, h, w, c) -> (v, 2h, 2w, features).
 
     An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i,
-    i + 1 under 2, 0; columns likewise. So one matrix product of all 2x2 neighbourhoods to 4 *
+    i + 1 under 2, 0; the same for columns. So one matrix product of all 2x2 neighbourhoods to 4 *
     features channels, interleaved, does it: as a dilated convolution (or a 2x2 one) its backward
     pass on a CPU is twenty times slower. The kernel (4, 4, c, features) is stored unflipped: input
     pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).

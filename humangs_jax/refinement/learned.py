@@ -345,8 +345,8 @@ def squared_errors(image: Image, photo: Photo) -> Image:
 
 @compiled
 def foreground_errors(image: Image, photo: Photo) -> Image:
-    """Likewise of the colors in the foreground alone: what stands before the background is to fade,
-    not to take its color.
+    """Gradient of the squared errors of colors in the foreground alone: what stands before the
+    background should fade, not take its color.
     """
     rgb, alpha = squared_errors(image, photo)
     return rgb * photo.mask[..., None], jnp.zeros_like(alpha)

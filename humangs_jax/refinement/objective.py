@@ -52,8 +52,8 @@ jax.tree_util.register_static(
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: called with arrays, a program of its own; inside of a transformation, a part of
-    that program.
+    """Decorator: compiles the function where it is called with arrays; inside of a transformation
+    it becomes a part of that program.
 
     Parameters named config and splat are static.
     """

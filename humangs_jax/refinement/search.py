@@ -349,7 +349,7 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
         clock.planned = 0
         yield iterated(task, start, everybody)[0]
         return
-    # whether the iterations help: each photo that is asked is left out of a trial of its own
+    # whether the iterations help: each photo that is asked is left out of one trial
     asked = [int(view) for view in np.argsort(losses, kind="stable")[:ASKED]]
     best, trials, ahead = start, dict.fromkeys(asked[:2], start), 0.0
     choices = (everybody, np.delete(everybody, int(np.argmax(losses)))) if config.iterations else ()

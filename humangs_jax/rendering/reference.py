@@ -205,7 +205,7 @@ def _project_by_lens(
 
 
 def _pixel(p: Float[Array, "3"], camera: Camera) -> Float[Array, "2"]:
-    """Where a camera sees a point of its own frame."""
+    """Gives the pixel of a point in the camera's frame."""
     focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
     if camera.lens == "orthographic":
         return focal * p[:2] + center

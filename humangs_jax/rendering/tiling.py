@@ -128,8 +128,8 @@ def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
     """Inclusive running sum of int32 numbers >= 0, saturating at `SUM_LIMIT`.
 
     Any 64 consecutive ones must sum to less than 2^24. Three levels: rows of 64 by a triangular
-    matrix product, rows of 64 of their totals likewise, and the few numbers left by comparing all
-    with all. Faster than `jnp.cumsum` on a CPU and, which matters more, it neither wraps nor has
+    matrix product, rows of 64 of their totals by another, and the few numbers left by comparing
+    all with all. It is faster than `jnp.cumsum` on a CPU, does not wrap, and does not have
     logarithmically many steps to compile.
     """
     n = x.shape[0]

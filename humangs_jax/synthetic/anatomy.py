@@ -398,7 +398,7 @@ def measure(
     # slices are 2 cm apart
     levels, along = np.arange(-1.3, 0.5, 0.02), np.arange(0.05, 0.8, 0.02)
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
-    # parts are told apart in template coordinates, which all bodies share
+    # parts are separated in template coordinates, which all bodies share
     trunk_points = vertices[body & (template[:, 1] > -0.6)]
     spine = np.zeros((len(levels), 2))
     torso = boundaries(trunk_points[:, 1], trunk_points[:, [0, 2]], levels, spine, 0.025)

@@ -120,7 +120,7 @@ def subject_key(seed: int, appearance: int = 0) -> Key:
 
 
 SHAPE_STD = 0.55
-"""Standard deviation of the shape coefficients without a rule of their own; values are clipped at
+"""Standard deviation of the shape coefficients without another rule; values are clipped at
 twice that.
 """
 HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}

@@ -122,7 +122,7 @@ def _orbits(
     azimuths: Float[Array, " v"],
     elevations: Float[Array, " v"],
 ) -> Camera:
-    """A batch of cameras that each look at a target of their own."""
+    """Makes a batch of cameras, one for each target that is looked at."""
     K = intrinsics_from_fov(VERTICAL_FOV, size, size)
 
     def one(target, distance, azimuth, elevation):

@@ -190,7 +190,7 @@ def ablate(
 
     Raises:
         ValueError: before the first run, for a variant that cannot be trained: named "base", with a
-            path that is no field, a seed of its own, or a loss whose network is missing; for a
+            path that is no field, another seed, or a loss whose network is missing; for a
             metric, budget or number of seeds that cannot be meant. Later, for a folder with runs of
             other settings.
         TrainingInterrupted: after Ctrl-C; what is trained is kept.
@@ -316,8 +316,7 @@ def _unusable(make: MakeSource, config: TrainConfig) -> dict[str, str]:
 
 def _folder_names(names: Sequence[str]) -> dict[str, str]:
     """A folder for each variant: its name without signs that file systems dislike, and a checksum
-    where that is no name of its own, not even for file systems that do not tell upper from lower
-    case.
+    where another variant has that name too, also on file systems that ignore upper and lower case.
     """
     plain = {name: re.sub(r"[^\w.+-]+", "_", name) for name in names}
     unusable = [
@@ -338,7 +337,7 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[MakeSource, int]:
-    """Whom all runs are compared on, and how many of them are looked at."""
+    """Gives the people that all runs are compared on, and how many of them are looked at."""
     found, count = _source(validation, body, base, "validation", each_once=True), VALIDATED
     if isinstance(validation, int):
         count = validation

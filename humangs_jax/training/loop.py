@@ -313,7 +313,7 @@ def train(
         The last state.
 
     Raises:
-        TrainingInterrupted: a KeyboardInterrupt, as said.
+        TrainingInterrupted: a KeyboardInterrupt, see above.
         ValueError: if `out` belongs to a run of another configuration, no capture can be used,
             devices and batch do not divide each other, or the sizes of a later stage do not fit.
         OSError: if another process trains into `out`.
@@ -420,7 +420,7 @@ def train(
                     break
             watch.look()
             checkpoints.close()
-            # a single process may have been told after its last step; several agree only on steps
+            # a single process may be asked to stop after its last step; several agree only on steps
             stop = stop or (jax.process_count() == 1 and stopping(end))
         if stop:
             raise TrainingInterrupted(state, config.steps)

@@ -3,7 +3,7 @@ one axis of the mesh.
 
 Data parallelism over both axes of the mesh ("data", "fsdp"); parameters, moments and averages are
 divided along "fsdp" and equal along "data". A step gathers the parameters once, works on its
-subjects, and sends every device the sum of its own part of the gradient (ZeRO stage 3, Rajbhandari
+subjects, and sends every device the sum of its part of the gradient (ZeRO stage 3, Rajbhandari
 et al., 2020, https://arxiv.org/abs/1910.02054, with one gathering a step: the network is small
 beside what it computes).
 """

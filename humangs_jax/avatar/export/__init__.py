@@ -120,7 +120,7 @@ OTHERS = {
         " folder"
     ),
 }
-"""What is said of files of Gaussians that are not read, by suffix."""
+"""Texts about files of Gaussians that are not read, by suffix."""
 
 
 @dataclasses.dataclass(frozen=True)

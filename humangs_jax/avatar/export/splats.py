@@ -149,7 +149,7 @@ def _fused(
 
 
 def _unused(elements: Mapping[str, Columns]) -> list[str]:
-    """What is to be said of properties and elements that have no meaning here."""
+    """Lists in words the properties and elements that have no meaning here."""
     found = [name for name in elements if name not in ("chunk", "vertex", "sh", "face")]
     found += [
         name
@@ -533,7 +533,7 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
 
 
 def _other_parts(placed: Sequence[tuple[dict[str, Any], Any]]) -> list[str]:
-    """What is to be said of kernels and attributes of the extension that have no meaning here."""
+    """Lists in words the kernels and attributes of the extension that have no meaning here."""
     kernels = {shown(part["extensions"][EXTENSION].get("kernel", KERNEL)) for part, _ in placed} - {
         shown(KERNEL)
     }

@@ -288,7 +288,7 @@ def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
 
 
 def _records(data: bytes) -> list[str]:
-    """What is to be said of the records of other programs."""
+    """Lists in words the records of other programs."""
     names, at = [], 0
     while at + RECORD.size <= len(data):
         kind, size = RECORD.unpack_from(data, at)

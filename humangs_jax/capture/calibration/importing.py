@@ -69,7 +69,7 @@ from humangs_jax.io.reading import check_limit, reading, write_json
 
 SIZES_SHOWN = 5
 """Sizes of photos that a report lists."""
-NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with a pose of its own"
+NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with another pose"
 """Warning about a file with a camera for each image."""
 NO_COMMON_FRAME = (
     "no two cameras have a photo of the same frame: photos of one frame must have the same file"

@@ -3,8 +3,8 @@ EXIF orientation; its mask.
 
 Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it.
 What an import writes has none: pixels are turned upright, and with them the camera, if it was
-calibrated for the pixels as stored (COLMAP). A calibration of the turned photo (OpenCV) is told by
-its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
+calibrated for the pixels as stored (COLMAP). A calibration of the turned photo (OpenCV) is known
+by its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
 """
 
 import dataclasses

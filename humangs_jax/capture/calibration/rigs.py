@@ -2,7 +2,7 @@
 Panoptic, TOML, Qualisys.
 
 A world point X is at R X + T in the camera, pixel centres are at whole numbers. The values of a
-camera stand in a map of its own, `{"cam00": {"K": .., "R": .., "T": .., "imgSize": [W, H]}}`, or
+camera stand in a map, `{"cam00": {"K": .., "R": .., "T": .., "imgSize": [W, H]}}`, or
 beside those of others with its name behind: `K_01`, `dist_01`, `Rot_01` or `R_01` (matrix or
 rotation vector), `T_01`, with the list `names`, as in EasyMocap's intri.yml and extri.yml
 (https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
@@ -358,7 +358,7 @@ def recognizes_multical(source: Source) -> bool:
 
 
 def read_multical(source: Source, format: CameraFormat) -> Calibration:
-    """The cameras of both maps; the world is the camera that has a pose of its own.
+    """Reads the cameras of both maps; the world is the camera whose pose is relative to no other.
 
     Raises: CaptureError naming the key.
     """

@@ -78,7 +78,7 @@ class _Shown(NamedTuple):
 
 
 class VideoPhotos(NamedTuple):
-    """Folders of photos and masks, and what is to be told about how they came from videos."""
+    """Folders of photos and masks that were taken out of videos, and lines about how."""
 
     images: Path
     """Folder of photos."""
@@ -537,7 +537,7 @@ def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int
         "0",
         "%08d.png",
     ]
-    _finished(path, command, folder)  # in the folder: its path may hold a % of its own
+    _finished(path, command, folder)  # run in the folder, because its path may hold a %
     table.unlink(missing_ok=True)
     count = sum(1 for _ in folder.iterdir())
     if not count:

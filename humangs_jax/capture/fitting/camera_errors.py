@@ -1,9 +1,9 @@
 """Whether a calibration is right: a camera that is turned sees all landmarks beside where the other
 cameras see them.
 
-The rotations that would mend it come from linearised bundle adjustment, in which every landmark of
-every moment is a free point (Triggs et al. 2000, "Bundle Adjustment"). Landmarks of a detector err,
-too, but each its own way: a camera is only named where its rotation exceeds several times the
+The rotations that would correct it come from linearised bundle adjustment, in which every landmark
+of every moment is a free point (Triggs et al. 2000, "Bundle Adjustment"). A detector's landmarks
+err too, but not together: a camera is only named where its rotation exceeds several times the
 standard error that the scatter over landmarks gives (a sandwich estimate, clustered by landmark).
 As few cameras are turned as explain the residuals, because turning all of them explains no more.
 """
@@ -51,7 +51,7 @@ ITERATIONS = 8
 FRAMES = 24
 """Moments that are looked at, at most."""
 CAMERAS = 64
-"""With more cameras than this nothing is said."""
+"""Cameras up to which errors are looked for."""
 ROBUST_SCALE = 3.0
 """Robust scale of residuals, standard deviations."""
 PARTS = (

@@ -162,7 +162,7 @@ def _agrees(found: Agreement) -> bool:
 def _remedies(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], height: int
 ) -> dict[str, tuple[Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]]:
-    """Cameras without a mistake that calibrations have, by what is said of it."""
+    """Gives the cameras as they were without a usual mistake, by the words for that mistake."""
     other = np.diag([1.0, -1.0, 1.0, 1.0])
     upwards = K.copy()
     upwards[:, 1, 2] = height - K[:, 1, 2]

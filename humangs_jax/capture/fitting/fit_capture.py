@@ -77,7 +77,7 @@ def fit_uncertainty(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> Uncertainty:
     """The covariance of a fit to these observations, in float64."""
-    # derivatives of the residuals by the pose of their own frame and by the shape that all share
+    # derivatives of the residuals by the pose of their frame and by the shape that all share
     model = replace(model, certainty=fit.certainty)
     derivatives = _derivatives(model, replace(observations, noise=fit.noise), fit)
     residuals_by, joints_by = (np.asarray(x, np.float64) for x in derivatives)

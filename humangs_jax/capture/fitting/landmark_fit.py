@@ -278,7 +278,7 @@ def _position(
     weights: Float[Array | np.ndarray, " k"],
 ) -> Float[Array, "3"]:
     """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a
-    detection over the focal length, x (z + t_z) = X + t_x and likewise y, linear in t.
+    detection over the focal length, x (z + t_z) = X + t_x, the same for y, linear in t.
     """
     rotation = observations.cam_from_world[:, :3, :3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)

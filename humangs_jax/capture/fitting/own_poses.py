@@ -127,8 +127,9 @@ def with_own_poses(capture: Capture) -> Capture:
 
 
 def record_of_photos(record: FitRecord, frames: Int[np.ndarray, " v"]) -> FitRecord:
-    """The record of a fit whose v photos have frames of their own from now on. frames: those of the
-    fit that they showed.
+    """Gives the record of a fit in which each of the v photos now has another frame.
+
+    frames: those of the fit that the photos showed before.
     """
     rows = {name: getattr(record, name)[frames] for name in ("noise", "joint_std", "determined")}
     return dataclasses.replace(record, **rows)

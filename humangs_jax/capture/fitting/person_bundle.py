@@ -154,7 +154,7 @@ def place_person(
     focal: float,
 ) -> Float[np.ndarray, "3"]:
     """Where landmarks at `offsets`, in camera axes, have to be put to project to their pixels: with
-    (x, y) a pixel over the focal length, x (z + t_z) = X + t_x and likewise y, linear in t. By the
+    (x, y) a pixel over the focal length, x (z + t_z) = X + t_x, the same for y, linear in t. By the
     person's size where that puts it behind the camera.
     """
     xy = points / focal
@@ -487,7 +487,7 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     """The damped step of Gauss and Newton, and the decrease of the cost that it expects.
 
     With l the landmarks, q the cameras, U the tied rows, r their residuals, and t = U l + r as
-    unknowns of their own:
+    separate unknowns:
 
         D l + E q + U^T t = -a                  D block diagonal: landmarks by landmark
         E^T l + C q       = -b

@@ -94,7 +94,7 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
             found, views=views, warnings=(*found.warnings, *explained.warnings)
         )
 
-    # each photo shows a person, and has a world, of its own
+    # each photo shows another person in another world
     every = range(len(seen.photos))
     alone = [seen.select([view]) for view in every]
     found = [

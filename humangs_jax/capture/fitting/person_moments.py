@@ -1,9 +1,9 @@
 """Whether photos of a person are of one moment, and the cameras about that moment, from the
 person's landmarks.
 
-A detector that takes a back for a front exchanges left and right of a whole view. The other views
-tell: each view is mirrored on trial. That all are mirrored is told by the body, whose toes and nose
-are in front.
+A detector that takes a back for a front exchanges left and right of a whole view. Each
+view is mirrored on trial, and the others decide. The body, whose toes and nose are in front,
+decides whether all are mirrored.
 
 A trial is an adjustment with some views mirrored. While trials are compared they are as exact as
 that needs; the one that is taken is then made as exact as it can be.

@@ -158,8 +158,8 @@ def usual_config(
 
 
 def cameras_are_unseen(capture: Capture) -> bool:
-    """Whether nothing tells how cameras should move: they were found from the person, and each
-    photo shows a pose of its own.
+    """Whether nothing tells how cameras should move: they were found from the person, and no two
+    photos show one pose.
     """
     return not capture.calibrated and capture.frame_count >= capture.view_count
 

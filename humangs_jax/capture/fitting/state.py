@@ -6,7 +6,7 @@ origin, solvers take steps of one length in all directions, and the square of a 
 
     keypoints    betas, the pose of every frame               origin: the mean shape in its usual
                                                               pose
-    scan         betas, one pose, log_scale                   origin: likewise
+    scan         betas, one pose, log_scale                   origin: the same
     refinement   betas, poses, cameras, clothing              origin: a capture
 
 The root turns by global_orient after the origin's rotation, because sums of rotation vectors near
@@ -110,7 +110,7 @@ def solve(
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation."""
 UNLIMITED = np.pi
-"""Radians: a component without a limit of its own."""
+"""Radians: the limit of a component that has no other."""
 LIMIT_STIFFNESS = 20.0
 """Standard deviations per radian beyond a joint's limit: 3 degrees count as much as one."""
 

@@ -290,8 +290,9 @@ class Match(NamedTuple):
 
 
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
-    """The people of some views of one moment, those seen by most views first; those whom no other
-    view shows come last.
+    """Matches the people of some views of one moment.
+
+    Those whom most views show come first, and those of a single view last.
 
     Arguments: mirror: for each landmark the index of its mirror image.
     """
@@ -433,8 +434,8 @@ def in_order_of_time(
 ) -> list[list[Match | None]]:
     """The matches of frames that follow each other, so that the i-th of each is one person.
 
-    The ways of all together are the shortest, in space and, of those whom space does not tell, in
-    the photos of one camera. Where others are nearly as short, nobody is linked.
+    The summed length of all ways is the shortest: in space, and in the photos of one camera for
+    people without a place in space. Where another choice is nearly as short, nobody is linked.
 
     Arguments: shown: the views of each frame; None: people are followed in space alone.
     Returns: for each frame a match for each person, None where the frame does not have the person.

@@ -414,7 +414,7 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
             raise CaptureError(
                 file,
                 f"line {number}: name",
-                f"expected the name of a camera of its own, got {name!r}",
+                f"expected a name that no other camera has, got {name!r}",
             )
         numbers = []
         for key in COLUMNS:

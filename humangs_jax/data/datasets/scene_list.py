@@ -106,7 +106,9 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
         (name,) = members(scene, file, f"[{i}]", scene_name=str)
         if name in scenes:
             raise CaptureError(
-                file, f"[{i}].scene_name", f"expected a name of its own, got {shown(name)}"
+                file,
+                f"[{i}].scene_name",
+                f"expected a name no other scene has, got {shown(name)}",
             )
         scenes[name] = scene
     return scenes

@@ -1,5 +1,5 @@
-"""The loader: which views of whom come when is a pure function of (seed, step); a run that resumes
-sees the same batches.
+"""The loader: which people and views a step has is a pure function of (seed, step); a run that
+resumes sees the same batches.
 
 A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written
 synthetic sets, data sets), `GeneratedSource` (people made on the fly from keys) and `Mixture`
@@ -106,7 +106,7 @@ class Loader:
         return self.source.example(self.seed, self._number(step, row), self.input_count(step))
 
     def describe_at(self, step: int, row: int) -> str:
-        """Whom that row shows, in words."""
+        """Names the person and views of that row, in words."""
         return self.source.describe(self.seed, self._number(step, row), self.input_count(step))
 
     def _number(self, step: int, row: int) -> int:

@@ -349,9 +349,9 @@ class CaptureSource:
         return str(self._found(seed, index, input_count)[0])
 
     def unusable(self) -> dict[str, str]:
-        """The people of whom no example can be made: name -> what is wrong.
+        """Names the people that no example can be made of: name -> what is wrong.
 
-        That are their files, or views or sizes that they lack. No photo is decoded.
+        Their files may be wrong, or they lack views or sizes. No photo is decoded.
         """
         problems = {}
         for i in range(len(self.cache)):

@@ -136,7 +136,7 @@ class Source(Protocol):
         ...
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
-        """Whom that example shows, in words: for reports, so it may take as long as `example`."""
+        """Names the person and views of that example for reports; may take as long as `example`."""
         ...
 
 

@@ -134,7 +134,7 @@ def interpolate_attributes(
     """Values at the corners of the faces, blended over the seen surface; `background` where there
     is no face.
 
-    Corners may have numbers of their own: with `faces` the texture indices of the same faces, in
+    Corners may be numbered in another way: with `faces` the texture indices of the same faces, in
     the same order, and `attributes` the texture coordinates, this is the texture coordinate of
     every pixel.
     """
