@@ -22,6 +22,7 @@ PLACES = (
     ("CITATION.cff", r"(?m)^version: .*$", "version: {version}"),
     ("CITATION.cff", r"(?m)^repository-code: .*$", "repository-code: {Repository}"),
     ("CITATION.cff", r"(?m)^url: .*$", "url: {Documentation}"),
+    ("README.md", r"git clone https://\S+", "git clone {Repository}"),
     ("mkdocs.yml", r"(?m)^repo_url: .*$", "repo_url: {Repository}"),
     ("mkdocs.yml", r"(?m)^site_url: .*$", "site_url: {Documentation}"),
     ("conda/recipe.yaml", r"(?m)^  version: .*$", '  version: "{version}"'),

@@ -321,7 +321,7 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
         f"{people['people']} synthetic people, 256 px, feed-forward": {
             name: feed_forward[key] for name, key in own.items()
         },
-        f"{refined['people']} of them, as `humangs reconstruct` makes them": scored(256, "novel"),
+        f"{refined['people']} of them, with the default refinement": scored(256, "novel"),
         "the same, 512 px": scored(512, "novel"),
         "the same, 512 px, in poses that no photo shows": scored(512, "animation"),
         f"the demo's person, {demo['image_size'][0]} px, refined for 15 s": demo["refined"],
