@@ -17,7 +17,7 @@ import pickletools
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -173,7 +173,7 @@ class StandIn:
     def __init__(self, *_: Any) -> None:
         self.state: dict[str, Any] = {}
 
-    def __new__(cls, *_: Any) -> Self:
+    def __new__(cls, *_: Any) -> Any:  # not Self: beartype in tests checks functions, not classes
         """An object whose state is empty: a pickle may make it without `__init__`."""
         made = super().__new__(cls)
         made.state = {}
