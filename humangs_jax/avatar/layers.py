@@ -41,7 +41,6 @@ from humangs_jax.io.atomic import add_files, check_ours, replace_file
 from humangs_jax.io.images import DRAWN, is_own_output, write_png
 from humangs_jax.io.reading import limits
 from humangs_jax.rendering.buffers import plan_buffers
-from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering, render
 
@@ -173,15 +172,22 @@ def exr_view(
             alpha[..., None] > 0, unprojected(camera, np.asarray(rendering.depth)), 0
         )
         channels |= {f"position.{axis}": positions[..., i] for i, axis in enumerate("XYZ")}
-    # normals and parts are drawn in one pass as values of the Gaussians
-    values = {}
+    # normals and parts are drawn in one image, as features of the Gaussians
+    values: dict[str, Float[Array, "g c"]] = {}
     if "normal" in layers:
         values["normal"] = gaussian_normals(avatar, pose)
     if "part" in layers:
         parts = gaussian_parts(avatar)
         present = np.unique(parts)
         values["part"] = jnp.asarray(parts[:, None] == present, jnp.float32)
-    drawn = splatted(posed(avatar, pose), camera, how, values) if values else {}
+    drawn: dict[str, Float[np.ndarray, "h w c"]] = {}
+    if values:
+        gaussians = posed(avatar, pose)
+        planned = plan_buffers(gaussians, camera, how)
+        together = jnp.concatenate(list(values.values()), axis=-1)
+        image = np.asarray(render(gaussians, camera, planned, features=together).features)
+        ends = np.cumsum([each.shape[1] for each in values.values()])
+        drawn = dict(zip(values, np.split(image, ends[:-1], axis=-1), strict=True))
     if "normal" in layers:
         sums = drawn["normal"]
         length = np.linalg.norm(sums, axis=-1, keepdims=True)
@@ -238,22 +244,6 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     points = (depth[..., None] * rays) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
     return points.astype(np.float32)
-
-
-def splatted(
-    gaussians: Gaussians,
-    camera: Camera,
-    how: SplatConfig,
-    values: Mapping[str, Float[Array, "g c"]],
-) -> dict[str, Float[np.ndarray, "h w c"]]:
-    """Any numbers of Gaussians, by name, summed by the weights of their colors; all of them in one
-    image.
-    """
-    planned = plan_buffers(gaussians, camera, how)
-    together = jnp.concatenate(list(values.values()), axis=-1)
-    drawn = np.asarray(render(gaussians, camera, planned, features=together).features)
-    ends = np.cumsum([each.shape[1] for each in values.values()])
-    return dict(zip(values, np.split(drawn, ends[:-1], axis=-1), strict=True))
 
 
 def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:

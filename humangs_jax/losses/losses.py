@@ -100,7 +100,9 @@ def loss_terms(
     if opacities is not None and config.opaque:
         losses["opaque"] = translucency(opacities)
     if opacities is not None and config.distortion:
-        losses["distortion"] = _needed(drawn.spread, "distortion", "spread of the rays")
+        losses["distortion"] = _needed(
+            drawn.rendering.distortion, "distortion", "distortion of the rays"
+        )
     if opacities is not None and config.depth:
         true = _needed(depths, "depth", "depth of the targets")
         losses["depth"] = surface_distance(drawn.rendering.depth, alpha, true, masks)
@@ -152,19 +154,6 @@ def surface_distance(
     """
     known = target_depth > 0
     return alpha * mask * known * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)
-
-
-def ray_spread(
-    alpha: Float[Array, "*b"], depth: Float[Array, "*b"], squared: Float[Array, "*b"]
-) -> Float[Array, "*b"]:
-    """Distortion of the weights w along a ray: sum over pairs of w_i w_j (z_i - z_j)^2, squared
-    units of z.
-
-    alpha: the sum of w. depth, squared: mean of z and of its square, weighted by w. The loss of
-    2DGS (https://arxiv.org/abs/2403.17888, eq. 13) with squared differences, after mip-NeRF 360
-    (https://arxiv.org/abs/2111.12077).
-    """
-    return 2 * alpha**2 * jnp.maximum(squared - depth**2, 0)
 
 
 def translucency(opacities: Float[Array, " g"]) -> Float[Array, " g"]:

@@ -235,9 +235,7 @@ class Drawn(NamedTuple):
     """Images of the v targets of one subject, and what losses compare besides."""
 
     rendering: Rendering
-    """The images of all targets."""
-    spread: Float[Array, "v h w"] | None = None
-    """`losses.ray_spread`, (v, h, w), square metres; None unless it has a weight."""
+    """The images of all targets; `distortion` is None unless its loss has a weight."""
     opacities: Float[Array, " g"] | None = None
     """Opacities of the Gaussians that were drawn, (g,). None: there were none, and no alpha or
     depth either.

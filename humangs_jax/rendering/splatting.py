@@ -358,28 +358,6 @@ def _of_bytes(color: Any) -> bool:
     return bool(np.any(np.asarray(color) > 1))
 
 
-def draw_projected(
-    projected: ProjectedGaussians,
-    gaussians: Gaussians,
-    camera: Camera,
-    config: SplatConfig = DEFAULT_CONFIG,
-    background: Background = None,
-    features: Float[Array, "g n"] | None = None,
-) -> Rendering:
-    """The second half of `render`, for use inside transformations.
-
-    projected: by `project_gaussians`, of these Gaussians, camera and config. Of the Gaussians only
-    opacities and colors are read here. background: as `Background`. features: other numbers of the
-    Gaussians, as in `render`.
-    """
-    gaussians, camera, background = with_background(gaussians, camera, background)
-    features = features_of(features, len(gaussians.opacities))
-    config = with_default_buffers(gaussians, camera, config)
-    rendering = _draw(projected, gaussians, camera, background, config, features)
-    warn_of_overflow(rendering.overflow, config)
-    return rendering
-
-
 def draw(
     gaussians: Gaussians,
     camera: Camera,

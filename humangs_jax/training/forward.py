@@ -18,7 +18,6 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import completed_avatar
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import Example, Source, ViewSampling
 from humangs_jax.data.views import SubjectViews, prepare_inputs
@@ -26,7 +25,6 @@ from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.losses.losses import (
     masked_psnr,
     psnr,
-    ray_spread,
     semi_transparent,
     similarity_map,
 )
@@ -35,8 +33,7 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, part_variables
 from humangs_jax.network.parts import Drawn, HumanGSOutputs, Parameters, Variables, stage
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.projection import project_gaussians
-from humangs_jax.rendering.splatting import draw_projected
+from humangs_jax.rendering.splatting import render
 from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.sources import MakeSource
 
@@ -112,31 +109,13 @@ def draw_posed(
     posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array, "v 3"], config: TrainConfig
 ) -> Drawn:
     """Gaussians posed for each target, from its camera. posed: with a leading axis v."""
+    splat = dataclasses.replace(config.splat, distortion=bool(config.loss.distortion))
 
-    def project(shapes):
-        shapes = replace(shapes, opacities=posed.opacities, colors=posed.colors)
-        return jax.lax.map(lambda x: project_gaussians(*x, config.splat), (shapes, targets.cameras))
+    def draw(posed):
+        one = lambda target: render(target[0], target[1], splat, target[2])
+        return Drawn(jax.lax.map(one, (posed, targets.cameras, backgrounds)))
 
-    def draw(projected, opacities, colors):
-        return jax.lax.map(one, (projected, opacities, colors, targets.cameras, backgrounds))
-
-    def one(target):
-        splats, opacities, colors, camera, background = target
-        gaussians = replace(jax.tree.map(lambda x: x[0], posed), opacities=opacities, colors=colors)
-        if not config.loss.distortion:
-            return Drawn(draw_projected(splats, gaussians, camera, config.splat, background))
-        z = splats.depths - jax.lax.stop_gradient(
-            jnp.mean(splats.depths)
-        )  # small numbers have small squares
-        # no colors, to which harmonics would be added, and which are not negative
-        powers = jnp.stack([z, z**2], axis=-1)
-        rendering = draw_projected(splats, gaussians, camera, config.splat, background, powers)
-        assert rendering.features is not None  # those that were given
-        first, second = (safe_divide(rendering.features[..., i], rendering.alpha) for i in (0, 1))
-        return Drawn(replace(rendering, features=None), ray_spread(rendering.alpha, first, second))
-
-    projected = stage("projected splats", project, replace(posed, opacities=None, colors=None))
-    return stage("images", draw, projected, posed.opacities, posed.colors)
+    return stage("images", draw, posed)
 
 
 def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:

@@ -12,7 +12,6 @@ from humangs_jax.losses.losses import (
     boundary_band,
     masked_psnr,
     psnr,
-    ray_spread,
     semi_transparent,
     silhouette_iou,
     squared_error,
@@ -71,17 +70,6 @@ def test_silhouettes_are_compared_at_a_half():
 
 def test_without_tight_gaussians_there_is_no_tightness():
     np.testing.assert_array_equal(tightness(jnp.zeros((4, 0, 3))), np.zeros(4))
-
-
-def test_the_spread_of_a_ray_is_the_sum_over_pairs():
-    rng = np.random.default_rng(0)
-    weights, z = rng.random((5, 4)) / 5, 0.1 * rng.random((5, 4))
-    pairs = np.einsum("ri,rj,rij->r", weights, weights, (z[:, :, None] - z[:, None]) ** 2)
-    alpha = weights.sum(1)
-    depth, squared = ((weights * z**power).sum(1) / alpha for power in (1, 2))
-    np.testing.assert_allclose(
-        ray_spread(*map(jnp.asarray, (alpha, depth, squared))), pairs, rtol=FLOAT32, atol=SQUARES
-    )
 
 
 def test_surfaces_are_compared_where_both_are_the_persons():

@@ -93,7 +93,7 @@ IN_BATCH = {
     "inputs.rotations": ((0, 1, 1, 2), "position maps"),
     "inputs.cameras.cam_from_world": ((0, 1, 0, 3), TOKENS),
     "targets.rotations": ((0, 1, 0, 0), "posed Gaussians"),
-    "targets.cameras.K": ((0, 1, 0, 0), "projected splats"),
+    "targets.cameras.K": ((0, 1, 0, 0), "images"),
 }
 
 
@@ -331,7 +331,7 @@ SPOILT = {
         "attention",
     ),  # in all blocks: going back it is the first
     "decoder": (vertex_decoder, "activate"),
-    "images": (forward, "draw_projected"),
+    "images": (forward, "render"),
 }
 
 

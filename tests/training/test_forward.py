@@ -75,7 +75,7 @@ def test_the_spread_of_rays_does_not_depend_on_harmonics():
     mean, squared = (safe_divide(expected.features[..., i], expected.alpha) for i in (0, 1))
     spread = 2 * expected.alpha**2 * (squared - mean**2)
     assert float(jnp.max(spread)) > 0.05
-    np.testing.assert_allclose(drawn.spread[0], spread, atol=1e-5)
+    np.testing.assert_allclose(drawn.rendering.distortion[0], spread, atol=1e-5)
     np.testing.assert_allclose(drawn.rendering.rgb[0], expected.rgb, atol=1e-6)
     assert drawn.rendering.features is None
 
@@ -91,5 +91,5 @@ def test_without_harmonics_the_spread_is_what_it_was():
     moments = jax.jit(lambda g: render(g, targets.cameras[0], CONFIG.splat, jnp.zeros(3)))(colored)
     mean, squared = (safe_divide(moments.rgb[..., i], moments.alpha) for i in (0, 1))
     np.testing.assert_allclose(
-        drawn.spread[0], 2 * moments.alpha**2 * (squared - mean**2), atol=1e-6
+        drawn.rendering.distortion[0], 2 * moments.alpha**2 * (squared - mean**2), atol=1e-6
     )

@@ -14,7 +14,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import CaptureCache, CaptureSource
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.losses.losses import FAR_SURFACE, loss_terms, ray_spread
+from humangs_jax.losses.losses import FAR_SURFACE, loss_terms
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Drawn
 from humangs_jax.rendering.splatting import Rendering
@@ -96,11 +96,13 @@ def own_case(names, side=SIDE):
 
     def values(point):
         point = {name: jnp.asarray(x) for name, x in point.items()}
-        alpha, mean = point["alpha"], point["depth"]
-        one = lambda rgb, alpha, depth: Rendering(rgb, alpha, depth, jnp.zeros((), jnp.int32))
-        rendering = jax.vmap(one)(point["rgb"], alpha, mean)
-        spread = ray_spread(alpha, mean, mean**2 + point["spread"])
-        drawn = Drawn(rendering, spread, point["opacities"], point["tight_offsets"])
+        alpha = point["alpha"]
+        one = lambda rgb, alpha, depth, spread: Rendering(
+            rgb, alpha, depth, jnp.zeros((), jnp.int32), distortion=spread
+        )
+        spread = 2 * alpha**2 * point["spread"]
+        rendering = jax.vmap(one)(point["rgb"], alpha, point["depth"], spread)
+        drawn = Drawn(rendering, point["opacities"], point["tight_offsets"])
         return loss_terms(drawn, images, masks, depths, config, networks)
 
     return values, point
