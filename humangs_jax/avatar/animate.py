@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.avatar.avatar import Avatar, light_terms, light_values, log_brightness, relit
+from humangs_jax.avatar.avatar import Avatar, light_terms, log_brightness, relit
 from humangs_jax.avatar.face import moved_gaussians, moved_hidden, with_hidden
 from humangs_jax.body.expressions import EYES
 from humangs_jax.body.model import (
@@ -26,12 +26,12 @@ from humangs_jax.body.model import (
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
+from humangs_jax.core.records import record_values
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import project
 from humangs_jax.rendering.gaussians import (
     Gaussians,
     factored,
-    gaussian_values,
     skin_gaussians,
     widened,
 )
@@ -164,7 +164,8 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
         "avatar.rest_joints": (avatar.rest_joints, FINITE),
         "pose.expression": (pose.expression, FINITE),
     }
-    check_values("animate", gaussian_values(avatar.gaussians) | light_values(avatar.light) | moves)
+    drawn = record_values(avatar.gaussians, "gaussians") | record_values(avatar.light, "light")
+    check_values("animate", drawn | moves)
     return _animate(avatar, pose)
 
 

@@ -15,9 +15,10 @@ from humangs_jax.avatar.face import Face
 from humangs_jax.body.library import expression_arrays, read_expressions
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.checks import FINITE, LARGEST, ROUNDING, Values, require_concrete
+from humangs_jax.core.checks import FINITE, LARGEST, ROUNDING, SIGNED_UNIT, UNIT, require_concrete
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, shape_fault, static_field
+from humangs_jax.core.records import array_fields
 from humangs_jax.geometry.transform import EXACT, along_curve
 from humangs_jax.io.arrays import (
     check_array,
@@ -76,14 +77,6 @@ class Light:
     """Log of the brightness in the photos, (g,): the colors of the Gaussians are those under this
     light.
     """
-
-
-def light_values(light: Light | None) -> dict[str, tuple[Array | None, Values]]:
-    """What `core.checks.check_values` needs to check the light of an avatar."""
-    return {
-        f"light.{name}": (getattr(light, name, None), FINITE)
-        for name in ("coefficients", "normals", "shading")
-    }
 
 
 def light_terms(normals: Float[Array, "g 3"]) -> Float[Array, "g 8"]:
@@ -498,6 +491,10 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
     return Face(hidden=hidden, expressions=expressions, **loaded)
 
 
+_RANGES = {"skinning_weights": UNIT, "light_normals": SIGNED_UNIT}
+"""What arrays of files may hold, where records allow more."""
+
+
 def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
     """Check the arrays of an avatar of j joints, as its file holds them. Raises: Refused."""
     g, n = (len(arrays[name]) for name in ("means", "rest_vertices"))
@@ -506,33 +503,19 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
             f"{'rest_vertices' if g else 'means'}: expected at least one"
             f" {'vertex' if g else 'Gaussian'}"
         )
-    # the range of the numbers in each array; others need only be finite
-    unit, lengths = (-ROUNDING, 1 + ROUNDING), (0.0, LARGEST)
-    ranges = {"scales": lengths, "low_pass": lengths, "opacities": unit, "skinning_weights": unit}
-    ranges["light_normals"] = (-1 - ROUNDING, 1 + ROUNDING)
-    # what every avatar has, then what some have
-    shapes = {
-        "means": (g, 3),
-        "quats": (g, 4),
-        "scales": (g, 3),
-        "opacities": (g,),
-        "colors": (g, 3),
-        "skinning_weights": (g, j),
-        "rest_vertices": (n, 3),
-        "rest_joints": (j, 3),
-    }
-    shapes |= {
-        "light_coefficients": (TERMS,),
-        "light_normals": (g, 3),
-        "light_shading": (g,),
-        "low_pass": (g,),
-    }
+    # shapes by the annotations of the records that the arrays are of, and numbers of some size
+    sizes = {"g": g, "n": n, "j": j}
+    for record, prefix in ((Gaussians, ""), (Avatar, ""), (Light, "light_")):
+        for field, annotated in array_fields(record).items():
+            array = arrays.get(prefix + field)
+            if array is None or field == "faces":
+                continue
+            values = _RANGES.get(prefix + field, annotated.values or FINITE)
+            shape = annotated.shape(array, sizes)
+            least, most = max(values.low, -LARGEST), min(values.high, LARGEST)
+            check_array(prefix + field, array, shape, least, most)
     if "harmonics" in arrays:
-        check_array("harmonics", arrays["harmonics"], (g, None, 3), -LARGEST, LARGEST)
         check_count(arrays["harmonics"].shape[1])
-    for name in arrays:
-        if name in shapes:
-            check_array(name, arrays[name], shapes[name], *ranges.get(name, (-LARGEST, LARGEST)))
     # what shapes and ranges do not say
     check_indices("faces", arrays["faces"], (None, 3), n)
     check_row_sums("skinning_weights", arrays["skinning_weights"])

@@ -5,7 +5,6 @@ few sizes (`buffers.round_up`), and padding is masked.
 """
 
 import contextlib
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -32,9 +31,10 @@ from humangs_jax.body.model import (
     spread_weights,
 )
 from humangs_jax.core.array_types import Array, Bool, Int
-from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
+from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
+from humangs_jax.core.records import check_record
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import (
     PreparedCapture,
@@ -51,7 +51,7 @@ from humangs_jax.data.views import (
     subject_rest,
 )
 from humangs_jax.geometry import transform
-from humangs_jax.geometry.camera import camera_values, require_pinhole
+from humangs_jax.geometry.camera import require_pinhole
 from humangs_jax.io.reading import check_limit
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import needed_tokens
@@ -509,39 +509,18 @@ def _check(given: Capture | PreparedCapture, name: str) -> None:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
     check_limit("network_views", capture.view_count, f"photos in {name}")
     require_pinhole(f"reconstruct: {name}", capture.cameras)
-    views, height, width = (*np.shape(capture.images), 0, 0, 0)[:3]
-    # one photo, mask, camera and frame for each view, and a body that fits the poses
-    shapes = {
-        "images": (views, height, width, 3),
-        "masks": None if capture.masks is None else (views, height, width),
-        "displacement": None if capture.displacement is None else capture.body.template.shape,
-        "frames": (views,),
-        "cameras.K": (views, 3, 3),
-        "cameras.cam_from_world": (views, 4, 4),
-        "poses.rotations": (capture.frame_count, len(capture.body.parents), 3),
-        "poses.translation": (capture.frame_count, 3),
-    }
-    for field, shape in shapes.items():
-        if shape is not None and (found := np.shape(operator.attrgetter(field)(capture))) != shape:
-            raise ValueError(f"reconstruct: {name}: {field}: expected shape {shape}, got {found}")
+    # a photo, mask, camera and frame for each view, a body that fits the poses, finite numbers
+    body, owner = capture.body, f"reconstruct: {name}"
+    sizes = {"m": capture.frame_count, "n": len(body.template), "j": len(body.parents)}
+    check_record(capture, owner, sizes)
+    arrays = {"template": body.template, "skinning_weights": body.skinning_weights}
+    check_values(owner, {f"body.{name}": (array, FINITE) for name, array in arrays.items()})
     # each view shows a pose that there is
     if not 0 <= np.min(capture.frames) <= np.max(capture.frames) < capture.frame_count:
         raise ValueError(
             f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got"
             f" {capture.frames}"
         )
-    # all numbers are finite, those of images in [0, 1]
-    arrays = {
-        "body.template": (capture.body.template, FINITE),
-        "body.skinning_weights": (capture.body.skinning_weights, FINITE),
-        "images": (capture.images, UNIT),
-        "masks": (capture.masks, UNIT),
-        "betas": (capture.betas, FINITE),
-        "displacement": (capture.displacement, FINITE),
-        "poses.rotations": (capture.poses.rotations, FINITE),
-        "poses.translation": (capture.poses.translation, FINITE),
-    }
-    check_values(f"reconstruct: {name}", arrays | camera_values(capture.cameras))
 
 
 def _equal(body: BodyModel, other: BodyModel) -> bool:

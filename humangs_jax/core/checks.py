@@ -212,6 +212,7 @@ ROUNDING = 1e-6
 [0, 1].
 """
 UNIT = Values("numbers in [0, 1]", -ROUNDING, 1 + ROUNDING)
+SIGNED_UNIT = Values("numbers in [-1, 1]", -1 - ROUNDING, 1 + ROUNDING)
 NOT_NEGATIVE = Values("finite numbers >= 0", 0.0)
 POSITIVE = Values("finite numbers > 0", math.ulp(0.0))
 

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import json
 import operator
+import types
 import typing
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar, dataclass_transform
@@ -202,11 +203,23 @@ class Batchable:
         return map(self.__getitem__, range(len(self)))
 
 
+def types_and_marks(annotation: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """The types that an annotation stands for, and the marks of what is `Annotated` in it."""
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        options = [types_and_marks(each) for each in typing.get_args(annotation)]
+        found = tuple(kind for kinds, _ in options for kind in kinds)
+        return found, tuple(mark for _, marks in options for mark in marks)
+    marks = getattr(annotation, "__metadata__", ())
+    if not marks:
+        return (annotation,), ()
+    return types_and_marks(annotation.__origin__)[0], marks
+
+
 def _annotated_rank(annotation: Any) -> int | None:
     """Number of axes in a jaxtyping annotation, or in that of an optional array; None for any other
     annotation.
     """
-    for option in typing.get_args(annotation) or (annotation,):
+    for option in types_and_marks(annotation)[0]:
         dims = getattr(option, "dims", None)
         if isinstance(dims, tuple) and option.index_variadic is None:
             return len(dims)
@@ -330,7 +343,7 @@ def _annotated_axes(cls: Any) -> dict[str, _Field]:
     for field in dataclasses.fields(cls):
         if field.metadata.get("static"):
             continue
-        options = typing.get_args(field.type) or (field.type,)
+        options, _ = types_and_marks(field.type)
         arrays = [x for x in options if hasattr(x, "dim_str")]
         optional = type(None) in options
         if not arrays:

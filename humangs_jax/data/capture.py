@@ -16,7 +16,7 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,9 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Bool, Float, Int
-from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.checks import UNIT, checked_arguments
 from humangs_jax.core.pytree import short_repr
+from humangs_jax.core.records import Batch
 from humangs_jax.data.capture_checks import (
     CaptureError,
     body_parameters,
@@ -65,11 +66,11 @@ OPTIONAL_BODY_KEYS = {"shape_names", "displacement"}
 class Capture:
     """A capture in memory (numpy on the host). `capture_from_arrays` makes a checked one."""
 
-    images: Float[np.ndarray, "v h w 3"]
+    images: Annotated[Float[np.ndarray, "v h w 3"], UNIT]
     """The photos, (v, h, w, 3), in [0, 1], white behind the masks."""
-    masks: Float[np.ndarray, "v h w"] | None
+    masks: Annotated[Float[np.ndarray, "v h w"] | None, UNIT]
     """The coverage by the person, (v, h, w), in [0, 1]; None: there are no masks."""
-    cameras: Camera
+    cameras: Annotated[Camera, Batch("v")]
     """A batch of v cameras, metres."""
     frames: Int[np.ndarray, " v"]
     """The frame that each view shows, (v,), an index into `poses`."""
@@ -77,7 +78,7 @@ class Capture:
     """The model that the parameters belong to."""
     betas: Float[np.ndarray, " s"]
     """The person's shape coefficients, (s,); fewer than the body has are allowed."""
-    poses: BodyPose
+    poses: Annotated[BodyPose, Batch("m")]
     """A batch of m poses."""
     names: tuple[str, ...]
     """The names of the views, which are used as file names."""

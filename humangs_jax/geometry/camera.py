@@ -7,6 +7,7 @@ through every lens; what works with bodies and photos of people is for pinholes 
 """
 
 import math
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +15,10 @@ import numpy as np
 from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
-from humangs_jax.core.checks import FINITE, POSITIVE, Values, checked_arguments
+from humangs_jax.core.checks import POSITIVE, checked_arguments
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
+from humangs_jax.core.records import Part
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.lens import check_lens, distorted
 
@@ -44,7 +46,7 @@ class Camera(Batchable):
         >>> camera = hg.Camera.from_opencv(K, cam_from_world, width=512, height=512)
     """
 
-    K: Matrix3
+    K: Annotated[Matrix3, Part("focal lengths", lambda K: K[..., [0, 1], [0, 1]], POSITIVE)]
     """Intrinsics, pixels."""
     cam_from_world: Matrix4
     """Rigid, metres; OpenCV: x right, y down, z forward."""
@@ -203,24 +205,6 @@ def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
             f"width and height: expected whole numbers of pixels, got {width} x {height}"
         )
     return int(width), int(height)
-
-
-def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values]]:
-    """What `core.checks.check_values` needs to check one camera or a batch; they are few numbers,
-    read on the host.
-    """
-    K, cam_from_world = cameras.K, cameras.cam_from_world
-    lens: dict[str, tuple[Array | np.ndarray, Values]] = {}
-    if cameras.distortion is not None:
-        lens = {"camera.distortion": (cameras.distortion, FINITE)}
-    if isinstance(K, Tracer) or isinstance(cam_from_world, Tracer):
-        return {"camera.K": (K, FINITE), "camera.cam_from_world": (cam_from_world, FINITE)} | lens
-    K = np.asarray(K)
-    return {
-        "camera.K": (K, FINITE),
-        "camera.K focal lengths": (K[..., [0, 1], [0, 1]], POSITIVE),
-        "camera.cam_from_world": (np.asarray(cam_from_world), FINITE),
-    } | lens
 
 
 @checked_arguments

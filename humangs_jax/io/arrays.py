@@ -91,25 +91,29 @@ def numbers(
     return array
 
 
-def _fits(array: np.ndarray, shape: tuple[int | None, ...]) -> bool:
+Shape = tuple[int | str | None, ...]
+"""Sizes of axes; a name or None stands for any size."""
+
+
+def _fits(array: np.ndarray, shape: Shape) -> bool:
     return array.ndim == len(shape) and all(
-        b in (None, a) for a, b in zip(array.shape, shape, strict=True)
+        not isinstance(b, int) or a == b for a, b in zip(array.shape, shape, strict=True)
     )
 
 
-def _in_words(shape: tuple[int | None, ...]) -> str:
+def _in_words(shape: Shape) -> str:
     return str(tuple("any" if size is None else size for size in shape)).replace("'", "")
 
 
 def check_array(
     name: str,
     array: np.ndarray,
-    shape: tuple[int | None, ...],
+    shape: Shape,
     low: float = -math.inf,
     high: float = math.inf,
 ) -> None:
-    """Real numbers in [low, high] that are finite in float32, of a shape in which None is any
-    size.
+    """Real numbers in [low, high] that are finite in float32, of a shape in which None and names
+    are any size.
     """
     if not _fits(array, shape):
         raise Refused(f"{name}: expected shape {_in_words(shape)}, got {array.shape}")

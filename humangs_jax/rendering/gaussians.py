@@ -5,17 +5,16 @@ Covariance of a Gaussian: A R diag(s)^2 R^T A^T with R the rotation of its quate
 identity if absent).
 """
 
-import dataclasses
 import functools
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, UNIT, Values, checked_arguments
+from humangs_jax.core.checks import NOT_NEGATIVE, UNIT, checked_arguments
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
@@ -35,17 +34,21 @@ class Gaussians(Batchable):
     """Centres, (g, 3), metres."""
     quats: Float[Array, "g 4"]
     """Rotations, (g, 4), quaternions wxyz, normalised where they are used."""
-    scales: Float[Array, "g 3"]
+    scales: Annotated[Float[Array, "g 3"], NOT_NEGATIVE]
     """Standard deviations along the Gaussians' axes, (g, 3), metres."""
-    opacities: Float[Array, " g"]
+    opacities: Annotated[Float[Array, " g"], UNIT]
     """Opacities at the centres, (g,), in [0, 1]."""
     colors: Float[Array, "g 3"]
-    """RGB, (g, 3), in [0, 1], as images have them (sRGB-encoded)."""
+    """RGB, (g, 3), in [0, 1], as images have them (sRGB-encoded).
+
+    Any finite numbers are drawn: splatting is linear in them, and people draw normals and labels as
+    colors.
+    """
     deformations: Float[Array, "g 3 3"] | None = None
     """Linear maps that are applied to the covariances after the rotation, never to the means, (g,
     3, 3), or None.
     """
-    low_pass: Float[Array, " g"] | None = None
+    low_pass: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
     """Side of the pixels of the images whose low-pass the scales contain (`avatar.animate`), (g,),
     metres, or None. Renderers then add no more than `MIP_EPS2D` pixels^2, and dim what this makes
     larger in images of larger pixels.
@@ -55,19 +58,6 @@ class Gaussians(Batchable):
     (k = 3), 1 to 2 (8) or 1 to 3 (15) in the frame of the means, (g, k, 3), or None.
     `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its T-pose.
     """
-
-
-def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Values]]:
-    """What `core.checks.check_values` needs to check Gaussians.
-
-    Colors may be any finite numbers: splatting is linear in them, and people draw normals and
-    labels as colors.
-    """
-    ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE, "low_pass": NOT_NEGATIVE}
-    names = (field.name for field in dataclasses.fields(gaussians))
-    return {
-        f"gaussians.{name}": (getattr(gaussians, name), ranges.get(name, FINITE)) for name in names
-    }
 
 
 def added_variance(low_pass: Float[Array, " g"] | None, eps2d: float) -> float:

@@ -28,7 +28,8 @@ from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
-from humangs_jax.geometry.camera import Camera, camera_values
+from humangs_jax.core.records import record_values
+from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import image_row, named_color, png_bytes
 from humangs_jax.rendering.buffers import (
     BufferOverflowError,
@@ -38,7 +39,7 @@ from humangs_jax.rendering.buffers import (
     with_default_buffers,
 )
 from humangs_jax.rendering.compositing import composite, pack_splats
-from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
+from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import ProjectedGaussians, project_gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import (
@@ -257,8 +258,8 @@ def _render(
     # values are known here: they are checked, and the buffers made to fit
     check_values(
         "render",
-        gaussian_values(gaussians)
-        | camera_values(cameras)
+        record_values(gaussians, "gaussians")
+        | record_values(cameras, "camera", on_host=True)
         | {"background": (background, FINITE), "features": (features, FINITE)}
         | {"shifts": (shifts, FINITE)},
     )

@@ -30,12 +30,13 @@ from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.core.records import array_fields
 from humangs_jax.data.body_and_masks import displacement, silhouette
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import project
 from humangs_jax.io.arrays import check_array, check_indices, check_joints, read_npz, write_npz
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.reading import Refused, reading, write_json
+from humangs_jax.io.reading import reading, write_json
 from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
 from humangs_jax.synthetic.anatomy import HEAD, joint_positions
 from humangs_jax.synthetic.poses import sample_rotations
@@ -341,20 +342,10 @@ _ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STAT
 
 def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
     """Sizes that fit each other, real and finite numbers, indices that exist. Raises: Refused."""
-    sizes = {}
+    sizes: dict[str, int] = {}
+    fields = array_fields(PeopleBank)
     for name in _ARRAYS:
-        dimensions = PeopleBank.__annotations__[name].dim_str.split()
-        if arrays[name].ndim != len(dimensions):
-            raise Refused(
-                f"{name}: expected shape ({', '.join(dimensions)}), got {arrays[name].shape}"
-            )
-        for dimension, size in zip(dimensions, arrays[name].shape, strict=True):
-            if sizes.setdefault(dimension, int(dimension) if dimension.isdigit() else size) != size:
-                raise Refused(
-                    f"{name}: expected {dimension} = {sizes[dimension]}, got shape"
-                    f" {arrays[name].shape}"
-                )
-        check_array(name, arrays[name], arrays[name].shape)
+        check_array(name, arrays[name], fields[name].shape(arrays[name], sizes))
     bounds = {
         "faces": sizes["n"],
         "joint_ids": sizes["j"],

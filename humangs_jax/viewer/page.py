@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.avatar.attach_face import faced, shipped_network
-from humangs_jax.avatar.avatar import Avatar, light_values
+from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export.gaussians import unit_quats
 from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
@@ -33,11 +33,12 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import printable, say
+from humangs_jax.core.records import record_values
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
 from humangs_jax.motion import load_motion
 from humangs_jax.motion.rules import page_rules
-from humangs_jax.rendering.gaussians import added_variance, gaussian_values
+from humangs_jax.rendering.gaussians import added_variance
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.viewer.page_face import pack_face
 
@@ -113,8 +114,8 @@ def pack(
     # a page with wrong numbers would show nothing and not say why
     check_values(
         "the page",
-        gaussian_values(avatar.gaussians)
-        | light_values(avatar.light)
+        record_values(avatar.gaussians, "gaussians")
+        | record_values(avatar.light, "light")
         | _other_values(avatar, motion),
     )
     joints = len(avatar.parents)

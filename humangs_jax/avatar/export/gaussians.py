@@ -34,6 +34,7 @@ from humangs_jax.core.checks import (
 )
 from humangs_jax.core.progress import printable
 from humangs_jax.core.pytree import replace
+from humangs_jax.core.records import record_values
 from humangs_jax.core.registry import Formats, alternatives, imported
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
@@ -42,7 +43,6 @@ from humangs_jax.io.reading import Refused, read_bytes, reading
 from humangs_jax.rendering.gaussians import (
     Gaussians,
     factored,
-    gaussian_values,
     turned_harmonics,
     widened,
 )
@@ -131,7 +131,7 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
     `checks.LARGEST`.
     """
     names = ("means", "quats", "scales", "colors", "harmonics")
-    check_values("export", gaussian_values(gaussians))
+    check_values("export", record_values(gaussians, "gaussians"))
     check_values(
         "export", {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names}
     )

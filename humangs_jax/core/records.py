@@ -1,0 +1,150 @@
+"""Checks of records by the annotations of their fields.
+
+    opacities: Annotated[Float[Array, " g"], UNIT]
+
+says that an array has one axis, as long as those that other fields call g, and numbers in [0, 1].
+Floating-point arrays without such a mark hold finite numbers. A record that is a field of another
+one is looked into where a mark names its batch axes: `Annotated[Camera, Batch("v")]`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.core import Tracer
+
+from humangs_jax.core.checks import FINITE, Values, check_values
+from humangs_jax.core.pytree import types_and_marks
+
+
+class Part(NamedTuple):
+    """A mark of an annotation: a part of the array that is checked by itself."""
+
+    words: str
+    """What an error calls the part, after the name of the array."""
+    take: Callable[[np.ndarray], np.ndarray]
+    """The part, of an array on the host."""
+    values: Values
+    """What its entries may be."""
+
+
+class Batch(NamedTuple):
+    """A mark of an annotation: the batch axes of a record that is a field of another one."""
+
+    axes: str
+    """Names of the axes, separated by spaces."""
+
+
+class ArrayField(NamedTuple):
+    """What an annotation says about an array."""
+
+    axes: tuple[str | int, ...] | None
+    """Names and sizes of the axes; None: any."""
+    values: Values | None
+    """What its entries may be; None: they are not floating-point numbers, and are not looked at."""
+    parts: tuple[Part, ...]
+    """Parts that are checked by themselves."""
+
+    def shape(
+        self, array: Any, sizes: dict[str, int], batch: tuple[str, ...] = ()
+    ) -> tuple[int | str, ...]:
+        """The shape that an array should have; names stand for sizes that are not known.
+
+        Arguments: sizes: of axes by their names; those that this array is the first to have are
+        added. batch: names of the axes that come first.
+        """
+        own = np.shape(array)
+        if self.axes is None:
+            return own
+        axes = (*batch, *self.axes)
+        if len(own) == len(axes):
+            for axis, size in zip(axes, own, strict=True):
+                if isinstance(axis, str):
+                    sizes.setdefault(axis, size)
+        return tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in axes)
+
+
+@functools.cache
+def array_fields(record: Any) -> dict[str, ArrayField]:
+    """The fields of a record that are arrays, by their names."""
+    found = {}
+    for field in dataclasses.fields(record):
+        types_, marks = types_and_marks(field.type)
+        arrays = [each for each in types_ if hasattr(each, "dim_str")]
+        if not arrays or field.metadata.get("static"):
+            continue
+        texts = str(arrays[0].dim_str).split()
+        named = all(text.isdigit() or text.isidentifier() for text in texts)
+        axes = tuple(int(text) if text.isdigit() else text for text in texts)
+        values = next((mark for mark in marks if isinstance(mark, Values)), None)
+        if values is None and all("float" in str(kind) for kind in arrays[0].dtypes):
+            values = FINITE
+        parts = tuple(mark for mark in marks if isinstance(mark, Part))
+        found[field.name] = ArrayField(axes if named else None, values, parts)
+    return found
+
+
+@functools.cache
+def _batches(record: Any) -> dict[str, tuple[str, ...]]:
+    """The batch axes of the records in a record that are looked into."""
+    found = {}
+    for field in dataclasses.fields(record):
+        for mark in types_and_marks(field.type)[1]:
+            if isinstance(mark, Batch):
+                found[field.name] = tuple(mark.axes.split())
+    return found
+
+
+def named_arrays(
+    record: Any, name: str = "", batch: tuple[str, ...] = ()
+) -> Iterator[tuple[str, Any, ArrayField, tuple[str, ...]]]:
+    """Yields the arrays of a record and of the records in it that are looked into: name, array,
+    what its annotation says, and its batch axes. None has none.
+    """
+    if record is None:
+        return
+    start = f"{name}." if name else ""
+    for field, annotated in array_fields(type(record)).items():
+        array = getattr(record, field)
+        if array is not None:
+            yield start + field, array, annotated, batch
+    for field, axes in _batches(type(record)).items():
+        yield from named_arrays(getattr(record, field), start + field, (*batch, *axes))
+
+
+def record_values(
+    record: Any, name: str = "", *, on_host: bool = False
+) -> dict[str, tuple[Any, Values]]:
+    """The arrays of a record with the values that each may have, for `check_values`.
+
+    Arguments: name: of the record, in errors. on_host: read all there, since they are few numbers.
+    """
+    found: dict[str, tuple[Any, Values]] = {}
+    for label, array, annotated, _ in named_arrays(record, name):
+        if annotated.values is None:
+            continue
+        known = not isinstance(array, Tracer)
+        array = np.asarray(array) if on_host and known else array
+        found[label] = array, annotated.values
+        for part in annotated.parts if known else ():
+            found[f"{label} {part.words}"] = part.take(np.asarray(array)), part.values
+    return found
+
+
+def check_record(record: Any, owner: str, sizes: Mapping[str, int] | None = None) -> None:
+    """Check the shapes and the values of a record, and of the records in it.
+
+    Arguments: record: a dataclass whose arrays are annotated. owner: who asks, for the message.
+    sizes: of axes that are known; others are as long as in the first array that has them.
+
+    Raises: ValueError, one line: the array, what was expected and what it has.
+    """
+    known = dict(sizes or {})
+    for name, array, annotated, batch in named_arrays(record):
+        expected, found = annotated.shape(array, known, batch), np.shape(array)
+        if found != expected:
+            shown = f"({', '.join(map(str, expected))}{',' * (len(expected) == 1)})"
+            raise ValueError(f"{owner}: {name}: expected shape {shown}, got {found}")
+    check_values(owner, record_values(record))
