@@ -37,6 +37,7 @@ COLUMNS = {
     "psnr_own": ("square, dB", 1),
     "fg_own": ("foreground, own pose", 2),
     "worst_own": ("worst view", 1),
+    "corrected_own": ("colors corrected", 2),
     "fg_shared": ("foreground, shared pose", 2),
     "alex_own": ("LPIPS, own", 3),
     "alex_shared": ("LPIPS, shared", 3),
@@ -44,6 +45,8 @@ COLUMNS = {
     "load": ("load", 0),
 }
 """Keys of a row's numbers: heading and digits."""
+MEASURED = {"psnr": "psnr", "fg": "psnr_fg", "corrected": "psnr_corrected", "alex": "alex"}
+"""Scores of a held-out photo, by what its numbers are called in a row."""
 TURN = 8
 """Photos of the turning man, 45 degrees apart."""
 RATE = 10
@@ -190,7 +193,7 @@ def measure(make: Callable[[], Case], out: Path, views: int) -> dict[str, Any]:
     numbers = {
         f"{key}_{pose}": scores[name]
         for pose, scores in found.items()
-        for key, name in (("psnr", "psnr"), ("fg", "psnr_fg"), ("alex", "alex"))
+        for key, name in MEASURED.items()
     }
     own = found["own"]["each"]
     return numbers | json.loads(times.read_text()) | {"worst_own": min(own), "each_own": own}
@@ -236,7 +239,8 @@ def real_people(
     Nothing is fetched: the folders hold what their owners publish. Needs the extra `photos` and
     `imageio-ffmpeg`. Each photo is held out in turn: body and cameras have seen all, the avatar the
     others. Own pose: the one that was found with the held-out photo; shared pose: the mean of the
-    others'. seconds: of `humangs start`; the first row compiles.
+    others'. Colors corrected: the gain of each channel is fitted to the held-out photo, own pose.
+    seconds: of `humangs start`; the first row compiles.
 
     Options:
     work: where photos, captures and times are kept; a later run goes on from there

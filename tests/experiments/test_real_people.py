@@ -12,7 +12,7 @@ from PIL import Image
 
 from experiments import real_people
 from experiments.harness import Run
-from experiments.held_out_photos import in_shared_pose
+from experiments.held_out_photos import in_shared_pose, psnr_corrected
 from experiments.real_capture import unpacked
 from experiments.real_people import Case, measure, section, turning_man, write_transforms
 from humangs_jax.capture.fitting.own_poses import with_own_poses
@@ -64,6 +64,16 @@ def test_the_shared_pose_of_a_held_out_photo_is_the_mean_of_the_others():
         np.testing.assert_allclose(found.poses.rotations[frame], mean, atol=1e-6)
 
 
+def test_gains_of_channels_are_no_error_of_corrected_colors_and_detail_is():
+    rng = np.random.default_rng(0)
+    photo, mask = rng.uniform(0.2, 0.8, (8, 8, 3)), np.ones((8, 8))
+    mask[:, :4], other = 0, photo.copy()
+    other[:, :4] = 0  # what is not the person does not count
+    assert psnr_corrected(other * [0.7, 1.2, 0.9], photo, mask) > 100
+    detail = photo + 0.1 * rng.choice([-1.0, 1.0], photo.shape)
+    np.testing.assert_allclose(psnr_corrected(detail, photo, mask), 20.0, atol=0.5)
+
+
 def test_what_a_run_has_finished_is_not_made_again(tmp_path, monkeypatch):
     out = tmp_path / "start"
     started = []
@@ -73,7 +83,8 @@ def test_what_a_run_has_finished_is_not_made_again(tmp_path, monkeypatch):
         out.mkdir(exist_ok=True)
         (out / "avatar.html").write_text("page")
 
-    scores = {"psnr": 20.0, "psnr_fg": 15.0, "alex": 0.1, "each": [14.0, 16.0]}
+    scores = {"psnr": 20.0, "psnr_fg": 15.0, "psnr_corrected": 16.0, "alex": 0.1}
+    scores |= {"each": [14.0, 16.0]}
     monkeypatch.setattr(real_people.subprocess, "run", start)
     monkeypatch.setattr(real_people, "load_capture", lambda _: load_capture("demo_capture"))
     monkeypatch.setattr(
@@ -86,7 +97,7 @@ def test_what_a_run_has_finished_is_not_made_again(tmp_path, monkeypatch):
     (out / "avatar.html").unlink()  # an interrupted run
     measure(lambda: Case(Path("photos")), out, 2)
     assert len(started) == 2
-    assert "| turning man, photos | 20.0 | 15.00 | 14.0 |" in section(
+    assert "| turning man, photos | 20.0 | 15.00 | 14.0 | 16.00 |" in section(
         {"turning man, photos": numbers}
     )
 
