@@ -1,7 +1,6 @@
 """Ctrl-C: exit code 130, one line, and nothing half-written, whatever the process is doing.
 
-Random moments of every command that writes are tried by tests/hostile/kills.py. `train` has its own
-handler (tests/training).
+What is written meanwhile: tests/io/test_atomic.py. `train` has its own handler (tests/training).
 """
 
 import os

@@ -1,9 +1,8 @@
-"""Hostile files end in one line, in bounded memory and time, and nothing else happens; commands
-that write lose nothing.
+"""Hostile files end in one line, in bounded memory and time, and nothing else happens.
 
 Some files of each item are read here, all of them in a process of their own (`worker`), by the slow
-tests. So are the commands: killed, and on full and read-only disks (`writers`). `python
-tests/hostile/test_hostile.py FOLDER` reads all files and prints the figures of docs/security.md.
+tests. `python tests/hostile/test_hostile.py FOLDER` reads all files and prints the figures of
+docs/security.md. That nothing is half-written is in tests/io/test_atomic.py.
 HUMANGS_HOSTILE_SEED=N makes the randomly damaged files from other seeds.
 """
 
@@ -26,7 +25,6 @@ sys.path[:0] = [
 
 from hostile_cases import all_cases  # noqa: E402
 from readers import FORMATS  # noqa: E402
-from writers import COMMANDS  # noqa: E402
 
 WORKER_SECONDS = 1800
 LONGEST_LINE = 1500
@@ -43,13 +41,8 @@ ITEMS = {
 in tests/avatar.
 """
 CASES = all_cases()
-FUZZED, MOMENTS = (
-    int(os.environ.get(*each))
-    for each in (("HUMANGS_FUZZ_INPUTS", "10000"), ("HUMANGS_KILLS", "2"))
-)
-"""Files for each reader, and kills and interrupts of each command; docs/results has the figures
-of more.
-"""
+FUZZED = int(os.environ.get("HUMANGS_FUZZ_INPUTS", "10000"))
+"""Files for each reader; docs/results has the figures of more."""
 EVERY = 12
 HEAVY = (
     *(
@@ -169,39 +162,6 @@ def test_the_fuzzer_finds_nothing(tmp_path):
     figures = json.loads(done.stdout.splitlines()[-1])
     assert not {name: each["found"] for name, each in figures.items() if each["found"]}
     assert len(figures) >= 45 and all(each["inputs"] >= FUZZED for each in figures.values())
-
-
-def disturbed(folder, *options):
-    """Figures of every command."""
-    record = folder / "figures.json"
-    done = program("kills.py", folder / "kills", "--count", MOMENTS, "--json", record, *options)
-    assert record.exists(), done.stderr[-3000:]
-    figures = json.loads(record.read_text())
-    assert not {name: each["faults"] for name, each in figures.items() if each["faults"]}
-    assert done.returncode == 0 and len(figures) == len(COMMANDS), done.stderr[-3000:]
-    return figures
-
-
-@pytest.mark.slow
-def test_killed_at_any_moment_nothing_is_half_written_or_lost_and_the_next_run_works(tmp_path):
-    commands = disturbed(tmp_path)
-    assert (
-        sum(each["killed"] for each in commands.values()) > MOMENTS * len(commands) / 2
-    )  # some come to their end before
-
-
-@pytest.mark.slow
-def test_interrupted_at_any_moment_a_command_exits_with_130_and_leaves_nothing(tmp_path):
-    commands = disturbed(tmp_path, "--interrupts")
-    assert sum(each["interrupted"] for each in commands.values()) > MOMENTS * len(commands) / 2
-
-
-@pytest.mark.slow
-def test_full_and_read_only_disks_end_in_one_line_and_lose_nothing(tmp_path):
-    done = program("disks.py", tmp_path / "disks")
-    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-    assert not [each for each in found if any(each.values())]
-    assert done.returncode == 0 and len(found) == len(COMMANDS), done.stderr[-3000:]
 
 
 def main():

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -378,23 +379,31 @@ def test_several_writers_of_one_folder_end_with_one_of_theirs(tmp_path):
 
 
 WRITE_FOR_EVER = """
-import sys
+import pathlib, sys
 from humangs_jax.io import atomic
+out, kind = pathlib.Path(sys.argv[1]), sys.argv[2]
+whole = {"a.txt": "whole " * 1000, "b.txt": "whole " * 1000}
 def write(folder):
-    folder.mkdir()
-    for name in ("a.txt", "b.txt"):
-        (folder / name).write_text("whole")
+    folder.mkdir(exist_ok=True)
+    for name, text in whole.items():
+        (folder / name).write_text(text)
+kinds = {
+    "folder": lambda: atomic.replace_folder(out, write, mark="a.txt"),
+    "files": lambda: atomic.add_files(out, write),
+    "texts": lambda: atomic.write_texts({out / name: text for name, text in whole.items()}),
+}
 print("writing", flush=True)
 while True:
-    atomic.replace_folder(sys.argv[1], write, mark="a.txt")
+    kinds[kind]()
 """
 
 
-def test_killed_at_any_moment_the_folder_is_whole_and_the_next_write_cleans_up(tmp_path):
+@pytest.mark.parametrize("kind", ["folder", "files", "texts"])
+def test_killed_at_any_moment_all_is_whole_and_the_next_write_cleans_up(kind, tmp_path):
     target = folder_with(tmp_path / "folder", "old")
     (target / "b.txt").write_text("old")
     for milliseconds in (1, 3, 7, 11):
-        command = [sys.executable, "-c", WRITE_FOR_EVER, str(target)]
+        command = [sys.executable, "-c", WRITE_FOR_EVER, str(target), kind]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
             process.stdout.readline()
             time.sleep(milliseconds / 1000)
@@ -404,7 +413,38 @@ def test_killed_at_any_moment_the_folder_is_whole_and_the_next_write_cleans_up(t
             atomic.replace_folder(
                 target, lambda temporary: (_ for _ in ()).throw(OSError("disk full")), mark=MARK
             )
+        atomic.write_texts({target / "a.txt": "old", target / "c.txt": ""})
+        (target / "c.txt").unlink()
         assert names(tmp_path) == ["folder"] and names(target) == ["a.txt", "b.txt"]
+        assert (target / "b.txt").read_text() in ("old", "whole " * 1000)
+
+
+WRITES_ITSELF = {
+    "training/loop.py": "lines that are added to a log",
+    "avatar/layers.py": "into the temporary file of replace_file",
+    "capture/calibration/videos.py": "into a temporary folder",
+    "capture/calibration/importing.py": "copies into the temporary folder of replace_folder",
+    "capture/fitting/files.py": "a copy into the temporary folder of add_files",
+    "capture/detection/people.py": "nothing, to /dev/null",
+    "io/arrays.py": "into the temporary file of replace_file",
+    "core/processes.py": "a switch of /proc",
+}
+"""Why a module opens a file to write, beside `io/atomic.py`."""
+WRITING = re.compile(
+    r"(?<!atomic)\.write_(text|bytes)\(|open\([^()]*\"(w|a|x)b?\"|np\.save|\.tofile\("
+    r"|shutil\.(copy|move)"
+)
+
+
+def test_nothing_else_writes_files():
+    """Whatever writes through `io.atomic` is whole at any moment."""
+    package = Path(atomic.__file__).parents[1]
+    found = {
+        str(path.relative_to(package))
+        for path in package.rglob("*.py")
+        if WRITING.search(path.read_text())
+    }
+    assert found - {"io/atomic.py"} == set(WRITES_ITSELF)
 
 
 def test_names_that_are_no_utf8_stay_what_they_are_in_text(tmp_path):
