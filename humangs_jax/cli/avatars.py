@@ -359,9 +359,17 @@ def _read_capture(
     """
     with stage("reading the capture"):
         from humangs_jax.data.capture import load_capture
+        from humangs_jax.data.hidden import hidden_line, with_hidden_parts
         from humangs_jax.data.prepared import prepare_capture
 
         photos = load_capture(path, fit_masks=fit_masks)
+    if fit_masks:
+        with stage("looking for what is in front of the person"):
+            seen = with_hidden_parts(photos)
+        line = hidden_line(photos, seen)
+        if line is not None:
+            warn(line)
+        photos = seen
     prepared, nobody = None, None
     with stage("preparing the photos"):
         try:

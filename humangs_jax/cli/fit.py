@@ -211,11 +211,12 @@ class Fit:
                 usual_config,
             )
             from humangs_jax.data.capture import load_capture
+            from humangs_jax.data.hidden import with_hidden_parts
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
-            start = load_capture(self.capture, fit_masks=True)
+            start = with_hidden_parts(load_capture(self.capture, fit_masks=True))
             # without --keypoints those of an earlier fit
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
         # cameras stay where nothing tells how they should move
@@ -275,9 +276,10 @@ class Check:
             from humangs_jax.capture.detection.people import available
             from humangs_jax.capture.fitting.files import UnknownViewError
             from humangs_jax.data.capture import load_capture
+            from humangs_jax.data.hidden import with_hidden_parts
 
         with stage("reading the capture"):
-            capture = load_capture(self.capture, fit_masks=True)
+            capture = with_hidden_parts(load_capture(self.capture, fit_masks=True))
             try:
                 keypoints, record = self.detections.read_or_recorded(self.capture, capture)
             # an older fit may be of other photos

@@ -205,8 +205,9 @@ class Start:
             self._check_same_options(mark)
             with stage("reading the fit of an earlier run"):
                 from humangs_jax.data.capture import load_capture
+                from humangs_jax.data.hidden import with_hidden_parts
 
-                capture = load_capture(self.out, fit_masks=self.fit_masks)
+                capture = with_hidden_parts(load_capture(self.out, fit_masks=self.fit_masks))
             tell(f"{self.out} has a body: going on from there (--overwrite begins anew)")
             self._finish(capture, None, limits)
             return
@@ -391,6 +392,7 @@ class Start:
                 refine_capture,
                 usual_config,
             )
+            from humangs_jax.data.hidden import with_hidden_parts
             from humangs_jax.data.photos import load_photos
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
@@ -446,7 +448,8 @@ class Start:
 
             capture = scaled_to_height(capture, self.height)
         write_fitted(self.out, self.out, capture, report, record)
-        return capture, estimate
+        # the refined body shows more exactly where something is in front of it
+        return with_hidden_parts(capture), estimate
 
     def _with_own_poses(
         self, photos: Path, bodies: "list[RefinedCapture]", record: "FitRecord"

@@ -329,7 +329,8 @@ def capture_checksum(path: str | Path) -> str:
         if body_file != DEFAULT_BODY:
             files.append(folder / body_file)
         for view in description["views"]:
-            files += [folder / view[kind] for kind in ("image", "mask") if kind in view]
+            kinds = [kind for kind in ("image", "mask", "unknown") if kind in view]
+            files += [folder / view[kind] for kind in kinds]
         return checksum({}, *(file_checksum(file) for file in files))
 
 

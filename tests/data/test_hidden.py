@@ -8,8 +8,10 @@ from changes import edit_json
 
 from humangs_jax.capture.fitting.refine import overlap
 from humangs_jax.capture.fitting.residuals.silhouettes import mask_boundary
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import displacement, unusable_views
 from humangs_jax.data.capture import CaptureError, load_capture, save_capture
+from humangs_jax.data.hidden import hidden_line, hidden_parts, with_hidden_parts
 from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.scores import score
@@ -102,3 +104,71 @@ def test_an_image_of_what_is_unknown_is_grey(hidden, tmp_path):
     save_capture(tmp_path / "c", hidden)
     file = tmp_path / "c" / "unknown" / f"{hidden.names[0]}.png"
     np.testing.assert_array_equal(read_grey(file) > 0.5, hidden.unknown[0])
+
+
+# What is in front, by the body
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small(demo):
+    """Two photos of the demo, small ones."""
+    return demo.select([0, 1]).resized(256)
+
+
+def with_bar(capture, low, high):
+    """The capture with masks that a bar cuts in the first photo, between two shares of the person's
+    height, and where the bar hides the person.
+    """
+    rows = np.flatnonzero((capture.masks[0] > 0.5).any(1))
+    masks = capture.masks.copy()
+    masks[0, rows[0] + int(low * np.ptp(rows)) : rows[0] + int(high * np.ptp(rows))] = 0
+    images = np.where(masks[..., None] > 0, capture.images, np.float32(1))
+    cut = dataclasses.replace(capture, images=images, masks=masks)
+    return cut, (capture.masks > 0.5) & (masks == 0)
+
+
+def moved(capture, degrees, seed=0):
+    """The capture with a body that is off by so much in each joint."""
+    turns = np.random.default_rng(seed).normal(0, np.radians(degrees), (1, 55, 3))
+    rotations = np.asarray(capture.poses.rotations) + turns
+    poses = replace(capture.poses, rotations=rotations.astype(np.float32))
+    return dataclasses.replace(capture, poses=poses)
+
+
+@pytest.mark.parametrize("degrees", [0, 2, 4])
+def test_nothing_is_in_front_where_masks_show_the_whole_person(degrees, small):
+    """Nor between arm and trunk, with a body that is a little off."""
+    assert hidden_parts(moved(small, degrees)) is None
+    assert with_hidden_parts(small) is demo and hidden_line(small, small) is None
+
+
+@pytest.mark.parametrize("degrees", [0, 2])
+@pytest.mark.parametrize(("low", "high"), [(0.3, 0.4), (0.6, 1.0)])
+def test_a_bar_in_front_of_the_body_is_unknown(low, high, degrees, small):
+    cut, truth = with_bar(moved(small, degrees), low, high)
+    found = hidden_parts(cut)
+    assert found is not None and not found[1:].any()
+    assert (found & truth).sum() > 0.6 * truth.sum()
+    # little of what the mask shows, and of what is beside the person
+    assert (found & (cut.masks > 0.5)).sum() < 0.02 * (cut.masks > 0.5).sum()
+    assert (found[0] & (small.masks[0] == 0)).sum() < 0.6 * truth.sum()
+    seen = with_hidden_parts(cut)
+    assert not seen.masks[seen.unknown].any() and (seen.images[seen.unknown] == 1).all()
+    line = hidden_line(cut, seen)
+    assert line is not None and line.startswith(f"{small.names[0]}: the mask has a hole where")
+    assert with_hidden_parts(seen) is seen
+
+
+def test_a_limb_that_the_body_has_elsewhere_is_not_hidden(small):
+    """The body's left leg is lifted to the side; the mask shows it where it is."""
+    rotations = np.asarray(small.poses.rotations).copy()
+    rotations[:, small.body.joint_names.index("left_hip"), 2] += 0.5
+    poses = replace(small.poses, rotations=rotations)
+    assert hidden_parts(dataclasses.replace(small, poses=poses)) is None
+
+
+def test_a_body_that_is_not_where_the_person_is_says_nothing(small):
+    poses = replace(small.poses, translation=small.poses.translation + np.asarray([0.45, 0, -0.45]))
+    cut, _ = with_bar(dataclasses.replace(small, poses=poses), 0.5, 0.8)
+    assert hidden_parts(cut) is None

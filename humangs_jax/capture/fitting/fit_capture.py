@@ -47,6 +47,7 @@ from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.capture_checks import few
+from humangs_jax.data.hidden import hidden_line, with_hidden_parts
 from humangs_jax.data.photos import Photos
 
 UNSEEN = 1e-8
@@ -362,6 +363,8 @@ def fit_photos(
     )
     # the record keeps the set as this detector uses it, so that later refinements need not find it
     # again
+    shown = with_hidden_parts(capture)
+    line = hidden_line(capture, shown)
     moved = np.zeros((len(kind.names), 3))
     if fit.state.places is not None:
         moved = model.by_landmark(PLACE_STD * fit.state.places)
@@ -370,10 +373,11 @@ def fit_photos(
     )
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
     record = FitRecord(keypoints, photos.names, *known)
-    notes = (*_places(model, fit), *(f"{error}: turned back" for error in errors))
+    turned = (f"{error}: turned back" for error in errors)
+    notes = (*_places(model, fit), *turned, *([] if line is None else [line]))
     motion = _motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), smoothness)
     warnings = (*_blind_frames(seen, smoothness > 0 and len(seen) > 2), *motion)
-    return FittedCapture(capture, record, fit, notes, warnings, errors)
+    return FittedCapture(shown, record, fit, notes, warnings, errors)
 
 
 def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:

@@ -1,0 +1,168 @@
+"""Where something in front of the person makes a hole in a mask: a chair, a table, a bicycle.
+
+A mask says where the person is seen. Where the posed body lies well inside of the photo and the
+mask has a hole or ends, something is in front, or the mask is wrong: the photo says nothing there.
+These pixels become unknown (`Capture.unknown`).
+
+A body that is posed a little wrong lies beside the mask, too. So only parts of the silhouette that
+are thicker than an arm count, well inside of its edge, and only where the mask shows no part of the
+person beside the body nearby: the arm or leg that the body has elsewhere.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy import ndimage
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.data.body_and_masks import (
+    MASK_THRESHOLD,
+    shaped,
+    silhouette,
+    skinned,
+    unusable_views,
+)
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.capture_checks import few
+from humangs_jax.io.images import resized
+
+LONGEST = 512
+"""Pixels: longest side of the photos in which silhouettes are compared."""
+INSIDE = 0.035
+"""Metres inside the edge of the silhouette from which on a pixel is expected on the mask: poses and
+shapes of fits are off by less."""
+THICK = 0.015
+"""Metres: half of the least thickness of what is expected and not there. With `INSIDE`, arms and
+the gap between arm and trunk are too thin for it."""
+AREA = 0.005
+"""Square metres: the least area of it."""
+EDGE = 0.01
+"""Metres inside the edge of the silhouette up to which a hole reaches that was found further in."""
+RIM = 0.03
+"""Metres by which a hole is enlarged: clothes are in front of it as well, and the mask's edge
+beside it shows colors of what is in front."""
+INTO_MASK = 0.008
+"""Metres of `RIM` that count within the mask."""
+LOOSE = 0.04
+"""Metres outside the silhouette up to which the mask may show clothes and hair."""
+NEARBY = 0.25
+"""Metres around a hole in which the mask may not show the person beside the body."""
+BESIDE = 0.35
+"""Most area of the person beside the body there, of that of the hole: more is the same part of the
+body, in another pose."""
+AGREES = 0.75
+"""Least share of the mask that lies on the body: else the body is not where the person is."""
+SHOWN = 0.3
+"""Least share of the body's silhouette that the mask shows: else most of it is a guess."""
+
+
+def with_hidden_parts(capture: Capture) -> Capture:
+    """The capture with those pixels unknown where something is in front of the posed body.
+
+    The same object where there are none, and without masks.
+    """
+    found = hidden_parts(capture)
+    if found is None:
+        return capture
+    assert capture.masks is not None
+    unknown = found if capture.unknown is None else capture.unknown | found
+    return dataclasses.replace(
+        capture,
+        images=np.where(unknown[..., None], np.float32(1), capture.images),
+        masks=np.where(unknown, np.float32(0), capture.masks),
+        unknown=unknown,
+    )
+
+
+def hidden_line(before: Capture, after: Capture) -> str | None:
+    """A line that names the photos in which `with_hidden_parts` has found something; None for
+    none.
+    """
+    if after.unknown is None:
+        return None
+    known = np.zeros_like(after.unknown) if before.unknown is None else before.unknown
+    new = (after.unknown & ~known).any(axis=(1, 2))
+    names = [name for name, hidden in zip(after.names, new, strict=True) if hidden]
+    told = "the mask has a hole where the body is: something is in front, and unknown there"
+    return f"{few(names)}: {told}" if names else None
+
+
+def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:
+    """Where something is in front of the posed body in each photo, and is not unknown already; None
+    where nothing is found.
+    """
+    if capture.masks is None:
+        return None
+    body, poses = capture.body, capture.poses
+    rest = shaped(body, capture.betas)
+    joints = np.asarray(body.joint_regressor, float) @ rest
+    weights, faces = np.asarray(body.skinning_weights, float), np.asarray(body.faces)
+    found, posed = np.zeros(capture.masks.shape, bool), {}
+    unusable = unusable_views(capture)
+    for i, frame in enumerate(np.asarray(capture.frames).tolist()):
+        if i in unusable:
+            continue
+        if frame not in posed:
+            linear, offset = skinned(body, joints, poses, frame, weights, corrected=True)
+            posed[frame] = np.einsum("nab,nb->na", linear, rest) + offset
+        if np.isfinite(posed[frame]).all():
+            found[i] = _hidden_part(capture, i, posed[frame], faces)
+    return found if found.any() else None
+
+
+def _hidden_part(
+    capture: Capture, view: int, vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
+) -> Bool[np.ndarray, "h w"]:
+    """`hidden_parts` of one photo. Arguments: vertices: of the posed body, metres."""
+    assert capture.masks is not None
+    height, width = capture.masks.shape[1:]
+    scale = min(1.0, LONGEST / max(height, width))
+    columns, rows = max(1, round(scale * width)), max(1, round(scale * height))
+    mask = resized(capture.masks[view], columns, rows) >= MASK_THRESHOLD
+    known = np.ones_like(mask)
+    if capture.unknown is not None:
+        known = resized(capture.unknown[view].astype(np.float32), columns, rows) == 0
+    nowhere = np.zeros((height, width), bool)
+
+    # the silhouette of the body, if all of it is before the camera
+    K = np.asarray(capture.cameras.K[view], float) * [[columns / width], [rows / height], [1]]
+    matrix = np.asarray(capture.cameras.cam_from_world[view], float)
+    seen = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    if seen[:, 2].min() <= 0:
+        return nowhere
+    pixels = (seen / seen[:, 2:] @ K.T)[:, :2]
+    per_metre = float(np.sqrt(K[0, 0] * K[1, 1]) / np.median(seen[:, 2]))
+    body = silhouette(pixels, faces, mask.shape) > 0
+    outside = ndimage.distance_transform_edt(~body) if body.any() else np.inf
+    beside = mask & (outside > LOOSE * per_metre)
+    on_body = (mask & body).sum()
+    if beside.sum() > (1 - AGREES) * mask.sum() or on_body <= SHOWN * (body & known).sum():
+        return nowhere
+
+    # holes that are thick, large and well inside, and what is connected to them up to the edge
+    depth = ndimage.distance_transform_edt(np.pad(body, 1, mode="edge"))[1:-1, 1:-1]
+    missing = ~mask & known
+    core = _opened(missing & (depth > INSIDE * per_metre), THICK * per_metre)
+    labels, count = ndimage.label(missing & (depth > EDGE * per_metre))
+    hole = np.zeros_like(mask)
+    for label in range(1, count + 1):
+        part = labels == label
+        area = int((part & core).sum())
+        if area < AREA * per_metre**2:
+            continue
+        around = ndimage.distance_transform_edt(~part) < NEARBY * per_metre
+        if (beside & around).sum() <= BESIDE * area:
+            hole |= part
+    if not hole.any():
+        return nowhere
+    away = ndimage.distance_transform_edt(~hole)
+    hidden = (away < RIM * per_metre) & (~mask | (away < INTO_MASK * per_metre))
+    return resized(hidden.astype(np.float32), width, height) > MASK_THRESHOLD
+
+
+def _opened(where: Bool[np.ndarray, "h w"], radius: float) -> Bool[np.ndarray, "h w"]:
+    """The union of the discs of a radius, in pixels, that fit into the True pixels."""
+    inner = ndimage.distance_transform_edt(where) > radius
+    if not inner.any():
+        return inner
+    return ndimage.distance_transform_edt(~inner) <= radius
