@@ -140,7 +140,7 @@ def moved(capture, degrees, seed=0):
 def test_nothing_is_in_front_where_masks_show_the_whole_person(degrees, small):
     """Nor between arm and trunk, with a body that is a little off."""
     assert hidden_parts(moved(small, degrees)) is None
-    assert with_hidden_parts(small) is demo and hidden_line(small, small) is None
+    assert with_hidden_parts(small) is small and hidden_line(small, small) is None
 
 
 @pytest.mark.parametrize("degrees", [0, 2])
