@@ -333,7 +333,9 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             # every pixel of the block starts with T = 1 and no features
             ones = jnp.ones((block, grid.pixels), dtype)
             zeros = jnp.zeros((block, splats.shape[1] - FEATURES.start, grid.pixels), dtype)
-            medians = jnp.full_like(ones, jnp.inf) if config.depth_median else None
+            medians = None
+            if config.depth_median:
+                medians = jnp.full_like(ones, jnp.inf)
             carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks, medians
             _, transmittance, features, lengths, _, peaks, medians = lax.while_loop(
                 lambda carry: jnp.any(carry[4]), body, carry
@@ -538,7 +540,9 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
         sums = jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype)
         lengths = jnp.zeros(t, jnp.int32)
         peaks = jnp.zeros(splats.shape[0], dtype)
-        medians = jnp.full((t, p), jnp.inf, dtype) if config.depth_median else None
+        medians = None
+        if config.depth_median:
+            medians = jnp.full((t, p), jnp.inf, dtype)
         carry = sums, lengths, peaks, medians, _no_tail(t, p, dtype)
         sums, lengths, peaks, medians, _ = lax.fori_loop(0, chunks.steps, draw, carry)
         return sums[:, :-1], jnp.exp(sums[:, -1]), lengths, peaks, medians
@@ -610,7 +614,9 @@ def _chunks_per_step(grid: TileGrid, dtype: np.dtype | type, capacity: int, t: i
 
 
 def _log_stop(config: SplatConfig) -> float:
-    return math.log(config.transmittance_stop) if config.transmittance_stop > 0 else -math.inf
+    if config.transmittance_stop > 0:
+        return math.log(config.transmittance_stop)
+    return -math.inf
 
 
 def _slice(chunks: Chunks, i: Array | int, step: int) -> Chunks:

@@ -81,7 +81,9 @@ def widened(
 
 def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
     """F = A R diag(s), so that the covariance is F F^T."""
-    quats = quaternion.normalize(gaussians.quats) if normalize_quats else gaussians.quats
+    quats = gaussians.quats
+    if normalize_quats:
+        quats = quaternion.normalize(gaussians.quats)
     factors = quaternion.to_matrix(quats) * gaussians.scales[:, None, :]
     if gaussians.deformations is not None:
         factors = jnp.matmul(gaussians.deformations, factors, precision=transform.EXACT)

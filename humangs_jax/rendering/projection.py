@@ -93,11 +93,15 @@ class ProjectedGaussians(NamedTuple):
 
     def dimmed(self, opacities: Float[Array, " g"]) -> Float[Array, " g"]:
         """Opacities as they are drawn."""
-        return opacities if self.dimming is None else opacities * self.dimming
+        if self.dimming is None:
+            return opacities
+        return opacities * self.dimming
 
     def seen_from_here(self, colors: Float[Array, "g 3"]) -> Float[Array, "g 3"]:
         """Colors as they are drawn."""
-        return colors if self.added_colors is None else jnp.maximum(colors + self.added_colors, 0.0)
+        if self.added_colors is None:
+            return colors
+        return jnp.maximum(colors + self.added_colors, 0.0)
 
     @property
     def means2d(self) -> Float[Array, "g 2"]:
@@ -278,7 +282,9 @@ def _times_factors(
     if gaussians.deformations is not None:
         entries = _planes(gaussians.deformations.reshape(-1, 9))
         rows = _times(rows, [entries[:3], entries[3:6], entries[6:]])
-    quats = quaternion.normalize(gaussians.quats) if normalize_quats else gaussians.quats
+    quats = gaussians.quats
+    if normalize_quats:
+        quats = quaternion.normalize(gaussians.quats)
     rows = _times(rows, _rotation_planes(quats))
     scales = _planes(gaussians.scales)
     return [[row[j] * scales[j] for j in range(3)] for row in rows]

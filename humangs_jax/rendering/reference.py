@@ -78,7 +78,8 @@ def _reference(
     shifts: Array | None,
 ) -> Rendering:
     centers, axes, depths, visible = _project(gaussians, camera, config)
-    centers = centers if shifts is None else centers + shifts
+    if shifts is not None:
+        centers = centers + shifts
     eps2d = added_variance(gaussians.low_pass, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
     if gaussians.low_pass is not None and eps2d > 0:  # dimmed as `projection` says
@@ -237,27 +238,20 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
     phi), by recurrence.
     """
     x, y, z = sight.T
-    cosine, sine, found = (
-        jnp.ones_like(x),
-        jnp.zeros_like(x),
-        {},
-    )  # of m phi, times sin(theta)^m, which P leaves out
+    # of m phi, times sin(theta)^m, which P leaves out
+    cosine, sine = jnp.ones_like(x), jnp.zeros_like(x)
+    found = {}
     for m in range(degree + 1):
-        legendre = [
-            0 * z,
-            (-1) ** m * math.prod(range(1, 2 * m, 2)) + 0 * z,
-        ]  # of degrees m - 1 and m
+        # of degrees m - 1 and m
+        legendre = [0 * z, (-1) ** m * math.prod(range(1, 2 * m, 2)) + 0 * z]
         for n in range(m, degree + 1):
-            norm = (
-                (2 if m else 1)
-                * (2 * n + 1)
-                / (4 * math.pi)
-                * math.factorial(n - m)
-                / math.factorial(n + m)
-            )
-            found[n, m], found[n, -m] = (
-                math.sqrt(norm) * legendre[1] * part for part in (cosine, sine if m else cosine)
-            )
+            orders = math.factorial(n - m) / math.factorial(n + m)
+            norm = math.sqrt((2 * n + 1) / (4 * math.pi) * orders)
+            if m == 0:
+                found[n, 0] = norm * legendre[1] * cosine
+            else:
+                found[n, m] = math.sqrt(2) * norm * legendre[1] * cosine
+                found[n, -m] = math.sqrt(2) * norm * legendre[1] * sine
             legendre = [
                 legendre[1],
                 ((2 * n + 1) * z * legendre[1] - (n + m) * legendre[0]) / (n + 1 - m),

@@ -213,14 +213,11 @@ def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
 
     It is returned as it is where it has none of the other conventions: other knobs are the user's.
     """
-    wanted, other = (
-        SPLAT_PRESETS[name]
-        for name in (("exact", "inria") if rendering == "exact" else ("inria", "exact"))
-    )
-    if all(
-        getattr(config, name) != getattr(other, name)
-        for name in ("jacobian_margin", "normalize_quats", "square")
-    ):
+    wanted, other = SPLAT_PRESETS["inria"], SPLAT_PRESETS["exact"]
+    if rendering == "exact":
+        wanted, other = other, wanted
+    conventions = ("jacobian_margin", "normalize_quats", "square")
+    if all(getattr(config, name) != getattr(other, name) for name in conventions):
         return config
     names = [field.name for field in dataclasses.fields(config)]
     differing = [name for name in names if getattr(wanted, name) != getattr(other, name)]

@@ -200,14 +200,10 @@ def render_views(
         >>> images = hg.render_views(gaussians, cameras).rgb  # (v, h, w, 3)
     """
     if len(cameras.batch_shape) != 1:
-        raise ValueError(
-            "render_views draws cameras with one leading axis, got "
-            + (
-                f"a batch {cameras.batch_shape}"
-                if cameras.batch_shape
-                else "a single camera: use render"
-            )
-        )
+        got = "a single camera: use render"
+        if cameras.batch_shape:
+            got = f"a batch {cameras.batch_shape}"
+        raise ValueError(f"render_views draws cameras with one leading axis, got {got}")
     return _render(draw_views, gaussians, cameras, config, background)
 
 
@@ -247,7 +243,10 @@ def _render(
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     features = features_of(features, len(gaussians.opacities))
-    more = (features,) if shifts is None else (features, _shifts_of(shifts, gaussians))
+    if shifts is None:
+        more = (features,)
+    else:
+        more = (features, _shifts_of(shifts, gaussians))
     # under a transformation values are unknown: buffers come from the configuration
     leaves = jax.tree.leaves((gaussians, cameras, background, more))
     if any(isinstance(leaf, Tracer) for leaf in leaves):
@@ -349,7 +348,9 @@ def _color(background: object, dtype: np.dtype) -> Array:
         raise ValueError(
             f"background: expected 3 numbers in [0, 1] or the name of a color, got {shown}"
         )
-    return color if isinstance(color, jax.Array) else jnp.asarray(color, dtype)
+    if isinstance(color, jax.Array):
+        return color
+    return jnp.asarray(color, dtype)
 
 
 def _of_bytes(color: Any) -> bool:
@@ -374,14 +375,7 @@ def draw(
     projected = project_gaussians(gaussians, camera, config)
     if shifts is not None:
         projected = projected._replace(x=projected.x + shifts[:, 0], y=projected.y + shifts[:, 1])
-    return _draw(
-        projected,
-        gaussians,
-        camera,
-        background,
-        config,
-        features,
-    )
+    return _draw(projected, gaussians, camera, background, config, features)
 
 
 def draw_views(
@@ -392,7 +386,10 @@ def draw_views(
     features: Array | None = None,
 ) -> Rendering:
     """`draw` for every camera of a batch, one after the other."""
-    project = lambda camera: project_gaussians(gaussians, camera, config)
+
+    def project(camera):
+        return project_gaussians(gaussians, camera, config)
+
     return lax.map(
         lambda camera: _draw(project(camera), gaussians, camera, background, config, features),
         cameras,
@@ -423,12 +420,11 @@ def _draw(
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
     behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
     # what is blended: colors, depth, other features, and the powers of the depth
-    seen = [
-        projected.seen_from_here(gaussians.colors),
-        behind[:, None],
-        *([] if others is None else [others]),
-        *([_powers(behind, projected.visible)] if config.distortion else []),
-    ]
+    seen = [projected.seen_from_here(gaussians.colors), behind[:, None]]
+    if others is not None:
+        seen.append(others)
+    if config.distortion:
+        seen.append(_powers(behind, projected.visible))
     seen = jnp.concatenate(seen, axis=-1)
     # rows in depth order, their tiles, and the image
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
@@ -438,11 +434,9 @@ def _draw(
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
     features, transmittance, peaks, medians = composite(splats, lists, grid, config)
     peaks = lax.stop_gradient(peaks)
-    visibility = (
-        jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True)
-        if config.visibility
-        else None
-    )
+    visibility = None
+    if config.visibility:
+        visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True)
     rendering = _blended(
         features, transmittance[:, None], grid, background, nearest, pairs.overflow, config
     )
@@ -469,7 +463,9 @@ def _blank(
     others: Array | None,
 ) -> Rendering:
     """The image of no Gaussians."""
-    count = 4 + (0 if others is None else others.shape[1]) + 2 * config.distortion
+    count = 4 + 2 * config.distortion
+    if others is not None:
+        count += others.shape[1]
     blank = jnp.zeros((grid.tiles, count, grid.pixels), projected.x.dtype)
     rendering = _blended(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), config)
     return replace(
@@ -515,7 +511,9 @@ def _blended(
         spread = 2 * jnp.maximum(alpha * second - first * first, 0.0)
         distortion = tiles_to_image(spread, grid)[..., 0]
         features = features[:, :-2]
-    others = tiles_to_image(features[:, 4:], grid) if features.shape[1] > 4 else None
+    others = None
+    if features.shape[1] > 4:
+        others = tiles_to_image(features[:, 4:], grid)
     return Rendering(
         rgb,
         alpha_image[..., 0],

@@ -358,9 +358,10 @@ class _Bands(NamedTuple):
         top = jnp.maximum(row * size + 0.5 - SLACK - self.y, -self.height)
         bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - self.y, self.height)
         right, left = jnp.clip(self.tip, top, bottom), jnp.clip(-self.tip, top, bottom)
-        half = lambda dy: jnp.sqrt(
-            jnp.maximum(self.ratio * (self.reach - dy * dy * self.inverse), 0)
-        )
+
+        def half(dy):
+            return jnp.sqrt(jnp.maximum(self.ratio * (self.reach - dy * dy * self.inverse), 0))
+
         column0 = _first(self.x + self.slope * left - half(left), size, grid.columns)
         column1 = _last(self.x + self.slope * right + half(right), size, grid.columns)
         return column0, column1

@@ -88,7 +88,10 @@ def unwrap(
     for peeling in range(PEELINGS + 1):
         charts = _connected(len(faces), pairs, sides + len(SIDES) * layer)
         flat = _flatten(vertices, faces, normals, charts, sides, density)
-        hidden = _hidden(flat, size) if peeling < PEELINGS else np.zeros(len(faces), bool)
+        if peeling < PEELINGS:
+            hidden = _hidden(flat, size)
+        else:
+            hidden = np.zeros(len(faces), bool)
         if not hidden.any():
             break
         layer[hidden] += 1
@@ -296,8 +299,10 @@ def _pack(flat: _Flat, size: int) -> Atlas:
     scale = size / np.sqrt(
         np.prod(_sizes(flat), 0).sum()
     )  # the boxes alone would fill the square: a start that is too large
-    while (corners := _place(flat, scale, size)) is None:
+    corners = _place(flat, scale, size)
+    while corners is None:
         scale *= SHRINKING
+        corners = _place(flat, scale, size)
     uvs = (flat.points * scale + corners[flat.point_charts]) / size
     return Atlas(
         uvs.astype(np.float32),

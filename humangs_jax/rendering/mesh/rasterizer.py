@@ -229,10 +229,8 @@ def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Arra
     """Perspective-correct weights (three arrays), depth, and whether the face covers the points (x,
     y).
     """
-    corner_x, corner_y = (
-        [corners[..., 3 * i] for i in range(3)],
-        [corners[..., 3 * i + 1] for i in range(3)],
-    )
+    corner_x = [corners[..., 3 * i] for i in range(3)]
+    corner_y = [corners[..., 3 * i + 1] for i in range(3)]
     edges = []
     for a, b in ((1, 2), (2, 0), (0, 1)):
         ax, ay, bx, by = corner_x[a], corner_y[a], corner_x[b], corner_y[b]
@@ -318,7 +316,9 @@ def _z_buffer(
             face_ids = face_ids.at[wins].min(face[span], mode="drop")
             return start + config.fragments_per_step, depth, face_ids
 
-        more = lambda state: state[0] < end[-1]
+        def more(state):
+            return state[0] < end[-1]
+
         _, depth, face_ids = lax.while_loop(
             more, draw_fragments, (jnp.zeros((), jnp.int32), depth, face_ids)
         )
@@ -326,7 +326,10 @@ def _z_buffer(
 
     depth = jnp.full(width * height, jnp.inf, corners.dtype)
     face_ids = jnp.full(width * height, NO_FACE, jnp.int32)
-    more = lambda state: state[0] < row_end[-1]
+
+    def more(state):
+        return state[0] < row_end[-1]
+
     return lax.while_loop(more, draw_rows, (jnp.zeros((), jnp.int32), depth, face_ids))[1:]
 
 
@@ -420,7 +423,10 @@ def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
     """Phong's light at the vertices: ambient and diffuse times the albedo, and a white
     highlight.
     """
-    dot = lambda a, b: jnp.sum(a * b, axis=-1, keepdims=True)
+
+    def dot(a, b):
+        return jnp.sum(a * b, axis=-1, keepdims=True)
+
     nowhere = jnp.zeros(3)
     to_light = safe_normalize(jnp.asarray(LIGHT, points.dtype) - points, nowhere)
     to_eye = safe_normalize(eye - points, nowhere)
