@@ -47,7 +47,8 @@ class Architecture:
                 raise ValueError(
                     'reader.shells lie along the normals: they need decoder.frame = "normal"'
                 )
-        if len(maps := self._surface_maps) > 1:
+        maps = self._surface_maps
+        if len(maps) > 1:
             raise ValueError(
                 f"surface_map: expected one for all parts, got {sorted(map(str, maps))}"
             )

@@ -195,7 +195,10 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
         )
 
     shape = functools.partial(_shape, state)
-    has = lambda prefix: any(key.startswith(prefix) for key in state)
+
+    def has(prefix):
+        return any(key.startswith(prefix) for key in state)
+
     base = published()
     # sizes of the texture, the tokens and their patches
     resolution, channels = shape("neural_texture", 4)[2:]
@@ -284,22 +287,24 @@ def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
     """Raises ValueError, in the release's names, unless the tensors are exactly those expected, and
     finite.
     """
-    if missing := sorted(set(expected) - set(state)):
+    missing = sorted(set(expected) - set(state))
+    if missing:
         raise ValueError(f"tensor {missing[0]!r} is missing ({len(missing)} in all)")
-    if unknown := sorted(set(state) - set(expected)):
+    unknown = sorted(set(state) - set(expected))
+    if unknown:
         raise ValueError(
             f"tensor {unknown[0]!r} is not part of the published network ({len(unknown)} such"
             " tensors)"
         )
-    if wrong := [key for key, shape in expected.items() if state[key].shape != shape]:
+    wrong = [key for key, shape in expected.items() if state[key].shape != shape]
+    if wrong:
         found, wanted = state[wrong[0]].shape, expected[wrong[0]]
         raise ValueError(
             f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted}"
             f" ({len(wrong)} such tensors)"
         )
-    if bad := [
-        key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()
-    ]:
+    bad = [key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()]
+    if bad:
         raise ValueError(
             f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such tensors)"
         )

@@ -146,18 +146,20 @@ class PatchTransformer(Encoder):
         Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
         """
         # every patch of every view
-        see = encoder_pixels if self.geometry == "rays_and_positions" else photo_pixels
+        see = photo_pixels
+        if self.geometry == "rays_and_positions":
+            see = encoder_pixels
         patches = patchify(see(inputs, run), self.patch_size)
         views, height, width = (
             len(inputs.images),
             *(side // self.patch_size for side in inputs.images.shape[1:3]),
         )
         dtype, present = run.runtime.compute_dtype, inputs.view_count
-        packing, dropped, count = (
-            None,
-            jnp.zeros((), jnp.int32),
-            None if present is None else present * height * width,
-        )
+        packing = None
+        dropped = jnp.zeros((), jnp.int32)
+        count = None
+        if present is not None:
+            count = present * height * width
         # only patches that the person touches, packed to the front; the rest of the capacity is
         # padding
         if run.tokens == "foreground":
@@ -188,7 +190,9 @@ class PatchTransformer(Encoder):
         maps = [x.reshape(views, height, width, features) for x in depths]
         if self.upsampler is None:
             return Encoding(maps[0], global_token, dropped, packing, self.patch_size)
-        real = None if present is None else jnp.arange(views) < present
+        real = None
+        if present is not None:
+            real = jnp.arange(views) < present
         upsampled = Upsampler(self.upsampler, dtype, run.axis_name, name="upsampler")(
             maps, run.train, real
         )
@@ -208,10 +212,9 @@ def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]
         )
     unit = subject_unit(inputs.canonical_vertices)
     cameras = inputs.cameras.in_units(unit)
-    twice = run.conventions.ray_origins == "twice_normalized"
-    rays = jax.vmap(plucker_rays)(cameras.in_units(unit) if twice else cameras).astype(
-        inputs.images.dtype
-    )
+    if run.conventions.ray_origins == "twice_normalized":
+        cameras = cameras.in_units(unit)
+    rays = jax.vmap(plucker_rays)(cameras).astype(inputs.images.dtype)
     return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
 
 
@@ -220,7 +223,10 @@ def photo_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
     [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
     """
     height, width = inputs.images.shape[1:3]
-    at = lambda size: (jnp.arange(size, dtype=inputs.images.dtype) + 0.5) * (2 / size) - 1
+
+    def at(size):
+        return (jnp.arange(size, dtype=inputs.images.dtype) + 0.5) * (2 / size) - 1
+
     place = jnp.stack(jnp.meshgrid(at(width), at(height)), axis=-1)
     waves = jnp.concatenate([place, jnp.sin(jnp.pi * place), jnp.cos(jnp.pi * place)], axis=-1)
     waves = jnp.broadcast_to(waves, (*inputs.images.shape[:3], waves.shape[-1]))
@@ -244,10 +250,11 @@ def needed_tokens(
 
     Of a batch, the largest.
     """
-    count = lambda *subject: jnp.sum(touched_patches(*subject, patch_size), dtype=jnp.int32)
+
+    def count(*subject):
+        return jnp.sum(touched_patches(*subject, patch_size), dtype=jnp.int32)
+
     batched = foreground.ndim == 4
-    return (
-        jnp.max(jax.vmap(count)(foreground, view_count))
-        if batched
-        else count(foreground, view_count)
-    )
+    if batched:
+        return jnp.max(jax.vmap(count)(foreground, view_count))
+    return count(foreground, view_count)

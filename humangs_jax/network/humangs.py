@@ -134,10 +134,13 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     run, parts = config.run(), config.architecture
     encoder_key, decoder_key = jax.random.split(key)
     inputs = _example_inputs(parts)
-    zeros = lambda tree: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
-    after = lambda part, variables, *given: zeros(
-        jax.eval_shape(lambda v: part.apply(v, *given, run), variables)
-    )
+
+    def zeros(tree):
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
+
+    def after(part, variables, *given):
+        return zeros(jax.eval_shape(lambda v: part.apply(v, *given, run), variables))
+
     made = {"encoder": parts.encoder.init(encoder_key, inputs, run)}
     encoding = after(parts.encoder, made["encoder"], inputs)
     made["reader"] = parts.reader.init(jax.random.fold_in(key, 2), encoding, inputs, run)
@@ -145,14 +148,16 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     made["decoder"] = parts.decoder.init(decoder_key, features, inputs, run)
     if parts.driver is not None:
         outputs = after(parts.decoder, made["decoder"], features, inputs)
-        outputs = outputs if outputs.scene is not None else replace(outputs, scene=features)
-        pose, pixels = (
-            BodyPose(jnp.zeros((getattr(parts.driver, "joints", 1), 3)), jnp.zeros(3)),
-            inputs.images[0, ..., :1],
-        )
+        if outputs.scene is None:
+            outputs = replace(outputs, scene=features)
+        pose = BodyPose(jnp.zeros((getattr(parts.driver, "joints", 1), 3)), jnp.zeros(3))
+        pixels = inputs.images[0, ..., :1]
         target = Target(pose, inputs.canonical_vertices, jnp.repeat(pixels, 9, axis=-1))
         made["driver"] = parts.driver.init(jax.random.fold_in(key, 3), outputs, target, run)
-    collect = lambda kind: {name: own[kind] for name, own in made.items() if kind in own}
+
+    def collect(kind):
+        return {name: own[kind] for name, own in made.items() if kind in own}
+
     return {"params": collect("params"), "batch_stats": collect("batch_stats")}
 
 

@@ -67,21 +67,21 @@ def sample_bilinear(
     size = jnp.asarray([width, height], indices.dtype)
     absolute = indices + origin
     inside = jnp.all((absolute > -1) & (absolute < size), axis=-1, keepdims=True)
-    corner = jnp.floor(
-        jnp.where(inside, absolute, -1.0)
-    )  # outside: weight one on a texel that does not exist
+    # outside: weight one on a texel that does not exist
+    corner = jnp.floor(jnp.where(inside, absolute, -1.0))
     fraction = jnp.where(inside, indices, corner - origin) - (corner - origin)
     x0, y0 = jnp.moveaxis(corner.astype(jnp.int32), -1, 0)
     rows = grid.reshape(height * width, channels)
 
+    # weights of the texels at x0 and x0 + 1, and at y0 and y0 + 1
+    along_x = (1 - fraction[..., 0], fraction[..., 0])
+    along_y = (1 - fraction[..., 1], fraction[..., 1])
     total = jnp.zeros((), jnp.result_type(grid, indices))
     for dy in (0, 1):
         for dx in (0, 1):
             x, y = x0 + dx, y0 + dy
             exists = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            weight = (fraction[..., 0] if dx else 1 - fraction[..., 0]) * (
-                fraction[..., 1] if dy else 1 - fraction[..., 1]
-            )
+            weight = along_x[dx] * along_y[dy]
             texel = rows.at[jnp.where(exists, y * width + x, 0)].get(mode="promise_in_bounds")
             total = total + jnp.where(exists, weight, 0.0)[..., None] * texel
     return total
@@ -120,7 +120,10 @@ def sample_neighborhoods(
     row_length = width + 2 * REACH
     rows = padded.reshape(-1, channels)
     top_left = (y0 + REACH - 1) * row_length + x0 + REACH - 1
-    texel = lambda i, j: rows.at[top_left + i * row_length + j].get(mode="promise_in_bounds")
+
+    def texel(i, j):
+        return rows.at[top_left + i * row_length + j].get(mode="promise_in_bounds")
+
     across = []  # of each of the four texel rows, three taps
     for i in range(KERNEL + 1):
         row = [texel(i, j) for j in range(KERNEL + 1)]

@@ -85,23 +85,28 @@ class PixelAlignedReader(Reader):
     @nn.compact
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
-        grid, unit, maps = (
-            run.conventions.pixel_grid,
-            subject_unit(inputs.canonical_vertices),
-            encoding.maps,
-        )
+        grid = run.conventions.pixel_grid
+        unit = subject_unit(inputs.canonical_vertices)
+        maps = encoding.maps
         # where each view sees each vertex, and whether it counts
         cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
         pixels, visible = project_and_test(
             cameras, vertices, inputs.depth_maps, inputs.present, grid
         )
-        pooled = visible if run.conventions.pool == "visible" else inputs.present[:, None]
+        pooled = visible
+        if run.conventions.pool != "visible":
+            pooled = inputs.present[:, None]
         weights = jnp.broadcast_to(pooled, visible.shape).astype(pixels.dtype)
         size = (cameras.width, cameras.height)
         indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), grid)
-        read = sample_bilinear if self.output_width is None else sample_neighborhoods
+        read = sample_neighborhoods
+        if self.output_width is None:
+            read = sample_bilinear
         counts = jnp.sum(weights, axis=0) + COUNT_EPSILON
-        mean = lambda sums: jnp.einsum("n...,n->n...", sums, 1 / counts, precision=transform.EXACT)
+
+        def mean(sums):
+            return jnp.einsum("n...,n->n...", sums, 1 / counts, precision=transform.EXACT)
+
         # the mean over views of what the maps hold there
         local = jax.tree.map(mean, sum_over_views(read, maps, indices, weights))
         if self.output_width is not None:
@@ -120,10 +125,8 @@ class PixelAlignedReader(Reader):
                 raise ValueError(
                     "reader.shells needs posed_normals of the inputs, see `prepare_inputs`"
                 )
-            photos, points = (
-                (inputs.images, inputs.foreground, inputs.depth_maps),
-                (vertices, inputs.posed_normals),
-            )
+            photos = (inputs.images, inputs.foreground, inputs.depth_maps)
+            points = (vertices, inputs.posed_normals)
             shells = sample_shells(*photos, cameras, *points, self.shells, inputs.present, grid)
         return VertexFeatures(
             local,
@@ -146,9 +149,10 @@ def project_and_test(
     none.
     """
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
-    see = lambda p, z, surface: visible_vertices(
-        p, z, surface, (cameras.width, cameras.height), grid
-    )
+
+    def see(p, z, surface):
+        return visible_vertices(p, z, surface, (cameras.width, cameras.height), grid)
+
     return pixels, jax.vmap(see)(pixels, depths, depth_maps) & present[:, None]
 
 
@@ -201,7 +205,10 @@ def sum_over_views(
     @jax.checkpoint  # what was read is read again for gradients: it is larger than the maps
     def add_view(total, view):
         texels, positions, weight = view
-        add = lambda t, x: t + weight.reshape(-1, *[1] * (x.ndim - 1)) * x
+
+        def add(t, x):
+            return t + weight.reshape(-1, *[1] * (x.ndim - 1)) * x
+
         return jax.tree.map(add, total, read(texels, positions)), None
 
     shapes = jax.eval_shape(read, maps[0], indices[0])
@@ -278,7 +285,10 @@ def sample_shells(
     mean = sums / jnp.maximum(total, WEIGHT_EPSILON)[:, None]
     known = jnp.sum(framed, axis=0)
     inside = jnp.where(known > 0, jnp.sum(masks * framed, axis=0) / jnp.maximum(known, 1), 1)
-    by_vertex = lambda x: x.reshape(count, len(distances), *x.shape[1:])
+
+    def by_vertex(x):
+        return x.reshape(count, len(distances), *x.shape[1:])
+
     return Shells(
         distances=steps,
         colors=by_vertex(jnp.where((total > WEIGHT_EPSILON)[:, None], mean, UNSEEN_COLOR)),

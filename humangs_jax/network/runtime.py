@@ -132,7 +132,9 @@ class Runtime:
     @property
     def compute_dtype(self) -> Any:
         """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
-        return None if self.dtype == "float32" else jnp.dtype(self.dtype)
+        if self.dtype == "float32":
+            return None
+        return jnp.dtype(self.dtype)
 
 
 @configuration

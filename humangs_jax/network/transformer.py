@@ -50,7 +50,9 @@ def resolve_implementation(implementation: str, tokens: int, dtype: Any) -> Atte
     if backend == "gpu" and jnp.dtype(dtype).itemsize == 2:
         return "cudnn"
     fits = tokens <= XLA_TOKENS and jnp.dtype(dtype).itemsize <= 4
-    return "xla" if backend in ("gpu", "tpu") and fits else "chunked"
+    if backend in ("gpu", "tpu") and fits:
+        return "xla"
+    return "chunked"
 
 
 def chunked_attention(
@@ -71,7 +73,9 @@ def chunked_attention(
         heads, blocks, block, width
     )
     statistics = jnp.promote_types(q.dtype, jnp.float32)
-    absent = None if count is None else jnp.arange(k.shape[1]) >= count
+    absent = None
+    if count is not None:
+        absent = jnp.arange(k.shape[1]) >= count
 
     @jax.checkpoint
     def attend(queries, keys, values):
@@ -106,7 +110,9 @@ def attention(
     resolved = resolve_implementation(implementation, max(len(q), len(k)), q.dtype)
     if resolved == "chunked":
         return chunked_attention(q, k, v, count)
-    lengths = None if count is None else count.astype(jnp.int32)[None]
+    lengths = None
+    if count is not None:
+        lengths = count.astype(jnp.int32)[None]
     out = jax.nn.dot_product_attention(
         q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved
     )
@@ -131,9 +137,12 @@ class Attention(nn.Module):
     ) -> Float[Array, "l d"]:
         length, width = tokens.shape
         heads, dtype = width // self.head_width, self.runtime.compute_dtype
-        dense = lambda features, name: nn.Dense(
-            features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name
-        )
+
+        def dense(features, name):
+            return nn.Dense(
+                features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name
+            )
+
         qkv = checkpoint_name(dense(3 * width, "qkv")(tokens), PRODUCT)
         qkv = qkv.reshape(length, 3, heads, self.head_width)
         q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
@@ -197,9 +206,10 @@ class Block(nn.Module):
     ) -> Float[Array, "l d"]:
         config, dtype = self.config, self.runtime.compute_dtype
         init = nn.initializers.normal(INIT_STD / (2 * (self.index + 1)) ** 0.5)
-        dense = lambda features, name: nn.Dense(
-            features, use_bias=False, dtype=dtype, kernel_init=init, name=name
-        )
+
+        def dense(features, name):
+            return nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=init, name=name)
+
         normed = layer_norm(dtype, "norm1")(x)
         x = x + Attention(config.head_width, config.qk_norm, self.runtime, init, name="attention")(
             normed, count
@@ -231,11 +241,9 @@ class Transformer(nn.Module):
             x, collected = self._scan_blocks(x, count, quarters)
         else:
             collected = []
-            block_class = (
-                Block
-                if runtime.remat == "none"
-                else nn.remat(Block, policy=_POLICIES[runtime.remat])
-            )
+            block_class = Block
+            if runtime.remat != "none":
+                block_class = nn.remat(Block, policy=_POLICIES[runtime.remat])
             for index in range(config.layers):
                 x = block_class(config, runtime, index, name=f"block_{index}")(x, count)
                 if index + 1 in quarters:
@@ -264,6 +272,8 @@ class Transformer(nn.Module):
             return (x, kept.at[slot].set(x, mode="drop")), None
 
         kept = jnp.zeros((len(quarters), *x.shape), x.dtype)
-        body = step if remat == "none" else jax.checkpoint(step, policy=_POLICIES[remat])
+        body = step
+        if remat != "none":
+            body = jax.checkpoint(step, policy=_POLICIES[remat])
         (x, kept), _ = jax.lax.scan(body, (x, kept), (stacked, jnp.asarray(slots)))
         return x, list(kept)

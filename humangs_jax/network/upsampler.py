@@ -93,7 +93,9 @@ class Upsampler(nn.Module):
     ) -> Float[Array, "v 4*h 4*w c"]:
         """present: views that count in the batch statistics; None: all."""
         hidden = self.config.hidden
-        mask = None if present is None else present[:, None, None, None]
+        mask = None
+        if present is not None:
+            mask = present[:, None, None, None]
 
         def norm_relu(x, name):
             norm = nn.BatchNorm(

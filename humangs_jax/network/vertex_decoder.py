@@ -112,7 +112,9 @@ class VertexDecoder(Decoder):
             )
         unit, shells = subject_unit(inputs.canonical_vertices), features.shells
         canonical = inputs.canonical_vertices / unit
-        entering = features if self.frame == "normal" else replace(features, normals=None)
+        entering = features
+        if self.frame != "normal":
+            entering = replace(features, normals=None)
         raw = self._heads(
             decoder_input(entering, canonical), 0 if shells is None else len(shells.distances)
         )
@@ -123,7 +125,10 @@ class VertexDecoder(Decoder):
             made = replace(made, opacities=jnp.where(kept, made.opacities, 0.0))
         if inputs.spacing is not None:
             made = replace(made, scales=made.scales * inputs.spacing[:, None, None])
-        flat = lambda x: x.reshape(-1, *x.shape[2:])
+
+        def flat(x):
+            return x.reshape(-1, *x.shape[2:])
+
         gaussians = Gaussians(
             means=flat(canonical[:, None] + made.offsets) * unit,
             quats=flat(made.quats),
@@ -146,7 +151,9 @@ class VertexDecoder(Decoder):
             )
 
         def head(x, name, bias, kernel_init):
-            bias_init = lambda key, shape, dtype=jnp.float32: jnp.tile(jnp.asarray(bias, dtype), k)
+            def bias_init(key, shape, dtype=jnp.float32):
+                return jnp.tile(jnp.asarray(bias, dtype), k)
+
             last = nn.Dense(
                 k * len(bias), kernel_init=kernel_init, bias_init=bias_init, name=f"{name}_out"
             )
@@ -221,7 +228,8 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
         parts += [2 * features.photo_colors - 1, features.visible_fraction[:, None]]
     if features.normals is not None:
         parts.append(features.normals)
-    if (shells := features.shells) is not None:
+    shells = features.shells
+    if shells is not None:
         parts += [
             (2 * shells.colors - 1).reshape(vertices, -1),
             shells.seen,
@@ -254,11 +262,9 @@ def activate(
     if config.offset_scale is not None:
         offsets = config.offset_scale * jnp.tanh(offsets / config.offset_scale)
     colors, opacities = raw.appearance[..., :3], raw.appearance[..., 3]
-    seen = (
-        None
-        if features is None or features.photo_colors is None
-        else features.photo_colors[:, None]
-    )
+    seen = None
+    if features is not None and features.photo_colors is not None:
+        seen = features.photo_colors[:, None]
     if raw.shells is not None:
         assert features is not None and features.shells is not None  # where the logits come from
         shells, chosen = features.shells, jax.nn.softmax(raw.shells, axis=-1)

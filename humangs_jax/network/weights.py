@@ -85,7 +85,9 @@ def shipped_checksum() -> str:
     none.
     """
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
-        return file_checksum(shipped) if shipped.exists() else "none"
+        if shipped.exists():
+            return file_checksum(shipped)
+        return "none"
 
 
 @checked_arguments
@@ -157,9 +159,11 @@ def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[st
     those.
     """
     expected = flatten_variables(variables)
-    if missing := sorted(set(expected) - set(tensors)):
+    missing = sorted(set(expected) - set(tensors))
+    if missing:
         raise ValueError(f"{where}: tensor {missing[0]!r} is missing ({len(missing)} in all)")
-    if unknown := sorted(set(tensors) - set(expected)):
+    unknown = sorted(set(tensors) - set(expected))
+    if unknown:
         raise ValueError(
             f"{where}: tensor {unknown[0]!r} is unknown to this configuration ({len(unknown)} in"
             " all)"
