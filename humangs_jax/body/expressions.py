@@ -90,7 +90,8 @@ def read_face(path: str | Path) -> dict[str, np.ndarray]:
         arrays, _ = read_npz(path)
         if str(arrays.get("format")) != FORMAT:
             raise Refused(f"expected a file of the format {FORMAT}")
-        if missing := sorted(set(KEYS) - set(arrays)):
+        missing = sorted(set(KEYS) - set(arrays))
+        if missing:
             raise Refused(f"key '{missing[0]}' is missing")
         names, count = arrays["names"], len(arrays["vertices"])
         check_indices("counts", arrays["counts"], (len(names),), count + 1)

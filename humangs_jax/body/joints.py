@@ -44,11 +44,12 @@ JOINT_NAMES = (
 """22 of the body, jaw and eyes, then 15 per hand from the palm outwards."""
 
 _BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
-PARENTS = (
-    *_BODY_PARENTS,
-    15,
-    15,
-    15,
-    *(j - 1 if (j - 25) % 3 else (20 if j < 40 else 21) for j in range(25, 55)),
-)
+
+
+def _hand_parents(wrist: int, first: int) -> list[int]:
+    """Parents of the 15 joints of a hand: five fingers of three joints each, from the wrist on."""
+    return [parent for j in range(first, first + 15, 3) for parent in (wrist, j, j + 1)]
+
+
+PARENTS = (*_BODY_PARENTS, 15, 15, 15, *_hand_parents(20, 25), *_hand_parents(21, 40))
 """Parent of each joint, -1 for the pelvis; every finger starts at its wrist."""

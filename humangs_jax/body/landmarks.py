@@ -263,7 +263,9 @@ def usual_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
 
 def kind_of(name: str) -> str:
     """The name without its side."""
-    return name.split("_", 1)[1] if name.startswith(("left_", "right_")) else name
+    if name.startswith(("left_", "right_")):
+        return name.split("_", 1)[1]
+    return name
 
 
 @checked_arguments
@@ -307,7 +309,10 @@ def landmark_model(
     regressor = np.zeros((len(names), joints + len(vertices) + len(placed)), np.float32)
     for row, name, found in zip(regressor, names, sources, strict=True):
         for source in found:
-            row[joints + vertices.index(source) if source >= 0 else -1 - source] += 1 / len(found)
+            column = -1 - source
+            if source >= 0:
+                column = joints + vertices.index(source)
+            row[column] += 1 / len(found)
         if name in moved:
             row[joints + len(vertices) + placed.index(moved[name])] = 1.0
     points = _concatenated(
@@ -346,7 +351,10 @@ def _rows(points: SurfacePoints, rows: Int[np.ndarray, " p"] | list[int]) -> Sur
 def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
     """A joint as a point that it carries itself."""
     row = body.joint_regressor[joint : joint + 1]
-    product = lambda values: jnp.einsum("jn,n...->j...", row, values, precision=EXACT)
+
+    def product(values):
+        return jnp.einsum("jn,n...->j...", row, values, precision=EXACT)
+
     return SurfacePoints(
         product(body.template),
         product(body.shape_directions),
@@ -414,8 +422,10 @@ def _movers(
     """
     moving = point_weights.max(axis=0, initial=0.0) > CARRIES
     for j in np.flatnonzero(joints_used | moving):
-        while (j := parents[j]) >= 0:
-            moving[j] = True
+        parent = parents[j]
+        while parent >= 0:
+            moving[parent] = True
+            parent = parents[parent]
     return tuple(int(j) for j in np.flatnonzero(moving))
 
 
@@ -444,7 +454,9 @@ class _Finder:
             return []
 
     def _find(self, name: str) -> list[int]:
-        joint = lambda x: -1 - self.index[x]
+        def joint(x):
+            return -1 - self.index[x]
+
         match name.split("_"):
             # the middle between two joints
             case ["neck"]:

@@ -84,12 +84,16 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
         if not own:
             return load_smplx(file, **smplx_options)
         if smplx_options:
-            which = "the shipped body" if path is None else f"the file {path}"
+            which = "the shipped body"
+            if path is not None:
+                which = f"the file {path}"
             raise TypeError(
                 f"options of SMPL-X files do not apply to {which}: {sorted(smplx_options)}"
             )
         body = read_body(file)
-        return body if path else replace(body, expressions=shipped_expressions(len(body.template)))
+        if path:
+            return body
+        return replace(body, expressions=shipped_expressions(len(body.template)))
 
 
 def _indices(array: np.ndarray) -> np.ndarray:
@@ -159,9 +163,10 @@ def save_body(path: str | Path, body: BodyModel) -> None:
     if body.uvs is not None:
         uvs = np.asarray(body.uvs, np.float64)
         inside = uvs.min() >= 0 and uvs.max() <= 1
-        arrays["uvs"] = (
-            np.rint(uvs * UV_STEPS).astype(np.uint16) if inside else uvs.astype(np.float32)
-        )
+        if inside:
+            arrays["uvs"] = np.rint(uvs * UV_STEPS).astype(np.uint16)
+        else:
+            arrays["uvs"] = uvs.astype(np.float32)
         arrays["uv_faces"] = _indices(np.asarray(body.uv_faces))
     if body.collapse_order is not None:
         arrays["collapse_order"] = _indices(np.asarray(body.collapse_order))
@@ -182,13 +187,12 @@ def read_body(path: str | Path) -> BodyModel:
             raise ValueError(f"{path}: not a '{FORMAT}' file (its keys: {sorted(arrays)})")
         if pickled:
             raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
-        if missing := sorted(KEYS - set(arrays)):
+        missing = sorted(KEYS - set(arrays))
+        if missing:
             raise Refused(f"key '{missing[0]}' is missing")
         # the parts that every body has
-        parents, joint_names = (
-            arrays["parents"].tolist(),
-            [str(name) for name in arrays["joint_names"]],
-        )
+        parents = arrays["parents"].tolist()
+        joint_names = [str(name) for name in arrays["joint_names"]]
         check_joints(parents, joint_names)
         joints, vertices, shapes = len(parents), len(arrays["template"]), len(arrays["shape_names"])
         check_array("template", arrays["template"], (vertices, 3), -LARGEST, LARGEST)
@@ -204,7 +208,8 @@ def read_body(path: str | Path) -> BodyModel:
         if uvs is not None:
             check_array("uvs", uvs, (None, 2))
             check_indices("uv_faces", arrays["uv_faces"], (len(arrays["faces"]), 3), len(uvs))
-            uvs = uvs / UV_STEPS if uvs.dtype == np.uint16 else uvs
+            if uvs.dtype == np.uint16:
+                uvs = uvs / UV_STEPS
         # parts that a body may lack
         for name in {"collapse_order", "collapse_into"} & set(arrays):
             check_indices(name, arrays[name], (vertices,), vertices)
@@ -263,7 +268,8 @@ def read_expressions(
     }
     if not found:
         return None
-    if missing := [name for name in ("vertices", "directions", "names") if name not in found]:
+    missing = [name for name in ("vertices", "directions", "names") if name not in found]
+    if missing:
         raise Refused(f"key '{EXPRESSION}{missing[0]}' is missing")
     # sizes of everything follow from the vertices and the names
     count, moved = len(np.atleast_1d(found["names"])), len(np.atleast_1d(found["vertices"]))
@@ -377,10 +383,8 @@ def _shape_directions(
                 file.path, "shapedirs", f"has {limit} {kind} directions, asked for {asked}"
             )
     # the first columns of each kind
-    shape, expression = (
-        stored[..., :shape_count],
-        stored[..., available[0] : available[0] + expression_count],
-    )
+    shape = stored[..., :shape_count]
+    expression = stored[..., available[0] : available[0] + expression_count]
     names = (
         *(f"shape_{i}" for i in range(shape_count)),
         *(f"expression_{i}" for i in range(expression_count)),

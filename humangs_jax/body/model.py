@@ -346,13 +346,18 @@ def expressed(
     """
     if pose.expression is None:
         return rest, pose
-    count = 0 if expressions is None else len(expressions.names)
+    count = 0
+    if expressions is not None:
+        count = len(expressions.names)
     if expressions is None or pose.expression.shape != (count,):
         raise ValueError(
             f"pose.expression: expected {count} coefficients, the expressions of this body, got"
             f" shape {pose.expression.shape}"
         )
-    moved = lambda directions: jnp.einsum("mae,e->ma", directions, pose.expression, precision=EXACT)
+
+    def moved(directions):
+        return jnp.einsum("mae,e->ma", directions, pose.expression, precision=EXACT)
+
     vertices = rest.vertices.at[expressions.vertices].add(moved(expressions.directions))
     joints, rotations = rest.joints, pose.rotations
     if expressions.joint_directions is not None:

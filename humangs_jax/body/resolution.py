@@ -72,11 +72,12 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
     if not longest > 0:
         raise ValueError(f"longest edge: expected a positive length in metres, got {longest}")
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
-    linear = {
-        name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None
-    }
+    values = {name: getattr(body, name) for name in names}
+    linear = {name: np.asarray(value) for name, value in values.items() if value is not None}
     faces = np.asarray(body.faces)
-    moves = None if body.expressions is None else _Moves(body.expressions, len(body.template))
+    moves = None
+    if body.expressions is not None:
+        moves = _Moves(body.expressions, len(body.template))
     linear["area"] = vertex_areas(linear["template"], faces)
     weights = sparse.eye_array(len(linear["template"]), format="csr")
     while True:
@@ -302,7 +303,9 @@ class _Mesh:
         reach v.
         """
         moves = {self.uv_at(f, u): self.uv_at(f, v) for f in shared}
-        return moves if all(self.uv_at(f, u) in moves for f in self.around[u]) else None
+        if all(self.uv_at(f, u) in moves for f in self.around[u]):
+            return moves
+        return None
 
     def uv_at(self, face: int, vertex: int) -> int:
         return self.uv_faces[face][self.faces[face].index(vertex)]
@@ -465,10 +468,8 @@ def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> n
     moved = np.zeros_like(regressor)
     np.add.at(moved.T, target, regressor.T)
     moved = moved[:, kept]
-    template, directions = (
-        np.asarray(body.template, np.float64),
-        np.asarray(body.shape_directions, np.float64),
-    )
+    template = np.asarray(body.template, np.float64)
+    directions = np.asarray(body.shape_directions, np.float64)
     # What a row of the regressor must reproduce: the template, every direction, and 1.
     full = np.concatenate(
         [template, directions.reshape(len(template), -1), np.ones((len(template), 1))], axis=1
