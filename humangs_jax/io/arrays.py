@@ -54,11 +54,9 @@ def numbers(
 
     Raises: `error` with file, field and what was expected.
     """
-    words = (
-        "numbers"
-        if shape is None or None in shape
-        else f"{' x '.join(map(str, shape))} numbers".lstrip()
-    )
+    words = "numbers"
+    if shape is not None and None not in shape:
+        words = f"{' x '.join(map(str, shape))} numbers".lstrip()
     try:
         array = np.asarray(value)
         if (
@@ -71,7 +69,8 @@ def numbers(
             raise TypeError
         array = array.astype(dtype)
     except (ValueError, TypeError, OverflowError):
-        words = f"real numbers, got {value.dtype}" if isinstance(value, np.ndarray) else words
+        if isinstance(value, np.ndarray):
+            words = f"real numbers, got {value.dtype}"
         raise error(file, field, f"expected {words}") from None
     if some and not array.size:
         raise error(file, field, f"expected at least one number, got shape {array.shape}")
@@ -126,11 +125,9 @@ def check_array(
         np.finfo(np.float32).max
     )  # what becomes inf when it is cast is no number either
     if not (max(low, -largest) <= least and most <= min(high, largest)):
-        words = (
-            "finite numbers"
-            if math.inf in (-low, high) and low != 0
-            else f"numbers in [{low:g}, {high:g}]"
-        )
+        words = "finite numbers"
+        if math.inf not in (-low, high) or low == 0:
+            words = f"numbers in [{low:g}, {high:g}]"
         raise Refused(f"{name}: expected {words}, got {least:.9g} to {most:.9g}")
 
 
@@ -141,7 +138,10 @@ SUM_TOLERANCE = 1e-2
 def check_row_sums(name: str, weights: np.ndarray) -> None:
     """Rows of weights that sum to 1."""
     sums = weights.sum(axis=1, dtype=np.float64)
-    if sums.size and abs((worst := float(sums[np.abs(sums - 1).argmax()])) - 1) > SUM_TOLERANCE:
+    if not sums.size:
+        return
+    worst = float(sums[np.abs(sums - 1).argmax()])
+    if abs(worst - 1) > SUM_TOLERANCE:
         raise Refused(f"{name}: expected rows with the sum 1, got {worst:.6g}")
 
 
@@ -246,11 +246,9 @@ class ArrayFile:
         """What is under a key, as an array of any kind. Raises: `error`."""
         if key not in self.values:
             found = ", ".join(sorted(map(str, self.values))) or "none"
-            reason = (
-                "a pickled object, which is never read"
-                if key in self.pickled
-                else f"missing (keys: {found})"
-            )
+            reason = "a pickled object, which is never read"
+            if key not in self.pickled:
+                reason = f"missing (keys: {found})"
             raise self.error(self.path, key, reason)
         try:
             return as_array(self.values[key])
@@ -348,11 +346,12 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
     members = archive.infolist()
     if len({member.filename for member in members}) < len(members):
         raise Refused("two members of one name")
-    if strange := [
+    strange = [
         m.filename
         for m in members
         if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-    ]:
+    ]
+    if strange:
         raise Refused(f"{strange[0]}: compressed by a method that is not read")
     check_unpacked(size, sum(member.file_size for member in members))
     return archive
@@ -380,10 +379,9 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
         return None
     if dtype.kind not in PLAIN_KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):
         raise Refused(f"expected numbers or strings, got {dtype}")
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != (
-        left := size - member.tell()
-    ):
-        raise Refused(f"shape {shape} of {dtype} does not fit its {size - member.tell():,} bytes")
+    left = size - member.tell()
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != left:
+        raise Refused(f"shape {shape} of {dtype} does not fit its {left:,} bytes")
     data = np.empty(left, np.uint8)
     at = 0
     while at < left:
@@ -392,11 +390,9 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
             raise EOFError("cut off")
         data[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
         at += len(piece)
-    return (
-        plain_array(data, dtype, shape[::-1]).T
-        if columns_first
-        else plain_array(data, dtype, shape)
-    )
+    if columns_first:
+        return plain_array(data, dtype, shape[::-1]).T
+    return plain_array(data, dtype, shape)
 
 
 def write_npz(

@@ -351,7 +351,9 @@ def check_ours(
     """
     foreign = [file for file in files if file.exists() and not ours(file)]
     if foreign:
-        more = f" (and {len(foreign) - 1} more)" if len(foreign) > 1 else ""
+        more = ""
+        if len(foreign) > 1:
+            more = f" (and {len(foreign) - 1} more)"
         raise ValueError(f"{foreign[0]}{more}: exists, and was not written by humangs: {advice}")
 
 
@@ -443,7 +445,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     """
     path = Path(path)
     place = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
-    place = place.parent if place == path and not path.is_dir() else place
+    if place == path and not path.is_dir():
+        place = place.parent
     try:
         tempfile.TemporaryFile(dir=place).close()
     except OSError as error:
@@ -465,7 +468,8 @@ def _sweep(parent: Path) -> None:
             found = _TEMPORARY.fullmatch(entry.name)
             if found is None or not _abandoned(entry, found["machine"], int(found["pid"])):
                 continue
-            if found["kind"] == "old" and not (original := parent / found["name"]).exists():
+            original = parent / found["name"]
+            if found["kind"] == "old" and not original.exists():
                 entry.rename(original)  # the process was killed between its two renames
             else:
                 _remove(entry)

@@ -175,7 +175,9 @@ def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> E
             except (ZeroDivisionError, np.linalg.LinAlgError):
                 return None
     encoding = Encoding((curve,), matrix)
-    return None if not np.abs(matrix).max() < LARGEST_FACTOR or is_srgb(encoding) else encoding
+    if not np.abs(matrix).max() < LARGEST_FACTOR or is_srgb(encoding):
+        return None
+    return encoding
 
 
 LARGEST_FACTOR = 10
@@ -204,7 +206,8 @@ def in_srgb(levels: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.nd
 
 def _light_in_srgb(light: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.ndarray, "n 3"]:
     light = light @ encoding.matrix.T.astype(light.dtype)
-    light = _compressed(light) if encoding.bright else light
+    if encoding.bright:
+        light = _compressed(light)
     return np.clip(light, 0, 1)
 
 
@@ -295,7 +298,9 @@ def read_profile(data: bytes) -> Profile:
             if not all(np.isfinite(curve(steps)).all() for curve in encoding.curves):
                 raise Refused("its curves are no numbers")
     except (LookupError, struct.error, OverflowError, ValueError) as error:
-        why = str(error) if isinstance(error, Refused) else "it is damaged"
+        why = "it is damaged"
+        if isinstance(error, Refused):
+            why = str(error)
         raise Refused(why) from error
     return Profile(space, encoding._replace(curves=tuple(map(_within_white, encoding.curves))))
 
@@ -358,7 +363,8 @@ def _curve(tag: bytes) -> Curve:
         d = -b / a if a else 0.0
     elif kind == 2:
         a, b, e = rest
-        d, f = -b / a if a else 0.0, e
+        d = -b / a if a else 0.0
+        f = e
     elif kind == 3:
         a, b, c, d = rest
     elif kind == 4:

@@ -62,7 +62,8 @@ def decoded_once(most: int = KEPT_BYTES) -> Generator[None]:
 
 def forget_decoded() -> None:
     """Free what has been kept, when no step that is left reads photos; none is kept any more."""
-    if (kept := _current.get()) is not None:
+    kept = _current.get()
+    if kept is not None:
         kept.pixels, kept.room = {}, 0
 
 

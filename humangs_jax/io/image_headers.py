@@ -53,7 +53,10 @@ def jpeg_scans(data: bytes) -> int:
     Segments are stepped over, and what is behind the picture is not looked at.
     """
     at, count = len(JPEG_START), 0
-    while (found := JPEG_MARKER.search(data, at)) is not None:
+    while True:
+        found = JPEG_MARKER.search(data, at)
+        if found is None:
+            break
         code, at = found[1][0], found.end()
         if code == END:
             break
@@ -102,7 +105,10 @@ def iso_kind(data: bytes) -> str | None:
 def png_chunks(data: bytes) -> dict[bytes, bytes]:
     """The chunks of a PNG file before its pixels, by name."""
     at, found = 8, {}
-    while at + 8 <= len(data) and (name := data[at + 4 : at + 8]) != b"IDAT":
+    while at + 8 <= len(data):
+        name = data[at + 4 : at + 8]
+        if name == b"IDAT":
+            break
         length = int.from_bytes(data[at : at + 4], "big")
         found[name] = data[at + 8 : at + 8 + length]
         at += 12 + length
@@ -136,7 +142,8 @@ def check_png_chunks(data: bytes) -> None:
             raise ValueError(f"chunk {name!r} is damaged or cut off")
         names.add(name)
         at += 12 + length
-    if missing := {b"IDAT", b"IEND"} - names:
+    missing = {b"IDAT", b"IEND"} - names
+    if missing:
         raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
     if data[25] == PALETTE and b"PLTE" not in names:
         raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")
@@ -154,7 +161,9 @@ def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] 
         return None
     # 3 : 4 of a frame of 4 : 3 may be turned, or cut out of it at its full height
     cut_upright = size != turned and (size[0] == frame[0] or size[1] == frame[1])
-    return None if _same_shape(size, turned) and not cut_upright else frame
+    if _same_shape(size, turned) and not cut_upright:
+        return None
+    return frame
 
 
 def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:

@@ -146,9 +146,12 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
         if alpha is not None and alpha.min() < 1:
             return _mask_of_alpha(colors, alpha)
         if _is_grey(colors):
-            return colors[..., 0] if (colors == colors[..., :1]).all() else colors.mean(axis=-1)
+            if (colors == colors[..., :1]).all():
+                return colors[..., 0]
+            return colors.mean(axis=-1)
         codes = to_uint8(colors).astype(np.uint32) @ np.asarray([1 << 16, 1 << 8, 1], np.uint32)
-        if (count := np.count_nonzero(np.unique(codes))) != 1 or codes.all():
+        count = np.count_nonzero(np.unique(codes))
+        if count != 1 or codes.all():
             black = " without black" if codes.all() else ""
             raise Refused(
                 f"{count} colors{black}: which is the person? expected one on black, or {GREY_MASK}"
@@ -179,11 +182,9 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
     if len(used) > 2 and colors.max() >= 128 and _is_grey(colors / 255):
         return palette[labels].mean(axis=-1, dtype=np.float32) / np.float32(255)
     shown = ", ".join(map(str, others[:5])) + (", ..." if len(others) > 5 else "")
-    which = (
-        "which is the person"
-        if background is not None
-        else "0 is not black: which is the background"
-    )
+    which = "0 is not black: which is the background"
+    if background is not None:
+        which = "which is the person"
     raise Refused(
         f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or"
         f" {GREY_MASK}"
@@ -247,7 +248,9 @@ def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
         with warnings.catch_warnings(), contextlib.suppress(Exception):
             warnings.simplefilter("ignore")
             tags = image.getexif()
-            return dict(tags) if folder is None else dict(tags.get_ifd(folder))
+            if folder is None:
+                return dict(tags)
+            return dict(tags.get_ifd(folder))
     return {}
 
 
@@ -255,9 +258,13 @@ def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
     """Pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on height and
     width are exchanged.
     """
-    pixels = np.swapaxes(pixels, 0, 1) if flag >= 5 else pixels
-    rows, columns = ((3, 4, 7, 8), (2, 3, 6, 7))  # that are reversed
-    return pixels[:: -1 if flag in rows else 1, :: -1 if flag in columns else 1]
+    if flag >= 5:
+        pixels = np.swapaxes(pixels, 0, 1)
+    if flag in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if flag in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return pixels
 
 
 def write_png(
@@ -381,7 +388,8 @@ def resized(
     found = image.astype(np.float32, copy=False)
     for old, new in ((h, height), (w, width)):  # one axis, which goes to the end; then the other
         along = found.reshape(old, -1)
-        along = _axis_weights(old, new) @ along if new != old else along
+        if new != old:
+            along = _axis_weights(old, new) @ along
         found = along.reshape(new, *found.shape[1:]).swapaxes(0, 1)
     return np.clip(found, image.min(), image.max(), order="C").reshape(height, width, *rest)
 
@@ -467,11 +475,10 @@ def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
             _check_size(*image.size)
             yield image
     except Image.UnidentifiedImageError as error:
-        wrong = (
-            f"neither {' nor '.join(FORMATS)}"
-            if formats == FORMATS
-            else f"damaged {NAMES[formats[0]]}"
-        )
+        if formats == FORMATS:
+            wrong = f"neither {' nor '.join(FORMATS)}"
+        else:
+            wrong = f"damaged {NAMES[formats[0]]}"
         raise ValueError(wrong) from error
 
 
@@ -508,10 +515,15 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
         if kept is not None and (found := kept.find(key)) is not None:
             return found
         levels, most = _levels(image, data)
-        colors = None if as_stored else _colors_in_srgb(path, image, data, levels, most)
+        colors = None
+        if not as_stored:
+            colors = _colors_in_srgb(path, image, data, levels, most)
         pixels = levels.astype(np.float32) / np.float32(most)
     if colors is not None:
-        alpha = pixels[..., -1:] if pixels.shape[-1] in (2, 4) else pixels[..., :0]
+        if pixels.shape[-1] in (2, 4):
+            alpha = pixels[..., -1:]
+        else:
+            alpha = pixels[..., :0]
         pixels = np.concatenate([colors, alpha], axis=-1)
     if kept is not None:
         kept.keep(key, pixels)
@@ -561,7 +573,8 @@ def _colors_in_srgb(
     own = levels[..., : 1 if levels.shape[-1] < 3 else 3]
     try:
         encoding = _encoding_in_header(image, data)
-        if encoding is None and (profile := image.info.get("icc_profile")):
+        profile = image.info.get("icc_profile")
+        if encoding is None and profile:
             found = read_profile(profile)
             if found.space not in PROFILE_OF_MODE.get(image.mode, ("colors", "greys")):
                 raise Refused(f"it is one of {found.space}, and the photo is none")
@@ -571,7 +584,9 @@ def _colors_in_srgb(
     except Refused as error:
         _tell(f"{path}: its color profile is not used: {error}")
         return None
-    return None if encoding is None or is_srgb(encoding) else pixels_in_srgb(own, most, encoding)
+    if encoding is None or is_srgb(encoding):
+        return None
+    return pixels_in_srgb(own, most, encoding)
 
 
 PROFILE_OF_MODE = {"CMYK": ("CMYK",), "RGB": ("colors",), "RGBA": ("colors",), "P": ("colors",)}
@@ -584,15 +599,19 @@ def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
     """
     if image.format == "PNG":
         chunks = png_chunks(data)
-        if len(points := chunks.get(b"cICP", b"")) >= 2:
+        points = chunks.get(b"cICP", b"")
+        if len(points) >= 2:
             return of_code_points(points[0], points[1])
         if b"iCCP" in chunks or b"sRGB" in chunks:
             return None
         return of_gamma(image.info.get("gamma"), image.info.get("chromaticity"))
     if image.info.get("icc_profile"):
         return None
-    points = nclx_colors(data) if image.format == "AVIF" else None
-    if image.format == "HEIF" and isinstance(nclx := image.info.get("nclx_profile"), dict):
+    points = None
+    if image.format == "AVIF":
+        points = nclx_colors(data)
+    nclx = image.info.get("nclx_profile")
+    if image.format == "HEIF" and isinstance(nclx, dict):
         points = int(nclx.get("color_primaries", 1)), int(nclx.get("transfer_characteristics", 13))
     return None if points is None else of_code_points(*points)
 
@@ -607,8 +626,12 @@ def _by_tables(
 
     if levels.shape[-1] == 1:
         raise Refused("it is tables, and the photo is grey")
-    stored = (levels >> 8).astype(np.uint8) if most > 255 else levels
-    source = image if image.mode == "CMYK" else Image.fromarray(stored)
+    stored = levels
+    if most > 255:
+        stored = (levels >> 8).astype(np.uint8)
+    source = image
+    if image.mode != "CMYK":
+        source = Image.fromarray(stored)
     converted = by_tables(source, profile)
     if converted is source:
         return None

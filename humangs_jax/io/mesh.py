@@ -293,7 +293,10 @@ def _grouped(text: str) -> str:
     others = _GROUPS.sub(
         "", "\n".join([begin, *(_FACES.sub("", chunk) for chunk in changes[1::2])])
     )
-    plain = lambda lines: lines.replace("usemtl", "-")
+
+    def plain(lines):
+        return lines.replace("usemtl", "-")
+
     faces = [
         f"usemtl {plain(name)}\n{plain(''.join(lines))}"
         for name, lines in of_material.items()
@@ -345,7 +348,9 @@ class _Folder:
         """Warn of the first file that could not be read, and say how many there are."""
         if self.faults:
             key, why = next(iter(self.faults.items()))
-            more = f" (and {len(self.faults) - 1} others)" if len(self.faults) > 1 else ""
+            more = ""
+            if len(self.faults) > 1:
+                more = f" (and {len(self.faults) - 1} others)"
             logger.warning("%s: %s", path, FileError("", f"left out {shown(key)}{more}", why))
 
 

@@ -94,11 +94,10 @@ def _local(
     for path, still in usual.items():
         value = np.asarray(node.get(path, still), np.float64).reshape(1, PATHS[path])
         check_finite(value, path)
-        parts[path] = (
-            _sampled(tracks[path], times, path)
-            if path in tracks
-            else np.tile(value, (len(times), 1))
-        )
+        if path in tracks:
+            parts[path] = _sampled(tracks[path], times, path)
+        else:
+            parts[path] = np.tile(value, (len(times), 1))
     local[:, :3, :3] = (
         Rotation.from_quat(parts["rotation"]).as_matrix() * parts["scale"][:, None, :]
     )

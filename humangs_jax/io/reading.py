@@ -164,7 +164,9 @@ class _Shown(reprlib.Repr):
 
     def repr_int(self, x: int, level: int) -> str:
         """Python refuses to write integers of thousands of digits."""
-        return repr(x) if abs(x) < SHOWN_INTEGER else f"an integer of {x.bit_length():,} bits"
+        if abs(x) < SHOWN_INTEGER:
+            return repr(x)
+        return f"an integer of {x.bit_length():,} bits"
 
     def repr_instance(self, x: object, level: int) -> str:
         """Of other types: those of numpy that are Python's too as these, else the name of the
@@ -172,11 +174,9 @@ class _Shown(reprlib.Repr):
         """
         if isinstance(x, str):
             return self.repr_str(str(x), level)
-        return (
-            repr(x)[: self.maxother]
-            if x is None or isinstance(x, bool | float)
-            else f"a {type(x).__name__}"
-        )
+        if x is None or isinstance(x, bool | float):
+            return repr(x)[: self.maxother]
+        return f"a {type(x).__name__}"
 
 
 def shown(value: object) -> str:
@@ -196,7 +196,9 @@ _SHOWN = _Shown()
 
 def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
     line = printable(" ".join(str(text).split()))
-    return line if len(line) <= longest else f"{line[:longest]} ..."
+    if len(line) <= longest:
+        return line
+    return f"{line[:longest]} ..."
 
 
 class FileError(ValueError):
@@ -270,13 +272,12 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
     """Raises: Refused, naming the limit and how it is raised, if that much is more than it
     allows.
     """
-    if amount > (most := getattr(limits(), name)):
+    most = getattr(limits(), name)
+    if amount > most:
         raised, found = "", f"more than {LARGEST_AMOUNT:,}"
         if amount <= LARGEST_AMOUNT:
-            raised, found = (
-                f"{ENVIRONMENT}={name}={math.ceil(amount)} raises it; ",
-                f"{math.ceil(amount):,}",
-            )
+            raised = f"{ENVIRONMENT}={name}={math.ceil(amount)} raises it; "
+            found = f"{math.ceil(amount):,}"
         raise Refused(f"{found} {unit}: the limit {name} is {most:,} ({raised}docs/security.md)")
 
 

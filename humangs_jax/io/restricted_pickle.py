@@ -251,7 +251,10 @@ class _Dtype(StandIn):
 
 def _dtype(code: Any = "", *_: Any) -> "_Dtype":
     made = _Dtype()
-    made.state["code"] = code.decode("latin1") if isinstance(code, bytes) else code
+    if isinstance(code, bytes):
+        made.state["code"] = code.decode("latin1")
+    else:
+        made.state["code"] = code
     return made
 
 
@@ -282,11 +285,9 @@ class _Array(StandIn):
         if not dtype.itemsize:
             raise ValueError(f"expected numbers, got {dtype}")
         columns_first = self.state["columns_first"]
-        return (
-            plain_array(data, dtype, sizes[::-1]).T
-            if columns_first
-            else plain_array(data, dtype, sizes)
-        )
+        if columns_first:
+            return plain_array(data, dtype, sizes[::-1]).T
+        return plain_array(data, dtype, sizes)
 
 
 def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Array":
@@ -406,11 +407,10 @@ class _Chumpy(StandIn):
 
 class _ChumpySelection(StandIn):
     def to_array(self) -> np.ndarray:
-        source = (
-            self.state["a"].to_array()
-            if isinstance(self.state["a"], _Chumpy)
-            else _numbers(self.state["a"])
-        )
+        if isinstance(self.state["a"], _Chumpy):
+            source = self.state["a"].to_array()
+        else:
+            source = _numbers(self.state["a"])
         return source.ravel()[_numbers(self.state["idxs"])].reshape(self.state["preferred_shape"])
 
 
@@ -460,17 +460,24 @@ def objects(value: Any) -> Any:
     """The list in an array of Python objects, or the one that it holds; everything else as it
     is.
     """
-    held = value.state.get("data") if isinstance(value, _Array) else None
+    held = None
+    if isinstance(value, _Array):
+        held = value.state.get("data")
     if not isinstance(held, list):
         return value
-    return held[0] if value.state.get("shape") == () and len(held) == 1 else held
+    if value.state.get("shape") == () and len(held) == 1:
+        return held[0]
+    return held
 
 
 def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
     """An array of the machine's byte order from bytes of a file, which may hold what numpy itself
     never writes.
     """
-    array = np.frombuffer(data, dtype).reshape(shape) if dtype.itemsize else np.zeros(shape, dtype)
+    if dtype.itemsize:
+        array = np.frombuffer(data, dtype).reshape(shape)
+    else:
+        array = np.zeros(shape, dtype)
     if dtype.kind == "b":
         return array.view(np.uint8) != 0
     array = array.astype(dtype.newbyteorder("="), copy=False)

@@ -124,9 +124,9 @@ class _Tensor(NamedTuple):
         steps = tuple(stride * data.itemsize for stride in strides)
         view = np.lib.stride_tricks.as_strided(data[offset:], shape, steps, writeable=False)
         array = np.ascontiguousarray(view).reshape(shape)
-        return (
-            (array.astype(np.uint32) << 16).view(np.float32) if kind == "BFloat16Storage" else array
-        )
+        if kind == "BFloat16Storage":
+            return (array.astype(np.uint32) << 16).view(np.float32)
+        return array
 
 
 def _counts(x: Any) -> bool:
@@ -325,11 +325,9 @@ def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> t
     Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for
     more than tensors.
     """
-    return (
-        read_safetensors(path, wanted)[:2]
-        if is_safetensors(path)
-        else read_torch_file(path, wanted)
-    )
+    if is_safetensors(path):
+        return read_safetensors(path, wanted)[:2]
+    return read_torch_file(path, wanted)
 
 
 def is_safetensors(path: str | os.PathLike[str]) -> bool:
