@@ -63,12 +63,11 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """
     # annotations are read once, when the function is defined
     signature = inspect.signature(function)
-    expected = {
-        name: found for name, p in signature.parameters.items() if (found := _classes(p.annotation))
-    }
-    arrays = {
-        name: found for name, p in signature.parameters.items() if (found := _arrays(p.annotation))
-    }
+    annotations = {name: p.annotation for name, p in signature.parameters.items()}
+    classes_of = {name: _classes(annotation) for name, annotation in annotations.items()}
+    arrays_of = {name: _arrays(annotation) for name, annotation in annotations.items()}
+    expected = {name: found for name, found in classes_of.items() if found}
+    arrays = {name: found for name, found in arrays_of.items() if found}
     call = _call(function, signature)
 
     @functools.wraps(function)
@@ -91,10 +90,12 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
                     f"{call}: {name}: expected one {type(value).__name__}, got a batch"
                     f" {value.batch_shape}: take one, {name}[0], or use jax.vmap"
                 )
-            if fault := shape_fault(value):
+            fault = shape_fault(value)
+            if fault:
                 raise ValueError(f"{call}: {name}{fault}")
         for name in arrays.keys() & given.keys():
-            if fault := _no_array(arrays[name], given[name]):
+            fault = _no_array(arrays[name], given[name])
+            if fault:
                 raise (ValueError if hasattr(given[name], "shape") else TypeError)(
                     f"{call}: {name}: {fault}"
                 )
@@ -109,7 +110,9 @@ def _arrays(annotation: Any) -> tuple[Any, ...]:
     """
     options = typing.get_args(annotation) or (annotation,)
     known = all(hasattr(x, "dims") or x is type(None) for x in options)
-    return options if known and any(hasattr(x, "dims") for x in options) else ()
+    if known and any(hasattr(x, "dims") for x in options):
+        return options
+    return ()
 
 
 def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
@@ -122,7 +125,10 @@ def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
     if shape is not None and (len(ranks) < len(types_) or len(shape) in ranks):
         return None
     axes = " or ".join(f"({', '.join(str(x.dim_str).split())})" for x in types_)
-    given = f"{type(value).__name__}; jnp.asarray makes one" if shape is None else str(shape)
+    if shape is None:
+        given = f"{type(value).__name__}; jnp.asarray makes one"
+    else:
+        given = str(shape)
     return f"expected an array of shape {axes}, got {given}"
 
 
@@ -139,7 +145,9 @@ def _classes(annotation: Any) -> tuple[type, ...]:
         getattr(x, "_is_protocol", False) and not getattr(x, "_is_runtime_protocol", False)
         for x in options
     ]
-    return options if all(plain) and all(known) and not any(protocol) else ()
+    if all(plain) and all(known) and not any(protocol):
+        return options
+    return ()
 
 
 def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
@@ -155,22 +163,21 @@ def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
 
 def _other_class(classes: tuple[type, ...], value: Any) -> str:
     names = [x.__name__ for x in classes if x is not type(None)]
-    given = (
-        "None"
-        if value is None
-        else value.__name__
-        if isinstance(value, type)
-        else type(value).__name__
-    )
-    shown = (
-        f" {value!r}"
-        if isinstance(value, str)
-        else f" the class {given}"
-        if isinstance(value, type)
-        else f" {given}"
-    )
-    hint = next((HINTS[pair] for name in names if (pair := (name, given)) in HINTS), None)
-    return f"expected {' or '.join(names)}, got{shown}{f'; {hint}' if hint else ''}"
+    if value is None:
+        given = "None"
+    elif isinstance(value, type):
+        given = value.__name__
+    else:
+        given = type(value).__name__
+    if isinstance(value, str):
+        shown = f" {value!r}"
+    elif isinstance(value, type):
+        shown = f" the class {given}"
+    else:
+        shown = f" {given}"
+    hints = [HINTS[name, given] for name in names if (name, given) in HINTS]
+    hint = f"; {hints[0]}" if hints else ""
+    return f"expected {' or '.join(names)}, got{shown}{hint}"
 
 
 def _of_a_field(
@@ -274,7 +281,9 @@ def _extremes(arrays: tuple[Array, ...]) -> Array:
 def _fault(array: np.ndarray, values: Values) -> str:
     wrong = ~(np.isfinite(array) & (array >= values.low) & (array <= values.high))
     first = np.argwhere(wrong)[0]
-    place = f"the first at {first.tolist()}: " if array.ndim else ""
+    place = ""
+    if array.ndim:
+        place = f"the first at {first.tolist()}: "
     return (
         f"expected {values.words}, but {wrong.sum()} of {wrong.size} are not,"
         f" {place}{array[tuple(first)]:.9g}"

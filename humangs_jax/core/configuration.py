@@ -47,7 +47,9 @@ class Range(NamedTuple):
     def __str__(self) -> str:
         if self.high < LARGEST:
             return f"{self.low:,.15g} to {self.high:,.15g}"
-        return f"at least {self.low:,.15g}" if self.low > -LARGEST else "a finite number"
+        if self.low > -LARGEST:
+            return f"at least {self.low:,.15g}"
+        return "a finite number"
 
 
 def at_least(low: float | int) -> Range:
@@ -169,22 +171,17 @@ def _fits(value: Any, annotation: Any) -> bool:
         return isinstance(value, str | int | None) and value in arguments
     # True is no number, and numbers are finite
     if annotation in (int, float):
-        if isinstance(value, bool) or not isinstance(
-            value, numbers.Integral if annotation is int else numbers.Real
-        ):
+        kind = numbers.Integral if annotation is int else numbers.Real
+        if isinstance(value, bool) or not isinstance(value, kind):
             return False
-        return (
-            abs(int(value)) <= LARGEST_INTEGER
-            if isinstance(value, numbers.Integral)
-            else math.isfinite(value)
-        )
+        if isinstance(value, numbers.Integral):
+            return abs(int(value)) <= LARGEST_INTEGER
+        return math.isfinite(value)
     # a tuple has an item for each argument, or any number of the same
     if origin is tuple:
-        items = (
-            arguments[:1] * len(value)
-            if arguments[-1] is Ellipsis and isinstance(value, tuple)
-            else arguments
-        )
+        items = arguments
+        if arguments[-1] is Ellipsis and isinstance(value, tuple):
+            items = arguments[:1] * len(value)
         return (
             isinstance(value, tuple) and len(items) == len(value) and all(map(_fits, value, items))
         )
@@ -197,14 +194,15 @@ def in_words(annotation: Any) -> str:
     """What an annotation allows, for a message."""
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     words = []
-    for option in typing.get_args(annotation) if union else [annotation]:
-        literal = typing.get_origin(option) is Literal
-        words += (
-            map(repr, typing.get_args(option))
-            if literal
-            else [_named(option).replace("NoneType", "None")]
-        )
-    return words[0] if len(words) == 1 else f"one of {', '.join(words)}"
+    options = typing.get_args(annotation) if union else [annotation]
+    for option in options:
+        if typing.get_origin(option) is Literal:
+            words += map(repr, typing.get_args(option))
+        else:
+            words.append(_named(option).replace("NoneType", "None"))
+    if len(words) == 1:
+        return words[0]
+    return f"one of {', '.join(words)}"
 
 
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
@@ -223,7 +221,9 @@ def configuration(cls: type[T]) -> type[T]:
             object.__setattr__(self, _MADE, True)
 
     setattr(cls, "__post_init__", __post_init__)  # noqa: B010 (a class of any kind)
-    return cls if issubclass(cls, Part) else dataclasses.dataclass(frozen=True)(cls)
+    if issubclass(cls, Part):
+        return cls
+    return dataclasses.dataclass(frozen=True)(cls)
 
 
 class Part:
@@ -294,7 +294,9 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
             last = path.rpartition(".")[2]
             same = [each for each in known if each.rpartition(".")[2] == last]
             like = same or difflib.get_close_matches(path, known, cutoff=0.7)
-            meant = f"; did you mean {' or '.join(like[:3])}?" if like else ""
+            meant = ""
+            if like:
+                meant = f"; did you mean {' or '.join(like[:3])}?"
             raise ValueError(
                 f"{path}: {type(config).__name__} has no such field{meant} (all paths:"
                 " docs/knobs.md)"
@@ -315,7 +317,9 @@ def field_paths(config: Any, before: str = "") -> dict[str, Any]:
 
 
 def _varied(config: Any, names: list[str], value: Any) -> Any:
-    changed = _varied(getattr(config, names[0]), names[1:], value) if names[1:] else value
+    changed = value
+    if names[1:]:
+        changed = _varied(getattr(config, names[0]), names[1:], value)
     return dataclasses.replace(config, **{names[0]: changed})
 
 
@@ -324,7 +328,9 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
     annotation.
     """
     ranges = _ranges(cls).get(name, ())
-    values = value if isinstance(value, tuple | list) else (value,)
+    values = value
+    if not isinstance(value, tuple | list):
+        values = (value,)
     if len(values) > MOST_ITEMS:
         raise ValueError(f"{path}: expected at most {MOST_ITEMS} numbers, got {len(values)}")
     for allowed in ranges:
@@ -367,9 +373,14 @@ def _plain(value: Any, kind: bool = False) -> Any:
                 f"{type(value).__name__} is no registered part: decorate its class with `part`"
             )
         named = {KIND: type(value).__name__} if kind else {}
-        plain = lambda name: _plain(getattr(value, name), _holds_part(annotations[name]))
+
+        def plain(name):
+            return _plain(getattr(value, name), _holds_part(annotations[name]))
+
         return named | {name: plain(name) for name in field_names(type(value))}
-    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return value
 
 
 def _holds_part(annotation: Any) -> bool:
@@ -407,10 +418,14 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
     # None, or the only other option
     if origin in (typing.Union, types.UnionType):
         options = [option for option in arguments if option is not type(None)]
-        return _build(options[0], value, path) if value is not None and len(options) == 1 else value
+        if value is not None and len(options) == 1:
+            return _build(options[0], value, path)
+        return value
     # lists become tuples, whose items are built and checked one by one
     if origin is tuple and isinstance(value, list):
-        items = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
+        items = arguments
+        if arguments[-1] is Ellipsis:
+            items = [arguments[0]] * len(value)
         if len(value) > MOST_ITEMS:
             raise ValueError(f"{path}: expected at most {MOST_ITEMS} items, got {len(value)}")
         if len(items) != len(value):
@@ -423,11 +438,9 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
             if not _fits(built[i], item):
                 raise ValueError(f"{path}[{i}]: expected {in_words(item)}, got {value[i]!r}")
         return built
-    return (
-        float(value)
-        if annotation is float and type(value) is int and abs(value) <= LARGEST_INTEGER
-        else value
-    )
+    if annotation is float and type(value) is int and abs(value) <= LARGEST_INTEGER:
+        return float(value)
+    return value
 
 
 def _find_part(kind: Any, base: Any, path: str) -> type:
@@ -450,14 +463,19 @@ def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     annotations = {
         name: hint for name, hint in typing.get_type_hints(cls).items() if name in field_names(cls)
     }
-    if unknown := sorted(set(values) - set(annotations)):
+    unknown = sorted(set(values) - set(annotations))
+    if unknown:
         raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
     fields = {
         name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()
     }
-    required = lambda field: field.default is field.default_factory is dataclasses.MISSING
+
+    def required(field):
+        return field.default is field.default_factory is dataclasses.MISSING
+
     needed = [f.name for f in dataclasses.fields(cls) if f.name in annotations and required(f)]
-    if missing := [name for name in needed if name not in fields]:
+    missing = [name for name in needed if name not in fields]
+    if missing:
         raise ValueError(f"{path}.{missing[0]} is missing")
     check_fields(cls, fields, path)
     try:
@@ -467,4 +485,6 @@ def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
 
 
 def _named(annotation: Any) -> str:
-    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    if isinstance(annotation, type):
+        return annotation.__name__
+    return str(annotation)

@@ -16,9 +16,13 @@ def at_least_float32(tree: PyTree) -> PyTree:
 
     Gradients come back in the narrow type.
     """
-    widen = lambda a: (
-        a.astype(dtype) if (dtype := jnp.promote_types(a.dtype, jnp.float32)) != a.dtype else a
-    )
+
+    def widen(a):
+        dtype = jnp.promote_types(a.dtype, jnp.float32)
+        if dtype != a.dtype:
+            return a.astype(dtype)
+        return a
+
     return jax.tree.map(widen, tree)
 
 

@@ -52,11 +52,9 @@ def peak_memory() -> Generator[list[float | None]]:
     or TPU is not in it.
     """
     result: list[float | None] = [None]
-    trim = (
-        getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if sys.platform.startswith("linux")
-        else None
-    )
+    trim = None
+    if sys.platform.startswith("linux"):
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is None:
         yield result
         return
@@ -224,11 +222,11 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
         return None
-    if given := (
-        sys.modules["jax"].config.jax_compilation_cache_dir
-        if "jax" in sys.modules
-        else os.environ.get(OF_JAX)
-    ):
+    if "jax" in sys.modules:
+        given = sys.modules["jax"].config.jax_compilation_cache_dir
+    else:
+        given = os.environ.get(OF_JAX)
+    if given:
         return Path(given)
     try:
         root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()
@@ -246,9 +244,11 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
 
 def user_cache() -> Path:
     """The user's cache folder, as the platform has it. Raises: RuntimeError without a home."""
-    if folder := os.environ.get("XDG_CACHE_HOME"):
+    folder = os.environ.get("XDG_CACHE_HOME")
+    if folder:
         return Path(folder)
-    if sys.platform == "win32" and (folder := os.environ.get("LOCALAPPDATA")):
+    folder = os.environ.get("LOCALAPPDATA")
+    if sys.platform == "win32" and folder:
         return Path(folder)
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
 
@@ -308,4 +308,6 @@ def compiler_options() -> dict[str, Any] | None:
     """
     import jax
 
-    return CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    if jax.default_backend() == "cpu":
+        return CPU_COMPILER_OPTIONS
+    return None

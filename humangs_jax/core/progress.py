@@ -59,9 +59,10 @@ def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     may end early.
     """
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows)))]
-    aligned = lambda row: (
-        f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row)
-    )
+
+    def aligned(row):
+        return (f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row))
+
     return ["  ".join(aligned(row)).rstrip() for row in rows]
 
 
@@ -145,7 +146,10 @@ def say(text: object, *, error: bool = False, lines: bool = True) -> None:
     encoding = getattr(stream, "encoding", None) or "utf-8"  # a terminal may know ASCII only
     text = printable(text, lines).encode(encoding, "backslashreplace").decode(encoding)
     tqdm = sys.modules.get("tqdm")
-    with tqdm.tqdm.external_write_mode(stream) if tqdm and len(_bars) else contextlib.nullcontext():
+    beside_bars = contextlib.nullcontext()
+    if tqdm and len(_bars):
+        beside_bars = tqdm.tqdm.external_write_mode(stream)
+    with beside_bars:
         if _current.ticking and (error or _current.names):
             sys.stderr.write(CLEAR)
             sys.stderr.flush()

@@ -107,7 +107,12 @@ def _static_bytes(values: tuple[Any, ...]) -> bytes:
 
 def _static_values(data: bytes | bytearray) -> tuple[Any, ...]:
     """Inverse of `_static_bytes`: lists were tuples, because static fields can be hashed."""
-    as_tuples = lambda x: tuple(map(as_tuples, x)) if isinstance(x, list) else x
+
+    def as_tuples(x):
+        if isinstance(x, list):
+            return tuple(map(as_tuples, x))
+        return x
+
     return as_tuples(json.loads(bytes(data)))
 
 
@@ -131,7 +136,10 @@ def short_repr(tree: Any) -> str:
 
 def _shortened(value: Any) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
-        kind = np.dtype(value.dtype) if isinstance(value, np.ndarray) else value.dtype
+        if isinstance(value, np.ndarray):
+            kind = np.dtype(value.dtype)
+        else:
+            kind = value.dtype
         name = (
             kind.name.replace("bfloat", "bf")
             .replace("float", "f")
@@ -142,11 +150,9 @@ def _shortened(value: Any) -> str:
     text = repr(value)
     if len(text) > SHORT and isinstance(value, tuple | list | dict):
         return f"{type(value).__name__} of {len(value)}"
-    return (
-        text
-        if dataclasses.is_dataclass(value) or len(text) <= SHORT
-        else f"{type(value).__name__}(...)"
-    )
+    if dataclasses.is_dataclass(value) or len(text) <= SHORT:
+        return text
+    return f"{type(value).__name__}(...)"
 
 
 class Batchable:
@@ -171,7 +177,8 @@ class Batchable:
 
     def __len__(self) -> int:
         """Size of the first batch axis. Raises: TypeError for one example."""
-        if shape := self.batch_shape:
+        shape = self.batch_shape
+        if shape:
             return shape[0]
         raise TypeError(
             f"this {type(self).__name__} is not a batch: it has no length and cannot be indexed or"
@@ -240,14 +247,15 @@ def shape_fault(tree: Any) -> str | None:
     fields = _annotated_axes(cls)
     ranks = list(_batch_ranks(tree, fields))
     usual = max(ranks, key=ranks.count, default=0)  # the first of equally many
-    batch_rank = max(usual, 0) if issubclass(cls, Batchable) else 0
+    batch_rank = 0
+    if issubclass(cls, Batchable):
+        batch_rank = max(usual, 0)
     for name, field in fields.items():
         value = getattr(tree, name)
-        fault = (
-            shape_fault(value)
-            if field.axes is None
-            else _array_fault(value, field, batch_rank, sizes)
-        )
+        if field.axes is None:
+            fault = shape_fault(value)
+        else:
+            fault = _array_fault(value, field, batch_rank, sizes)
         if fault:
             return f".{name}{fault}"
     return _size_fault(tree)
@@ -311,16 +319,16 @@ def _shown_shape(axes: Sequence[str | int]) -> str:
 
 
 def _shown_kind(value: Any) -> str:
-    return "None" if value is None else f"{type(value).__name__}; jnp.asarray makes one"
+    if value is None:
+        return "None"
+    return f"{type(value).__name__}; jnp.asarray makes one"
 
 
 def _advice(dtype: Any) -> str:
     """What to do with integers."""
-    return (
-        "; colors of 0 to 255 are divided by 255"
-        if dtype == np.uint8
-        else "; x.astype(float) makes them"
-    )
+    if dtype == np.uint8:
+        return "; colors of 0 to 255 are divided by 255"
+    return "; x.astype(float) makes them"
 
 
 def _size_fault(tree: Any) -> str | None:
@@ -382,7 +390,8 @@ def replace(tree: T, **changes: Any) -> T:
         >>> grey = hg.replace(gaussians, colors=jnp.full_like(gaussians.colors, 0.5))
     """
     names = {f.name for f in dataclasses.fields(tree)}  # ty: ignore[invalid-argument-type]
-    if unknown := set(changes) - names:
+    unknown = set(changes) - names
+    if unknown:
         raise TypeError(
             f"{type(tree).__name__} has no field {sorted(unknown)}; its fields are {sorted(names)}"
         )
