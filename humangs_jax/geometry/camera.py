@@ -189,7 +189,9 @@ def require_pinhole(what: str, camera: Camera) -> None:
     where `what` knows only those.
     """
     if not camera.is_plain:
-        kind = "distortion" if camera.lens == "pinhole" else f"a lens that is {camera.lens}"
+        kind = "distortion"
+        if camera.lens != "pinhole":
+            kind = f"a lens that is {camera.lens}"
         raise ValueError(f"{what} is for pinhole cameras without distortion, got one with {kind}")
 
 
@@ -232,7 +234,10 @@ def project(
     p = transform.apply(camera.cam_from_world, points)
     depth = p[..., 2]
     if not camera.is_plain:
-        slopes = p[..., :2] if camera.lens == "orthographic" else p[..., :2] / depth[..., None]
+        if camera.lens == "orthographic":
+            slopes = p[..., :2]
+        else:
+            slopes = p[..., :2] / depth[..., None]
         if camera.lens != "orthographic":
             x, y = distorted(camera.lens, camera.distortion, slopes[..., 0], slopes[..., 1])
             slopes = jnp.stack([x, y], axis=-1)

@@ -46,7 +46,9 @@ def check_lens(lens: object, count: int | None) -> None:
         raise ValueError(f"lens: expected {', '.join(COUNTS)}, got {lens!r}")
     allowed = COUNTS[str(lens)]
     if count is not None and count not in allowed:
-        expected = f"{' or '.join(map(str, allowed))} coefficients" if allowed else "none"
+        expected = "none"
+        if allowed:
+            expected = f"{' or '.join(map(str, allowed))} coefficients"
         raise ValueError(f"distortion of a {lens} lens: expected {expected}, got {count}")
 
 
@@ -89,7 +91,10 @@ def distorted_with_slopes(
     """x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]], by forward mode: it has a
     gradient itself.
     """
-    lensed = lambda u, v: distorted(lens, coefficients, u, v)
+
+    def lensed(u, v):
+        return distorted(lens, coefficients, u, v)
+
     one, zero = jnp.ones_like(u), jnp.zeros_like(u)
     (x, y), (xu, yu) = jax.jvp(lensed, (u, v), (one, zero))
     _, (xv, yv) = jax.jvp(lensed, (u, v), (zero, one))
@@ -110,7 +115,10 @@ def within_reach(
         straight = [i for i in (2, 3, 8, 9, 10, 11) if i < coefficients.shape[-1]]
         coefficients = coefficients.at[jnp.asarray(straight)].set(0.0)
     r = jnp.sqrt(u * u + v * v)
-    image = lambda r: distorted(lens, coefficients, r, jnp.zeros_like(r))[0]
+
+    def image(r):
+        return distorted(lens, coefficients, r, jnp.zeros_like(r))[0]
+
     grows = jnp.isfinite(r)
     for i in range(1, RINGS + 1):
         _, slope = jax.jvp(image, (r * (i / RINGS),), (jnp.ones_like(r),))

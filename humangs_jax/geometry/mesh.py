@@ -82,7 +82,10 @@ def in_front(
     frame = np.stack([right, np.cross(forward, right), forward])
     own, others = (frame @ vectors.T for vectors in (some, points))
     low = np.minimum(own[:2].min(axis=1), others[:2].min(axis=1))
-    cells = lambda placed: ((placed[:2] - low[:, None]) / cell).astype(int)
+
+    def cells(placed):
+        return ((placed[:2] - low[:, None]) / cell).astype(int)
+
     (column, row), (columns, rows) = cells(own), cells(others)
     height = 1 + max(row.max(), rows.max())
     nearest = np.full((1 + max(column.max(), columns.max())) * height, np.inf)
