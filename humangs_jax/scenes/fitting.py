@@ -130,14 +130,21 @@ def fit_scene(
     require_concrete("fit_scene", "reads photos and measures buffers", cameras, points)
     # photos and cameras
     began, config = time.perf_counter(), config or SceneConfig()
-    views = list(cameras.values()) if isinstance(cameras, Mapping) else list(cameras)
+    if isinstance(cameras, Mapping):
+        views = list(cameras.values())
+    else:
+        views = list(cameras)
     photos, extent = read_photos(images, views, config), extent_of(views)
-    color = named_color(background) if isinstance(background, str) else background
+    color = background
+    if isinstance(background, str):
+        color = named_color(background)
     color = jnp.asarray(color, jnp.float32)
     # where it begins: the points, or where the checkpoint stopped
     step, relocate = _programs()
     state = begin_scene(first_gaussians(points, views, config), config.capacity)
-    about = _about(config, photos, views, state) if checkpoint is not None else ""
+    about = ""
+    if checkpoint is not None:
+        about = _about(config, photos, views, state)
     state = _resumed(checkpoint, state, about)
     plans = _plans(_drawn(state.parameters, state.used), views, config)
     key, interrupted, saved = jax.random.key(config.seed), False, time.perf_counter()
@@ -186,7 +193,10 @@ def begin_scene(gaussians: Gaussians, capacity: int) -> SceneState:
     count = len(gaussians.opacities)
     if count > capacity:
         raise ValueError(f"points: {count:,} are more than SceneConfig.capacity {capacity:,}")
-    pad = lambda leaf: jnp.pad(leaf, [(0, capacity - count)] + [(0, 0)] * (leaf.ndim - 1))
+
+    def pad(leaf):
+        return jnp.pad(leaf, [(0, capacity - count)] + [(0, 0)] * (leaf.ndim - 1))
+
     parameters, used = jax.tree.map(pad, unconstrain(gaussians)), jnp.arange(capacity) < count
     zero = jnp.zeros((), jnp.int32)
     return SceneState(zero, parameters, used, ADAM.init(parameters), zero)

@@ -102,7 +102,9 @@ def mcmc_relocate(
     """
     opacities = jax.nn.sigmoid(parameters.opacity_logits)
     alive = used & (opacities > DEAD)
-    room = 0 if count is None else jnp.asarray(count, jnp.int32) - jnp.sum(used, dtype=jnp.int32)
+    room = 0
+    if count is not None:
+        room = jnp.asarray(count, jnp.int32) - jnp.sum(used, dtype=jnp.int32)
     grown = ~used & (jnp.cumsum(~used, dtype=jnp.int32) <= room)
     moving = ((used & ~alive) | grown) & jnp.any(alive)
 
@@ -119,7 +121,10 @@ def mcmc_relocate(
         opacity_logits=jnp.where(split, jnp.maximum(logits, least), parameters.opacity_logits),
         log_scales=parameters.log_scales + jnp.where(split, jnp.log(shrink), 0.0)[:, None],
     )
-    take = lambda leaf: jnp.where(_like(moving, leaf), leaf[source], leaf)
+
+    def take(leaf):
+        return jnp.where(_like(moving, leaf), leaf[source], leaf)
+
     return Relocated(jax.tree.map(take, parameters), used | (moving & grown), moving | split)
 
 

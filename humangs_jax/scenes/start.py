@@ -91,7 +91,10 @@ def _points(
     if isinstance(points, tuple):
         points, colors = points
     points = np.asarray(points, np.float64)
-    colors = np.full(points.shape, 0.5) if colors is None else np.asarray(colors, np.float64)
+    if colors is None:
+        colors = np.full(points.shape, 0.5)
+    else:
+        colors = np.asarray(colors, np.float64)
     for name, array in (("points", points), ("colors of points", colors)):
         if array.shape != (len(points), 3) or not len(points) or not np.isfinite(array).all():
             raise ValueError(f"{name}: expected finite numbers (n, 3), got shape {array.shape}")
