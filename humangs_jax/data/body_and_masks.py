@@ -101,7 +101,8 @@ def unusable_views(capture: Capture) -> dict[int, str]:
         if capture.unknown is not None:
             # what may be hidden says nothing, unless that is nearly all
             seen = ~capture.unknown[i][y, x]
-            on_mask = on_mask[seen] if seen.mean() > LEAST_SHARE else on_mask
+            if seen.mean() > LEAST_SHARE:
+                on_mask = on_mask[seen]
         if not len(on_mask) or on_mask.mean() < LEAST_SHARE:
             found[i] = "mask and posed body hardly meet (`humangs check` draws both)"
     return dict(sorted(found.items()))
@@ -109,11 +110,9 @@ def unusable_views(capture: Capture) -> dict[int, str]:
 
 def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
     """The views whose mask shows nobody."""
-    return [
-        i
-        for i, mask in enumerate(() if masks is None else masks)
-        if not (np.asarray(mask) > MASK_THRESHOLD).any()
-    ]
+    if masks is None:
+        return []
+    return [i for i, mask in enumerate(masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]
 
 
 # Points on the skin
@@ -411,10 +410,8 @@ def _window(
     rows, columns = (max(1, round(side * scale)) for side in window.shape)
     x, y = columns / window.shape[1], rows / window.shape[0]
     to_window = np.asarray([[x, 0, -left * x], [0, y, -top * y], [0, 0, 1]])
-    low, high = (
-        np.asarray([-left * x, -top * y]),
-        np.asarray([(width - left) * x, (height - top) * y]),
-    )
+    low = np.asarray([-left * x, -top * y])
+    high = np.asarray([(width - left) * x, (height - top) * y])
     covers = None
     if hidden is not None and hidden[cut].any():
         share = resized(np.pad(hidden[cut], pad, mode="edge").astype(np.float32), columns, rows)
@@ -448,11 +445,9 @@ def _share_outside(
     few = share(
         lambda view, pixels, _: at(view.coverage, pixels) < MASK_THRESHOLD
     )  # needs no distances
-    return (
-        few
-        if few < MISFIT
-        else share(lambda view, pixels, scale: at(view.mask, pixels) < -OUTSIDE * scale)
-    )
+    if few < MISFIT:
+        return few
+    return share(lambda view, pixels, scale: at(view.mask, pixels) < -OUTSIDE * scale)
 
 
 def _targets(
@@ -548,11 +543,9 @@ def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_
         a, b, c = (faces[:, (i + k) % 3] for k in range(3))
         u, v = vertices[a] - vertices[c], vertices[b] - vertices[c]
         cotangent = (u * v).sum(-1) / np.maximum(np.linalg.norm(np.cross(u, v), axis=-1), 1e-10)
-        rows, columns, values = (
-            [*rows, a, b],
-            [*columns, b, a],
-            [*values, *[np.clip(cotangent, 0.05, 5) / 2] * 2],
-        )
+        rows = [*rows, a, b]
+        columns = [*columns, b, a]
+        values = [*values, *[np.clip(cotangent, 0.05, 5) / 2] * 2]
     size = len(vertices)
     weights = sparse.coo_array(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)

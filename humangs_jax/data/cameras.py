@@ -156,8 +156,11 @@ class Calibration:
             own = new[seen.cameras] >= 0
             colors = None if seen.colors is None else seen.colors[own]
             seen = Observations(seen.points[own], new[seen.cameras[own]], seen.pixels[own], colors)
-            seen = seen if own.any() else None
-        stations = None if self.stations is None else min(self.stations, len(cameras))
+            if not own.any():
+                seen = None
+        stations = None
+        if self.stations is not None:
+            stations = min(self.stations, len(cameras))
         return dataclasses.replace(
             self, cameras=tuple(cameras), observations=seen, stations=stations
         )
@@ -180,7 +183,9 @@ class Source:
     @functools.cached_property
     def json(self) -> Any:
         """The value of a file that begins like a JSON object, else None. Raises: CaptureError."""
-        return checked_json(self.path, self.text) if self.text.lstrip().startswith("{") else None
+        if self.text.lstrip().startswith("{"):
+            return checked_json(self.path, self.text)
+        return None
 
     def calibration(
         self,
@@ -213,7 +218,8 @@ def read_calibration(
     """
     calibration = _read(path, photo_size)
     refusals = (camera.refusal for camera in calibration.cameras if camera.refusal is not None)
-    if not any_lens and (refusal := next(refusals, None)) is not None:
+    refusal = None if any_lens else next(refusals, None)
+    if refusal is not None:
         raise refusal
     return calibration
 
@@ -236,7 +242,8 @@ def _read(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibrati
         if found is None or file.suffix.lower() in CAMERAS.suffixes:
             format = CAMERAS.of_content(source)
         if format is None:
-            found = described(source.text) if found is None else found
+            if found is None:
+                found = described(source.text)
             raise CaptureError(file, found, f"not a known format: expected {CAMERAS.listed()}")
         return format(source, format)
 
@@ -320,11 +327,9 @@ def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
     from scipy.spatial.transform import Rotation
 
     values = file_numbers(value, file, field)
-    return (
-        Rotation.from_rotvec(values.ravel()).as_matrix()
-        if values.size == 3
-        else floats(values, file, field, (3, 3))
-    )
+    if values.size == 3:
+        return Rotation.from_rotvec(values.ravel()).as_matrix()
+    return floats(values, file, field, (3, 3))
 
 
 # Lenses
@@ -379,7 +384,10 @@ def fisheye_lens(values: Any, file: object, field: str, refusal: CaptureError) -
     photos have to be undistorted.
     """
     values = file_numbers(values, file, field).ravel()
-    coefficients = values if values[4:].any() else np.pad(values[:4], (0, max(0, 4 - len(values))))
+    if values[4:].any():
+        coefficients = values
+    else:
+        coefficients = np.pad(values[:4], (0, max(0, 4 - len(values))))
     return {"distortion": coefficients, "lens": "fisheye", "refusal": refusal}
 
 
@@ -441,11 +449,9 @@ def undistort_person(
     source = _in_photo(np.stack(np.meshgrid(columns, rows), axis=-1), K, coefficients)
     person = np.argwhere(mask > 0)[:, ::-1]
     # a cell more than the person on every side
-    near = (
-        [((source > person.min(0) - step) & (source < person.max(0) + step)).all(axis=-1)]
-        if len(person)
-        else []
-    )
+    near = []
+    if len(person):
+        near = [((source > person.min(0) - step) & (source < person.max(0) + step)).all(axis=-1)]
     if not np.any(near):
         return np.ones_like(image), np.zeros_like(mask)
     box = [
@@ -534,13 +540,16 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
     """Check cameras as their source has them, and as they came into the capture's convention with
     that axis up.
     """
-    matrices = lambda calibration: np.stack(
-        [camera.cam_from_world for camera in calibration.cameras]
-    )
+
+    def matrices(calibration):
+        return np.stack([camera.cam_from_world for camera in calibration.cameras])
+
     # what the points and the axes of the cameras say
     reprojection = mean_reprojection_error(converted)
     depths, _ = axes_meeting(matrices(converted))
-    distance = None if depths is None else float(np.median(np.abs(depths)))
+    distance = None
+    if depths is not None:
+        distance = float(np.median(np.abs(depths)))
     warnings = []
     if reprojection is not None and reprojection > REPROJECTION_LIMIT:
         limit = f"(expected below {REPROJECTION_LIMIT:g})"
@@ -564,7 +573,9 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
     warnings += [warning for camera in converted.cameras for warning in _center_warnings(camera)][
         :1
     ]
-    count = 0 if converted.observations is None else len(converted.observations.points)
+    count = 0
+    if converted.observations is not None:
+        count = len(converted.observations.points)
     return Checks(reprojection, count, distance, tuple(warnings))
 
 
@@ -578,7 +589,9 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
     matrices[:, :3, :3] = [nearest_rotation(matrix[:3, :3]) for matrix in matrices]
     depths, _ = axes_meeting(matrices)
-    distance = None if depths is None else float(np.median(np.abs(depths)))
+    distance = None
+    if depths is not None:
+        distance = float(np.median(np.abs(depths)))
     low, high = DISTANCES
     if distance is None or low <= known * distance <= high:
         line = (
@@ -614,7 +627,8 @@ def mean_reprojection_error(calibration: Calibration) -> float | None:
         if (p[:, 2] <= 0).any():
             return float("inf")
         plane = p[:, :2] / p[:, 2:]
-        plane = plane if camera.distortion is None else distort(plane, camera.distortion)
+        if camera.distortion is not None:
+            plane = distort(plane, camera.distortion)
         pixels = plane * np.diag(camera.K)[:2] + camera.K[:2, 2]
         errors.append(np.linalg.norm(pixels - seen.pixels[mine], axis=-1))
     return float(np.concatenate(errors).mean())
@@ -664,9 +678,9 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
     """
     if axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
         return []
-    matrices = (
-        np.linalg.inv(OPENGL_FROM_OPENCV @ poses) if convention == WORLD_FROM_CAM_OPENGL else poses
-    )
+    matrices = poses
+    if convention == WORLD_FROM_CAM_OPENGL:
+        matrices = np.linalg.inv(OPENGL_FROM_OPENCV @ poses)
     misses = {name: _miss(meaning(matrices)) for name, meaning in CONVENTIONS.items()}
     best = min(misses, key=lambda name: misses[name])
     problem = "the cameras do not look at one place before them"
@@ -699,9 +713,7 @@ def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
 def _center_warnings(camera: CalibratedCamera) -> list[str]:
     if np.abs(camera.K[:2, 2] / (camera.width, camera.height) - 0.5).max() < OFF_CENTER:
         return []
-    center, size = (
-        f"({camera.K[0, 2]:.1f}, {camera.K[1, 2]:.1f})",
-        f"{camera.width} x {camera.height}",
-    )
+    center = f"({camera.K[0, 2]:.1f}, {camera.K[1, 2]:.1f})"
+    size = f"{camera.width} x {camera.height}"
     problem = f"the principal point {center} is far from the middle of {size}"
     return [f"{camera.name}: {problem}: is K that of photos of another size?"]

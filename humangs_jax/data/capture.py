@@ -141,9 +141,14 @@ class Capture:
         """The capture with photos whose longest side has that many pixels."""
         height, width = self.images.shape[1:3]
         size = [max(1, round(side * longest / max(height, width))) for side in (width, height)]
-        resize = lambda images: np.stack([resized(image, *size) for image in images])
+
+        def resize(images):
+            return np.stack([resized(image, *size) for image in images])
+
         masks = None if self.masks is None else resize(self.masks)
-        unknown = None if self.unknown is None else resize(self.unknown.astype(np.float32)) > 0
+        unknown = None
+        if self.unknown is not None:
+            unknown = resize(self.unknown.astype(np.float32)) > 0
         return dataclasses.replace(
             self,
             images=resize(self.images),
@@ -229,7 +234,8 @@ def capture_from_arrays(
         for i in range(v)
     ]
     # the person: shape and poses
-    body = _load_model(source, str(body_file)) if body is None else body
+    if body is None:
+        body = _load_model(source, str(body_file))
     parameters = body_parameters(
         body, betas, rotations, translations, source, shape_names, displacement
     )
@@ -248,7 +254,10 @@ def capture_from_arrays(
         checked_frame(x.item(), len(rotations), source, f"frames[{i}]")
         for i, x in enumerate(np.asarray(frames))
     ]
-    names = tuple(f"{i:03d}" for i in range(v)) if names is None else tuple(names)
+    if names is None:
+        names = tuple(f"{i:03d}" for i in range(v))
+    else:
+        names = tuple(names)
     check_names(names, v, source)
     check_background(background, source)
     # photos on white, as the network knows them
@@ -421,7 +430,8 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
     }
     # what only some files hold
     parameters["displacement"] = values.get("displacement")
-    if (names := values.get("shape_names")) is not None:
+    names = values.get("shape_names")
+    if names is not None:
         if names.ndim != 1 or names.dtype.kind not in "US":
             raise CaptureError(
                 file, "shape_names", f"expected one name for each of betas, got shape {names.shape}"

@@ -94,11 +94,8 @@ KINDS: dict[type, str] = {
 
 def expect(value: Any, kind: type, file: object, field: str) -> Any:
     """A JSON value, of one of `KINDS`; names are not empty."""
-    if (
-        not isinstance(value, int | float if kind is float else kind)
-        or isinstance(value, bool)
-        or value == ""
-    ):
+    allowed = int | float if kind is float else kind
+    if not isinstance(value, allowed) or isinstance(value, bool) or value == "":
         raise CaptureError(file, field, f"expected {KINDS[kind]}, got {shown(value)}")
     return value
 
@@ -212,7 +209,10 @@ def body_parameters(
         ("betas", betas, LARGEST_BETA),
         ("displacement", displacement, LARGEST_DISPLACEMENT),
     ):
-        if array is not None and (most := np.abs(array).max(initial=0)) > largest:
+        if array is None:
+            continue
+        most = np.abs(array).max(initial=0)
+        if most > largest:
             raise CaptureError(
                 file, field, f"expected numbers of at most {largest:g} in magnitude, got {most:.4g}"
             )
@@ -255,7 +255,9 @@ def shape_coefficients(
         name for name, value in zip(names, betas, strict=True) if value and name not in places
     ]
     if unknown:
-        known = f"{len(places)}, from {directions[0]!r} to {directions[-1]!r}" if places else "none"
+        known = "none"
+        if places:
+            known = f"{len(places)}, from {directions[0]!r} to {directions[-1]!r}"
         problem = (
             f"{unknown[0]!r} is no shape direction of body '{body.name}': expected coefficients of"
             f" its own ({known})"

@@ -86,7 +86,8 @@ def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
     if capture.gains is not None:
         return 1 / capture.gains
     apart, found = unusable_views(capture), np.ones((capture.view_count, 3))
-    if usable := [i for i in range(capture.view_count) if i not in apart]:
+    usable = [i for i in range(capture.view_count) if i not in apart]
+    if usable:
         found[usable] = 1 / camera_gains(capture.select(usable))
     return found
 
@@ -145,7 +146,8 @@ def gains_of(
         rows, values = list(np.eye(count) / EXPECTED), [0.0] * count
         for one, other in itertools.combinations(range(count), 2):
             both = known[one, :, channel] & known[other, :, channel]
-            if (points := np.count_nonzero(both)) < LEAST_POINTS:
+            points = np.count_nonzero(both)
+            if points < LEAST_POINTS:
                 continue
             ratios = logs[other, both, channel] - logs[one, both, channel]
             middle = np.median(ratios)

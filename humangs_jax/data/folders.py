@@ -110,7 +110,8 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
         if place.name in SYSTEM_FOLDERS or skip(place):
             return True
         is_capture = (place / "capture.json").exists()
-        captures.extend([place] if is_capture else [])
+        if is_capture:
+            captures.append(place)
         return is_capture
 
     with reading(folder, "folder of photos", CaptureError):
@@ -124,7 +125,8 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
     masks = masks_beside(pictures)
     photos = [file for file in pictures if file not in masks]
     whole = len(set(masks.values())) == len(photos)  # else who knows which of them are meant
-    unused += [] if whole else [Unused(file, MASK) for file in masks]
+    if not whole:
+        unused += [Unused(file, MASK) for file in masks]
     # what a user may have meant as photos is named, all else is not
     for file in files:
         suffix = file.suffix.lower()

@@ -71,7 +71,9 @@ class CameraFormat(SourceFormat):
     """Metres in the unit of length of the format; None where it may be any."""
 
     def __str__(self) -> str:
-        return f"{self.about} ({', '.join(self.names)})" if self.files else self.about
+        if self.files:
+            return f"{self.about} ({', '.join(self.names)})"
+        return self.about
 
 
 class SourceFormats(Formats[F]):
@@ -81,7 +83,8 @@ class SourceFormats(Formats[F]):
         """The first format of which a folder has files, and the first of these; None: none."""
         for each in self.values():
             for pattern in each.files:
-                if (file := next(iter(sorted(visible(folder.glob(pattern)))), None)) is not None:
+                file = next(iter(sorted(visible(folder.glob(pattern)))), None)
+                if file is not None:
                     return each, file
         return None
 

@@ -100,12 +100,13 @@ def masks_at_edges(
     """
     found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
     seen = [shift for shift in found if shift is not None]
-    return [
-        (mask, 0.0)
-        if shift is None or not _believed(shift, seen)
-        else (_moved(mask, shift), shift.excess)
-        for mask, shift in zip(masks, found, strict=True)
-    ]
+    fitted = []
+    for mask, shift in zip(masks, found, strict=True):
+        if shift is None or not _believed(shift, seen):
+            fitted.append((mask, 0.0))
+        else:
+            fitted.append((_moved(mask, shift), shift.excess))
+    return fitted
 
 
 def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
@@ -113,7 +114,10 @@ def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
     alike = [other for other in seen if other.excess * shift.excess > 0]
     if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
         return False
-    share = lambda votes: votes[0] / max(sum(votes), 1)
+
+    def share(votes):
+        return votes[0] / max(sum(votes), 1)
+
     return bool(
         share(shift.votes) >= AGREE_ALONE
         and share(np.sum([other.votes for other in alike], axis=0)) >= AGREE
@@ -143,7 +147,10 @@ def _shift(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) ->
     reduced = min(1.0, MOST_PIXELS / (bottom - top))
     height, width = own.shape
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
-    small = (resized(photo, *size), resized(own, *size)) if reduced < 1 else (photo, own)
+    if reduced < 1:
+        small = resized(photo, *size), resized(own, *size)
+    else:
+        small = photo, own
     whole, moves = boundary_moves(*small, reduced * unit)
     if abs(whole) < LEAST * reduced * unit:
         return _Shift(0.0)
@@ -168,7 +175,10 @@ def boundary_moves(
     contrast = np.linalg.norm(
         slopes[0] * normal[0][..., None] + slopes[1] * normal[1][..., None], axis=-1
     )
-    blurred = lambda values: ndimage.gaussian_filter(values, NEIGHBORHOOD * unit, truncate=2.5)
+
+    def blurred(values):
+        return ndimage.gaussian_filter(values, NEIGHBORHOOD * unit, truncate=2.5)
+
     best, moves, highest, whole = np.full(mask.shape, -np.inf), np.zeros(mask.shape), -np.inf, 0.0
     for step in np.arange(-REACH, REACH + STEP / 2, STEP) * unit:
         near = np.exp(-0.5 * ((distances - step) / (0.7 * STEP * unit)) ** 2)
@@ -203,7 +213,10 @@ def sector_votes(
     def colors(depth):
         """At that distance inside of the points; not beyond the middle of a limb or the frame."""
         at = points + depth * normal
-        sample = lambda values: ndimage.map_coordinates(values, at, order=1, mode="nearest")
+
+        def sample(values):
+            return ndimage.map_coordinates(values, at, order=1, mode="nearest")
+
         seen = (np.abs(sample(distances) - depth) < 0.75) & (at >= 0).all(axis=0)
         seen &= (at <= np.subtract(mask.shape, 1)[:, None]).all(axis=0)
         return np.stack([sample(image[..., c]) for c in range(3)], axis=-1), seen
@@ -236,11 +249,9 @@ def sector_votes(
         ):
             continue
         texture = np.concatenate([size[seen & (sectors == sector)] for size, seen in textures])
-        least = (
-            (1 + OF_TEXTURE) * np.median(texture) + EDGE * highest[sector]
-            if len(texture)
-            else np.inf
-        )
+        least = np.inf
+        if len(texture):
+            least = (1 + OF_TEXTURE) * np.median(texture) + EDGE * highest[sector]
         ends = abs(whole) >= SEEN_APART and np.median(across[chosen]) > least
         if ends or clear[sector]:
             votes[
@@ -361,11 +372,12 @@ def _depth(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Pixels from each pixel's centre to the edge, negative outside; the photo's own border is no
     edge of the person.
     """
-    of = lambda part: (
-        ndimage.distance_transform_edt(np.pad(part, 1, mode="edge"))[1:-1, 1:-1]
-        if part.any()
-        else 0
-    )
+
+    def of(part):
+        if part.any():
+            return ndimage.distance_transform_edt(np.pad(part, 1, mode="edge"))[1:-1, 1:-1]
+        return 0
+
     return np.where(inside, of(inside) - 0.5, 0.5 - of(~inside))
 
 
@@ -373,9 +385,12 @@ def _blurred(
     colors: Float[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"], sigma: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """The mean color of what is nearby and True, and whether there is anything."""
-    blur = lambda values: ndimage.gaussian_filter(
-        values.astype(np.float32), sigma, truncate=4.0, mode="nearest"
-    )
+
+    def blur(values):
+        return ndimage.gaussian_filter(
+            values.astype(np.float32), sigma, truncate=4.0, mode="nearest"
+        )
+
     weight = blur(where)
     found = np.stack([blur(colors[..., i] * where) for i in range(3)], axis=-1)
     return found / np.maximum(weight, LEAST_WEIGHT)[..., None], weight >= LEAST_WEIGHT

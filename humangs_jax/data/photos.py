@@ -130,7 +130,8 @@ def read_description(file: Path) -> dict[str, Any]:
     )
     # what kind of file it is, before anything else is read of it
     for key, wanted in (("format", FORMAT), ("version", VERSION)):
-        if (found := expect(description, dict, file, "").get(key)) != wanted:
+        found = expect(description, dict, file, "").get(key)
+        if found != wanted:
             raise CaptureError(file, key, f"expected {wanted!r}, got {shown(found)}")
     check_keys(description, TOP_KEYS | OPTIONAL_TOP_KEYS, TOP_KEYS - {"background"}, file)
     if not isinstance(description.get("calibrated", True), bool):
@@ -287,7 +288,8 @@ def read_photos(
                 f"frames for each of {len(views)} photos",
             )
     # the chosen views: all with masks or none
-    views = views if chosen is None else [views[i] for i in chosen]
+    if chosen is not None:
+        views = [views[i] for i in chosen]
     with_mask = ["mask" in view for view in views]
     if any(with_mask) and not all(with_mask):
         first = with_mask.index(False)
@@ -354,7 +356,9 @@ def _check_orientations(
     """
     flagged = []
     for view, camera in zip(views, K, strict=True):
-        if (flag := read_checked(orientation, file := folder / view["image"])) == 1:
+        file = folder / view["image"]
+        flag = read_checked(orientation, file)
+        if flag == 1:
             continue
         flagged.append(file.name)
         stored, shown = (
@@ -416,11 +420,14 @@ def _read_images(
     images, masks, searched = None, None, []
     for i, view in enumerate(views):
         image, mask, on_background = read_view(folder, view, on_white)
-        searched += [i] if on_background else []
+        if on_background:
+            searched.append(i)
         if images is None:  # in place: a list of photos and an array of them are twice the memory
             height, width = image.shape[:2]
             images = np.empty((len(views), height, width, 3), np.float32)
-            masks = None if mask is None else np.empty((len(views), height, width), np.float32)
+            masks = None
+            if mask is not None:
+                masks = np.empty((len(views), height, width), np.float32)
         file = folder / view["image"]
         if image.shape != images.shape[1:]:
             size = f"{image.shape[1]} x {image.shape[0]}"
@@ -438,10 +445,14 @@ def _read_images(
     moved = []
     if masks is not None and searched:
         photos, own = [images[i] for i in searched], [masks[i] for i in searched]
-        fitted = masks_at_edges(photos, own) if fit_masks else [(mask, 0.0) for mask in own]
+        if fit_masks:
+            fitted = masks_at_edges(photos, own)
+        else:
+            fitted = [(mask, 0.0) for mask in own]
         for i, (mask, excess) in zip(searched, fitted, strict=True):
             images[i], masks[i] = cut_out(images[i], mask), mask
-            moved += [excess] if excess else []
+            if excess:
+                moved.append(excess)
     if moved:
         off = float(np.median(moved))
         wrong = f"{abs(off):.1f} pixels too {'large' if off > 0 else 'small'}"
@@ -524,7 +535,10 @@ def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
     """File names without folder and suffix, in letters, digits, '.', '_' and '-'; with their
     folders where they are ambiguous.
     """
-    plain = lambda name, i: re.sub(r"[^\w.-]", "_", name).lstrip(".") or f"{i:03d}"
+
+    def plain(name, i):
+        return re.sub(r"[^\w.-]", "_", name).lstrip(".") or f"{i:03d}"
+
     for name_of in (lambda path: path.stem, lambda path: "_".join(path.with_suffix("").parts)):
         names = tuple(plain(name_of(Path(path)), i) for i, path in enumerate(paths))
         if len(set(names)) == len(names):

@@ -87,9 +87,10 @@ def begin_set(
     earlier = _flat(read_manifest(folder, kind), made_with)
     asked = _flat(made_with, made_with)
     pairs = {name: (earlier.get(name), asked.get(name)) for name in sorted({**asked, **earlier})}
-    if changed := [
+    changed = [
         f"{name} {shown(old)} -> {shown(new)}" for name, (old, new) in pairs.items() if old != new
-    ]:
+    ]
+    if changed:
         problem = (
             f"written with settings other than asked for now ({', '.join(changed)}): choose another"
             " folder"

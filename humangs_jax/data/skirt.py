@@ -148,7 +148,9 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
     rows = np.flatnonzero(skirt[: ends[0] if len(ends) else ROWS])
     # wide trousers look like a skirt, so some cloth must be well clear of both legs
     certain = clear[rows] > (CLEAR if len(ends) else LONG_CLEAR)
-    return float(levels[rows[-1]]) if np.count_nonzero(certain) >= LEAST_ROWS else None
+    if np.count_nonzero(certain) >= LEAST_ROWS:
+        return float(levels[rows[-1]])
+    return None
 
 
 def with_tube(body: BodyModel, hem: float) -> BodyModel:
@@ -159,9 +161,8 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     # each vertex of the tube combines vertices of the body, and so does all that belongs to it
     combined = _tube(body, np.linspace(TOP, hem, ROWS))
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
-    linear = {
-        name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None
-    }
+    values = {name: getattr(body, name) for name in names}
+    linear = {name: np.asarray(value) for name, value in values.items() if value is not None}
     for name, own in linear.items():
         added = (combined @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
         linear[name] = np.concatenate([own, added.astype(own.dtype)])
@@ -260,7 +261,10 @@ def _tube(body: BodyModel, levels: Float[np.ndarray, " r"]) -> sparse.csr_array:
             _farthest(vertices, faces, origins[i], way * outwards)
             for i, way in enumerate((1.0, -1.0))
         )
-        gap = lambda a, b: sparse.csr_array((1 - shares)[:, None] * a + shares[:, None] * b)
+
+        def gap(a, b):
+            return sparse.csr_array((1 - shares)[:, None] * a + shares[:, None] * b)
+
         loops += [gap(left[[-1]], right[[0]]), right, gap(right[[-1]], left[[0]]), left]
     return sparse.vstack(loops, format="csr")
 

@@ -36,14 +36,8 @@ def binary_kind(file: Path) -> str | None:
     with open_file(file) as opened:
         head = opened.read(HEAD)
     known = (kind for start, kind in BINARIES.items() if head.startswith(start))
-    return next(
-        known,
-        (
-            "a binary file"
-            if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff"))
-            else None
-        ),
-    )
+    wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
+    return next(known, "a binary file" if b"\0" in head and not wide else None)
 
 
 def described(text: str) -> str:
@@ -61,8 +55,6 @@ def described(text: str) -> str:
             "the lens of one camera, without where it stands: K, R and T of each camera are needed"
         )
     names = list(dict.fromkeys(keys))
-    return (
-        f"it has the keys {few(names, KEYS_SHOWN)}"
-        if names
-        else f"a text that begins with {text.split()[0][:40]!r}"
-    )
+    if names:
+        return f"it has the keys {few(names, KEYS_SHOWN)}"
+    return f"a text that begins with {text.split()[0][:40]!r}"

@@ -196,7 +196,9 @@ def subject_rest(
 ) -> RestBody:
     """The person's body in the T-pose; a displacement does not move the joints."""
     rest = shape_body(body, betas)
-    return rest if displacement is None else replace(rest, vertices=rest.vertices + displacement)
+    if displacement is None:
+        return rest
+    return replace(rest, vertices=rest.vertices + displacement)
 
 
 @checked_arguments
@@ -225,7 +227,8 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
         vertices, camera = arguments
         return draw(vertices / unit, canonical, body.faces, camera, config.runtime.raster)
 
-    normals = lambda vertices: vertex_normals(vertices, body.faces)
+    def normals(vertices):
+        return vertex_normals(vertices, body.faces)
 
     # one view after the other: a vmapped rasterizer would make every view pay for the fullest one
     position_maps, depth_maps = jax.lax.map(rasterize_view, (posed, cameras))
@@ -297,9 +300,15 @@ def _squares(
     """Photos, masks and cameras, each cut to a square (left, top, side), white beyond the photo,
     and resized to `size` pixels.
     """
-    cut = lambda array, fill: np.stack(
-        [resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)]
-    )
+
+    def cut(array, fill):
+        return np.stack(
+            [
+                resized(_window(x, *box, fill), size, size)
+                for x, box in zip(array, boxes, strict=True)
+            ]
+        )
+
     left, top, sides = np.asarray(boxes, np.float32).T
     shift = np.zeros((len(boxes), 3, 3), np.float32)
     shift[:, 0, 2], shift[:, 1, 2] = left, top
@@ -314,10 +323,8 @@ def _window(
     """A square of an image, filled up where it reaches beyond."""
     height, width = image.shape[:2]
     window = np.full((side, side, *image.shape[2:]), fill, np.float32)
-    rows, columns = (
-        slice(max(top, 0), min(top + side, height)),
-        slice(max(left, 0), min(left + side, width)),
-    )
+    rows = slice(max(top, 0), min(top + side, height))
+    columns = slice(max(left, 0), min(left + side, width))
     window[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[
         rows, columns
     ]

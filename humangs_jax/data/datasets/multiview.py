@@ -167,7 +167,8 @@ def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
             calibration.file,
             camera.name,
         )
-        if (away := float(np.linalg.norm(camera.cam_from_world[:3, 3]))) > FARTHEST:
+        away = float(np.linalg.norm(camera.cam_from_world[:3, 3]))
+        if away > FARTHEST:
             problem = (
                 f"the camera stands {away:.4g} m from the origin: expected metres and at most"
                 f" {FARTHEST:g}"
@@ -180,12 +181,10 @@ def numbered(folder: Path) -> dict[int, Path]:
     """Frame -> its file, of the photos in a folder that are called by a number; empty if it does
     not exist.
     """
-    names = [
-        name
-        for name in (os.listdir(folder) if folder.is_dir() else ())
-        if name.lower().endswith(PHOTO_SUFFIXES)
-    ]
-    return {int(found[1]): folder / name for name in names if (found := PHOTO.fullmatch(name))}
+    listed = os.listdir(folder) if folder.is_dir() else ()
+    names = [name for name in listed if name.lower().endswith(PHOTO_SUFFIXES)]
+    matches = {name: PHOTO.fullmatch(name) for name in names}
+    return {int(found[1]): folder / name for name, found in matches.items() if found}
 
 
 def read_missing(file: Path) -> set[tuple[str, int]]:
@@ -225,10 +224,8 @@ def video_subject(
     a view.
     Raises: CaptureError if there is no photo.
     """
-    count, missing = (
-        len(parameters.translations),
-        {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0},
-    )
+    count = len(parameters.translations)
+    missing = {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0}
     shown = []
     # which frames each camera shows, and why others are left out
     for number, (camera, there, masked) in enumerate(zip(cameras, photos, masks, strict=True)):
@@ -252,7 +249,9 @@ def video_subject(
         frame, owner = int(frames[view]), int(owners[view])
         image, person = read(photos[owner][frame], masks[owner][frame])
         K, lens = cameras[owner].K, cameras[owner].distortion
-        return (image, person) if lens is None else undistort_person(image, person, K, lens)
+        if lens is None:
+            return image, person
+        return undistort_person(image, person, K, lens)
 
     return Subject(
         name=str(name),
@@ -333,7 +332,9 @@ def subfolders(
     """The folder itself, or those up to `depth` folders below that are a subject, sorted."""
     folder = Path(folder)
     below = (path for level in range(depth) for path in visible(folder.glob("*/" * (level + 1))))
-    return (folder,) if is_one(folder) else tuple(sorted(path for path in below if is_one(path)))
+    if is_one(folder):
+        return (folder,)
+    return tuple(sorted(path for path in below if is_one(path)))
 
 
 def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Subject:
@@ -343,7 +344,10 @@ def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Su
     """
     folder = Path(folder)
     cameras = read_cameras(folder / layout.calibration)
-    place = lambda part, camera: folder / part.replace("NAME", camera.name)
+
+    def place(part, camera):
+        return folder / part.replace("NAME", camera.name)
+
     places = [(place(layout.photos, camera), place(layout.masks, camera)) for camera in cameras]
     return folder_subject(
         folder,
@@ -541,9 +545,8 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
         masks.append(
             {int(name): f"{masked}/{name}" for name in notes.names(masked) if name.isdecimal()}
         )
-        cameras.append(
-            _camera(notes, number, photos, shown[-1][min(shown[-1])] if shown[-1] else None)
-        )
+        first = shown[-1][min(shown[-1])] if shown[-1] else None
+        cameras.append(_camera(notes, number, photos, first))
 
     def read(photo: str, mask: str) -> Photo:
         image, person = (file.image(key, _colors) for file, key in ((photos, photo), (notes, mask)))
@@ -577,6 +580,9 @@ def _camera(notes: Smc, number: int, photos: Smc, first: str | None) -> Calibrat
     at = f"Camera_Parameter/{number:02d}"
     K, pose = notes.numbers(f"{at}/K", (3, 3)), notes.numbers(f"{at}/RT", (4, 4))
     lens = brown_conrady(notes.array(f"{at}/D").reshape(-1), notes.path, f"{at}/D")
-    width, height = (1, 1) if first is None else photos.image(first, lambda image: image.size)
+    if first is None:
+        width, height = 1, 1
+    else:
+        width, height = photos.image(first, lambda image: image.size)
     with reading(f"{notes.path}: {at}/RT", "pose", CaptureError):
         return CalibratedCamera(f"{number:02d}", K, np.linalg.inv(pose), width, height, lens)

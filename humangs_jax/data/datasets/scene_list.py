@@ -85,11 +85,9 @@ def find_scene_list(path: str | Path) -> tuple[Path, ...]:
 def _list_of(path: str | Path) -> Path:
     """The JSON file; of a folder train.json, else test.json."""
     file = Path(path)
-    return (
-        next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
-        if file.is_dir()
-        else file
-    )
+    if file.is_dir():
+        return next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
+    return file
 
 
 def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -132,8 +130,13 @@ def open_scene_list(
         firsts = (frames[0] for frames in listed if frames and isinstance(frames[0], dict))
         images = (file.parent / str(frame.get("image_path")) for frame in firsts)
         first = next((image for image in images if image.is_file()), None)
-        size = STORED_SIZE if first is None else max(read_checked(image_size, first))
-    opened = lambda name, scene: functools.partial(open_scene, file, name, scene, body)
+        size = STORED_SIZE
+        if first is not None:
+            size = max(read_checked(image_size, first))
+
+    def opened(name, scene):
+        return functools.partial(open_scene, file, name, scene, body)
+
     return tuple(
         Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items()
     )
@@ -166,10 +169,8 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
 
     # all images have one size; cameras go from the units of the scene to metres
     sizes = np.asarray([read_checked(image_size, _inside(file, name, views[0].image))] * len(views))
-    K, poses = (
-        np.stack([view.K for view in views]),
-        np.stack([view.cam_from_world for view in views]),
-    )
+    K = np.stack([view.K for view in views])
+    poses = np.stack([view.cam_from_world for view in views])
     for i in range(len(views)):
         checked_camera(K[i], poses[i], *sizes[i].tolist(), file, f"{name}.frames[{i}]")
     poses[:, :3, 3] /= scale
@@ -277,9 +278,12 @@ def scene_entry(
 
 def rounded(array: Float[np.ndarray, "..."]) -> Any:
     """Nested lists of numbers of `SIGNIFICANT` digits."""
-    short = lambda x: (
-        [short(row) for row in x] if isinstance(x, list) else float(f"{x:.{SIGNIFICANT}g}")
-    )
+
+    def short(x):
+        if isinstance(x, list):
+            return [short(row) for row in x]
+        return float(f"{x:.{SIGNIFICANT}g}")
+
     return short(array.tolist())
 
 

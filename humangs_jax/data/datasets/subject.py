@@ -84,11 +84,9 @@ class FileBody:
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 s"], Float[np.ndarray, "j n"]]:
         """Template, shape directions and joint regressor, float64."""
         model = self.model
-        template, directions, regressor = (
-            model.template,
-            model.shape_directions,
-            model.joint_regressor,
-        )
+        template = model.template
+        directions = model.shape_directions
+        regressor = model.joint_regressor
         template, directions, regressor = (
             np.asarray(x, np.float64) for x in (template, directions, regressor)
         )
@@ -461,7 +459,8 @@ def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tu
     """
     path = Path(path)
     for name, data_set in DATASETS.items():
-        if not (folders := imported(data_set.find)(path)):
+        folders = imported(data_set.find)(path)
+        if not folders:
             continue
         if data_set.scans:
             raise CaptureError(
@@ -469,7 +468,10 @@ def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tu
             )
         if data_set.lists:
             return data_set(path, body, size)
-        opened = lambda folder, open_one=data_set: functools.partial(open_one, folder, body)
+
+        def opened(folder, open_one=data_set):
+            return functools.partial(open_one, folder, body)
+
         return tuple(Person(str(folder), opened(folder), size or STORED_SIZE) for folder in folders)
     known = ", ".join(each.about for each in DATASETS.where(lambda each: not each.lists).values())
     raise CaptureError(

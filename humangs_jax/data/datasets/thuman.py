@@ -87,7 +87,9 @@ class Scan:
 def find_thuman(folder: str | Path) -> tuple[Path, ...]:
     """The folder, if it holds scans."""
     folder = Path(folder)
-    return (folder,) if (folder / "model").is_dir() and (folder / "smplx").is_dir() else ()
+    if (folder / "model").is_dir() and (folder / "smplx").is_dir():
+        return (folder,)
+    return ()
 
 
 def scan_files(folder: Path, name: str) -> tuple[Path, Path]:
@@ -116,7 +118,9 @@ def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
         else:
             names.append(name)
     if not names:
-        why = f" ({next(iter(skipped.values()))})" if skipped else ""
+        why = ""
+        if skipped:
+            why = f" ({next(iter(skipped.values()))})"
         raise CaptureError(
             folder, "", f"no scan with a fit{why}: expected model/ID/ID.obj and smplx/ID/{FIT}"
         )
@@ -145,7 +149,10 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     keys = ("left_hand_pose", "right_hand_pose")
     hands = [values.numbers(key, (1, None), LARGEST_ANGLE)[0] for key in keys]
     length = len(hands[0])
-    lengths = (HAND_NUMBERS,) if of_kind == "transl" else (PCA_NUMBERS, HAND_NUMBERS)
+    if of_kind == "transl":
+        lengths = (HAND_NUMBERS,)
+    else:
+        lengths = PCA_NUMBERS, HAND_NUMBERS
     for key, hand in zip(keys, hands, strict=True):
         if len(hand) not in lengths or len(hand) != length:
             raise CaptureError(
@@ -154,15 +161,17 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
                 f"expected {' or '.join(map(str, lengths))} numbers beside {of_kind}, got"
                 f" {len(hand)}",
             )
-    kind: Kind = "C" if of_kind == "transl" else "A" if length == PCA_NUMBERS else "B"
+    kind: Kind = "A" if length == PCA_NUMBERS else "B"
+    if of_kind == "transl":
+        kind = "C"
     # place and size; translations in scan units become metres
     scale = values.number("scale")
     if not scale > 0:
         raise CaptureError(file, "scale", f"expected a positive number, got {scale:g}")
     offset = values.numbers(of_kind, (1, 3))
-    translation = checked_numbers(
-        offset if kind == "C" else offset / scale, file, of_kind, largest=FARTHEST
-    )
+    if kind != "C":
+        offset = offset / scale
+    translation = checked_numbers(offset, file, of_kind, largest=FARTHEST)
     # poses: hands of principal components become angles, and the mean hand is added
     parts = [values.numbers(key, (1, size), LARGEST_ANGLE)[0] for key, size in _ANGLES.items()]
     if kind == "A":
@@ -220,11 +229,9 @@ def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
         for number, line in enumerate(read_text(file).splitlines(), 1):
             kind, *words = line.split() or [""]
             if (kind == "v" and len(words) < 3) or (kind == "f" and len(words) != 3):
-                expected = (
-                    "three coordinates of a vertex"
-                    if kind == "v"
-                    else "three corners of a triangle"
-                )
+                expected = "three corners of a triangle"
+                if kind == "v":
+                    expected = "three coordinates of a vertex"
                 raise Refused(f"line {number}: expected {expected}, got {len(words)}")
             if kind == "v":
                 vertices.append(words[:3])

@@ -184,4 +184,6 @@ class Loader:
 def _stack(*leaves: Array | np.ndarray) -> Array | np.ndarray:
     """Leaves that are all on a device stay there."""
     on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
-    return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])
+    if on_device:
+        return jnp.stack(leaves)
+    return np.stack([np.asarray(leaf) for leaf in leaves])

@@ -44,11 +44,10 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     Raises: ValueError if there is none.
     """
     root = Path(root)
-    folders = (
-        [root]
-        if (root / "capture.json").is_file()
-        else sorted(p.parent for p in root.glob("*/capture.json"))
-    )
+    if (root / "capture.json").is_file():
+        folders = [root]
+    else:
+        folders = sorted(p.parent for p in root.glob("*/capture.json"))
     folders = [folder for folder in folders if not folder.name.startswith(".")]  # half-written ones
     if not folders:
         raise ValueError(f"{root}: no capture folder here (a folder with a capture.json)")
@@ -94,7 +93,10 @@ def read_summary(
             )
         if "mask" not in view and not has_alpha:
             raise CaptureError(folder, "", "no masks: training needs to know where the person is")
-        if "mask" in view and (masked := read_checked(check_image, mask)[0]) != size:
+        if "mask" not in view:
+            continue
+        masked = read_checked(check_image, mask)[0]
+        if masked != size:
             raise CaptureError(
                 mask, "size", f"{masked}, but its image has {size}: expected the same"
             )
@@ -230,8 +232,10 @@ class PeopleCache:
             decoded = {
                 view: self._images[name, view] for view in views if (name, view) in self._images
             }
-        summary = person.summary() if summary is None else summary
-        if missing := [view for view in views if view not in decoded]:
+        if summary is None:
+            summary = person.summary()
+        missing = [view for view in views if view not in decoded]
+        if missing:
             for view, image, mask in zip(missing, *person.decode(missing), strict=True):
                 decoded[view] = image, mask
                 self._keep(name, view, image, mask)

@@ -211,7 +211,10 @@ class ScanRenderer:
     def of(cls, scan: Scan, vertices: Float[np.ndarray, "n 3"]) -> "ScanRenderer":
         """A scan with its vertices moved."""
         spare, spare_faces = -len(vertices) % STEP, -len(scan.faces) % STEP
-        pad = lambda x: jnp.asarray(np.pad(x, ((0, spare), (0, 0)), mode="edge"), jnp.float32)
+
+        def pad(x):
+            return jnp.asarray(np.pad(x, ((0, spare), (0, 0)), mode="edge"), jnp.float32)
+
         faces = jnp.asarray(np.pad(scan.faces, ((0, spare_faces), (0, 0))), jnp.int32)
         surface = face_areas(vertices, scan.faces).sum()
         flat = face_areas(np.pad(scan.uvs.astype(np.float64), ((0, 0), (0, 1))), scan.faces).sum()
@@ -286,7 +289,10 @@ def _render(
     )
     light = AMBIENT + HEADLIGHT * cosine / jnp.maximum(lengths, 1e-12)
     color = jnp.where(covered, sample_texture(texture, seen[..., 6:]) * light, 1.0)
-    mean = lambda x: x.reshape(camera.height, supersample, camera.width, supersample, -1).mean(
-        axis=(1, 3)
-    )
+
+    def mean(x):
+        return x.reshape(camera.height, supersample, camera.width, supersample, -1).mean(
+            axis=(1, 3)
+        )
+
     return mean(color), mean(covered.astype(color.dtype))[..., 0]

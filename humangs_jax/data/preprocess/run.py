@@ -178,9 +178,8 @@ def preprocess(
     scans, done = DATASETS[settings.kind].scans, 0  # photos of videos are decoded by threads
     try:
         with bar(total=len(due), desc="scans", shown=progress and scans) as shown:
-            for name, error in made(
-                _make_scan if scans else _make_video, tasks, workers if scans else 1, load
-            ):
+            make = _make_scan if scans else _make_video
+            for name, error in made(make, tasks, workers if scans else 1, load):
                 shown.update()
                 if error is None:
                     done += 1
@@ -208,9 +207,12 @@ def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[s
         raise CaptureError(
             source, "", f"no subject in the layout of {settings.kind} (docs/datasets.md)"
         )
-    named = lambda path: (
-        path.stem if path.is_file() else "_".join(path.relative_to(source).parts) or path.name
-    )
+
+    def named(path):
+        if path.is_file():
+            return path.stem
+        return "_".join(path.relative_to(source).parts) or path.name
+
     return {named(path): path for path in folders}, {}
 
 
@@ -290,11 +292,10 @@ def _write_lists(
         if file.stem not in scenes
     }
     # the split is that of all names, so that it does not depend on what is finished
-    train, test = (
-        split_ids(names, settings.train, settings.test)
-        if DATASETS[settings.kind].scans
-        else ([], sorted(names))
-    )
+    if DATASETS[settings.kind].scans:
+        train, test = split_ids(names, settings.train, settings.test)
+    else:
+        train, test = [], sorted(names)
     split = {
         "train": [name for name in train if name in scenes],
         "test": [name for name in test if name in scenes],
@@ -396,7 +397,10 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
     number = int(name) if name.isdecimal() else zlib.crc32(os.fsencode(name))
     cameras = scan_cameras(number, radius, settings.views, settings.factors)
     renderer, K = ScanRenderer.of(scan, vertices), intrinsics(settings.size)
-    render = lambda pose: renderer.render(pose, settings.size, settings.supersample)
+
+    def render(pose):
+        return renderer.render(pose, settings.size, settings.supersample)
+
     known = {
         "fit_kind": fit.kind,
         "fit_error_mm": [round(1e3 * each, 4) for each in error],
