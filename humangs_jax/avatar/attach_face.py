@@ -79,7 +79,9 @@ def shipped_network() -> HumanGSConfig:
     are shipped.
     """
     with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
-        metadata = read_safetensors(file, lambda key: False)[2] if file.exists() else {}
+        metadata = {}
+        if file.exists():
+            metadata = read_safetensors(file, lambda key: False)[2]
     return HumanGSConfig(
         conventions=config_from_json(Conventions, metadata.get("conventions", "{}"))
     )
@@ -106,7 +108,10 @@ def _has_face(avatar: Avatar, body: BodyModel) -> bool:
         return False
     faces, own = np.asarray(body.faces), np.asarray(avatar.faces)
     faces = faces[np.isin(faces, np.asarray(body.expressions.vertices)).any(axis=1)]
-    number = lambda corners: np.dot(corners.astype(np.int64), (1 << 42, 1 << 21, 1))
+
+    def number(corners):
+        return np.dot(corners.astype(np.int64), (1 << 42, 1 << 21, 1))
+
     return bool(np.isin(number(faces), number(own)).all())
 
 
@@ -120,7 +125,9 @@ def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
         return avatar
     found = body_of(avatar) if body is None else body
     if found is None or found.expressions is None or not _has_face(avatar, found):
-        name = "the shipped body" if body is None else f"the body '{body.name}'"
+        name = "the shipped body"
+        if body is not None:
+            name = f"the body '{body.name}'"
         raise ValueError(f"with_face: the avatar's vertices are not those of {name} with a face")
     expressions = found.expressions
     return replace(avatar, face=_face(avatar, found, "eyeBlinkLeft" in expressions.names))
@@ -129,7 +136,9 @@ def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
 def faced(avatar: Avatar) -> Avatar:
     """The avatar with a face where its body is known, else as it is."""
     found = body_of(avatar) if avatar.face is None else None
-    return avatar if found is None else with_face(avatar, found)
+    if found is None:
+        return avatar
+    return with_face(avatar, found)
 
 
 def with_face_for(avatar: Avatar, motion: Motion) -> Avatar:

@@ -248,7 +248,9 @@ class Avatar(Batchable):
     @property
     def expression_names(self) -> tuple[str, ...]:
         """The names of the coefficients of a pose's expression; none without a face."""
-        return () if self.face is None else self.face.expressions.names
+        if self.face is None:
+            return ()
+        return self.face.expressions.names
 
     def with_face(self, body: BodyModel | None = None) -> "Avatar":
         """The avatar with a face, so that poses may have an expression; without one it is drawn as
@@ -302,7 +304,8 @@ class Avatar(Batchable):
                 f"expected one avatar, got a batch {self.batch_shape}: save each,"
                 " avatars[0].save(path)"
             )
-        if fault := shape_fault(self):
+        fault = shape_fault(self)
+        if fault:
             raise ValueError(f"avatar{fault}")
         if self.gaussians.deformations is not None:
             raise ValueError(
@@ -324,9 +327,8 @@ class Avatar(Batchable):
         # what only some avatars have
         if self.light is not None:
             values |= {f"light_{name}": getattr(self.light, name) for name in _LIGHT}
-        values |= {
-            name: x for name in _OPTIONAL if (x := getattr(self.gaussians, name)) is not None
-        }
+        optional = {name: getattr(self.gaussians, name) for name in _OPTIONAL}
+        values |= {name: x for name, x in optional.items() if x is not None}
         values = {
             name: np.asarray(x if name == "faces" else at_least_float32(x))
             for name, x in values.items()
@@ -396,7 +398,8 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     with_light = any(f"light_{name}" in arrays for name in _LIGHT)
     wanted = _ARRAYS + tuple(f"light_{name}" for name in _LIGHT if with_light)
     wanted += tuple(name for name in _OPTIONAL if name in arrays)
-    if missing := [name for name in wanted if name not in arrays]:
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
         raise Refused(f"missing keys {missing}")
     check_joints(header["parents"], header["joint_names"])
     skinning, rendering = (
@@ -458,7 +461,8 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
         return None
     # a face is there whole or not at all
     keys = [f"face_{name}" for name in _FACE] + [f"face_hidden_{name}" for name in _ARRAYS[:5]]
-    if missing := [key for key in keys if key not in of_face]:
+    missing = [key for key in keys if key not in of_face]
+    if missing:
         raise Refused(f"missing keys {missing}")
     # sizes: g Gaussians, q hidden ones, m vertices that expressions move
     g, e = len(arrays["means"]), len(expressions.names)

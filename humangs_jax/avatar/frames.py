@@ -75,12 +75,16 @@ def draw(
     """One rendering per pose and camera. how: None for what the avatar's weights were trained with.
     exposures: of the cameras, see `data.exposure`.
     """
-    how = SPLAT_PRESETS[avatar.rendering] if how is None else how
+    if how is None:
+        how = SPLAT_PRESETS[avatar.rendering]
     gaussians = (posed(avatar, pose) for pose in poses)
     if exposures is not None:
-        lit = lambda g, e: replace(
-            g, **jax.tree.map(lambda x: x * e, {"colors": g.colors, "harmonics": g.harmonics})
-        )
+
+        def lit(g, e):
+            return replace(
+                g, **jax.tree.map(lambda x: x * e, {"colors": g.colors, "harmonics": g.harmonics})
+            )
+
         gaussians = (lit(g, e) for g, e in zip(gaussians, exposures, strict=True))
     return draw_gaussians(gaussians, cameras, background, how)
 
@@ -114,7 +118,9 @@ def splatting_of(shot: Shot, avatar: Avatar) -> SplatConfig:
     if shot.splat == "as_trained":
         return SPLAT_PRESETS[avatar.rendering]
     config = SPLAT_PRESETS[shot.splat]
-    return config if shot.splat in ("exact", "inria") else drawn_as(config, avatar.rendering)
+    if shot.splat in ("exact", "inria"):
+        return config
+    return drawn_as(config, avatar.rendering)
 
 
 def image_of(
@@ -141,7 +147,8 @@ def a_pose_of(avatar: Avatar) -> BodyPose:
     Raises: ValueError for a body without the joints left_shoulder and right_shoulder.
     """
     names, angle = avatar.joint_names, np.radians(A_POSE)
-    if missing := {"left_shoulder", "right_shoulder"} - set(names):
+    missing = {"left_shoulder", "right_shoulder"} - set(names)
+    if missing:
         raise ValueError(f"A-pose: the avatar's body has no joint {' and '.join(sorted(missing))}")
     rotations = np.zeros((len(names), 3), np.float32)
     rotations[names.index("left_shoulder"), 2] = -angle  # the left side is at +x, y is up
@@ -198,9 +205,10 @@ def shot_cameras(
         [right, np.cross(right, back), -back], axis=1
     )  # of the cameras in the world: right, down, forward
     targets = np.broadcast_to(targets, back.shape)
-    distance = (
-        _fitting_distance(shot, points, targets, axes) if shot.distance is None else shot.distance
-    )
+    if shot.distance is None:
+        distance = _fitting_distance(shot, points, targets, axes)
+    else:
+        distance = shot.distance
     width, height = shot.resolution
     views = np.zeros((len(turns), 4, 4), np.float32)
     views[:, :3, :3], views[:, 3, 3] = axes, 1
@@ -271,7 +279,8 @@ def excerpt(
     """
     count = len(motion.translations)
     length = count / motion.fps
-    stop = length if stop is None else stop
+    if stop is None:
+        stop = length
     if not 0 <= start < stop <= length + 0.5 / motion.fps:
         raise ArgumentError(
             "start",
@@ -288,7 +297,8 @@ def excerpt(
     first = min(int(start * motion.fps), count - 1)
     last = max(first + 1, min(round(stop * motion.fps), count))
     part = motion.part(slice(first, last))
-    part = part if fps is None else part.at_rate(fps)
+    if fps is not None:
+        part = part.at_rate(fps)
     if loop == 1:
         return part
     # repetitions go on along the ground
@@ -412,7 +422,8 @@ def motion_frames(
     progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Frames of a moving avatar, drawn when asked for; see `motion_views` and `images`."""
-    shot = Shot() if shot is None else shot
+    if shot is None:
+        shot = Shot()
     poses, cameras = motion_views(avatar, motion, shot, turn)
     return images(avatar, poses, cameras, shot, "animate" if progress else None)
 
@@ -469,7 +480,9 @@ def circle_cameras(
         np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
     ]
     middle = np.median(means, axis=0) if len(means) else np.zeros(3)
-    radius = np.quantile(np.linalg.norm(means - middle, axis=1), SHOWN) if len(means) else 1.0
+    radius = 1.0
+    if len(means):
+        radius = np.quantile(np.linalg.norm(means - middle, axis=1), SHOWN)
     if len(means):
         low, high = np.quantile(means, [1 - NEARLY_ALL, NEARLY_ALL], axis=0)
         whole = np.quantile(np.linalg.norm(means - (low + high) / 2, axis=1), NEARLY_ALL)

@@ -88,7 +88,8 @@ class ExrLayers:
 
     def check(self) -> None:
         """Raises: ValueError naming a layer that does not exist."""
-        if unknown := [layer for layer in self.layers if layer not in LAYERS]:
+        unknown = [layer for layer in self.layers if layer not in LAYERS]
+        if unknown:
             raise ArgumentError("channels", f"{unknown[0]!r}: expected some of {', '.join(LAYERS)}")
 
     def bytes_of(self, views: int, width: int, height: int) -> int:
@@ -121,7 +122,8 @@ def write_views(
     docs/security.md); OSError.
     """
     out, count = Path(out), len(poses)
-    names = [f"view_{i:03d}" for i in range(count)] if names is None else names
+    if names is None:
+        names = [f"view_{i:03d}" for i in range(count)]
     # an EXR file is checked before anything is drawn
     if exr is not None:
         exr.check()
@@ -236,10 +238,8 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
     the camera's axis, metres.
     """
     require_pinhole("unprojection", camera)
-    K, world_from_cam = (
-        np.asarray(camera.K, np.float64),
-        np.linalg.inv(np.asarray(camera.cam_from_world, np.float64)),
-    )
+    K = np.asarray(camera.K, np.float64)
+    world_from_cam = np.linalg.inv(np.asarray(camera.cam_from_world, np.float64))
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     points = (depth[..., None] * rays) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]

@@ -381,7 +381,8 @@ def _reconstruct(
     views: SubjectViews,
     inputs: HumanGSInputs | None = None,
 ) -> tuple[Avatar, Int[Array, ""]]:
-    inputs = prepare_inputs(body, views, config) if inputs is None else inputs
+    if inputs is None:
+        inputs = prepare_inputs(body, views, config)
     outputs, _ = apply_humangs(variables, inputs, config)
     outputs = with_guesses(outputs, inputs, body, config)
     return completed_avatar(outputs, body, views, config), outputs.dropped_tokens
@@ -399,10 +400,8 @@ def make_avatar(
         raise ValueError(
             f"{name} draws images without Gaussians: there is no avatar to make or animate"
         )
-    weights, per_vertex = (
-        outputs.skinning_weights,
-        outputs.gaussians.means.shape[0] // body.template.shape[0],
-    )
+    weights = outputs.skinning_weights
+    per_vertex = outputs.gaussians.means.shape[0] // body.template.shape[0]
     if weights is None:
         weights = corrected_skinning_weights(
             body.skinning_weights, outputs.skinning_offsets, per_vertex
@@ -460,9 +459,15 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
     terms = jnp.sum(
         share[:, None, None] * jax.vmap(terms_in)(views.rotations, views.translations), axis=0
     )
-    pooled = lambda values: jnp.sum(values.reshape(len(vertices), per_vertex, -1), axis=1)
+
+    def pooled(values):
+        return jnp.sum(values.reshape(len(vertices), per_vertex, -1), axis=1)
+
     weights = pooled(gaussians.opacities)
-    mean = lambda values: pooled(values * gaussians.opacities[:, None]) / jnp.maximum(weights, 1e-6)
+
+    def mean(values):
+        return pooled(values * gaussians.opacities[:, None]) / jnp.maximum(weights, 1e-6)
+
     coefficients = light_coefficients(vertices, mean(gaussians.colors), weights[:, 0], mean(terms))
     return replace(avatar, light=Light(coefficients, normals, log_brightness(terms, coefficients)))
 

@@ -125,7 +125,10 @@ def write_video(
     else:
         old = sorted(path.glob("frame_*.png"))
         check_ours(old, is_own_output)
-        write = lambda folder: form(folder, frames, float(fps), first.shape)
+
+        def write(folder):
+            return form(folder, frames, float(fps), first.shape)
+
         add_files(path, write, without=[file.name for file in old], ours=is_own_output)
     return next(count)
 
@@ -136,7 +139,9 @@ def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
     """
     suffix = Path(path).suffix.lower()
     even = any(form.even_sides for form in VIDEOS.values() if suffix in form.suffixes)
-    return (width + width % 2, height + height % 2) if even else (width, height)
+    if even:
+        return width + width % 2, height + height % 2
+    return width, height
 
 
 def write_images(
@@ -156,7 +161,8 @@ def _checked(path: Path, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
             raise ValueError(
                 f"{path}: frame {i}: expected shape (h, w, 3) or (h, w, 4), got {frame.shape}"
             )
-        shape = frame.shape if shape is None else shape
+        if shape is None:
+            shape = frame.shape
         if 0 in frame.shape:
             raise ValueError(
                 f"{path}: expected at least one frame of at least one pixel, got {frame.shape[:2]}"
@@ -372,7 +378,9 @@ def side_by_side(
     triples = np.stack([truth, ours, errors], axis=1).reshape(-1, *truth.shape[1:])
     headers = ("truth", "ours", "error")
     columns = 3 if len(truth) <= 3 else 6
-    texts = None if labels is None else [text for label in labels for text in (label, "", "")]
+    texts = None
+    if labels is not None:
+        texts = [text for label in labels for text in (label, "", "")]
     sheet = tile(triples, labels=texts, headers=headers * (columns // 3), columns=columns)
     legend = error_legend(sheet.shape[1], _text_height(truth.shape[2]))
     write_png(path, np.concatenate([sheet, legend]), mark=DRAWN)
@@ -393,7 +401,10 @@ def tile(
         columns: images in a row; about as many as rows if left out.
     """
     count, height, width = images.shape[:3]
-    columns = int(np.ceil(np.sqrt(count))) if columns is None else min(columns, count)
+    if columns is None:
+        columns = int(np.ceil(np.sqrt(count)))
+    else:
+        columns = min(columns, count)
     text = _text_height(width)
     strip = 0 if labels is None else text + 2 * GAP
     top = 0 if headers is None else text + 2 * GAP

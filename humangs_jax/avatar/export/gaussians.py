@@ -80,7 +80,9 @@ def up_matrix(up: Up) -> Float[np.ndarray, "3 3"]:
 def world_matrix(form: ExportFormat) -> Float[np.ndarray, "3 3"]:
     """The rotation to the world of a format from ours, which has y up and people who face +z."""
     matrix = up_matrix(form.up)
-    return matrix @ _matrix(BACKWARDS) if form.backwards else matrix
+    if form.backwards:
+        return matrix @ _matrix(BACKWARDS)
+    return matrix
 
 
 def turned(gaussians: Gaussians, up: Up) -> Gaussians:
@@ -201,7 +203,9 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
         gaussians = imported(form.reader)(data, said)
         if said:
             logger.warning("%s: %s", path, printable("; ".join(dict.fromkeys(said))))
-        return _between_worlds(gaussians, form) if y_up else gaussians
+        if y_up:
+            return _between_worlds(gaussians, form)
+        return gaussians
 
 
 @checked_arguments
@@ -261,7 +265,8 @@ def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
     """From a world with y up to the one that viewers of a format expect, or back: half turns are
     their own inverse.
     """
-    gaussians = rotated(gaussians, BACKWARDS) if form.backwards else gaussians
+    if form.backwards:
+        gaussians = rotated(gaussians, BACKWARDS)
     return turned(gaussians, form.up)
 
 
@@ -305,7 +310,8 @@ def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, n
             finite = np.isfinite(array.astype(np.float32))
         rows = finite.all(axis=tuple(range(1, array.ndim)))
         keep &= rows
-        bad += [] if rows.all() else [name]
+        if not rows.all():
+            bad.append(name)
     if not bad:
         return arrays
     if not keep.any():
@@ -408,10 +414,8 @@ def export(
     form = chosen_format(path.suffix, mesh)
     if form is None:
         known = EXPORTS.where(lambda each: each.mesh >= mesh).suffixes
-        raise ValueError(
-            f"{path}: expected a name ending in"
-            f" {alternatives(known)}{' for a mesh' if mesh else ''}"
-        )
+        purpose = " for a mesh" if mesh else ""
+        raise ValueError(f"{path}: expected a name ending in {alternatives(known)}{purpose}")
     if rest_fields and not form.rest_fields:
         holding = EXPORTS.where(lambda each: each.rest_fields).suffixes
         raise ValueError(
@@ -421,31 +425,35 @@ def export(
     # one file for each frame, unless one holds a whole motion
     frames = 1 if motion is None else len(motion.translations)
     if not form.animated and frames != (1 if numbers is None else len(numbers)):
-        given = "no numbers" if numbers is None else f"{len(numbers)} numbers"
+        given = "no numbers"
+        if numbers is not None:
+            given = f"{len(numbers)} numbers"
         raise ValueError(f"numbers: expected one for each of the {frames} frames, got {given}")
     if motion is not None and (form.mesh or numbers is not None):
         motion = grounded(
             motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents
         )
     one = form.animated or numbers is None
-    files = (
-        [path]
-        if one
-        else [path.with_stem(f"{path.stem}_{number:0{DIGITS}d}") for number in numbers or ()]
-    )
+    if one:
+        files = [path]
+    else:
+        files = [path.with_stem(f"{path.stem}_{number:0{DIGITS}d}") for number in numbers or ()]
     # meshes take the motion, Gaussians are posed frame after frame
     if form.mesh:
         form(path, files, avatar, motion, up or form.up, name)
         return files
     for i, file in enumerate(files):
-        pose = None if motion is None else motion.pose(i, avatar.expression_names)
-        gaussians = avatar.gaussians if pose is None else animate(avatar, pose)
+        pose = None
+        if motion is not None:
+            pose = motion.pose(i, avatar.expression_names)
+        gaussians = avatar.gaussians
+        if pose is not None:
+            gaussians = animate(avatar, pose)
         if numbers is None:
             gaussians = grounded_gaussians(gaussians)
         if form.backwards:  # before up is elsewhere: the half turn is about the vertical axis
             gaussians = rotated(gaussians, BACKWARDS)
         gaussians = turned(gaussians, up or form.up)
-        form(
-            file, gaussians, **({"rest_fields": True} if rest_fields else {}), **_versioned(version)
-        )
+        options = {"rest_fields": True} if rest_fields else {}
+        form(file, gaussians, **options, **_versioned(version))
     return files

@@ -104,10 +104,8 @@ def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     Raises: ValueError for an avatar without faces or Gaussians, or with numbers that files cannot
     hold, or a size that is no multiple of 128.
     """
-    vertices, faces = (
-        np.asarray(avatar.rest_vertices, np.float32),
-        np.asarray(avatar.faces, np.int32),
-    )
+    vertices = np.asarray(avatar.rest_vertices, np.float32)
+    faces = np.asarray(avatar.faces, np.int32)
     if len(faces) == 0 or len(avatar.gaussians.means) == 0:
         raise ValueError("a body mesh needs an avatar with faces and Gaussians")
     own = {
@@ -121,7 +119,10 @@ def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     ids, shares = texels(atlas)
     known = ids >= 0
     corners = faces[ids[known]]
-    mixed = lambda values: np.einsum("pc,pcd->pd", shares[known], values[corners])
+
+    def mixed(values):
+        return np.einsum("pc,pcd->pd", shares[known], values[corners])
+
     colors = np.zeros((*ids.shape, 3), np.float32)
     colors[known] = skin_colors(avatar, mixed(vertices), mixed(normals))
     texture = np.rint(255 * np.clip(fill_gaps(colors, known), 0, 1)).astype(np.uint8)
@@ -430,14 +431,10 @@ def write_poses(
     floor = _floor(mesh)
     for i, file in enumerate(files):
         still = dataclasses.replace(mesh, vertices=mesh.vertices - floor)
-        write_obj(
-            file,
-            still
-            if motion is None
-            else mesh.posed(avatar, motion.pose(i, avatar.expression_names)),
-            material,
-            up,
-        )
+        shown = still
+        if motion is not None:
+            shown = mesh.posed(avatar, motion.pose(i, avatar.expression_names))
+        write_obj(file, shown, material, up)
 
 
 def write_material(path: Path, mesh: BodyMesh) -> Path:
@@ -459,9 +456,10 @@ def write_obj(path: Path, mesh: BodyMesh, material: Path, up: Up) -> None:
     the file.
     """
     turn = up_matrix(up)
-    rows = lambda key, values: [
-        f"{key} " + " ".join(f"{x:.6g}" for x in row) for row in values.tolist()
-    ]
+
+    def rows(key, values):
+        return [f"{key} " + " ".join(f"{x:.6g}" for x in row) for row in values.tolist()]
+
     corners = [" ".join(f"{i}/{i}/{i}" for i in face) for face in (mesh.faces + 1).tolist()]
     lines = [
         f"{WRITTEN}: metres, {up} up",

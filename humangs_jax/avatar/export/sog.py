@@ -45,17 +45,21 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
         meta = parse_json(_member(archive, root + META, "text_bytes").decode("utf-8"))
         # the description in the bundle: other versions store other pictures
         if not isinstance(meta, dict) or meta.get("version") != VERSION:
-            found = shown(meta.get("version")) if isinstance(meta, dict) else "none"
+            found = "none"
+            if isinstance(meta, dict):
+                found = shown(meta.get("version"))
             convert = "`npx @playcanvas/splat-transform scene.sog scene.ply` makes a .ply of it"
             raise Refused(f"{META}: version {found}, expected {VERSION}: {convert}")
-        if (model := meta.get("model", USUAL)) != USUAL:
+        model = meta.get("model", USUAL)
+        if model != USUAL:
             said.append(f"model {shown(model)} is not applied (SplatConfig.antialiased draws such)")
         # one pixel of a picture holds one Gaussian
         count = _whole(meta.get("count"), "count")
         check_limit("gaussians", count, "Gaussians")
-        pictures = lambda part, number: [
-            _picture(archive, root + name, count) for name in _files(meta, part, number)
-        ]
+
+        def pictures(part, number):
+            return [_picture(archive, root + name, count) for name in _files(meta, part, number)]
+
         low, high = pictures("means", 2)
         scales, quats, colors = (pictures(part, 1)[0] for part in ("scales", "quats", "sh0"))
         harmonics = _harmonics(archive, root, meta, count)

@@ -157,8 +157,12 @@ def _unused(elements: Mapping[str, Columns]) -> list[str]:
         for name in elements.get(each, {})
         if not KNOWN.fullmatch(name)
     ]
-    more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
-    return [f"properties that are not used: {', '.join(found[:SHOWN])}{more}"] if found else []
+    more = ""
+    if len(found) > SHOWN:
+        more = f" and {len(found) - SHOWN} more"
+    if found:
+        return [f"properties that are not used: {', '.join(found[:SHOWN])}{more}"]
+    return []
 
 
 def _exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
@@ -182,7 +186,8 @@ def _harmonics(
         *(f"f_rest_{i}" for i in range(count)),
         dtype=np.float32 if values is None else np.uint8,
     )
-    rest = rest if values is None else values[rest]
+    if values is not None:
+        rest = values[rest]
     return {"f_rest_*": rest.reshape(len(rest), 3, count // 3).swapaxes(1, 2)}
 
 
@@ -386,7 +391,9 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
     def tensor(name: str, *shape: int) -> np.ndarray:
         if name not in tensors:
             network = "features" in tensors and name in ("sh0", "shN")
-            why = "trained with --app_opt, whose colors a network makes" if network else "missing"
+            why = "missing"
+            if network:
+                why = "trained with --app_opt, whose colors a network makes"
             raise Refused(f"{SPLATS}.{name}: {why}")
         array = tensors[name]
         expected = (len(tensors.get("means", ())), *shape)
@@ -406,7 +413,9 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
     }
     # harmonics of the higher degrees, if there are any
     rest = tensors.get("shN")
-    functions = 0 if rest is None or rest.ndim != 3 else rest.shape[1]
+    functions = 0
+    if rest is not None and rest.ndim == 3:
+        functions = rest.shape[1]
     if functions not in COUNTS:
         degree = " of degree 4" if 3 * functions == DEGREE_4 else ""
         raise Refused(
@@ -498,9 +507,10 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     """
     content, binary = parse_glb(data)
     # files that cannot be read right without another extension are refused
-    if needed := sorted(
+    needed = sorted(
         set(content.get("extensionsRequired", [])) - {EXTENSION, "KHR_mesh_quantization"}
-    ):
+    )
+    if needed:
         raise Refused(
             f"needs the extension {shown(needed[0])}: expected {EXTENSION} without compression"
         )
@@ -509,7 +519,8 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     placed = [
         (part, places[i])
         for i, node in enumerate(content.get("nodes", []))
-        for part in (content["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ())
+        if "mesh" in node
+        for part in content["meshes"][node["mesh"]]["primitives"]
         if EXTENSION in part.get("extensions", {})
     ]
     if not placed:
@@ -543,7 +554,9 @@ def _other_parts(placed: Sequence[tuple[dict[str, Any], Any]]) -> list[str]:
     found = [f"kernel {kernel}" for kernel in sorted(kernels)] + [
         shown(name) for name in sorted(names)
     ]
-    return [f"parts that are not used: {', '.join(found[:SHOWN])}"] if found else []
+    if found:
+        return [f"parts that are not used: {', '.join(found[:SHOWN])}"]
+    return []
 
 
 def _part(
@@ -563,9 +576,10 @@ def _part(
     arrays[turns] = np.roll(arrays[turns], 1, axis=1)
     arrays[opacities] = arrays[opacities].reshape(-1)
     arrays[colors] = colors_of(arrays[colors])
-    if count := next(
+    count = next(
         count for count in COUNTS[::-1] if not count or COEFFICIENTS[count - 1] in attributes
-    ):
+    )
+    if count:
         arrays["SH"] = np.stack([array(name) for name in COEFFICIENTS[:count]], axis=1)
     gaussians = loaded(arrays, said)
     if np.array_equal(place, np.eye(4)):

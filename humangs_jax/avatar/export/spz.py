@@ -171,7 +171,10 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
 
     Raises: Refused; what gzip and zstd raise for damaged files.
     """
-    header, parts = _with_table(data, said) if data.startswith(b"NGSP") else _of_gzip(data)
+    if data.startswith(b"NGSP"):
+        header, parts = _with_table(data, said)
+    else:
+        header, parts = _of_gzip(data)
     # what is in the file and not used
     if header.flags & ANTIALIASED:
         said.append(
@@ -187,15 +190,17 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
         for part, width in zip(parts, header.widths, strict=True)
     )
     # bytes to numbers; places and rotations differ by the version
+    if version == 1:
+        means = positions.view("<f2")
+    else:
+        means = _fixed_point(positions, header.bits)
+    if version < 3:
+        rotations = with_largest(quats / 127.5 - 1, np.zeros(count))
+    else:
+        rotations = _smallest_three(quats)
     arrays = {
-        "positions": (
-            positions.view("<f2") if version == 1 else _fixed_point(positions, header.bits)
-        ),
-        "rotations": (
-            with_largest(quats / 127.5 - 1, np.zeros(count))
-            if version < 3
-            else _smallest_three(quats)
-        ),
+        "positions": means,
+        "rotations": rotations,
         "scales": np.exp(scales / SCALE_STEPS - SCALE_ZERO),
         "alphas": opacities[:, 0] / 255,
         "colors": colors_of((colors / 255 - 0.5) / COLOR_SCALE),
@@ -297,7 +302,9 @@ def _records(data: bytes) -> list[str]:
         else:
             names.append(f"{kind:#010x}")
         at += RECORD.size + size
-    return [f"records of other programs that are not used: {', '.join(names[:4])}"] if names else []
+    if names:
+        return [f"records of other programs that are not used: {', '.join(names[:4])}"]
+    return []
 
 
 def _unpacked(stream: bytes, size: int) -> bytes:

@@ -87,7 +87,10 @@ def write_vrma(
 
     # an expression is a node whose x is its weight
     custom = {}
-    values = np.zeros((len(rotations), 0)) if motion.expressions is None else motion.expressions
+    if motion.expressions is None:
+        values = np.zeros((len(rotations), 0))
+    else:
+        values = motion.expressions
     for shape, weights in zip(motion.expression_names, np.asarray(values).T, strict=True):
         custom[shape] = {"node": len(nodes)}
         tracks.append((len(nodes), "translation", "VEC3", weights[:, None] * (1.0, 0, 0)))
