@@ -197,7 +197,10 @@ class Refiner(nn.Module):
         """(values, hidden) after an iteration; values: the parameters side by side, start: those
         before the first one.
         """
-        dense = lambda name, width: nn.Dense(width, name=name)
+
+        def dense(name, width):
+            return nn.Dense(width, name=name)
+
         # what each photo says about a Gaussian; photos that hardly show it count less
         errors = _relative_errors(values, signals)
         seen = jnp.minimum(signals.visibility / SEEN, 1.0)[..., None]
@@ -243,8 +246,13 @@ class Refiner(nn.Module):
         """Features of the clusters around each Gaussian, after messages between clusters and a mean
         over all of them.
         """
-        dense = lambda name: nn.Dense(self.width, name=f"cluster_{name}")
-        norm = lambda name: nn.LayerNorm(name=f"cluster_{name}")
+
+        def dense(name):
+            return nn.Dense(self.width, name=f"cluster_{name}")
+
+        def norm(name):
+            return nn.LayerNorm(name=f"cluster_{name}")
+
         clusters = dense("enter")(norm("norm")(jnp.mean(features[graph.members], axis=1)))
         for i in range(self.cluster_layers):
             normed = norm(f"norm_{i}")(clusters)

@@ -73,7 +73,9 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        return function(*args, **kwargs) if traced else program()(*args, **kwargs)
+        if traced:
+            return function(*args, **kwargs)
+        return program()(*args, **kwargs)
 
     return call
 

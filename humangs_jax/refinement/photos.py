@@ -140,7 +140,9 @@ def photo_order(views: Int[np.ndarray, " v"], steps: int, seed: int) -> Int[np.n
 def _bounds(mask: Float[np.ndarray, "h w"]) -> Sequence[Sequence[int]]:
     """((top, bottom), (left, right)) of the person; the whole image if nobody is in it."""
     box = person_box(mask > COVERED).tolist()
-    return box if any(box[0]) else [(0, size) for size in mask.shape]
+    if any(box[0]):
+        return box
+    return [(0, size) for size in mask.shape]
 
 
 def _window(bounds: Sequence[Sequence[int]], size: int) -> int:

@@ -75,13 +75,17 @@ class Refinement:
             verdict += f"; without {', '.join(self.left_out)}, which contradicts the others"
         if self.moved:
             verdict += "; the photos differ by pixels from one another, and were moved together"
-        head = f", {self.head_steps} on the head," if self.head_steps else ""
+        head = ""
+        if self.head_steps:
+            head = f", {self.head_steps} on the head,"
         ended = ", interrupted" if self.interrupted else ""
         took = (
             f"{self.iterations} iterations and {self.steps} steps{head} in {self.seconds:.1f} s "
             f"(compiled in {self.compile_seconds:.1f} s)"
         )
-        again = f" (the same again: {self.planned}steps)" if self.planned else ""
+        again = ""
+        if self.planned:
+            again = f" (the same again: {self.planned}steps)"
         return f"refined by {took}{ended}: {verdict}{again}"
 
 
@@ -167,7 +171,8 @@ def refine_with_report(
             best = compile_parts(task, best)
         task, each = align(task, best, each)
         for found in search(task, best, each):
-            best = found if found.kept else best
+            if found.kept:
+                best = found
             if watch is not None:
                 watch(avatar_of(found.state.parameters, task.avatar))
     except KeyboardInterrupt:

@@ -165,7 +165,10 @@ class Clock:
             fitting = int(
                 max(self.seconds - now - ahead, 0.0) * TIMED_STEPS / max(now - began, 1e-9)
             )
-            self.planned = fitting if self.limit is None else min(self.limit, fitting)
+            if self.limit is None:
+                self.planned = fitting
+            else:
+                self.planned = min(self.limit, fitting)
         return self.planned
 
     def tick(self, shown: float) -> None:
@@ -307,9 +310,8 @@ def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
     of the start with photos.
     """
     held_photo = len(task.photos) >= HELD_OUT_PHOTOS and task.config.held_out > 0
-    yield from (search_by_photo if held_photo else search_by_blocks)(
-        task, start, np.asarray(each.loss)
-    )
+    method = search_by_photo if held_photo else search_by_blocks
+    yield from method(task, start, np.asarray(each.loss))
 
 
 def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
@@ -335,7 +337,8 @@ def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) 
     for found in steps(task, best, best.used, total, total, (0.0, 1.0)):
         psnr = psnr_of(task, found, hidden)
         kept = psnr > highest or not any_hidden
-        highest = psnr if kept else highest
+        if kept:
+            highest = psnr
         yield found._replace(kept=kept)
 
 
@@ -352,7 +355,9 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
     # whether the iterations help: each photo that is asked is left out of one trial
     asked = [int(view) for view in np.argsort(losses, kind="stable")[:ASKED]]
     best, trials, ahead = start, dict.fromkeys(asked[:2], start), 0.0
-    choices = (everybody, np.delete(everybody, int(np.argmax(losses)))) if config.iterations else ()
+    choices = ()
+    if config.iterations:
+        choices = everybody, np.delete(everybody, int(np.argmax(losses)))
     for used in choices:
         begun, tried = clock.elapsed(), {}
         if photos_agree(_trial_gains(task, start, used, asked, tried), -ALLOWED_LOSS_OF_ITERATIONS):
@@ -414,7 +419,9 @@ def steps(
     shown: from where to where the bar goes.
     """
     config, clock = task.config, task.clock
-    share = min(1.0, config.full_steps / max(total, 1)) if begin.iterations else 1.0
+    share = 1.0
+    if begin.iterations:
+        share = min(1.0, config.full_steps / max(total, 1))
     state = replace(begin.state, done=0, total=total, share=share)
     for done, view in enumerate(photo_order(photos, end, config.seed), 1):
         state = stepped(task, state, view)

@@ -122,7 +122,9 @@ def update(
         value, step = getattr(state.parameters, name), getattr(steps, name)
         rate = state.share * cosine * getattr(config.rates, name)
         value = value - rate * state.trust.reshape(-1, *[1] * (value.ndim - 1)) * step
-        return value - DECAY * (value - getattr(state.start, name)) if name in PULLED else value
+        if name in PULLED:
+            return value - DECAY * (value - getattr(state.start, name))
+        return value
 
     parameters = replace(state.parameters, **{name: moved(name) for name in vars(config.rates)})
     return replace(state, parameters=parameters, moments=moments, done=state.done + 1)
