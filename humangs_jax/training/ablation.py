@@ -93,15 +93,10 @@ class Ablation:
 
     def __str__(self) -> str:
         head = ["variant", "seeds", self.metric, "difference", f"{CONFIDENCE:.0%} interval"]
-        cells = [
-            [
-                row.name,
-                str(row.seeds),
-                f"{row.mean:.2f}",
-                *(_shown(row) if row.name != BASE else ("", "")),
-            ]
-            for row in self.rows
-        ]
+        cells = []
+        for row in self.rows:
+            difference = ("", "") if row.name == BASE else _shown(row)
+            cells.append([row.name, str(row.seeds), f"{row.mean:.2f}", *difference])
         return "\n".join([*text_table([head, *cells]), *self._missing_told()])
 
     def _missing_told(self) -> list[str]:
@@ -210,7 +205,8 @@ def ablate(
     # all variants, people and scores are checked before the first run
     runs = {BASE: base, **_checked_variants(base, variants, networks)}
     folders = {name: Path(out) / folder for name, folder in _folder_names(list(runs)).items()}
-    body = load_body() if body is None else body
+    if body is None:
+        body = load_body()
     learned = _source(people, body, base, "train")
     compared, count = _compared(validation, body, base)
     if people and not isinstance(people, int):
@@ -248,7 +244,9 @@ def ablate(
 
 def _check_metric(metric: str, networks: LossNetworks) -> None:
     """Raises: ArgumentError for one that validation does not find."""
-    known = METRICS if networks.lpips is None else (*METRICS, "lpips")
+    known = METRICS
+    if networks.lpips is not None:
+        known = *METRICS, "lpips"
     if metric not in known:
         usual_first = sorted(known, key=lambda name: (name != DEFAULT_METRIC, name))
         raise ArgumentError(
@@ -276,7 +274,8 @@ def _checked_variants(
         except (TypeError, ValueError, ZeroDivisionError) as error:
             said = (str(error).splitlines() or [type(error).__name__])[0]
             raise ArgumentError("variants", f"{name!r}: {said}") from error
-        if missing := missing_networks(run, networks):
+        missing = missing_networks(run, networks)
+        if missing:
             raise ArgumentError(
                 "variants", f"{name!r}: loss.{missing[0]}: expected its network in networks"
             )
@@ -292,7 +291,10 @@ def _check_people(
 
     Raises: ArgumentError naming the variant; ValueError if nobody can be used.
     """
-    make = captured_people(people, body) if isinstance(people, Sequence) else people
+    if isinstance(people, Sequence):
+        make = captured_people(people, body)
+    else:
+        make = people
     usual = _unusable(make, runs[BASE])
     for name, config in runs.items():
         lacking = {who: why for who, why in _unusable(make, config).items() if who not in usual}
@@ -378,7 +380,12 @@ def _seconds(budget: str | None) -> float | None:
 
 def _as_budget(seconds: float) -> str:
     """A time, rounded up, as a budget is written."""
-    unit = "s" if seconds < 90 else "min" if seconds < 5400 else "h"
+    if seconds < 90:
+        unit = "s"
+    elif seconds < 5400:
+        unit = "min"
+    else:
+        unit = "h"
     return f"{math.ceil(seconds / UNITS[unit])}{unit}"
 
 
@@ -394,6 +401,8 @@ def _source(
 def _validated(folder: Path, step: int) -> dict[str, float]:
     """What the validation after that step found; empty if there was none."""
     file = folder / "log.jsonl"
-    lines = [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    lines = []
+    if file.is_file():
+        lines = [json.loads(line) for line in file.read_text().splitlines()]
     numbers = [item for line in lines if line.get("step") == step for item in line.items()]
     return {name.removeprefix("val_"): value for name, value in numbers if name.startswith("val_")}

@@ -98,7 +98,10 @@ def augment_views(
     pelvis: (3,) metres, in the rest pose: cameras turn about the posed one.
     """
     photo_key, camera_key, pose_key, body_key = jax.random.split(key, 4)
-    normal = lambda key, like: jax.random.normal(key, like.shape, like.dtype)
+
+    def normal(key, like):
+        return jax.random.normal(key, like.shape, like.dtype)
+
     rotations = views.rotations[0]
     images, masks = augment_photos(photo_key, views.images, views.masks, config)
     return replace(

@@ -70,7 +70,8 @@ class Checkpoints:
             create=not read_only,
             read_only=read_only,
         )
-        if unreadable := _without_score(folder):
+        unreadable = _without_score(folder)
+        if unreadable:
             if read_only:
                 raise FileError(
                     unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside"
@@ -145,11 +146,15 @@ class Checkpoints:
         """
         self.wait()
         folder = Path(self._manager.directory)
-        steps = self.steps[::-1] if step is None else [step] if step in self.steps else []
+        if step is None:
+            steps = self.steps[::-1]
+        elif step in self.steps:
+            steps = [step]
+        else:
+            steps = []
         if not steps:
-            raise FileNotFoundError(
-                f"{folder}: no checkpoint{'' if step is None else f' of step {step}'}"
-            )
+            wanted = "" if step is None else f" of step {step}"
+            raise FileNotFoundError(f"{folder}: no checkpoint{wanted}")
         damaged: list[Path] = []
         for candidate in steps:
             state, problem = self._restore(candidate, like)
@@ -191,9 +196,9 @@ class Checkpoints:
         # a checkpoint may be whole and still hold other numbers
         recorded = (self._manager.metrics(step) or {}).get(CHECKSUM)
         if state is not None and recorded != (found := _checksum(state)):
-            state, problem = (
-                None,
-                f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}",
+            state = None
+            problem = (
+                f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}"
             )
         # one process that cannot read it stops all, or they would go on from different steps
         if not _everywhere(state is not None).all():
@@ -246,7 +251,10 @@ def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
         np.arange(size) + (part.start or 0)
         for size, part in zip(data.shape, shard.index, strict=True)
     ]
-    places = np.ravel_multi_index(np.ix_(*axes), shape).reshape(-1) if shape else np.zeros(1)
+    if shape:
+        places = np.ravel_multi_index(np.ix_(*axes), shape).reshape(-1)
+    else:
+        places = np.zeros(1)
     return int(((2 * places.astype(np.uint64) + 1) * words).sum(dtype=np.uint64))
 
 
@@ -260,7 +268,8 @@ def _without_score(folder: Path) -> list[Path]:
             readable = isinstance(read_json(step / "metrics" / "metrics")["score"], int | float)
         except (OSError, ValueError, LookupError, TypeError):
             readable = False
-        found += [] if readable else [step]
+        if not readable:
+            found.append(step)
     return found
 
 
@@ -268,9 +277,8 @@ def _set_aside(steps: list[Path]) -> None:
     """Rename damaged checkpoints, so that their steps can be saved again; nothing is deleted."""
     for step in steps if jax.process_index() == 0 else ():
         numbers = ("", *(f"-{i}" for i in range(1, 1000)))
-        aside = next(
-            p for i in numbers if not (p := step.with_name(f"damaged-{step.name}{i}")).exists()
-        )
+        places = (step.with_name(f"damaged-{step.name}{i}") for i in numbers)
+        aside = next(place for place in places if not place.exists())
         step.rename(aside)
         logger.warning("%s: a damaged checkpoint, set aside as %s", step, aside.name)
     _everywhere(0)  # all processes wait for it
@@ -290,7 +298,10 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
             _flat(json.loads(config_to_json(run))) for run in (load_config(out), config)
         )
         finished = (Path(out) / "checkpoints" / str(earlier["steps"])).is_dir()
-        longer = {"steps"} if finished and now["steps"] > earlier["steps"] else set()
+        if finished and now["steps"] > earlier["steps"]:
+            longer = {"steps"}
+        else:
+            longer = set()
         for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE) - longer):
             if earlier.get(name) != now.get(name):
                 other = f"{name} = {earlier.get(name)}, not {now.get(name)}"
@@ -318,7 +329,9 @@ def _placed_as(value: jax.Array, like: jax.Array) -> jax.Array:
     if not value.is_fully_addressable:
         return value
     host = jax.device_get(value)
-    return jax.device_put(host, like.sharding) if like.committed else jnp.asarray(host)
+    if like.committed:
+        return jax.device_put(host, like.sharding)
+    return jnp.asarray(host)
 
 
 def _as_dict(state: TrainState) -> dict[str, Any]:
@@ -329,11 +342,10 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """{"loss.squared": 1.0, ...} from nested dicts."""
     items = {}
     for name, value in tree.items():
-        items |= (
-            _flat(value, f"{prefix}{name}.")
-            if isinstance(value, dict)
-            else {f"{prefix}{name}": value}
-        )
+        if isinstance(value, dict):
+            items |= _flat(value, f"{prefix}{name}.")
+        else:
+            items[f"{prefix}{name}"] = value
     return items
 
 

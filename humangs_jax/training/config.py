@@ -181,7 +181,9 @@ class TrainConfig:
         the same.
         """
         inner = [stage.start for stage in self.stages if start < stage.start < stop]
-        return list(itertools.pairwise([start, *inner, stop])) if start < stop else []
+        if start < stop:
+            return list(itertools.pairwise([start, *inner, stop]))
+        return []
 
     def examples_before(self, step: int) -> int:
         """Subjects that the steps before this one have taken, over all stages."""

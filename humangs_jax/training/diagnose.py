@@ -70,7 +70,9 @@ class Leaf:
         """The numbers of an array."""
         wrong = ~np.isfinite(array.astype(np.promote_types(array.dtype, np.float32), copy=False))
         finite = array[~wrong].astype(np.float64)
-        first = tuple(np.argwhere(wrong)[0].tolist()) if wrong.any() else ()
+        first = ()
+        if wrong.any():
+            first = tuple(np.argwhere(wrong)[0].tolist())
         mean = float(np.abs(finite).mean()) if finite.size else 0.0
         extremes = float(finite.min(initial=np.inf)), float(finite.max(initial=-np.inf))
         return cls(name, int(wrong.sum()), first, *extremes, mean, float(np.linalg.norm(finite)))
@@ -114,7 +116,10 @@ def _stored(name: str, tree: PyTree) -> StageReport:
 
 def _numbers(report: StageReport) -> StageReport:
     """A report of arrays as one of `Leaf`s."""
-    of = lambda arrays: {name: Leaf.of(name, np.asarray(x)) for name, x in arrays.items()}
+
+    def of(arrays):
+        return {name: Leaf.of(name, np.asarray(x)) for name, x in arrays.items()}
+
     return StageReport(
         report.name, *map(of, (report.values, report.taken, report.returned, report.gradients))
     )
@@ -185,14 +190,10 @@ class Diagnosis:
             for leaf in part.values.values()
             if leaf.bad
         ]
-        forward = [
-            Fault("forward", stage.name, leaf)
-            for stage in self.stages
-            if (leaf := _first_bad(stage.values))
-        ]
-        back = [
-            Fault("backward", stage.name, leaf) for stage in self.stages if (leaf := stage.spoils)
-        ]
+        made = [(stage.name, _first_bad(stage.values)) for stage in self.stages]
+        forward = [Fault("forward", name, leaf) for name, leaf in made if leaf]
+        spoilt = [(stage.name, stage.spoils) for stage in self.stages]
+        back = [Fault("backward", name, leaf) for name, leaf in spoilt if leaf]
         inner = [
             fault
             for fault in back
@@ -240,18 +241,23 @@ class Diagnosis:
                 "norm",
             )
         ]
+
         # entries that are not finite: none is 0, and no array at all is an empty cell
-        bad = lambda leaves: str(sum(leaf.bad for leaf in leaves.values())) if leaves else ""
+        def bad(leaves):
+            if leaves:
+                return str(sum(leaf.bad for leaf in leaves.values()))
+            return ""
+
         for report in (*self.stored, *self.stages):
-            leaves, columns = (
-                report.values.values(),
-                ((min, "smallest"), (max, "largest"), (np.mean, "mean")),
-            )
+            leaves = report.values.values()
+            columns = (min, "smallest"), (max, "largest"), (np.mean, "mean")
             numbers = [
                 f"{of([getattr(x, name) for x in leaves]):.3g}" if leaves else ""
                 for of, name in columns
             ]
-            norm = f"{report.gradient_norm:.3g}" if report.gradients else ""
+            norm = ""
+            if report.gradients:
+                norm = f"{report.gradient_norm:.3g}"
             rows.append(
                 (
                     report.name,
@@ -285,7 +291,10 @@ class Recorder:
         if isinstance(module, Watched):
             if not module.apart:
                 return self.watch(str(module.name), *arguments)
-            entry = lambda key: lambda *learned: first(*learned)[key]
+
+            def entry(key):
+                return lambda *learned: first(*learned)[key]
+
             names = jax.eval_shape(lambda: first(*others))
             return {key: self.watch(f"{module.name}: {key}", entry(key), *others) for key in names}
         path = ".".join(module.path)
@@ -310,7 +319,10 @@ class Recorder:
             self.shapes.setdefault(stage, ({}, {}))[side].update(jax.eval_shape(lambda: leaves))
             return tree
         sums = [x + self._probes[stage][side][name] for name, x in leaves.items()]
-        floating = lambda x: hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.inexact)
+
+        def floating(x):
+            return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.inexact)
+
         return jax.tree.map(lambda x: sums.pop(0) if floating(x) else x, tree)
 
 
@@ -349,9 +361,10 @@ def observe_subject(
     for name, gradient in inexact_leaves(gradients):
         users = [stage for stage in given if name.startswith(f"{stage}.")] or ["driver"]
         own.setdefault(max(users, key=len), {})[name] = gradient
-    report = lambda name, values: StageReport(
-        name, values, *sent.get(name, ({}, {})), own.get(name, {})
-    )
+
+    def report(name, values):
+        return StageReport(name, values, *sent.get(name, ({}, {})), own.get(name, {}))
+
     return value, [
         report(name, given[name]) for name in (*dry.given, "loss")
     ]  # a transformation sorts what it returns
@@ -412,7 +425,10 @@ def diagnose_run(
     Raises: FileNotFoundError without a run in `out`.
     """
     config = load_config(out)
-    make_source = captured_people(training, body) if isinstance(training, Sequence) else training
+    if isinstance(training, Sequence):
+        make_source = captured_people(training, body)
+    else:
+        make_source = training
     body = gaussian_body(body, config.model)
     checkpoints = Checkpoints(
         Path(out) / "checkpoints", read_only=True

@@ -86,10 +86,8 @@ def draw_targets(
     """
     driver = config.model.architecture.driver
     if driver is not None:
-        own, given = (
-            part_variables(variables, "driver"),
-            (body, inputs, targets, backgrounds, config),
-        )
+        own = part_variables(variables, "driver")
+        given = body, inputs, targets, backgrounds, config
         return stage("driver", lambda outputs: driver.draw(own, outputs, *given), outputs)
 
     def pose(outputs):
@@ -199,13 +197,15 @@ def evaluate(
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
     shown = jnp.clip(drawn.rendering.rgb, 0, 1)
+    if drawn.opacities is None:
+        fog = jnp.full((), jnp.nan)
+    else:
+        fog = jnp.mean(jax.vmap(semi_transparent)(drawn.rendering.alpha, masks))
     metrics = {
         "psnr": jnp.mean(jax.vmap(psnr)(shown, images)),
         "psnr_fg": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
         "ssim": jnp.mean(jax.vmap(similarity_map)(shown, images)),
-        "semi_transparent": jnp.full((), jnp.nan)
-        if drawn.opacities is None
-        else jnp.mean(jax.vmap(semi_transparent)(drawn.rendering.alpha, masks)),
+        "semi_transparent": fog,
         "dropped_tokens": outputs.dropped_tokens.astype(shown.dtype),
         "overflow": jnp.sum(drawn.rendering.overflow).astype(shown.dtype),
     }
@@ -234,7 +234,9 @@ def validate(
         shown, metrics = evaluate(variables, body, example, config, networks)
         images.append(np.asarray(shown))
         rows.append({name: float(value) for name, value in metrics.items()})
-    names = METRICS if networks.lpips is None else (*METRICS, "lpips")
+    names = METRICS
+    if networks.lpips is not None:
+        names = *METRICS, "lpips"
     return _means(names, rows), images
 
 

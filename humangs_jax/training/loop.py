@@ -107,7 +107,8 @@ class RunLog:
         before, began, waited = self._previous
         now = time.perf_counter()
         self._previous = (done, now, waiting.seconds)
-        if (count := done - before) > 0:
+        count = done - before
+        if count > 0:
             numbers["seconds_per_step"] = (now - began) / count
             numbers["samples_per_second"] = count * subjects / (now - began)
             numbers["data_seconds_per_step"] = (waiting.seconds - waited) / count
@@ -142,7 +143,12 @@ class RunLog:
 
     def _write(self, record: dict[str, Any]) -> None:
         if self._lines is not None:  # JSON has no NaN
-            finite = lambda x: x if not isinstance(x, float) or math.isfinite(x) else None
+
+            def finite(x):
+                if not isinstance(x, float) or math.isfinite(x):
+                    return x
+                return None
+
             with _naming(self._lines.name):
                 self._lines.write(
                     json.dumps({name: finite(value) for name, value in record.items()}) + "\n"
@@ -182,7 +188,10 @@ class Watch:
         skipped, replaced = (now > before for now, before in zip(counts, self._counts, strict=True))
         self._counts = counts
         self._in_a_row = self._in_a_row + 1 if skipped else 0
-        self._without_gradient = self._without_gradient + 1 if numbers["grad_norm"] == 0 else 0
+        if numbers["grad_norm"] == 0:
+            self._without_gradient = self._without_gradient + 1
+        else:
+            self._without_gradient = 0
         if skipped or replaced:
             samples = bad_samples()
             text = "; ".join(
@@ -324,16 +333,22 @@ def train(
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
-    with only_writer(out) if leading else contextlib.nullcontext():
+    alone = only_writer(out) if leading else contextlib.nullcontext()
+    with alone:
         save_config(out, config, write=leading)
-        of = lambda people: (
-            captured_people(people, body) if isinstance(people, Sequence) else people
-        )
-        make_source, unseen = of(training), of(validation) if validation else None
+
+        def of(people):
+            if isinstance(people, Sequence):
+                return captured_people(people, body)
+            return people
+
+        make_source = of(training)
+        unseen = of(validation) if validation else None
         body = gaussian_body(body, config.model)
 
         mesh = training_mesh(fsdp)
-        mesh = None if mesh.size == 1 else mesh
+        if mesh.size == 1:
+            mesh = None
         state, own_networks, own_body = init_state(config, variables), networks, body
         if mesh is not None:
             state = place(state, state_shardings(state, mesh))
@@ -342,11 +357,13 @@ def train(
         best = None
         if checkpoints.steps:
             state, best_step = checkpoints.restore(state), checkpoints.best_step
-            best = None if best_step is None else checkpoints.score(best_step)
-        begin, end = (
-            int(state.step),
-            config.steps if stop_at is None else min(config.steps, stop_at),
-        )
+            best = None
+            if best_step is not None:
+                best = checkpoints.score(best_step)
+        begin = int(state.step)
+        end = config.steps
+        if stop_at is not None:
+            end = min(config.steps, stop_at)
 
         for first, _ in config.spans(begin, end)[1:]:
             _rehearse(make_source, config, first, state, body, networks, mesh)
@@ -360,7 +377,9 @@ def train(
             for first, last in config.spans(begin, end):
                 part = config.at(first)
                 loader = stage_loader(make_source, config, first, mesh)
-                examples = [] if unseen is None else validation_examples(unseen, part, validated)
+                examples = []
+                if unseen is not None:
+                    examples = validation_examples(unseen, part, validated)
                 batches = loader.batches(first, last, waiting=waiting)
                 for step, batch in batches:
                     if (
@@ -370,7 +389,8 @@ def train(
                             log.event(step, "sample", line, samples=[line])
                     with stage("compiling the step") if step == first else contextlib.nullcontext():
                         state, metrics = train_step(state, batch, body, part, networks, mesh)
-                    watch(done := step + 1, metrics, functools.partial(bad_samples, loader, step))
+                    done = step + 1
+                    watch(done, metrics, functools.partial(bad_samples, loader, step))
                     stop = stopping(done)
                     if done % config.log_every == 0 or done == end or stop:
                         log.steps(
@@ -391,10 +411,10 @@ def train(
                     recorded = part.model.with_conventions(
                         tokens=part.model.tokens
                     )  # what the weights were trained with
-                    variables, score = (
-                        state.variables if mesh is None else whole(state.variables, mesh),
-                        None,
-                    )
+                    variables = state.variables
+                    if mesh is not None:
+                        variables = whole(state.variables, mesh)
+                    score = None
                     if validating:
                         numbers, images = validate(
                             variables, own_body, examples, part, own_networks
@@ -451,7 +471,12 @@ def _report(
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
     write_png(out / "sheets" / f"{done:07d}.png", image, mark=DRAWN)
     log.image(done, "validation/sheet", image)
-    why = lambda name, value: f" ({DROPPED[name]})" if value and name in DROPPED else ""
+
+    def why(name, value):
+        if value and name in DROPPED:
+            return f" ({DROPPED[name]})"
+        return ""
+
     say(
         f"step {done}: " + ", ".join(f"{name} {x:.4g}{why(name, x)}" for name, x in numbers.items())
     )

@@ -36,7 +36,8 @@ def training_mesh(fsdp: int | None = None, devices: Sequence[jax.Device] | None 
     Raises: ValueError if fsdp does not divide the number of devices.
     """
     devices = jax.devices() if devices is None else list(devices)
-    fsdp = len(devices) if fsdp is None else fsdp
+    if fsdp is None:
+        fsdp = len(devices)
     if fsdp < 1 or len(devices) % fsdp:
         raise ValueError(f"fsdp {fsdp} does not divide {len(devices)} devices")
     # automatic axes: with explicit ones, the default of newer jax, every gather of a divided array
@@ -59,14 +60,19 @@ def partition(tree: PyTree, mesh: Mesh) -> PyTree:
 
     def spec(leaf):
         axis = divided_axis(leaf.shape, mesh.shape["fsdp"])
-        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, "fsdp")
+        if axis is None:
+            return PartitionSpec()
+        return PartitionSpec(*[None] * axis, "fsdp")
 
     return jax.tree.map(spec, tree)
 
 
 def state_shardings(state: TrainState, mesh: Mesh) -> TrainState:
     """NamedSharding of every leaf of a state; batch statistics are whole everywhere."""
-    named = lambda spec: NamedSharding(mesh, spec)
+
+    def named(spec):
+        return NamedSharding(mesh, spec)
+
     divided = replace(state, batch_stats={})
     shardings = jax.tree.map(named, partition(divided, mesh))
     return replace(
@@ -115,9 +121,9 @@ def gather(params: PyTree, specs: PyTree) -> PyTree:
     """Inside `shard_map`: whole parameters from this device's parts."""
 
     def one(part, spec):
-        return (
-            jax.lax.all_gather(part, "fsdp", axis=len(spec) - 1, tiled=True) if len(spec) else part
-        )
+        if len(spec):
+            return jax.lax.all_gather(part, "fsdp", axis=len(spec) - 1, tiled=True)
+        return part
 
     return jax.tree.map(one, params, specs)
 

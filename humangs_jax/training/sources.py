@@ -66,11 +66,10 @@ def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list
     """
     found, kinds = [], {"images": UNIT, "masks": UNIT}
     for i, row in enumerate(loader.rows):
-        example = (
-            loader.example_at(step, row)
-            if batch is None
-            else jax.tree.map(lambda x, i=i: x[i], batch)
-        )
+        if batch is None:
+            example = loader.example_at(step, row)
+        else:
+            example = jax.tree.map(lambda x, i=i: x[i], batch)
         leaves = {path: np.asarray(leaf) for path, leaf in inexact_leaves(example)}
         try:
             check_values(
@@ -141,7 +140,9 @@ def training_people(
     The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are
     none, or if synthetic people are asked for beside a body that is not theirs.
     """
-    parts = [] if data is None else [people_on_disk(data, FileBody(body, str(body_file)))]
+    parts = []
+    if data is not None:
+        parts = [people_on_disk(data, FileBody(body, str(body_file)))]
     if on_the_fly and str(body_file) != DEFAULT_BODY:
         raise ValueError(
             f"synthetic people have the body that comes with the package, not {body_file}"
@@ -152,4 +153,6 @@ def training_people(
         raise ValueError(
             "nobody to train on: expected a folder of captures, or a number of people on the fly"
         )
-    return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
+    if len(parts) == 1:
+        return parts[0]
+    return mixed_people(parts, [1] * len(parts))

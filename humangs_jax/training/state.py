@@ -53,7 +53,9 @@ def init_state(config: TrainConfig, variables: Variables | None = None) -> Train
     own = jax.tree.map(lambda x: jnp.array(x, jnp.float32), dict(variables))
     params, batch_stats = own["params"], own["batch_stats"]
     opt_state = make_optimizer(config.optimizer, config.steps).init(params)
-    average = None if config.ema_decay is None else jax.tree.map(jnp.copy, params)
+    average = None
+    if config.ema_decay is not None:
+        average = jax.tree.map(jnp.copy, params)
     return TrainState(jnp.zeros((), jnp.int32), params, batch_stats, opt_state, average)
 
 
@@ -118,7 +120,10 @@ def guard(
         norm = gradient_norm(gradients)
         good = jnp.isfinite(value) & (norm <= skip_norm)
         updates, advanced = inner.update(gradients, state.inner, params)
-        keep = lambda new, old: jnp.where(good, new, old)
+
+        def keep(new, old):
+            return jnp.where(good, new, old)
+
         updates = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), updates)
         advanced = jax.tree.map(keep, advanced, state.inner)
         return updates, GuardState(state.skipped + ~good, state.nonfinite + ~finite, norm, advanced)

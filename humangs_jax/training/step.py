@@ -92,14 +92,17 @@ def subject_loss(
     )
     # targets on random backgrounds, so that coverage is learned; drivers without it stay on white
     driver = config.model.architecture.driver
-    colored = config.loss.random_background if driver is None or driver.has_alpha else 0.0
+    colored = 0.0
+    if driver is None or driver.has_alpha:
+        colored = config.loss.random_background
     backgrounds = random_backgrounds(key, len(targets.translations), colored)
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets.images, targets.masks, backgrounds)
     drawn = draw_targets(variables, outputs, body, example.inputs, targets, backgrounds, config)
-    compare = lambda drawn: loss_terms(
-        drawn, images, targets.masks, targets.depths, config.loss, networks
-    )
+
+    def compare(drawn):
+        return loss_terms(drawn, images, targets.masks, targets.depths, config.loss, networks)
+
     # the terms of the loss, and what the log shows
     terms = stage("loss", compare, drawn, apart=True)
     metrics = {
@@ -139,11 +142,17 @@ def local_gradients(
 
     def microbatch_loss(params, batch, keys):
         names = (SUBJECTS, *axes) if size > 1 else axes
-        one = lambda example, key: subject_loss(
-            params, batch_stats, body, example, key, config, networks, names or None
-        )
+
+        def one(example, key):
+            return subject_loss(
+                params, batch_stats, body, example, key, config, networks, names or None
+            )
+
         if size == 1:  # without vmap: a CPU runs the loops of a single subject faster
-            first = lambda tree: jax.tree.map(lambda x: x[0], tree)
+
+            def first(tree):
+                return jax.tree.map(lambda x: x[0], tree)
+
             loss, aux = one(first(batch), keys[0])
             return loss, jax.tree.map(lambda x: x[None], (loss, aux))
         losses, aux = jax.vmap(one, axis_name=SUBJECTS)(batch, keys)
@@ -157,7 +166,10 @@ def local_gradients(
     microbatches = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), (batch, keys))
     zeros = jax.tree.map(jnp.zeros_like, params)
     gradients, (losses, (updated, metrics)) = jax.lax.scan(accumulate, zeros, microbatches)
-    average = lambda x: jnp.mean(x, axis=(0, 1))
+
+    def average(x):
+        return jnp.mean(x, axis=(0, 1))
+
     totals = {name: jnp.sum(metrics.pop(name)) for name in COUNTS}
     metrics = {name: average(x) for name, x in metrics.items()} | totals
     return average(losses), gradients, jax.tree.map(average, updated), metrics
