@@ -132,7 +132,8 @@ def find_people(
             return _find_in_data_set(path, choice, body)
         body, folders = _model(body), find_captures(path)
         names = tuple(folder.name for folder in folders)
-        if indices is not None and (unknown := [name for name in indices if name not in names]):
+        unknown = [name for name in indices or () if name not in names]
+        if unknown:
             raise ValueError(f"indices: {unknown[0]!r} is no capture in {source}")
         return People(names, lambda index: _load(folders[index], choice, body))
     if isinstance(source, Source):
@@ -141,7 +142,8 @@ def find_people(
             names, lambda index: _from_source(source, index, names[index], inputs, _model(body))
         )
     cases = list(source)
-    if others := [type(case).__name__ for case in cases if not isinstance(case, Case)]:
+    others = [type(case).__name__ for case in cases if not isinstance(case, Case)]
+    if others:
         raise TypeError(f"evaluate: source: expected Cases, got a {others[0]} among them")
     return People(tuple(case.name for case in cases), cases.__getitem__)
 
@@ -151,7 +153,10 @@ def _load(folder: Path, choice: Choice, body: BodyModel | None) -> Case:
     if choice.indices is not None or not (held_out / "capture.json").is_file():
         return _split(folder.name, capture, choice)
     first = int(np.sum(np.asarray(capture.frames) == capture.frames[0]))
-    count = min(DEFAULT_INPUTS, first) if choice.inputs is None else choice.inputs
+    if choice.inputs is None:
+        count = min(DEFAULT_INPUTS, first)
+    else:
+        count = choice.inputs
     chosen = spread_views(
         folder.name, capture.frames, np.asarray(capture.cameras.cam_from_world), count
     )
@@ -159,12 +164,17 @@ def _load(folder: Path, choice: Choice, body: BodyModel | None) -> Case:
 
 
 def _model(body: BodyModel | str | Path | None) -> BodyModel | None:
-    return load_body(body) if isinstance(body, str | Path) else body
+    if isinstance(body, str | Path):
+        return load_body(body)
+    return body
 
 
 def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path | None) -> People:
     """The people of a data set; photos are read when a case is loaded."""
-    file_body = FileBody(body) if isinstance(body, BodyModel) else FileBody.load(body)
+    if isinstance(body, BodyModel):
+        file_body = FileBody(body)
+    else:
+        file_body = FileBody.load(body)
     people = open_people(path, file_body)
     names = _short_names([Path(person.name.rpartition(": ")[2]) for person in people])
 
@@ -176,7 +186,9 @@ def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path |
                 f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some"
                 " by indices"
             )
-        seen = subject.capture(chosen, file_body, size) if chosen else None
+        seen = None
+        if chosen:
+            seen = subject.capture(chosen, file_body, size)
         return Case(name, subject.capture(targets, file_body, size), seen)
 
     return People(names, load)
@@ -223,9 +235,8 @@ def choose_views(
         return chosen, targets
     if inputs is None and not reconstructs:
         return [], list(range(count))
-    chosen = spread_views(
-        name, frames, cam_from_world, DEFAULT_INPUTS if inputs is None else inputs
-    )
+    count = DEFAULT_INPUTS if inputs is None else inputs
+    chosen = spread_views(name, frames, cam_from_world, count)
     targets = [i for i in range(count) if i not in chosen]
     if not targets:
         raise ValueError(f"{name}: {count} views, all of them inputs: none is left to compare with")
@@ -251,18 +262,23 @@ def spread_views(
 def _from_source(
     source: Source, index: int, name: str, inputs: int | None, body: BodyModel | None
 ) -> Case:
-    count = inputs or (
-        DEFAULT_INPUTS if DEFAULT_INPUTS in source.input_counts else source.input_counts[0]
-    )
+    usual = source.input_counts[0]
+    if DEFAULT_INPUTS in source.input_counts:
+        usual = DEFAULT_INPUTS
+    count = inputs or usual
     example = source.example(0, index, count)
-    body = load_body() if body is None else body
+    if body is None:
+        body = load_body()
     return Case(name, capture_of(example.targets, body), capture_of(example.inputs, body))
 
 
 def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
     """Views of a source as a capture: equal poses are one frame, names are numbers."""
     views = jax.tree.map(np.asarray, views)
-    count = len(views.images) if views.view_count is None else int(views.view_count)
+    if views.view_count is None:
+        count = len(views.images)
+    else:
+        count = int(views.view_count)
     poses = np.concatenate(
         [views.rotations.reshape(len(views.images), -1), views.translations], axis=1
     )[:count]
@@ -300,7 +316,9 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
     Raises: ValueError for one avatar and several people; OSError.
     """
-    folder = None if isinstance(avatar, Avatar) else Path(avatar)
+    folder = None
+    if not isinstance(avatar, Avatar):
+        folder = Path(avatar)
     if folder is None or not folder.is_dir():
         if people != 1:
             raise ValueError(
@@ -311,11 +329,9 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
     def one_of(case: Case, background: float) -> Predicted:
         file = folder / f"{case.name}.npz"
-        return (
-            draw_views(Avatar.load(file), case.truth, background)
-            if file.is_file()
-            else _nothing(case, (str(file),))
-        )
+        if file.is_file():
+            return draw_views(Avatar.load(file), case.truth, background)
+        return _nothing(case, (str(file),))
 
     return one_of
 
@@ -328,7 +344,8 @@ def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
     def method(case: Case, background: float) -> Predicted:
         if case.inputs is None:
             raise ValueError(f"{case.name}: no inputs to reconstruct from")
-        if (driver := config.architecture.driver) is not None:
+        driver = config.architecture.driver
+        if driver is not None:
             images, alpha = driver.show(variables, config, case.inputs, case.truth, background)
             return Predicted(images, alpha, tuple(range(len(images))))
         return draw_views(reconstruct(variables, config, case.inputs), case.truth, background)
@@ -363,15 +380,16 @@ def predictions_method(folder: str | Path, people: int) -> Method:
             counts = f"{len(coverage)} of {len(read)} images"
             raise ValueError(f"{place}: {counts} have an alpha channel: expected all or none")
         images = np.stack([image for image, _ in read])
-        return Predicted(
-            images, np.stack(coverage) if coverage else None, tuple(i for i, _ in found), missing
-        )
+        alpha = np.stack(coverage) if coverage else None
+        return Predicted(images, alpha, tuple(i for i, _ in found), missing)
 
     return method
 
 
 def _predictions_of(case: Case, root: Path, people: int) -> Path:
-    return root / case.name if people > 1 or (root / case.name).is_dir() else root
+    if people > 1 or (root / case.name).is_dir():
+        return root / case.name
+    return root
 
 
 def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | None]:
@@ -433,7 +451,9 @@ def choose_method(
     if len(asked) > 1:
         raise ValueError(f"{' and '.join(asked)}: expected one of them")
     if avatar is not None:
-        name = "avatar" if isinstance(avatar, Avatar) else Path(avatar).name
+        name = "avatar"
+        if not isinstance(avatar, Avatar):
+            name = Path(avatar).name
         return name, avatar_method(avatar, people)
     if predictions is not None:
         return Path(predictions).name, predictions_method(predictions, people)

@@ -80,7 +80,9 @@ def file_key(file: Path) -> str:
 
 def case_key(case: Case) -> str:
     """A checksum of the name of a case and of all that is in its captures."""
-    inputs = "none" if case.inputs is None else _capture_key(case.inputs)
+    inputs = "none"
+    if case.inputs is not None:
+        inputs = _capture_key(case.inputs)
     return checksum({}, case.name, _capture_key(case.truth), inputs)
 
 

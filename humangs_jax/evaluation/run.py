@@ -121,9 +121,11 @@ class Gallery:
         key = 0.0 if psnr is None else -psnr
         if len(self._shots) >= self.limit and (not self._shots or key <= self._shots[0][0]):
             return
-        (heapq.heappushpop if len(self._shots) >= self.limit else heapq.heappush)(
-            self._shots, (key, row, images())
-        )
+        shot = (key, row, images())
+        if len(self._shots) >= self.limit:
+            heapq.heappushpop(self._shots, shot)
+        else:
+            heapq.heappush(self._shots, shot)
 
     @property
     def shots(self) -> dict[int, dict[str, str]]:
@@ -165,7 +167,10 @@ def page_html(evaluation: dict[str, Any], notes: list[str], gallery: Gallery) ->
         "largest_error": LARGEST_ERROR,
     }
     folder = resources.files("humangs_jax") / "evaluation" / "report"
-    read = lambda name: (folder / name).read_text(encoding="utf-8").strip()
+
+    def read(name):
+        return (folder / name).read_text(encoding="utf-8").strip()
+
     parts = {
         "title": html.escape(f"{evaluation['name']}, protocol {evaluation['protocol']['name']}"),
         "style": read("style.css"),
@@ -370,7 +375,10 @@ def evaluate(
         if net not in networks and net in installed_lpips()
     }
     # the people to score on, and the method to score
-    choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
+    if isinstance(indices, str | Path):
+        choice = read_evaluation(indices)
+    else:
+        choice = indices
     people = find_people(
         source, inputs, choice, body, avatar is None and predictions is None and method is None
     )
@@ -396,8 +404,12 @@ def evaluate(
     for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
         case = people.load(index)
         score = functools.partial(_score_person, case, predict, rules, networks, gallery, len(rows))
-        person, was_kept = (score(), False) if kept is None else kept(case, score)
-        for i, shot in person["shots"] if was_kept else ():
+        if kept is None:
+            person, was_kept = score(), False
+        else:
+            person, was_kept = kept(case, score)
+        kept_shots = person["shots"] if was_kept else ()
+        for i, shot in kept_shots:
             gallery.add(len(rows) + i, person["rows"][i][-1]["psnr"], functools.partial(dict, shot))
         missing += person["missing"]
         if person["rows"]:
@@ -442,7 +454,9 @@ def evaluate(
 
 def _told(source: Any) -> str:
     """A path as it was given; of another source its kind."""
-    return str(source) if isinstance(source, str | Path) else type(source).__name__
+    if isinstance(source, str | Path):
+        return str(source)
+    return type(source).__name__
 
 
 def _score_person(
@@ -482,17 +496,16 @@ def _score_person(
         gallery.add(first + i, scores["psnr"], shot)
         about["rows"].append([name, int(truth.frames[i]), printable(truth.names[i]), scores])
     shots = gallery.shots
+    input_images = []
+    if inputs and gallery.limit:
+        input_images = [_data_url(image, INPUT_SIDE) for image in inputs.images]
     return about | {
         "shots": [[i, shots[first + i]] for i in range(len(scored)) if first + i in shots],
         "masks": truth.masks is not None,
         "alpha": predicted.alpha is not None,
         "side": truth.images.shape[2:0:-1],
         "inputs": None if inputs is None else inputs.view_count,
-        "input_images": (
-            [_data_url(image, INPUT_SIDE) for image in inputs.images]
-            if inputs and gallery.limit
-            else []
-        ),
+        "input_images": input_images,
     }
 
 
@@ -504,11 +517,9 @@ def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
     if not empty:
         return predicted
     names = ", ".join(case.truth.names[i] for i in sorted(empty))
-    count = (
-        "1 view is not compared, its"
-        if len(empty) == 1
-        else f"{len(empty)} views are not compared, their"
-    )
+    count = "1 view is not compared, its"
+    if len(empty) != 1:
+        count = f"{len(empty)} views are not compared, their"
     logger.warning("%s: %s mask is empty: %s", case.name, count, names)
     kept = [row for row, view in enumerate(predicted.views) if view not in empty]
     return predicted._replace(
@@ -531,9 +542,9 @@ def _plain(value: Any) -> Any:
     if not dataclasses.is_dataclass(value):
         return list(value) if isinstance(value, tuple) else value
     fields = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return (
-        fields if isinstance(value, EvaluationProtocol) else {"kind": type(value).__name__} | fields
-    )
+    if isinstance(value, EvaluationProtocol):
+        return fields
+    return {"kind": type(value).__name__} | fields
 
 
 # Tables
@@ -542,14 +553,18 @@ def _plain(value: Any) -> Any:
 
 def shown(value: float | None, name: str) -> str:
     """A score with its digits; a dash for a missing one."""
-    return "-" if value is None else f"{value:.{COLUMNS[name].digits}f}"
+    if value is None:
+        return "-"
+    return f"{value:.{COLUMNS[name].digits}f}"
 
 
 def shown_mean(mean: Mean | None, name: str) -> str:
     """A mean with its interval in brackets."""
     if mean is None:
         return "-"
-    interval = "" if mean.low is None else f" [{shown(mean.low, name)}, {shown(mean.high, name)}]"
+    interval = ""
+    if mean.low is not None:
+        interval = f" [{shown(mean.low, name)}, {shown(mean.high, name)}]"
     return shown(mean.mean, name) + interval
 
 
@@ -560,9 +575,10 @@ _MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The first column to the left, the others to the right."""
     rule = ["---", *["---:"] * (len(header) - 1)]
-    escape = lambda cell: "".join(_MARKDOWN.get(c, c) for c in printable(cell)).replace(
-        "](", "]\\("
-    )
+
+    def escape(cell):
+        return "".join(_MARKDOWN.get(c, c) for c in printable(cell)).replace("](", "]\\(")
+
     lines = (" | ".join(map(escape, row)) for row in (header, *rows))
     first, *others = (f"| {line} |" for line in lines)
     return "\n".join([first, f"| {' | '.join(rule)} |", *others]) + "\n"
@@ -574,9 +590,12 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 def latex_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A tabular with rules of the package booktabs."""
     special = _LATEX | {sign: f"\\{sign}" for sign in "&%$#_{}"}
-    line = lambda row: (
-        " & ".join("".join(special.get(c, c) for c in printable(cell)) for cell in row) + r" \\"
-    )
+
+    def line(row):
+        return (
+            " & ".join("".join(special.get(c, c) for c in printable(cell)) for cell in row) + r" \\"
+        )
+
     body = "\n".join(line(row) for row in rows)
     begin = (
         f"\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}\n\\toprule\n{line(header)}\n\\midrule\n"
@@ -599,17 +618,14 @@ def csv_text(rows: Sequence[Scored]) -> str:
     names = list(rows[0].scores)
     writer.writerow(["person", "frame", "view", *names])
     for row in rows:
-        writer.writerow(
-            [
-                _cell(row.person),
-                row.frame,
-                _cell(row.view),
-                *("" if (x := row.scores[n]) is None else x for n in names),
-            ]
-        )
+        values = [row.scores[name] for name in names]
+        scores = ["" if value is None else value for value in values]
+        writer.writerow([_cell(row.person), row.frame, _cell(row.view), *scores])
     return text.getvalue()
 
 
 def _cell(name: str) -> str:
     name = printable(name)
-    return f"'{name}" if name.lstrip()[:1] in _FORMULAS else name
+    if name.lstrip()[:1] in _FORMULAS:
+        return f"'{name}"
+    return name

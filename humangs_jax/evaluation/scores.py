@@ -179,7 +179,9 @@ class EvaluationProtocol:
     @property
     def crops(self) -> tuple[Crop, ...]:
         """What PSNR and SSIM see first, what LPIPS sees last."""
-        return (self.crop,) if self.lpips_crop is None else (self.crop, self.lpips_crop)
+        if self.lpips_crop is None:
+            return (self.crop,)
+        return self.crop, self.lpips_crop
 
     @property
     def needs_masks(self) -> bool:
@@ -269,7 +271,8 @@ def known_means(rows: Sequence[Row]) -> Row:
     """Means of the scores over those that have them, such as images with patches; None for what
     none has.
     """
-    known = {name: [value for row in rows if (value := row[name]) is not None] for name in rows[0]}
+    listed = {name: [row[name] for row in rows] for name in rows[0]}
+    known = {name: [x for x in values if x is not None] for name, values in listed.items()}
     return {name: sum(values) / len(values) if values else None for name, values in known.items()}
 
 
@@ -302,10 +305,12 @@ def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
     over = next((over for over, units in levels.items() if len(units) > 1), "images")
     found: dict[str, Mean | None] = {}
     for name in rows[0].scores:
-        values = [value for unit in levels[over] if (value := unit[name]) is not None]
-        found[name] = (
-            Mean(float(np.mean(values)), *bootstrap(values), len(values), over) if values else None
-        )
+        of_units = [unit[name] for unit in levels[over]]
+        values = [value for value in of_units if value is not None]
+        if values:
+            found[name] = Mean(float(np.mean(values)), *bootstrap(values), len(values), over)
+        else:
+            found[name] = None
     return found
 
 
@@ -316,7 +321,10 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, flo
     if len(values) < 2:
         return None, None
     generator, numbers = np.random.default_rng(seed), np.asarray(values, np.float64)
-    drawn = lambda: generator.integers(len(numbers), size=(RESAMPLES // BLOCKS, len(numbers)))
+
+    def drawn():
+        return generator.integers(len(numbers), size=(RESAMPLES // BLOCKS, len(numbers)))
+
     means = np.concatenate([numbers[drawn()].mean(axis=1) for _ in range(BLOCKS)])
     low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(low), float(high)
@@ -377,7 +385,10 @@ def person_scores(
     kept = (shares > LEAST_FOREGROUND) & within[0][:, None] & within[1]
     errors = jnp.mean(jnp.square(predicted - truth), axis=-1)
     similarities = jnp.mean(similarity_map(predicted, truth, window), axis=-1)
-    mean = lambda x: jnp.sum(jnp.where(kept, x, 0)) / jnp.sum(kept)
+
+    def mean(x):
+        return jnp.sum(jnp.where(kept, x, 0)) / jnp.sum(kept)
+
     return {
         "psnr_fg": masked_psnr(predicted, truth, mask),
         "psnr_boundary": masked_psnr(predicted, truth, band),
@@ -423,11 +434,9 @@ def score_image(
     """
     # scores of the person need somebody in the mask
     empty = mask is None or not (mask > 0.5).any()
-    predicted, window, row = (
-        np.clip(predicted, 0, 1),
-        protocol.ssim,
-        dict.fromkeys(score_names(protocol)),
-    )
+    predicted = np.clip(predicted, 0, 1)
+    window = protocol.ssim
+    row = dict.fromkeys(score_names(protocol))
     if protocol.masked and mask is not None:
         predicted = predicted * mask[..., None] + protocol.behind * (1 - mask[..., None])
     # the whole image or its crop; LPIPS may have a crop that differs
@@ -545,13 +554,17 @@ def score_views(
     if truth.masks is None and protocol.needs_masks:
         raise ValueError("the protocol needs a mask for every view, and the capture has none")
     for i in range(truth.view_count):
-        mask = None if truth.masks is None else np.asarray(truth.masks[i])
+        mask = None
+        if truth.masks is not None:
+            mask = np.asarray(truth.masks[i])
         image = on_background(truth.images[i], mask, protocol)
-        shown, opacity = predicted[i], None if alpha is None else alpha[i]
+        shown = predicted[i]
+        opacity = None if alpha is None else alpha[i]
         if truth.unknown is not None:
             # nothing can be wrong where the person may be hidden
             shown = np.where(truth.unknown[i][..., None], image, shown)
-            opacity = None if opacity is None else np.where(truth.unknown[i], 0, opacity)
+            if opacity is not None:
+                opacity = np.where(truth.unknown[i], 0, opacity)
         yield score_image(shown, image, mask, opacity, protocol, networks or {})
 
 
