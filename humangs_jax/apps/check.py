@@ -129,7 +129,9 @@ class CheckReport:
         rows = [["view", "silhouette IoU", "body outside mask", "body in frame"]]
         for view in self.views:
             iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
-            outside = "" if view.outside is None else f"{view.outside:.1%}"
+            outside = ""
+            if view.outside is not None:
+                outside = f"{view.outside:.1%}"
             rows.append(
                 [view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warning))]
             )
@@ -241,7 +243,9 @@ def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3
     close, _ = around_person(whole, vertices)
     if close is whole:
         return small
-    return close.resized(LONGEST_SIDE) if max(close.images.shape[1:3]) > LONGEST_SIDE else close
+    if max(close.images.shape[1:3]) > LONGEST_SIDE:
+        return close.resized(LONGEST_SIDE)
+    return close
 
 
 def draw_body(
@@ -399,7 +403,10 @@ def _with_keypoints(
     )
     pen = ImageDraw.Draw(canvas)
     scale = FINE * np.asarray([width / capture.images.shape[2], height / capture.images.shape[1]])
-    within = lambda points: np.clip((points - corner) * scale, -FINE * width, 2 * FINE * width)
+
+    def within(points):
+        return np.clip((points - corner) * scale, -FINE * width, 2 * FINE * width)
+
     discs, crosses = within(keypoints.points[view]), within(examination.landmarks[view])
     shown = np.flatnonzero(examination.compared[view])
     radii = [FINE * (SMALL if _is_small(name) else RADIUS) for name in keypoints.set.names]
@@ -435,7 +442,9 @@ def _is_small(name: str) -> bool:
 
 def _color(name: str) -> tuple[int, ...]:
     side = {"left": LEFT, "right": RIGHT}.get(name.split("_")[0])
-    return WHITE if side is None else tuple(to_uint8(np.asarray(side)).tolist())
+    if side is None:
+        return WHITE
+    return tuple(to_uint8(np.asarray(side)).tolist())
 
 
 def _fit_label(examination: Examination, view: int) -> str:

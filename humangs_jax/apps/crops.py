@@ -50,8 +50,12 @@ def around_person(
     shift[:, :2, 2] = corners
     K = jnp.asarray(np.asarray(capture.cameras.K) - shift)
     cameras = replace(capture.cameras, K=K, width=int(size[0]), height=int(size[1]))
-    masks = None if capture.masks is None else _cut(capture.masks, corners, size)
-    unknown = None if capture.unknown is None else _cut(capture.unknown, corners, size)
+    masks = None
+    if capture.masks is not None:
+        masks = _cut(capture.masks, corners, size)
+    unknown = None
+    if capture.unknown is not None:
+        unknown = _cut(capture.unknown, corners, size)
     images = _cut(capture.images, corners, size)
     cut = dataclasses.replace(capture, images=images, masks=masks, cameras=cameras, unknown=unknown)
     return cut, corners
@@ -93,4 +97,6 @@ def _box(
     seen = seen[
         np.isfinite(seen).all(axis=1) & (seen >= 0).all(axis=1) & (seen <= photo).all(axis=1)
     ]
-    return (seen.min(axis=0), seen.max(axis=0)) if len(seen) else None
+    if len(seen):
+        return seen.min(axis=0), seen.max(axis=0)
+    return None

@@ -76,7 +76,10 @@ def run_demo(
     report: dict[str, Any] = {}
     settings = settings or Settings()
     _check_place(Path(out))
-    write = lambda folder: report.update(_write_demo(folder, weights, frame_size, refine, settings))
+
+    def write(folder):
+        return report.update(_write_demo(folder, weights, frame_size, refine, settings))
+
     add_files(Path(out), write, first=FILES[0])
     return report
 
@@ -174,7 +177,10 @@ def _write_demo(
         report["refined"] = _scores(refined, truth) | counts | times
     with stage("animating"):
         shot = settings.shot(Shot(size=frame_size, azimuth=25.0))
-        draw = lambda: np.stack(list(motion_frames(avatar, motion, shot, turn=40.0)))
+
+        def draw():
+            return np.stack(list(motion_frames(avatar, motion, shot, turn=40.0)))
+
         frames = _timed(timings, "animation_frames", draw)
         for name in ("animation.mp4", "animation.gif"):
             write_video(folder / name, frames, motion.fps)
@@ -205,7 +211,8 @@ def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False
     and running (second).
     """
     start = time.perf_counter()
-    with stage(COMPILING) if twice else contextlib.nullcontext():
+    compiling = stage(COMPILING) if twice else contextlib.nullcontext()
+    with compiling:
         result = jax.block_until_ready(run())
     first = time.perf_counter() - start
     timings[name] = {"seconds": round(first, 3)}

@@ -115,7 +115,9 @@ def left_out(folder: Path) -> str | None:
 
     Raises: as it.
     """
-    return None if (folder / "capture.json").is_file() else unused_line(scan_photos(folder).unused)
+    if (folder / "capture.json").is_file():
+        return None
+    return unused_line(scan_photos(folder).unused)
 
 
 def found_in_capture(folder: Path) -> list[PhotoPeople]:
@@ -275,7 +277,8 @@ def person_of(
             dataclasses.replace(photo, people=tuple(people), known=photo.known or max(row) > 0)
         )
     blank = [v for v in range(len(photos)) if not _has_any(given, v)]
-    if unclear := [photos[v].name for v in blank if is_unclear(settled, v, number)]:
+    unclear = [photos[v].name for v in blank if is_unclear(settled, v, number)]
+    if unclear:
         told = (
             f"{few(unclear)}: which of the people of {sheet} is meant? There are no {kind} of the"
             " person: add them"
@@ -285,7 +288,9 @@ def person_of(
 
 
 def _has_any(given: Keypoints | Masks, view: int) -> bool:
-    return bool(np.any(given.confidences[view] if isinstance(given, Keypoints) else given[view]))
+    if isinstance(given, Keypoints):
+        return bool(np.any(given.confidences[view]))
+    return bool(np.any(given[view]))
 
 
 def _agreement(found: Found | None, given: Keypoints | Masks, view: int) -> float:
@@ -446,13 +451,15 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
         for photo in photos
         if photo.people[person] is None
     ]
-    found = [(photo, each) for photo in photos if (each := photo.people[person]) is not None]
+    everywhere = [(photo, photo.people[person]) for photo in photos]
+    found = [(photo, each) for photo, each in everywhere if each is not None]
     for photo, each in found:
         points = each.person.points[:, :2]
         beyond = np.maximum(-points, points - np.asarray(photo.size))
         if (beyond > BEYOND * np.ptp(points, axis=0).max()).any():
             told.append(f"{photo.name}: a part of the person is outside of the photo")
-    if apart := [photo.name for photo, each in found if each.apart]:
+    apart = [photo.name for photo, each in found if each.apart]
+    if apart:
         where = "the person is not where the other photos of the moment show them"
         told.append(f"{few(apart)}: {where}: the calibration is off there, or it is somebody else")
     mirrored = "left and right of the person were exchanged, as the other views show: repaired"
@@ -520,7 +527,8 @@ def write_found(
     files = [mask_name(photo.name) for photo in photos]
     owners: dict[str, str] = {}
     for photo, file in zip(photos, files, strict=True):
-        if (other := owners.setdefault(file, photo.name)) != photo.name:
+        other = owners.setdefault(file, photo.name)
+        if other != photo.name:
             raise ValueError(f"{other} and {photo.name}: both masks would be {file}: rename one")
 
     def write(temporary: Path) -> None:
@@ -532,7 +540,8 @@ def write_found(
         # the chosen person alone: `humangs fit` need not choose again
         write_people(temporary / KEYPOINTS_FILE, images)
         write_sheet(temporary / SHEET_FILE, photos, person)
-        for photo, file in zip(photos, files, strict=True) if masks else ():
+        with_mask = zip(photos, files, strict=True) if masks else ()
+        for photo, file in with_mask:
             (temporary / file).parent.mkdir(parents=True, exist_ok=True)
             write_png(temporary / file, person_mask(photo, person), mark=MASK)
         # a capture has to name its masks
@@ -541,14 +550,15 @@ def write_found(
             views = []
             for photo, file, view in zip(photos, files, description["views"], strict=True):
                 named = {"mask": file} if masks else {}
-                given = None if masks or "mask" not in view else read_grey(folder / view["mask"])
+                given = None
+                if not masks and "mask" in view:
+                    given = read_grey(folder / view["mask"])
                 hidden = hidden_by_others(photo, person, given)
                 if "unknown" in view:  # what was known before anybody was found stays
                     known = read_mask(folder / view["unknown"], "its photo", *photo.size)
                     known = known >= LEAST_UNKNOWN
-                    hidden = (
-                        None if hidden is None or not (hidden & ~known).any() else hidden | known
-                    )
+                    if hidden is not None:
+                        hidden = hidden | known if (hidden & ~known).any() else None
                 if hidden is not None:
                     named["unknown"] = f"{UNKNOWN}/{Path(file).relative_to(MASKS).as_posix()}"
                     (temporary / named["unknown"]).parent.mkdir(parents=True, exist_ok=True)
@@ -565,7 +575,8 @@ def write_found(
 def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
     """The mask of a person at the size of the photo; black if the person is not in it."""
     mask = np.zeros(photo.size[::-1], np.float32)
-    if (found := photo.people[person]) is not None:
+    found = photo.people[person]
+    if found is not None:
         (top, left), (height, width) = found.corner, found.mask.shape
         mask[top : top + height, left : left + width] = found.mask / np.float32(255)
     return mask
@@ -587,7 +598,9 @@ def hidden_by_others(
         if own is not None and other.covered and not own.covered:
             continue
         hidden |= person_mask(photo, i) > SEEN
-    hidden &= (person_mask(photo, person) if mask is None else mask) <= SEEN
+    if mask is None:
+        mask = person_mask(photo, person)
+    hidden &= mask <= SEEN
     return hidden if hidden.any() else None
 
 
@@ -616,9 +629,8 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
         if found is None:
             continue
         color = np.asarray(COLORS[i % len(COLORS)]) / 255
-        mask = resized(person_mask(photo, i), width, height)[..., None] * (
-            FAINT if chosen in (None, i) else FAINT / 2
-        )
+        opacity = FAINT if chosen in (None, i) else FAINT / 2
+        mask = opacity * resized(person_mask(photo, i), width, height)[..., None]
         picture = picture * (1 - mask) + color * mask
         # the number stands above the nose, inside the picture
         x, y = found.person.points[0, :2] * width / photo.size[0]

@@ -92,7 +92,8 @@ def import_photos(
     images, files = photo_files(folder)
     choice = _Choice(person, keypoints, masks, out, others)
     with tempfile.TemporaryDirectory() as place:
-        if reduce and (smaller := _reduced(images, files, Path(place))):
+        smaller = _reduced(images, files, Path(place)) if reduce else None
+        if smaller:
             found = _look(Path(place), files, smaller, choice)
             if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
                 with named_after(Path(place), images):
@@ -167,7 +168,8 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
     photos, number = _chosen(photos, images, files, choice)
     # cameras are found from photos with the person only
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
-    people = [found for i in shown if (found := photos[i].people[number]) is not None]
+    everywhere = [photos[i].people[number] for i in shown]
+    people = [found for found in everywhere if found is not None]
     # EXIF gives the focal length of the file, which may have been reduced since
     known = (
         (focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size))
@@ -188,7 +190,8 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
 
 def _cropped(files: list[Path]) -> tuple[str, ...]:
     """A warning that names the photos whose EXIF describes a larger frame."""
-    found = [(file, frame) for file in files if (frame := cropped_from(file)) is not None]
+    frames = [(file, cropped_from(file)) for file in files]
+    found = [(file, frame) for file, frame in frames if frame is not None]
     if not found:
         return ()
     named = [f"{file.name} ({_by(image_size(file))}, EXIF {_by(frame)})" for file, frame in found]
@@ -247,7 +250,8 @@ def _written(
     written = []
     for view, mirrored, described in zip(found.views, found.mirrored, views, strict=True):
         photo, people = photos[shown[view]], list(photos[shown[view]].people)
-        if mirrored and (person := people[number]) is not None:
+        person = people[number]
+        if mirrored and person is not None:
             people[number] = exchanged(person)
         name, size = f"{Path(described['image']).stem}.png", (report.width, report.height)  # padded
         written.append(dataclasses.replace(photo, people=tuple(people), name=name, size=size))
@@ -259,7 +263,10 @@ def _written(
 
 
 def _calibration(seen: PersonViews, found: PersonCameras, images: Path) -> Calibration:
-    frames = range(len(found.views)) if found.moments > 1 else [0] * len(found.views)
+    if found.moments > 1:
+        frames = range(len(found.views))
+    else:
+        frames = [0] * len(found.views)
     cameras = [
         CalibratedCamera(
             seen.photos[view],

@@ -123,7 +123,8 @@ def faults(capture: Capture) -> Faults:
             f"the poses seem to be in degrees: rotations up to {largest:.0f}, expected radians"
         )
         return Faults((degrees,), problems, inside, set(range(len(views))))
-    if exchanged := _exchanged_cameras(views):
+    exchanged = _exchanged_cameras(views)
+    if exchanged:
         pairs = [f"{views[i].name} by the camera of {views[j].name}" for i, j in exchanged.items()]
         return Faults(
             (f"cameras are exchanged: the body would fit {few(pairs)}",),
@@ -158,10 +159,8 @@ class _View(NamedTuple):
 def _coarse_views(capture: Capture) -> list[_View]:
     points = surface_points(capture.body, capture.betas, capture.poses, capture.frames, POINTS)
     translations = np.asarray(capture.poses.translation, float)
-    K, matrices = (
-        np.asarray(capture.cameras.K, float),
-        np.asarray(capture.cameras.cam_from_world, float),
-    )
+    K = np.asarray(capture.cameras.K, float)
+    matrices = np.asarray(capture.cameras.cam_from_world, float)
     views = []
     for i, frame in enumerate(capture.frames.tolist()):
         mask = None if capture.masks is None else capture.masks[i]
@@ -227,7 +226,10 @@ def _cause(view: _View, body: Cells) -> str | None:
             view._replace(matrix=undo(view.matrix, view.translation))
         )
         if inside > SURELY_INSIDE and height > LEAST_HEIGHT:
-            tried[mistake] = 1.0 if view.cells is None else _overlap(drawn, view.cells)
+            if view.cells is None:
+                tried[mistake] = 1.0
+            else:
+                tried[mistake] = _overlap(drawn, view.cells)
     best = max(tried, key=lambda mistake: tried[mistake], default=None)
     if best is None or tried[best] <= SURELY_IOU or (view.cells is None and len(tried) > 1):
         return None
@@ -239,7 +241,10 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
 
     An exchange has to explain all of its views.
     """
-    drawn = lambda i, j: _silhouette(views[i]._replace(K=views[j].K, matrix=views[j].matrix))[0]
+
+    def drawn(i, j):
+        return _silhouette(views[i]._replace(K=views[j].K, matrix=views[j].matrix))[0]
+
     masks = {i: view.cells for i, view in enumerate(views) if view.cells is not None}
     own = {i: _overlap(drawn(i, i), mask) for i, mask in masks.items()}
     off = [i for i, overlap in own.items() if overlap < SURELY_IOU]
@@ -281,14 +286,19 @@ def _silhouette(view: _View) -> tuple[Cells, float, float]:
     closed = ndimage.binary_closing(np.pad(covered, 2), np.ones((3, 3)))[
         2:-2, 2:-2
     ]  # gaps between the points
-    tall = float(np.ptp(pixels[:, 1])) / height if len(pixels) else 0.0
+    tall = 0.0
+    if len(pixels):
+        tall = float(np.ptp(pixels[:, 1])) / height
     return closed, len(pixels) / len(view.points), tall
 
 
 def _mask_cells(mask: Float[np.ndarray, "h w"]) -> Cells:
     height, width = mask.shape
     (rows, columns), cell = _grid(width, height)
-    at = lambda count, most: np.minimum(((np.arange(count) + 0.5) * cell).astype(int), most - 1)
+
+    def at(count, most):
+        return np.minimum(((np.arange(count) + 0.5) * cell).astype(int), most - 1)
+
     return mask[at(rows, height)][:, at(columns, width)] > 0.5
 
 

@@ -144,11 +144,10 @@ def _matched(
     for own, people in zip(times, in_order_of_time(matches, shown), strict=True):
         for match in people:
             for i, v in enumerate(own):
-                found = (
-                    None
-                    if match is None or (member := match.members[i]) is None
-                    else photos[v].people[member]
-                )
+                member = None if match is None else match.members[i]
+                found = None
+                if member is not None:
+                    found = photos[v].people[member]
                 mirrored = found is not None and match is not None and match.mirrored[i]
                 rows[v].append(exchanged(found) if mirrored else found)
     return rows

@@ -324,14 +324,23 @@ def measure(
     size: int = 512,
 ) -> Cost:
     """What settings cost here: an avatar of this capture, and frames of it from all around."""
-    make = lambda: reconstruct_with(settings, variables, config, capture)
+
+    def make():
+        return reconstruct_with(settings, variables, config, capture)
+
     # The first avatar and the first frame compile; what follows is timed.
     avatar = make()
     shot = settings.shot(Shot(size=size))
     poses, cameras = turntable_views(avatar, rest_pose_of(avatar), FRAMES + 1, shot)
-    pose = lambda i: jax.tree.map(lambda x: x[i], poses)
+
+    def pose(i):
+        return jax.tree.map(lambda x: x[i], poses)
+
     drawn = draw(avatar, map(pose, range(FRAMES + 1)), cameras, how=splatting_of(shot, avatar))
-    frame = lambda: jax.block_until_ready(next(drawn))
+
+    def frame():
+        return jax.block_until_ready(next(drawn))
+
     frame()
     with peak_memory() as peak:
         reconstruct_ms = max(_milliseconds(make) for _ in range(MAKES))
@@ -343,7 +352,9 @@ def measure(
 
 def _shown(cost: Cost) -> str:
     text = f"{cost.reconstruct_ms:.0f} ms a reconstruction, {cost.frame_ms:.1f} ms a frame"
-    return text if cost.memory_mb is None else f"{text}, {cost.memory_mb:.0f} MiB"
+    if cost.memory_mb is None:
+        return text
+    return f"{text}, {cost.memory_mb:.0f} MiB"
 
 
 def _uninterrupted(run: Refinement) -> Refinement:

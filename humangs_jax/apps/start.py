@@ -142,8 +142,12 @@ def look(
     # places by their names; what the arguments name goes before them
     mask_folders = [folder / name for name in MASK_FOLDERS if has_photos(folder / name)]
     in_front = [folder / name for name in OTHERS_FOLDERS if has_photos(folder / name)]
-    named = [folder / KEYPOINT_FOLDER] if (folder / KEYPOINT_FOLDER).exists() else []
-    named += [found[1]] if (found := KEYPOINTS.found(folder)) else []
+    named = []
+    if (folder / KEYPOINT_FOLDER).exists():
+        named = [folder / KEYPOINT_FOLDER]
+    found = KEYPOINTS.found(folder)
+    if found:
+        named.append(found[1])
     # where no name is known: whatever is called keypoints
     further = sorted(
         path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
@@ -179,7 +183,8 @@ def scan_photos(folder: Path) -> FolderScan:
     Raises: CaptureError, one line, if there is no photo.
     """
     _expect_folder(folder)
-    images = next((place for name in PHOTO_FOLDERS if has_photos(place := folder / name)), folder)
+    places = (folder / name for name in PHOTO_FOLDERS)
+    images = next((place for place in places if has_photos(place)), folder)
     whole = _scan(folder)
     if images == folder:
         scan = whole
@@ -193,9 +198,8 @@ def scan_photos(folder: Path) -> FolderScan:
     if not scan.photos:
         expected = f"expected {', '.join(PHOTO_SUFFIXES)} files in it or in {folder / 'images'}"
         left_out = unused_line(scan.unused)
-        raise CaptureError(
-            folder, "", f"no photo: {expected}" + ("" if left_out is None else f" ({left_out})")
-        )
+        others = "" if left_out is None else f" ({left_out})"
+        raise CaptureError(folder, "", f"no photo: {expected}{others}")
     return scan
 
 
@@ -416,7 +420,9 @@ def better_body(
     better = photos_agree(gains(), CLEARLY)
     if not reports:
         return first, None
-    return (second, reports[0][1]) if better else (first, reports[0][0])
+    if better:
+        return second, reports[0][1]
+    return first, reports[0][0]
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:

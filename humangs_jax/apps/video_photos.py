@@ -65,7 +65,9 @@ def video_of(place: Path) -> Path | None:
     Raises: CaptureError for several videos.
     """
     if not place.is_dir():
-        return place if place.is_file() and is_video(place) else None
+        if place.is_file() and is_video(place):
+            return place
+        return None
     if has_photos(place):
         return None
     videos = find_videos(place)
@@ -90,7 +92,9 @@ def photos_of_video(video: Path, folder: Path) -> str:
     of_video = {"video": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns}
     # frames of the same video are kept; anything else in the folder is left alone
     if folder.exists() or folder.is_symlink():
-        known = read_json(folder / MARK) if (folder / MARK).is_file() else None
+        known = None
+        if (folder / MARK).is_file():
+            known = read_json(folder / MARK)
         if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
             problem = (
                 f"exists, and is not of {video.name} as it is now: expected another folder, or"
@@ -101,7 +105,9 @@ def photos_of_video(video: Path, folder: Path) -> str:
     # without the detector, or if the person does not turn, frames that look different are taken
     sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
     with reading(video, "video", CaptureError):
-        chosen = _by_direction(video, sharpness) if available() else []
+        chosen = []
+        if available():
+            chosen = _by_direction(video, sharpness)
         by_direction = bool(chosen)
         chosen = chosen or choose_frames(sharpness, thumbnails, PHOTOS)
     count = len(sharpness)
@@ -118,7 +124,9 @@ def photos_of_video(video: Path, folder: Path) -> str:
 def _told(
     video: Path, folder: Path, chosen: Sequence[int], count: int, by_direction: bool | None
 ) -> str:
-    which = "from all sides of the person" if by_direction else "that show different things"
+    which = "that show different things"
+    if by_direction:
+        which = "from all sides of the person"
     return (
         f"{video}: {len(chosen)} of {count:,} frames, sharp ones {which}"
         f" ({', '.join(map(str, chosen))}), are the photos in {folder / 'images'}; what is to be"
@@ -132,8 +140,12 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
 
     None for other folders, and where the video does not say its rate.
     """
-    known = read_json(folder / MARK) if (folder / MARK).is_file() else None
-    rate = known.get("rate") if isinstance(known, dict) else None
+    known = None
+    if (folder / MARK).is_file():
+        known = read_json(folder / MARK)
+    rate = None
+    if isinstance(known, dict):
+        rate = known.get("rate")
     numbers = [name.rpartition("_")[2] for name in names]
     if not isinstance(rate, int | float) or not rate > 0 or not all(n.isdigit() for n in numbers):
         return None
@@ -166,10 +178,13 @@ def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterabl
     networks, last, missed = Networks(), None, 0
     for frame in bar(frames, total=count, desc="following the person", unit="frame"):
         photo = frame.astype(np.float32) / 255
-        found = None if last is None else networks.landmarks(photo, last.again.crop())
+        found = None
+        if last is not None:
+            found = networks.landmarks(photo, last.again.crop())
         if found is None or found.presence < LEAST_PRESENCE:
             found = next(iter(find_people(networks, photo)), None)
-        last, missed = found, missed + 1 if found is None else 0
+        last = found
+        missed = missed + 1 if found is None else 0
         if missed == PATIENCE:
             return
         yield found
