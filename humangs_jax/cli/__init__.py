@@ -106,10 +106,8 @@ def execute(arguments: Sequence[str]) -> int:
 
     screen.heard.clear()
     everywhere = {"--quiet", "--verbose", "--version"}
-    given, arguments = (
-        everywhere & set(arguments),
-        [word for word in arguments if word not in everywhere],
-    )
+    given = everywhere & set(arguments)
+    arguments = [word for word in arguments if word not in everywhere]
     verbose = "--verbose" in given
     try:
         if "--version" in given:
@@ -181,7 +179,9 @@ def _parsed(arguments: list[str]) -> Command:
         )
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else "`humangs --help` lists them"
+        hint = "`humangs --help` lists them"
+        if near:
+            hint = f"did you mean {near[0]!r}?"
         raise UsageError(f"{name!r} is no command: {hint}")
     command = described(_command(name))
     known = option_names(command) | {"--help"}
@@ -189,11 +189,10 @@ def _parsed(arguments: list[str]) -> Command:
         option = word.split("=")[0].replace("_", "-")
         if option.startswith("--") and option not in known:
             near = difflib.get_close_matches(option, known, n=1)
-            raise UsageError(
-                f"{option}: no option of humangs"
-                f" {name}{f': did you mean {near[0]}?' if near else ''}"
-            )
-    typed = " ".join(arguments[: 2 if arguments[:2] == ["import", "cameras"] else 1])
+            hint = f": did you mean {near[0]}?" if near else ""
+            raise UsageError(f"{option}: no option of humangs {name}{hint}")
+    words = 2 if arguments[:2] == ["import", "cameras"] else 1
+    typed = " ".join(arguments[:words])
     try:
         return parsed(command, typed, options)
     except SystemExit:
@@ -234,7 +233,9 @@ def _failed(error: Exception, verbose: bool) -> int:
             error.__traceback__
         )
     screen.fail(error, verbose)
-    return BAD_USAGE if isinstance(error, UsageError) else BAD_DATA
+    if isinstance(error, UsageError):
+        return BAD_USAGE
+    return BAD_DATA
 
 
 def _interrupted() -> int:

@@ -188,7 +188,9 @@ class Render:
         # a video is one turn; images are 8 views of a circle
         video, views = self.out.suffix != "", self.views
         if views is None:
-            views = max(2, round(TURN_SECONDS * self.fps)) if video else 8
+            views = 8
+            if video:
+                views = max(2, round(TURN_SECONDS * self.fps))
         if video and self.exr:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         self._require_one_kind_of_cameras()
@@ -227,9 +229,8 @@ class Render:
             if self.camera is not None:
                 found = file_cameras(self.camera, shot, upright=True)
                 cameras, names = one_size(self.camera, found), list(found)
-                pose = standing(
-                    avatar, rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
-                )
+                pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
+                pose = standing(avatar, pose)
                 poses = repeated(pose, len(names))
             elif self.capture is not None:
                 capture = load_capture(self.capture)
@@ -268,7 +269,8 @@ class Render:
             "exr": self.exr,
             "prune": self.shot.prune,
         }
-        if wrong := [name for name, given in said.items() if given]:
+        wrong = [name for name, given in said.items() if given]
+        if wrong:
             raise UsageError(f"--{wrong[0]}: {self.avatar} is no avatar, which this needs")
         if self.camera is not None and self.out.suffix:
             raise UsageError("--camera: expected a folder as --out")

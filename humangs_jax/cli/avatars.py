@@ -247,7 +247,8 @@ class Reconstruct:
         if self.weights is None:
             said["weights"] += f" ({shipped_checksum()[:SHORT]})"
         for name in ("weights", "config"):  # other contents under the same name are other settings
-            if (file := getattr(self, name)) is not None and file.is_file():
+            file = getattr(self, name)
+            if file is not None and file.is_file():
                 said[name] += f" ({file_checksum(file)[:SHORT]})"
         begin_set(out, AVATARS, {SETTINGS: said})
 
@@ -319,7 +320,9 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
     """
     folders = []
     for path in given:
-        inside = [] if (path / "capture.json").is_file() else sorted(path.glob("*/capture.json"))
+        inside = []
+        if not (path / "capture.json").is_file():
+            inside = sorted(path.glob("*/capture.json"))
         folders += [file.parent for file in inside if not file.parent.name.startswith(".")] or [
             path
         ]
@@ -475,7 +478,10 @@ class Export:
     """Version of a .spz. Default: 3, which more programs read."""
 
     def run(self) -> None:
-        out = Path("avatar.ply") if self.out is None and self.html is None else self.out
+        if self.out is None and self.html is None:
+            out = Path("avatar.ply")
+        else:
+            out = self.out
         # a mesh goes into fewer formats than Gaussians
         suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
         if out is not None:
@@ -486,11 +492,12 @@ class Export:
             from humangs_jax.avatar.avatar import Avatar
 
             avatar = Avatar.load(self.avatar)
-            motion = (
-                None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
-            )
+            motion = None
+            if self.motion is not None:
+                motion = self.part.load(self.motion, avatar.rest_joints)
             # a motion with expressions needs an avatar with a face
-            avatar = avatar if motion is None else with_face_for(avatar, motion)
+            if motion is not None:
+                avatar = with_face_for(avatar, motion)
         # the page has the whole motion, whichever frame --out has
         if self.html is not None:
             with stage("making the page"):
@@ -521,11 +528,9 @@ class Export:
         if self.frame is not None and (
             self.frames is not None or (form is not None and form.animated)
         ):
-            with_it = (
-                "--frames"
-                if self.frames is not None
-                else "a file that holds the whole motion: use --frames"
-            )
+            with_it = "a file that holds the whole motion: use --frames"
+            if self.frames is not None:
+                with_it = "--frames"
             raise UsageError(f"--frame {self.frame}: does not go with {with_it}")
         if self.rest and form is not None and not form.rest_fields:
             raise UsageError(f"--rest: {out} has no such fields: expected a file of 3DGS")
@@ -535,7 +540,9 @@ class Export:
             )
 
     def _format(self, out: Path | None) -> "ExportFormat | None":
-        return None if out is None else chosen_format(out.suffix, self.mesh)
+        if out is None:
+            return None
+        return chosen_format(out.suffix, self.mesh)
 
     def _write(self, out: Path, avatar: "Avatar", motion: "Motion | None") -> None:
         from humangs_jax.avatar.export.gaussians import export
@@ -554,22 +561,20 @@ class Export:
         }
         with stage("writing"):
             files = export(out, avatar, motion, None if form.animated else numbers, **options)
-        what = (
-            f"{len(avatar.faces):,} triangles"
-            if form.mesh
-            else f"{len(avatar.gaussians.means):,} Gaussians"
-        )
-        poses = (
-            f", {len(motion.translations)} frames" if motion is not None and form.animated else ""
-        )
-        written = (
-            str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
-        )
-        beside = (
-            f"; {' and '.join(file.name for file in files_beside(out, form))} belong to it"
-            if form.beside
-            else ""
-        )
+        if form.mesh:
+            what = f"{len(avatar.faces):,} triangles"
+        else:
+            what = f"{len(avatar.gaussians.means):,} Gaussians"
+        poses = ""
+        if motion is not None and form.animated:
+            poses = f", {len(motion.translations)} frames"
+        if len(files) == 1:
+            written = str(out)
+        else:
+            written = f"{files[0]} to {files[-1].name}: {len(files)} files"
+        beside = ""
+        if form.beside:
+            beside = f"; {' and '.join(file.name for file in files_beside(out, form))} belong to it"
         wrote(written, f"{what}{poses}, feet on 0{beside}")
 
     def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
@@ -655,5 +660,7 @@ class Tune:
         save_settings(self.out, tuned.settings, **about)
         tell(tuned)
         wrote(self.out, "settings")
-        weights = () if self.weights is None else ("--weights", self.weights)
+        weights = ()
+        if self.weights is not None:
+            weights = "--weights", self.weights
         suggest("humangs reconstruct", self.capture, "--config", self.out, *weights)

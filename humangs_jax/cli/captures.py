@@ -40,22 +40,22 @@ def keypoints_of(views: Any, file: Path | None, person: int | None) -> Any:
     from humangs_jax.capture.keypoints.reading import read_keypoints
 
     height, width = views.images.shape[1:3]
-    return None if file is None else read_keypoints(file, views.names, width, height, person=person)
+    if file is None:
+        return None
+    return read_keypoints(file, views.names, width, height, person=person)
 
 
 def keypoints_wanted() -> tuple[str, ...]:
     """Gives the options that `humangs fit` needs: none where it finds keypoints itself."""
     from humangs_jax.capture.detection.people import available
 
+    if available():
+        return ()
     return (
-        ()
-        if available()
-        else (
-            (
-                "--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the"
-                " photos)"
-            ),
-        )
+        (
+            "--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the"
+            " photos)"
+        ),
     )
 
 
@@ -275,14 +275,14 @@ class Synth:
             from humangs_jax.synthetic.writer import Layout, write_set
 
         # close views are part of the full set, and of another only where they are asked for
+        close_views = self.close_views
+        if close_views is None:
+            close_views = 12 if self.views is None else 0
         layout = Layout(
             small.get("size", self.size),
             small.get("poses", self.poses),
             small.get("views", self.views or 60),
-            small.get(
-                "close_views",
-                (12 if self.views is None else 0) if self.close_views is None else self.close_views,
-            ),
+            small.get("close_views", close_views),
             extras.held_out,
             frames=self.motion_frames if self.sequences else 0,
             scan_texture=2048 if extras.scans else 0,

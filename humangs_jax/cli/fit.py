@@ -131,10 +131,8 @@ class Fit:
         """
         for part in (self.refinement, self.detections, self):
             for field in dataclasses.fields(part):
-                chosen = (
-                    not dataclasses.is_dataclass(value := getattr(part, field.name))
-                    and value != field.default
-                )
+                value = getattr(part, field.name)
+                chosen = not dataclasses.is_dataclass(value) and value != field.default
                 if chosen and field.name not in ("capture", "out", "overwrite"):
                     yield field.name
 
@@ -148,7 +146,8 @@ class Fit:
             require_replaceable(self.out, self.overwrite, "capture.json", inputs)
         elif self.capture.is_dir():
             require_folder(self.capture, "CAPTURE")
-            if (body := self.capture / "body.npz").exists() and not self.overwrite:
+            body = self.capture / "body.npz"
+            if body.exists() and not self.overwrite:
                 raise UsageError(
                     f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere"
                 )
@@ -181,7 +180,9 @@ class Fit:
             photos = load_photos(self.capture)
             keypoints = detections.read(photos)
             body = load_body(self.body)
-        body_file = DEFAULT_BODY if self.body is None else str(self.body)
+        body_file = DEFAULT_BODY
+        if self.body is not None:
+            body_file = str(self.body)
         with stage("fitting"):
             fixed = self.refinement.fixed_cameras
             fitted = fit_photos(
@@ -271,7 +272,9 @@ class Check:
             from humangs_jax.io.images import is_own_output
 
             # files that nobody named must not replace those of others
-            unasked = [sheet, *([self.out] if self.out == DEFAULT_SHEET else [])]
+            unasked = [sheet]
+            if self.out == DEFAULT_SHEET:
+                unasked.append(self.out)
             check_ours(unasked, is_own_output, "choose another name by --out, or move it away")
             from humangs_jax.capture.detection.people import available
             from humangs_jax.capture.fitting.files import UnknownViewError

@@ -56,7 +56,9 @@ def option_of(argument: str) -> str:
     """The option that an argument of the library comes from: "frame_ms" is --frame-ms; files are
     written to --out.
     """
-    return "--out" if argument == "path" else f"--{argument.replace('_', '-')}"
+    if argument == "path":
+        return "--out"
+    return f"--{argument.replace('_', '-')}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,20 +83,18 @@ class PartOfMotion:
         for name, value in vars(self).items():
             if value is not None:  # what begins with a dash would be taken for an option
                 text = str(value)
-                said += (
-                    [f"{option_of(name)}={text}"]
-                    if text.startswith("-")
-                    else [option_of(name), text]
-                )
+                if text.startswith("-"):
+                    said.append(f"{option_of(name)}={text}")
+                else:
+                    said += [option_of(name), text]
         return () if path is None else ("--motion", path, *said)
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
         """The motion of a file; None: the shipped walk. Raises: MotionError."""
         from humangs_jax.motion import load_motion
 
-        if path is None and (
-            said := [name for name, value in vars(self).items() if value is not None]
-        ):
+        said = [name for name, value in vars(self).items() if value is not None]
+        if path is None and said:
             raise UsageError(f"{option_of(said[0])}: expected --motion with it")
         up = self.motion_up or "auto"
         return load_motion(
@@ -153,7 +153,9 @@ def described(command: type[Any]) -> type[Any]:
         shown = _value_shown(kind)
         if positional and get_origin(kind) is not Literal:
             name = field.name.upper()
-            shown = name if field.default is dataclasses.MISSING else f"[{name}]"
+            shown = name
+            if field.default is not dataclasses.MISSING:
+                shown = f"[{name}]"
         quiet = field.default in (None, ()) or kind is bool
         seen = arg(metavar=shown, help_behavior_hint="" if quiet else None)
         command.__annotations__[field.name] = Annotated[hint, seen]
@@ -197,7 +199,9 @@ def _value_shown(kind: Any) -> str | None:
         return "{" + ",".join(map(str, get_args(kind))) + "}"
     if get_origin(kind) in (Union, UnionType):
         parts = [_value_shown(part) for part in get_args(kind) if part is not type(None)]
-        return None if None in parts else "|".join(part for part in parts if part)
+        if None in parts:
+            return None
+        return "|".join(part for part in parts if part)
     return _VALUES.get(kind)
 
 
@@ -214,7 +218,8 @@ def check_options(command: Any) -> None:
     places = {name: place for name, hint in hints.items() for place in marks_in(hint, Place)}
     read = [getattr(command, name) for name in hints if name not in places]
     for name in hints:
-        if dataclasses.is_dataclass(value := getattr(command, name)):
+        value = getattr(command, name)
+        if dataclasses.is_dataclass(value):
             check_options(value)
             continue
         try:
@@ -222,7 +227,8 @@ def check_options(command: Any) -> None:
         except ValueError as error:
             raise UsageError(str(error)) from None
     for name, place in places.items():
-        if (path := getattr(command, name)) is not None:
+        path = getattr(command, name)
+        if path is not None:
             require_place(
                 path, option_of(name), place, [each for each in read if isinstance(each, Path)]
             )
@@ -316,7 +322,10 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
     """
     from humangs_jax.io.atomic import contents
 
-    if (unless is None or folder.resolve() != unless.resolve()) and (found := contents(folder)):
+    if unless is not None and folder.resolve() == unless.resolve():
+        return
+    found = contents(folder)
+    if found:
         say(f"--overwrite: once the work is done, {folder} is replaced; this is deleted: {found}")
 
 
@@ -335,9 +344,9 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
         raise UsageError(
             f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"'
         )
-    return (
-        {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
-    )
+    if in_steps:
+        return {"steps": int(number), "seconds": None}
+    return {"steps": None, "seconds": number}
 
 
 def first_refinement(text: str | None) -> dict[str, Any] | None:
@@ -346,7 +355,9 @@ def first_refinement(text: str | None) -> dict[str, Any] | None:
     """
     if text is None:
         return ITERATIONS_ALONE
-    return None if text == "0" else refine_limits(text, "--refine")
+    if text == "0":
+        return None
+    return refine_limits(text, "--refine")
 
 
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":
@@ -379,7 +390,8 @@ def shard_of(text: str) -> tuple[int, int]:
 
 def cores(workers: int | None) -> int:
     """That many processes, by default one for each core that this one may use."""
-    available = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    if hasattr(os, "sched_getaffinity"):
+        available = len(os.sched_getaffinity(0))
+    else:
+        available = os.cpu_count() or 1
     return available if workers is None else workers

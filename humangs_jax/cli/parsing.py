@@ -32,10 +32,8 @@ def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
     asked_for_help = "--help" in words or "-h" in words
     said = io.StringIO()
     try:
-        with (
-            contextlib.redirect_stderr(said),
-            contextlib.nullcontext() if asked_for_help else _wide_screen(),
-        ):
+        screen = contextlib.nullcontext() if asked_for_help else _wide_screen()
+        with contextlib.redirect_stderr(said), screen:
             return tyro.cli(
                 command, prog=f"humangs {name}", args=words, config=(tyro.conf.FlagCreatePairsOff,)
             )
@@ -68,20 +66,24 @@ def _one_line(command: type[Any], name: str, words: Sequence[str], lines: list[s
     """What is wrong with the words, after what tyro says in these lines."""
     text = " ".join(line.strip() for line in lines)
     example = f"as in `{command.examples[0]}`"
-    if match := re.search(
-        r"[Ii]nvalid choice '(?P<given>.*?)' for argument '(?P<option>.*?)'", text
-    ):
+    match = re.search(r"[Ii]nvalid choice '(?P<given>.*?)' for argument '(?P<option>.*?)'", text)
+    if match:
         return _wrong_value(command, match["option"], match["given"])
-    if match := re.search(r"Error parsing (?P<option>[\w-]+): ", text):
+    match = re.search(r"Error parsing (?P<option>[\w-]+): ", text)
+    if match:
         return _wrong_value(command, match["option"], _value_after(words, match["option"]))
-    if match := re.search(r"Missing value for argument '(?P<option>.*?)'", text):
+    match = re.search(r"Missing value for argument '(?P<option>.*?)'", text)
+    if match:
         return _no_value(command, match["option"], words)
-    if match := re.search(r"Unrecognized options: (?P<given>.*?) (For full|$)", f"{text} "):
+    match = re.search(r"Unrecognized options: (?P<given>.*?) (For full|$)", f"{text} ")
+    if match:
         return f"{match['given']}: not expected here, {example}"
     if "Missing from" in text:
         missing = _missing(lines)
-        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if missing[1:] else missing)
-        return f"{listed} {'are' if missing[1:] else 'is'} missing, {example}"
+        listed, verb = missing, "is"
+        if len(missing) > 1:
+            listed, verb = [", ".join(missing[:-1]), missing[-1]], "are"
+        return f"{' and '.join(listed)} {verb} missing, {example}"
     plain = re.sub(r"For full helptext.*", "", text).strip()
     return f"{plain}: `humangs {name} --help` lists the options, {example}"
 
@@ -113,7 +115,10 @@ def _value_after(words: Sequence[str], option: str) -> str:
 def _wrong_value(command: type[Any], option: str, given: str) -> str:
     choices = _choices(_kind(command, option))
     near = difflib.get_close_matches(given, choices, n=1)
-    hint = f": did you mean {shlex.quote(near[0])}?" if near else _usual(command, option)
+    if near:
+        hint = f": did you mean {shlex.quote(near[0])}?"
+    else:
+        hint = _usual(command, option)
     return f"{_shown(option)} {given}: expected {_expected(command, option)}{hint}"
 
 
@@ -121,12 +126,12 @@ def _no_value(command: type[Any], option: str, words: Sequence[str]) -> str:
     """An option without a value; what follows it looks like an option, as negative numbers and axes
     do.
     """
-    following = words[words.index(option) + 1 :] if option in words else []
-    joined = (
-        f", as in {option}={following[0]}"
-        if following and following[0][1:2] not in ("", "-")
-        else ""
-    )
+    following = []
+    if option in words:
+        following = words[words.index(option) + 1 :]
+    joined = ""
+    if following and following[0][1:2] not in ("", "-"):
+        joined = f", as in {option}={following[0]}"
     return f"{option}: expected {_expected(command, option)} after it{joined}"
 
 
@@ -135,11 +140,9 @@ def _usual(command: type[Any], option: str) -> str:
     usual = next(
         (field.default for field, _ in fields_of(command) if option_of(field.name) == option), None
     )
-    return (
-        f", such as {option} {usual}"
-        if isinstance(usual, int | float) and not isinstance(usual, bool)
-        else ""
-    )
+    if isinstance(usual, int | float) and not isinstance(usual, bool):
+        return f", such as {option} {usual}"
+    return ""
 
 
 def _shown(option: str) -> str:
@@ -153,11 +156,10 @@ def _expected(command: type[Any], option: str) -> str:
     words = [*numbers, *_choices(kind)]
     if not words:
         return "a value"
-    return (
-        words[0]
-        if len(words) == 1
-        else f"{'' if numbers else 'one of '}{', '.join(words[:-1])} or {words[-1]}"
-    )
+    if len(words) == 1:
+        return words[0]
+    listed = f"{', '.join(words[:-1])} or {words[-1]}"
+    return listed if numbers else f"one of {listed}"
 
 
 def _kind(command: type[Any], option: str) -> Any:

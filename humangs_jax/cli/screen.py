@@ -76,14 +76,18 @@ def end_within_seconds() -> None:
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
     def watch():
-        while number := os.read(reader, 1):
+        while True:
+            number = os.read(reader, 1)
+            if not number:
+                break
             if signal.getsignal(number[0]) is end:
                 os.kill(os.getpid(), signal.SIGINT)
             if number[0] != signal.SIGINT or signal.getsignal(signal.SIGINT) is not interrupt:
                 continue
             time.sleep(PATIENCE)
             if not heard.is_set():
-                if atomic := sys.modules.get("humangs_jax.io.atomic"):  # not imported now
+                atomic = sys.modules.get("humangs_jax.io.atomic")  # not imported now
+                if atomic:
                     atomic.remove_unfinished()
                 os.write(2, b"\nhumangs: interrupted\n")
                 os._exit(INTERRUPTED)
@@ -147,9 +151,10 @@ def silence(verbose: bool) -> None:
     sys.excepthook = lambda *what: say(
         "".join(traceback.format_exception(*what)).rstrip(), error=True
     )
-    show = lambda *what, file=None, line=None: say(
-        warnings.formatwarning(*what[:4], line).rstrip(), error=True
-    )
+
+    def show(*what, file=None, line=None):
+        return say(warnings.formatwarning(*what[:4], line).rstrip(), error=True)
+
     warnings.showwarning = show  # ty: ignore[invalid-assignment]
     for stream in (sys.stdout, sys.stderr):  # what others print, such as --help; it may be no file
         if isinstance(stream, io.TextIOWrapper):

@@ -182,7 +182,9 @@ class Start:
         """Raises: UsageError if the body of the earlier run was made with other options than this
         run has.
         """
-        earlier = mark.get("options") if isinstance(mark, dict) else None
+        earlier = None
+        if isinstance(mark, dict):
+            earlier = mark.get("options")
         if not isinstance(earlier, dict):  # of a version that did not record them
             return
         for name, value in self._decisive().items():
@@ -218,7 +220,9 @@ class Start:
             self._from_photos_alone(material, limits)
             return
         # with cameras: import them, and name what is still to be made
-        report = self._import(material) if material.cameras is not None else None
+        report = None
+        if material.cameras is not None:
+            report = self._import(material)
         changed = report is not None and (report.undistorted or report.turned or report.heic)
         masked = self.without_masks or (report is not None and report.masks)
         needed = missing(material, self.out / "images" if changed else None)
@@ -291,19 +295,21 @@ class Start:
         from humangs_jax.apps.detect import KEYPOINTS_FILE, MASKS
 
         keypoints = material.keypoints or self.out / KEYPOINTS_FILE
-        return dataclasses.replace(
-            material, keypoints=keypoints, masks=self.out / MASKS if masks else material.masks
-        )
+        if masks:
+            material = dataclasses.replace(material, masks=self.out / MASKS)
+        return dataclasses.replace(material, keypoints=keypoints)
 
     def _photos(self) -> Path:
         """The folder of photos; that of a video is beside --out."""
         from humangs_jax.apps.video_photos import photos_of_video, video_of
 
-        if (video := video_of(self.photos)) is None:
+        video = video_of(self.photos)
+        if video is None:
             return self.photos
         out = self.out if self.out.name not in ("", "..") else self.out.resolve()
         with stage("choosing frames of the video"):
-            told = photos_of_video(video, folder := out.with_name(f"{out.name}_photos"))
+            folder = out.with_name(f"{out.name}_photos")
+            told = photos_of_video(video, folder)
         tell(told)
         return folder
 
@@ -406,7 +412,8 @@ class Start:
             keypoints = keypoints_of(
                 photos, material.keypoints, None if found_here else self.person
             )
-            if photos.calibrated and (against := find_contradiction(photos, keypoints)):
+            against = find_contradiction(photos, keypoints) if photos.calibrated else None
+            if against:
                 raise ValueError(
                     f"{material.cameras}: {against}: correct it, or go on without it by"
                     " --cameras ignore"
@@ -420,9 +427,10 @@ class Start:
         if capture.masks is not None and (capture.masks > 0.5).any():
             with stage("refining the body by the masks"):
                 # calibrated ones move where the keypoints have shown that they are off
-                fixed = (
-                    not fitted.camera_errors if capture.calibrated else cameras_are_unseen(capture)
-                )
+                if capture.calibrated:
+                    fixed = not fitted.camera_errors
+                else:
+                    fixed = cameras_are_unseen(capture)
                 bodies = [
                     refine_capture(
                         capture,

@@ -234,11 +234,9 @@ class Train:
             body = file_body.model
         with stage("finding people"):
             people = training_people(self.data, self.on_the_fly, self.out, body, file_body.file)
-            others = (
-                ()
-                if self.validation is None
-                else people_on_disk(self.validation, file_body, split=None)
-            )
+            others = ()
+            if self.validation is not None:
+                others = people_on_disk(self.validation, file_body, split=None)
         if self.diagnose:
             with stage("diagnosing"):
                 diagnosis = diagnose_run(
@@ -314,7 +312,10 @@ class Convert:
 
         with stage("reading"):
             # loss networks are read only if they are asked for
-            networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
+            if losses is None:
+                networks, names = {}, []
+            else:
+                networks, names = collect_loss_networks(checkpoint)
             converted = load_checkpoint(checkpoint, self.head_width)
         with stage("writing"):
             # shapes do not tell how features are pooled: the option does
@@ -418,7 +419,8 @@ class Evaluate:
         # LPIPS of each backbone whose files are given
         networks = []
         for net in ("vgg", "alex", "squeeze"):
-            if found := getattr(self.lpips, f"lpips_{net}"):
+            found = getattr(self.lpips, f"lpips_{net}")
+            if found:
                 if len(found) > 2:
                     raise UsageError(
                         f"--lpips-{net}: expected a backbone and at most one file of heads, got"
@@ -427,7 +429,8 @@ class Evaluate:
                 networks.append(load_lpips(net, *found))
         # scores of an interrupted run of the same command are used again
         keep = self._kept()
-        if keep is not None and (scored := len(list(keep.glob("person_*.json")))):
+        scored = 0 if keep is None else len(list(keep.glob("person_*.json")))
+        if scored:
             tell(f"going on: {scored} {'person is' if scored == 1 else 'people are'} scored")
         with stage("evaluating"):
             result = evaluate(
@@ -467,12 +470,13 @@ class Evaluate:
         named += [file for files in vars(self.lpips).values() for file in files]
         said: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None]
         for path in named:
-            files = [] if path is None else [path, *sorted(path.rglob("*"))]
-            said += [
-                (str(file.resolve()), (stat := file.stat()).st_size, stat.st_mtime_ns)
-                for file in files
-                if file.exists()
-            ]
+            files = []
+            if path is not None:
+                files = [path, *sorted(path.rglob("*"))]
+            for file in files:
+                if file.exists():
+                    stat = file.stat()
+                    said.append((str(file.resolve()), stat.st_size, stat.st_mtime_ns))
         try:
             root = user_cache() / "humangs_jax" / "evaluations"
             folder = root / hashlib.sha256(repr(said).encode()).hexdigest()[:16]
