@@ -171,7 +171,9 @@ def pack(
 
 def _low_pass(avatar: Avatar) -> float:
     """Metres; one for all Gaussians, whose photos were taken from similar distances. 0: none."""
-    return 0.0 if avatar.gaussians.low_pass is None else float(np.median(avatar.gaussians.low_pass))
+    if avatar.gaussians.low_pass is None:
+        return 0.0
+    return float(np.median(avatar.gaussians.low_pass))
 
 
 def largest_weights(
@@ -329,7 +331,8 @@ def page_html(
         walk = load_motion()
         motion = walk if walk.rotations.shape[1] == len(avatar.parents) else None
     if motion is not None and motion.rotations.shape[1] == len(avatar.parents):
-        motion = motion.at_rate(LARGEST_FPS) if motion.fps > LARGEST_FPS else motion
+        if motion.fps > LARGEST_FPS:
+            motion = motion.at_rate(LARGEST_FPS)
         motion = grounded(
             motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents
         )
@@ -454,7 +457,9 @@ def known_body(avatar: Avatar) -> BodyModel | None:
     if len(avatar.rest_vertices) != len(body.template):
         body = gaussian_body(body, shipped_network())
     same = np.array_equal(body.faces, avatar.faces) and avatar.gaussians_per_vertex is not None
-    return body if same and fitted_shape(avatar, body) is not None else None
+    if same and fitted_shape(avatar, body) is not None:
+        return body
+    return None
 
 
 def page_script(*names: str) -> str:

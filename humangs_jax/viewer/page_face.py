@@ -52,7 +52,10 @@ def pack_face(
     arrays["face_eyes"] = np.rint(255 * eyes).astype("u1")
     # sliders of shape move a hidden Gaussian with the vertex that is nearest
     tree = KDTree(np.asarray(avatar.rest_vertices))
-    nearest = tree.query(np.asarray(face.hidden.means))[1] if hidden else np.zeros(0)
+    if hidden:
+        nearest = tree.query(np.asarray(face.hidden.means))[1]
+    else:
+        nearest = np.zeros(0)
     arrays["face_vertices"] = nearest.astype("<u2")
     # what is in the mouth is shown by the gap between the lips, the rest by an expression
     shown = np.asarray(face.hidden_shown)
@@ -69,7 +72,9 @@ def pack_face(
         "eyes": [avatar.joint_names.index(name) for name in EYES],
     }
     # the motion's coefficients, in 16 bits as its rotations
-    faces = None if motion is None else motion.expressions_of(names)
+    faces = None
+    if motion is not None:
+        faces = motion.expressions_of(names)
     if faces is not None:
         values = np.asarray(faces, np.float64)
         scale = max(float(np.abs(values).max()), 1.0) / 32767
