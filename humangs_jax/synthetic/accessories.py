@@ -55,10 +55,16 @@ def build(
     if kind in ("glasses", "sunglasses"):
         return glasses(anatomy, garment)
     if kind == "necklace":
-        metal = color(0.12, 0.5, 0.75) if fabric.rng(2).random() < 0.5 else color(0.6, 0.04, 0.72)
+        if fabric.rng(2).random() < 0.5:
+            metal = color(0.12, 0.5, 0.75)
+        else:
+            metal = color(0.6, 0.04, 0.72)
         return [(necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
     if kind in ("cap", "brim_hat"):
-        shell = hat(0.016, 0.0, crown=0.008) if kind == "cap" else hat(0.017, 0.0, crown=0.05)
+        if kind == "cap":
+            shell = hat(0.016, 0.0, crown=0.008)
+        else:
+            shell = hat(0.017, 0.0, crown=0.05)
         albedo = functools.partial(_panelled if kind == "cap" else _ribboned, fabric)
         return [(join([shell, hat_edge(rng, anatomy, garment)]), Material(albedo, wrinkles=0.05))]
     if kind == "scarf":
@@ -226,9 +232,11 @@ def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Su
         droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
     else:
         backwards, across = garment.sizes["backwards"] > 0, np.linspace(-1, 1, 15)
-        chosen = ((RING // 2 if backwards else 0) + np.arange(-7, 8)) % RING
+        middle = RING // 2 if backwards else 0
+        chosen = (middle + np.arange(-7, 8)) % RING
         start = ring[chosen] + out[chosen] * 0.011
-        out = unit(np.tile(-FORWARD if backwards else FORWARD, (15, 1)) + 0.25 * out[chosen])
+        facing = -FORWARD if backwards else FORWARD
+        out = unit(np.tile(facing, (15, 1)) + 0.25 * out[chosen])
         widths = (0.030 + size * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
         droop = 0.010 + 0.016 * across**2
     start[:, 1] += 0.004
@@ -294,7 +302,9 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
     )
     parts.append(sweep(bridge, UP, wire, 6))
     glass = (lenses, _painted(color(0.08, 0.3, 0.06), 0.7))
-    made = [(parts, _painted(garment.fabric.base, 0.4)), *([glass] if dark else [])]
+    made = [(parts, _painted(garment.fabric.base, 0.4))]
+    if dark:
+        made.append(glass)
     return [
         (join([_on_head(anatomy, v, f, v - middle) for v, f in pieces]), material)
         for pieces, material in made
@@ -379,7 +389,8 @@ def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) 
     rings = []
     for y, i, extra in rows:
         radius = shape.radius(np.full(COLUMNS, levels[i]), circle(COLUMNS)) + ease + extra
-        radius = radius if rings else 0 * radius
+        if not rings:
+            radius = 0 * radius
         rings.append(
             surfaces.around(radius, circle(COLUMNS), np.full(COLUMNS, y), shape.centers[i])
         )

@@ -381,9 +381,8 @@ def _person(
 ) -> dict[str, np.ndarray]:
     """One subject's share of the bank, unpadded: name -> array."""
     subject = make_subject(seed, _shipped_body() if body is None else body)
-    baked = bake_subject(
-        subject, texture_size, 2 if texture_size <= 512 else 1
-    )  # fine patterns on coarse texels
+    supersample = 2 if texture_size <= 512 else 1  # fine patterns on coarse texels
+    baked = bake_subject(subject, texture_size, supersample)
     surface, atlas, materials = subject.surface, baked.atlas, subject.materials
     if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
         raise ValueError(
@@ -481,8 +480,8 @@ def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: st
 def mirrored_joints(names: tuple[str, ...]) -> tuple[int, ...]:
     """For each joint the one on the other side; joints in the middle are their own."""
     other = {"left": "right", "right": "left"}
-    swapped = [
-        f"{other[n.split('_')[0]]}_{n.split('_', 1)[1]}" if n.split("_")[0] in other else n
-        for n in names
-    ]
+    swapped = []
+    for name in names:
+        side, _, part = name.partition("_")
+        swapped.append(f"{other[side]}_{part}" if side in other else name)
     return tuple(names.index(name) for name in swapped)

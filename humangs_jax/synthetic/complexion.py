@@ -305,7 +305,9 @@ def _mouth_and_brows(
     # roots of the beard
     chin = {"none": 0.0, "stubble": 0.75}.get(haircut.beard, 0.9)
     if chin > 0:
-        kind = haircut.beard if haircut.beard in ("moustache", "goatee") else "full"
+        kind = "full"
+        if haircut.beard in ("moustache", "goatee"):
+            kind = haircut.beard
         jaw = np.clip((beard_field(template, kind) + 0.005) / 0.018, 0, 1) * (1 - lips)
         result = mix(
             result, 0.6 * tones.hair + 0.15 * result, np.clip(0.8 * chin * jaw * grain, 0, 1)

@@ -105,12 +105,11 @@ numbers.
 
 
 def _color_of(rng: np.random.Generator, ranges: Iterable[Sequence[float | int]]) -> Vector:
-    return color(
-        *(
-            rng.uniform(values[0], values[1]) if len(values) == 2 else rng.choice(values)
-            for values in ranges
-        )
-    )
+    numbers = [
+        rng.uniform(values[0], values[1]) if len(values) == 2 else rng.choice(values)
+        for values in ranges
+    ]
+    return color(*numbers)
 
 
 def random_color(rng: np.random.Generator) -> Vector:
@@ -273,7 +272,9 @@ def checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> P
         0.5 * (_lines(s.around, period, period / 2) + _lines(s.along, period, period / 2)),
     )
     lines = np.maximum(_lines(s.around, period, 0.004, 0.25), _lines(s.along, period, 0.004, 0.25))
-    return mix(result, third, 0.7 * lines) if tartan else result
+    if tartan:
+        return mix(result, third, 0.7 * lines)
+    return result
 
 
 def dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
@@ -305,7 +306,8 @@ def flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
 def mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Camouflage, batik, tie-dye: thresholded or soft noise."""
     scale, seed = rng.choice([0.03, 0.06, 0.1]), _seed(rng)
-    width, third = 0.02 if rng.random() < 0.5 else 0.2, accent(rng, other)
+    width = 0.02 if rng.random() < 0.5 else 0.2
+    third = accent(rng, other)
     p = s.cloth[:, :3] / scale
     n = 0.65 * lattice(p, seed) + 0.35 * lattice(2.1 * p, seed + 1)
     first = np.clip((n - 0.47) / width + 0.5, 0, 1)

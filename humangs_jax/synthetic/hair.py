@@ -107,14 +107,18 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
         odds["bald"] *= 3.0
     cut = drawn(rng, odds | (dict.fromkeys(NOT_UNDER_HEADWEAR, 0) if headwear else {}))
     thickness = row(rng, {name: value[2] for name, value in CUTS.items()}, cut)
-    thickness = min(thickness, 0.010) if headwear else thickness
+    if headwear:
+        thickness = min(thickness, 0.010)
     # bottom and waves matter to long hair only
     bottom = rng.uniform(0.15, 0.2) if cut == "bob" else rng.uniform(-0.17, 0.1)
     wave = rng.choice([rng.uniform(0.002, 0.004), rng.uniform(0.006, 0.014)], p=[0.55, 0.45])
-    receding = (
-        rng.uniform(-0.004, 0.012 + 0.012 * (years > 45)) if male else rng.uniform(-0.006, 0.004)
-    )
-    beard = drawn(rng, BEARDS) if male and years > 17 else "none"
+    if male:
+        receding = rng.uniform(-0.004, 0.012 + 0.012 * (years > 45))
+    else:
+        receding = rng.uniform(-0.006, 0.004)
+    beard = "none"
+    if male and years > 17:
+        beard = drawn(rng, BEARDS)
     long = 0.35 if rng.random() < 0.8 else 1.0
     fringe, side = drawn(rng, FRINGES), float(rng.choice([-1, 1]))
     beard_length = rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016)
@@ -184,7 +188,9 @@ def style(
         )
     elif kind not in ("buzz", "bald"):
         bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
-        quiff = rng.uniform(0.012, 0.026) if kind == "quiff" else 0.0
+        quiff = 0.0
+        if kind == "quiff":
+            quiff = rng.uniform(0.012, 0.026)
         side, shift = haircut.side * parted, haircut.receding
         parts.append(
             scalp_shell(
@@ -364,7 +370,8 @@ def tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float
     apart.
     """
     start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[HEAD, 2] - 0.105])
-    rows, columns = 40 if knots else 16, 14
+    rows = 40 if knots else 16
+    columns = 14
     t = np.linspace(0, 1, rows)
     sway = 0.012 * np.sin(3 * t + rng.uniform(0, 6)) * t
     line = start + np.stack(

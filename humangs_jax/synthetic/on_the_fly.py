@@ -303,7 +303,9 @@ def _views(
         return *draw_view(bank, scene, pose, camera, config), camera
 
     poses = plan[2]
-    batch = None if config.views_at_once == 1 else min(config.views_at_once, len(poses))
+    batch = None
+    if config.views_at_once != 1:
+        batch = min(config.views_at_once, len(poses))
     images, masks, depths, found = lax.map(view, plan, batch_size=batch)
     rotations = scene.rotations[poses]
     translations = scene.translations[poses]

@@ -323,7 +323,10 @@ def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[G
     name = drawn(rng, {name: style.men if male else style.women for name, style in STYLES.items()})
     style = STYLES[name]
     outer = rng.random() < style.outer
-    worn = _dress(rng, outer) if name == "dressed" else _separates(rng, name, male, outer)
+    if name == "dressed":
+        worn = _dress(rng, outer)
+    else:
+        worn = _separates(rng, name, male, outer)
     worn += _fastened(rng, name, male, worn)
     if outer:
         worn.append(_outer(rng, style, worn))
@@ -346,7 +349,8 @@ def _made(
 def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> list[Garment]:
     style = STYLES[name]
     kind = drawn(rng, style.tops)
-    kind = "shirt" if male and kind == "blouse" else kind
+    if male and kind == "blouse":
+        kind = "shirt"
     tucked = rng.random() < style.tucked and kind not in ("hoodie", "jersey")
     waist = rng.uniform(-0.235, -0.212)
     top = _top(rng, name, kind, male, waist, tucked, outer)
@@ -468,11 +472,16 @@ def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
 
 def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
     kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
-    end = rng.uniform(-1.14, -0.85) if kind == "long_dress" else rng.uniform(-0.78, -0.56)
+    if kind == "long_dress":
+        end = rng.uniform(-1.14, -0.85)
+    else:
+        end = rng.uniform(-0.78, -0.56)
     sleeve = float(
         drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25)))
     )
-    neck = "collar" if kind == "shirt_dress" else drawn(rng, {"crew": 1, "vee": 1.3, "scoop": 1.3})
+    neck = "collar"
+    if kind != "shirt_dress":
+        neck = drawn(rng, {"crew": 1, "vee": 1.3, "scoop": 1.3})
     sizes = {
         "sleeve": sleeve,
         "waist": rng.uniform(-0.235, -0.165),
@@ -581,7 +590,10 @@ def _extras(
         )
     # at most one kind of headwear, chosen by one number
     left = rng.random()
-    for kind, odds in (style.headwear if male else {**style.headwear, "headscarf": 0.06}).items():
+    headwear = style.headwear
+    if not male:
+        headwear = {**headwear, "headscarf": 0.06}
+    for kind, odds in headwear.items():
         if left < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
             put(
                 kind,

@@ -294,7 +294,9 @@ def bend_arm(
     """
     matrix, vector = kin.rotation_matrix, kin.rotation_vector
     collar, shoulder, elbow, wrist = ARMS[side]
-    mirror, n, wanted = np.ones(3) if side == 0 else kin.MIRROR, CANDIDATES, GOALS[goal]
+    mirror = np.ones(3) if side == 0 else kin.MIRROR
+    n = CANDIDATES
+    wanted = GOALS[goal]
     rotations[collar] = (
         np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
     )
@@ -307,7 +309,10 @@ def bend_arm(
     about_both = np.stack(
         [forward[:, 1], down[:, 1], down[:, 2]], 1
     )  # a hanging arm swings about the axis of both shoulders
-    swing = matrix(about_both) if goal == "hang" else matrix(forward) @ matrix(down)
+    if goal == "hang":
+        swing = matrix(about_both)
+    else:
+        swing = matrix(forward) @ matrix(down)
     upper = vector(swing @ matrix(twist)) * mirror
     lower = vector(matrix(flex) @ matrix(pronation)) * mirror
 
@@ -418,7 +423,10 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
     """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a
     random gesture.
     """
-    first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
+    if side == 0:
+        first, mirror = kin.LEFT_HAND, np.ones(3)
+    else:
+        first, mirror = kin.RIGHT_HAND, kin.MIRROR
     goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
     blends = (
         (1 - t) * np.asarray(a) + t * np.asarray(b)

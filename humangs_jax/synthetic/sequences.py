@@ -133,9 +133,10 @@ def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
 
 def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: Gait) -> Moves:
     start = rng.uniform(0, 1)
-    begin_heading = (
-        rng.uniform(-np.pi, np.pi) if abs(gait.step) < 0.1 * build.leg else rng.uniform(-0.7, 0.7)
-    )
+    if abs(gait.step) < 0.1 * build.leg:
+        begin_heading = rng.uniform(-np.pi, np.pi)
+    else:
+        begin_heading = rng.uniform(-0.7, 0.7)
     phase = start + gait.cadence * (np.arange(frames) / FPS)  # strides; two steps each
 
     def heading(p):
@@ -211,9 +212,10 @@ def _foot_at(
         u = share / STANCE_SHARE
         rise = np.clip((u - FLAT_UNTIL) / (1 - FLAT_UNTIL), 0.0, 1.0)  # from rest to full motion
         late = off * (rise**2 * (3 - rise) / 2)
-        return dataclasses.replace(
-            here, pitch=float(-strike * (1 - _ease(u / FLAT_FROM)) if u < FLAT_FROM else late)
-        )
+        pitch = late
+        if u < FLAT_FROM:
+            pitch = -strike * (1 - _ease(u / FLAT_FROM))
+        return dataclasses.replace(here, pitch=float(pitch))
     u = (share - STANCE_SHARE) / (1 - STANCE_SHARE)
     s = _ease(u)
     at = (
@@ -319,9 +321,9 @@ def _key_pose(
     be).
     """
     rotations = np.zeros((kin.JOINTS, 3))
-    sink = stance.sink * build.leg + (
-        rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0
-    )
+    sink = stance.sink * build.leg
+    if rng.random() < 0.3:
+        sink += rng.uniform(0.05, 0.3) * build.leg
     stooped = sink / build.leg
     tilt, aside = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
     turn = kin.turned(y=heading + aside) @ kin.turned(x=tilt, z=stance.roll)

@@ -185,16 +185,18 @@ def sample_shape(
     at = {name: i for i, name in enumerate(body.shape_names)}
     betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * SHAPE_STD
     betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
-    betas[at["age"]] = (years - YOUNG) / (OLD - YOUNG) if years > YOUNG else 0.03 * (years - YOUNG)
+    if years > YOUNG:
+        betas[at["age"]] = (years - YOUNG) / (OLD - YOUNG)
+    else:
+        betas[at["age"]] = 0.03 * (years - YOUNG)
     heavier = 0.25 * np.clip((years - 20) / 30, 0, 1)
     betas[at["weight"]] = np.clip(rng.normal(0.05 + heavier, 0.62), -1.0, 1.8)
     betas[at["muscle"]] = np.clip(rng.normal(0.1 - 0.4 * (years > 60), 0.6), -1.0, 1.5)
     mean, std = HEIGHTS[male]
     youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
     tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
-    wanted = np.clip(
-        mean - youth + std * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN
-    )
+    tallest = HEIGHT_RANGE[1] if male else TALLEST_WOMAN
+    wanted = np.clip(mean - youth + std * tall, HEIGHT_RANGE[0], tallest)
     *_, stature, gains = _host_arrays(body)
     lengths = [at[name] for name in LENGTHS]
     betas[lengths] += (
@@ -250,7 +252,8 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
     """
     if (body.name, len(body.template)) != BODY:
         raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
-    person = describe(seed, body) if person is None else person
+    if person is None:
+        person = describe(seed, body)
     rest = _shape(body, jnp.asarray(person.betas))
     # the body is measured at rest, and dressed from the inside out
     template, faces, weights, *_ = _host_arrays(body)
@@ -323,7 +326,9 @@ def _hair(
 ) -> list[wardrobe.Piece]:
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
-    haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut
+    haircut = person.haircut
+    if hooded:
+        haircut = dataclasses.replace(person.haircut, cut="buzz")
     pieces = [
         wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)
     ]

@@ -66,7 +66,8 @@ class Folds:
         directions: int = 6,
         upright: bool = False,
     ):
-        tilt = rng.uniform(*((1.25, 1.57) if upright else (0.5, 1.5)), directions)
+        low, high = (1.25, 1.57) if upright else (0.5, 1.5)
+        tilt = rng.uniform(low, high, directions)
         turn = rng.uniform(0, 2 * np.pi, directions)
         k = np.stack([np.sin(tilt) * np.cos(turn), np.cos(tilt), np.sin(tilt) * np.sin(turn)], -1)
         self.directions = k.astype(np.float32)
@@ -306,9 +307,8 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
     Counter-clockwise seen from the side where columns run to the right and rows run down.
     """
-    row, column = np.meshgrid(
-        np.arange(rows - 1), np.arange(columns if closed else columns - 1), indexing="ij"
-    )
+    gaps = columns if closed else columns - 1
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(gaps), indexing="ij")
     right = (column + 1) % columns
     a, b = row * columns + column, row * columns + right
     c, d = (row + 1) * columns + column, (row + 1) * columns + right
@@ -432,7 +432,10 @@ def boundaries(
     """
     directions = np.stack([np.sin(_GRID), np.cos(_GRID)])
     support = np.full((len(levels), ANGLES), EMPTY)
-    found = np.zeros((len(levels), 2)) if centers is None else np.asarray(centers, float)
+    if centers is None:
+        found = np.zeros((len(levels), 2))
+    else:
+        found = np.asarray(centers, float)
     order = np.argsort(along, kind="stable")
     along, across = along[order], across[order]
     starts, ends = np.searchsorted(along, levels - window), np.searchsorted(along, levels + window)

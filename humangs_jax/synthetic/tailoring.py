@@ -80,9 +80,9 @@ def sleeves(template: Points, end: float) -> Field:
     armpit.
     """
     x, y = np.abs(template[:, 0]), template[:, 1]
-    return (
-        end + 1.6 * np.maximum(0.03 - y, 0) - x if end < 0.2 else np.where(y > -0.1, end - x, 0.5)
-    )
+    if end < 0.2:
+        return end + 1.6 * np.maximum(0.03 - y, 0) - x
+    return np.where(y > -0.1, end - x, 0.5)
 
 
 def above(template: Points, level: float) -> Field:
@@ -257,9 +257,8 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
     )
     angle, radius = polar(points[:, [0, 2]], np.zeros((1, 2)))
     wanted = hanging(anatomy.trunk, fit.hang).radius(points[:, 1], angle) + fit.ease
-    grown = radius + (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit * np.maximum(
-        wanted - radius, 0
-    )
+    share = (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit
+    grown = radius + share * np.maximum(wanted - radius, 0)
     points = points.astype(np.float64)
     points[:, [0, 2]] *= (grown / np.maximum(radius, 1e-4))[:, None]
     for side, sign in ((0, 1), (1, -1)):

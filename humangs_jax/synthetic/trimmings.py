@@ -161,7 +161,9 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     number, base = "number" in garment.details, garment.fabric.base
     ink = accent(rng, base)
     ink2 = accent(rng, ink)
-    kind = "number" if number else str(rng.choice(list(PRINTS), p=list(PRINTS.values())))
+    kind = "number"
+    if not number:
+        kind = str(rng.choice(list(PRINTS), p=list(PRINTS.values())))
     cells = bitmap(str(rng.integers(0, 100)) if number else random_text(rng))
     width = cells.shape[1] - 1
     cell = min(rng.uniform(0.17, 0.26) / width, 0.026 if number else 0.014)
@@ -206,7 +208,9 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     # the chest, and on the back mirrored, so that words can be read
     trunk, x, y = _trunk(s), 1.1 * s.template[:, 0], s.template[:, 1] - height
     result = motif(colors, x, y, trunk * (s.cloth[:, 2] > 0))
-    return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result
+    if on_back:
+        return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0))
+    return result
 
 
 def side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
@@ -247,7 +251,10 @@ def buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
     if garment.kind == "polo":
         low = 0.02
     dyed = rng.random() < 0.3
-    ink = accent(rng, garment.fabric.base) if dyed else color(0.1, 0.1, rng.choice([0.12, 0.8]))
+    if dyed:
+        ink = accent(rng, garment.fabric.base)
+    else:
+        ink = color(0.1, 0.1, rng.choice([0.12, 0.8]))
     pitch, size = rng.uniform(0.07, 0.1), rng.uniform(0.005, 0.0075)
     x, y = s.cloth[:, 0], s.cloth[:, 1]
     front = (s.cloth[:, 2] > 0) * _trunk(s) * band(y, low, high)

@@ -78,9 +78,8 @@ class Outfit:
 
     def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
         """Put one more piece on. layered: whether later layers can hide parts of it."""
-        self.pieces.append(
-            Piece(surface, material, np.zeros(len(surface.vertices), bool) if layered else None)
-        )
+        shown = np.zeros(len(surface.vertices), bool) if layered else None
+        self.pieces.append(Piece(surface, material, shown))
 
     def hide(self, cover: Cover, margin: float, cloth: bool = True) -> None:
         """Take away what lies further than a margin inside of a garment that is put on next: skin,
@@ -172,10 +171,14 @@ def _top(outfit: Outfit, garment: Garment) -> None:
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
     # looser tops stand off further, hang more, and have higher folds
+    # short sleeves stand away from the arm, and what hangs loose falls in other ways
+    least = 0.008 if "tucked" in details else 0.012
+    hang = outfit.rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0
+    wide = 0.035 if sleeve < 0.45 else 0.016
     fit = Fit(
-        ease=max((0.008 if "tucked" in details else 0.012) + 0.016 * loose, outfit.trunk + LAYER),
-        hang=outfit.rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0,
-        sleeve=0.003 + (0.035 if sleeve < 0.45 else 0.016) * loose,
+        ease=max(least + 0.016 * loose, outfit.trunk + LAYER),
+        hang=hang,
+        sleeve=0.003 + wide * loose,
         fold=0.0015 + 0.0055 * loose,
         inner=outfit.trunk + 0.5 * LAYER if outfit.trunk else 0.0,
         skirted=True,
@@ -183,7 +186,9 @@ def _top(outfit: Outfit, garment: Garment) -> None:
     stitches = sewn(garment, bottom + 0.018, sleeve - 0.016 if sleeve > 0.2 else None)
     material = Material(stitches, 0.25 + 0.45 * loose, sheen=0.04)
     # an open front is one more cut through the bodice
-    opening = [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
+    opening = []
+    if "open" in details:
+        opening = [(tailoring.front_opening, 0.03, 0.12)]
     _bodice(
         outfit,
         _neck(garment),
@@ -219,7 +224,7 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         ease=ease,
         hang=hang,
         sleeve=0.01 + 0.012 * loose,
-        fold=0.002 if padded or blazer else 0.002 + 0.003 * loose,
+        fold=0.002 + folds,
         hem=0.014,
         quilt=QUILT if padded else 0.0,
         skirted=True,
@@ -252,9 +257,8 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         edge, low = max(gap, 0.004), outfit.rng.uniform(-0.16, -0.08)
         strip = dataclasses.replace(fit, ease=ease + 0.006, fold=0.0, hem=0.005, inner=ease + 0.003)
         dark = Material(lambda s: 0.88 * stitches(s), sheen=0.06)  # seen against its pile
-        outfit.strip(
-            tailoring.lapel(outfit.template, edge, spread if gap > 0 else 0.0, low), strip, dark
-        )
+        wide = spread if gap > 0 else 0.0
+        outfit.strip(tailoring.lapel(outfit.template, edge, wide, low), strip, dark)
         _collar(outfit, dark, strip, 0.001, (0.12, 0.17, max(edge, 0.03)))
     elif "hood" in details or kind == "hooded_jacket":
         outfit.add(accessories.hood(outfit.rng, outfit.anatomy, False), material, layered=False)
@@ -270,12 +274,16 @@ def _trousers(outfit: Outfit, garment: Garment) -> None:
     top, end, loose, tucked = sizes["top"], sizes["end"], sizes["loose"], sizes["tucked"] > 0
     ease = outfit.trunk + 0.004 if tucked else 0.005
     hang = outfit.rng.choice([0.05, 0.1])
+    distance = 0.004 if kind == "leggings" and not tucked else ease
+    fold = 0.0025 + 0.0035 * loose
+    if kind in ("leggings", "slim"):
+        fold = 0.0012
     fit = Fit(
-        ease=ease if kind != "leggings" or tucked else 0.004,
+        ease=distance,
         hang=0.6,
         leg=sizes["width"],
         leg_hang=LEG_HANG.get(kind, hang),
-        fold=0.0012 if kind in ("leggings", "slim") else 0.0025 + 0.0035 * loose,
+        fold=fold,
         calm=9.0 if tucked else outfit.lowest + 0.02,
     )
     material = Material(sewn(garment, end + 0.018), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
@@ -354,9 +362,8 @@ def _socks(outfit: Outfit, garment: Garment) -> None:
 
 def _shoes(outfit: Outfit, garment: Garment) -> None:
     height, sole, over = (garment.sizes[name] for name in ("height", "sole", "over"))
-    material = Material(
-        lambda s: trimmings.leather(s, garment), sheen=0.2 if garment.kind != "sneakers" else 0.08
-    )
+    sheen = 0.2 if garment.kind != "sneakers" else 0.08
+    material = Material(lambda s: trimmings.leather(s, garment), sheen=sheen)
     if garment.kind == "sandals":
         outfit.add(
             accessories.pair_of_shoes(outfit.anatomy, 0.024, sole, 0.004), material, layered=False
@@ -402,7 +409,11 @@ def _watch(outfit: Outfit, garment: Garment) -> None:
 
 def _bag(outfit: Outfit, garment: Garment) -> None:
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
-    on_back, colors = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
+    on_back = garment.kind == "backpack"
+
+    def colors(s):
+        return trimmings.bagged(s, garment)
+
     if on_back:
         ease = outfit.trunk
         material = Material(colors, 0.1)

@@ -176,7 +176,9 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
     """One person as `layout` says. Written whole or not at all; an existing folder is replaced."""
     subject = make_subject(seed, body)
     # poses are independent, or evenly spaced frames of one motion
-    motion = sample_motion(subject, layout.frames) if layout.frames else None
+    motion = None
+    if layout.frames:
+        motion = sample_motion(subject, layout.frames)
     if motion is None:
         posed = [sample_pose(subject, i) for i in range(layout.poses)]
     else:
@@ -294,7 +296,8 @@ def _views(
 ) -> list[View]:
     """`count` views of each pose, from cameras that `place` finds."""
     rng, views = np.random.default_rng(stream), []
-    for frame, posed in enumerate(poses if count else ()):
+    shown = poses if count else ()
+    for frame, posed in enumerate(shown):
         cameras = place(rng, posed.vertices, spread_azimuths(rng, count), size)
         views += [View(frame, f"{frame}_{mark}{i:02d}", cameras[i]) for i in range(count)]
     return views
