@@ -134,17 +134,19 @@ def load_motion(
             path, "fps", f"expected a positive number of frames per second, got {fps}"
         )
     with reading(path, "motion", MotionError):
-        options = Reading(
-            None if fps is None else float(fps), person, None if clip is None else str(clip)
-        )
+        rate = None if fps is None else float(fps)
+        options = Reading(rate, person, None if clip is None else str(clip))
         return _load(Path(path), up, options, rest_joints)
 
 
 def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array | None) -> Motion:
     read = _reader(path)
-    body = lambda: (
-        skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
-    )
+
+    def body():
+        if rest_joints is None:
+            return skeleton.shipped_joints()
+        return np.asarray(rest_joints, np.float64)
+
     with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
         found = read(path, options)
         if isinstance(found, skeleton.Clip):
@@ -162,15 +164,18 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
         rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
     if not np.isfinite(rotations).all():
         raise MotionError(path, "", "expected rotations and a skeleton of finite size")
-    if (largest := np.abs(rotations).max()) > LARGEST_TURN:
+    largest = np.abs(rotations).max()
+    if largest > LARGEST_TURN:
         raise MotionError(
             path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}"
         )
-    if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
+    farthest = np.abs(translations).max()
+    if not farthest <= LARGEST_DISTANCE:
         limit = f"at most {LARGEST_DISTANCE:g} from the origin"
         raise MotionError(path, "", f"expected metres, {limit}, got {farthest:g}")
     check_limit("frames", len(rotations), "frames")
-    rate = rate if options.fps is None else options.fps
+    if options.fps is not None:
+        rate = options.fps
     check_limit("rate", rate, "frames per second")
     if rate < SLOWEST:
         raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
@@ -185,7 +190,8 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
     if isinstance(found, Poses) and found.frames is not None:
         motion, filled = _without_gaps(motion, found.frames, path)
         said = "; ".join(filter(None, (said, filled)))
-    if said := "; ".join(filter(None, (found.said, said))):
+    said = "; ".join(filter(None, (found.said, said)))
+    if said:
         logger.warning("%s: %s", path, said)
     return motion
 
@@ -220,7 +226,9 @@ def _reader(path: Path) -> MotionFormat:
     found = MOTIONS.recognized(path)
     if found is None and path.is_file() and not MOTIONS.of(path):
         with open_file(path) as file:
-            found = MOTIONS["humangs"] if file.read(2) == b"PK" else None
+            found = None
+            if file.read(2) == b"PK":
+                found = MOTIONS["humangs"]
     if found is None:
         got = path.suffix or "no suffix"
         hint = OTHERS.get(path.suffix.lower(), "")
@@ -234,7 +242,9 @@ def _reader(path: Path) -> MotionFormat:
 
 def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
     rotations, translations, usual = poses.rotations, poses.translations, poses.up
-    stands = None if poses.fixed else standing_axis(rotations[:, 0])
+    stands = None
+    if not poses.fixed:
+        stands = standing_axis(rotations[:, 0])
     if (
         stands in (None, usual) or len(joints := body()) != rotations.shape[1]
     ):  # another number is refused later

@@ -60,18 +60,15 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     # points in space are a skeleton; all others are rotations of a body
     if form.kind == "points":
         return clip_of_points(file, file.rate(form))
-    rotations = (
-        file.numbers(form.poses["all"], (None, None, 3))
-        if form.kind == "ours"
-        else _posed(file, form)
-    )
+    if form.kind == "ours":
+        rotations = file.numbers(form.poses["all"], (None, None, 3))
+    else:
+        rotations = _posed(file, form)
     moves = _placed(file, form, rotations)
     face = _face(file, form, len(rotations))
-    frames = (
-        person.frames
-        if person.frames is not None and len(person.frames) == len(rotations)
-        else None
-    )
+    frames = None
+    if person.frames is not None and len(person.frames) == len(rotations):
+        frames = person.frames
     return Poses(
         rotations,
         moves,
@@ -145,7 +142,9 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
 
 def _frames(person: Person) -> int:
     form = format_of(person.values)
-    return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys) if form else 0
+    if form:
+        return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys)
+    return 0
 
 
 # Rotations
@@ -164,16 +163,14 @@ def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
             )
             rotations = np.zeros((1 if single else len(values), len(JOINT_NAMES), 3))
         count = len(rotations)
-        flat = (
-            values.reshape(count, -1)
-            if count == 1 or len(np.atleast_1d(values)) == count
-            else np.zeros((count, 0))
-        )
-        part = (
-            _all(file, form, key, values, flat)
-            if place == "all"
-            else _part(file, place, key, values, flat)
-        )
+        if count == 1 or len(np.atleast_1d(values)) == count:
+            flat = values.reshape(count, -1)
+        else:
+            flat = np.zeros((count, 0))
+        if place == "all":
+            part = _all(file, form, key, values, flat)
+        else:
+            part = _part(file, place, key, values, flat)
         if (
             form.pivot == "origin" and place == "all"
         ):  # the root's own rotation, before that about the origin
@@ -196,15 +193,16 @@ def _part(
 ) -> Rotations:
     most, (count, width) = PLACES[place][1], flat.shape
     of_smpl = place in ("limbs", "body")
-    for joints in (most, most + 2) if of_smpl else (most,):
+    counts = (most, most + 2) if of_smpl else (most,)
+    for joints in counts:
         if width in (3 * joints, 9 * joints):
             return _axis_angles(file, key, flat, joints)[:, :most]
     if 3 * most == HAND_NUMBERS and 0 < width < HAND_NUMBERS:
         file.said.append(f"{key}: {NO_HANDS.format(width)}")
         return np.zeros((count, most, 3))
-    shapes = f"({count}, {3 * most})" + (
-        f", or ({count}, {3 * most + 6}) of SMPL" if of_smpl else ""
-    )
+    shapes = f"({count}, {3 * most})"
+    if of_smpl:
+        shapes += f", or ({count}, {3 * most + 6}) of SMPL"
     raise MotionError(file.path, key, f"expected shape {shapes}, got {values.shape}")
 
 
@@ -234,7 +232,10 @@ def _all(
         pose = _axis_angles(file, key, flat, joints)
         if joints < 52:  # the last two of 24 are whole hands, the last three of 25 jaw and eyes
             return pose if joints == 25 else pose[:, :22]
-        face = pose[:, 22:25] if joints == len(JOINT_NAMES) else np.zeros((count, 3, 3))
+        if joints == len(JOINT_NAMES):
+            face = pose[:, 22:25]
+        else:
+            face = np.zeros((count, 3, 3))
         return np.concatenate([pose[:, :22], face, pose[:, -30:]], axis=1)
     words = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
     joints = f", {width // 3} joints" if width % 3 == 0 else ""
@@ -280,11 +281,9 @@ def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float
         raise MotionError(file.path, key, f"expected shape ({count}, 3), got {moves.shape}")
     moves = moves.reshape(count, 3)
     if form.scaling is not None:
-        scale = (
-            float(file.numbers(form.scaling, None).reshape(-1)[0])
-            if form.scaling in file.values
-            else MILLIMETRES
-        )
+        scale = MILLIMETRES
+        if form.scaling in file.values:
+            scale = float(file.numbers(form.scaling, None).reshape(-1)[0])
         if not scale > 0:
             raise MotionError(file.path, form.scaling, f"expected a positive number, got {scale}")
         moves = moves / scale
@@ -319,9 +318,8 @@ def _cameras(
     """
     # one camera, or one of each frame
     if "cam2world" in file.values:
-        matrices = file.numbers(
-            "cam2world", (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)
-        ).reshape(-1, 4, 4)
+        shape = (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)
+        matrices = file.numbers("cam2world", shape).reshape(-1, 4, 4)
         turns, places = matrices[:, :3, :3], matrices[:, :3, 3]
     elif "pred_rotmat" in file.values:
         # cameras are in a file beside that of the person, for the frames in which the person was
@@ -336,10 +334,8 @@ def _cameras(
         camera = ArrayFile(beside, read_values(beside), error=MotionError)
         own = file.numbers(file.first(("frame", "frames")), (count,)).astype(int)
         kind = "world" if "world_cam_R" in camera else "pred"
-        turns, places = (
-            camera.numbers(f"{kind}_cam_R", (None, 3, 3)),
-            camera.numbers(f"{kind}_cam_T", (None, 3)),
-        )
+        turns = camera.numbers(f"{kind}_cam_R", (None, 3, 3))
+        places = camera.numbers(f"{kind}_cam_T", (None, 3))
         if own.min() < 0 or own.max() >= min(len(turns), len(places)):
             raise MotionError(
                 beside,
@@ -448,14 +444,13 @@ def _of_frames(
     file: Any, key: str, shape: tuple[int, ...], count: int | None = None
 ) -> Float[np.ndarray, "m ..."]:
     values = file.numbers(key, None)
-    values = values.reshape(1, *shape) if values.size == np.prod(shape) else values
+    if values.size == np.prod(shape):
+        values = values.reshape(1, *shape)
     if values.shape[1:] != shape and values.shape[2:] == shape and values.shape[1] == 1:
         values = values[:, 0]
-    return (
-        values
-        if values.shape == (count or len(values), *shape)
-        else file.numbers(key, (count, *shape))
-    )
+    if values.shape == (count or len(values), *shape):
+        return values
+    return file.numbers(key, (count, *shape))
 
 
 def _carried(

@@ -57,7 +57,8 @@ def read_bvh(path: Path, options: object = None) -> Clip:
     if text.split(maxsplit=1)[:1] != ["HIERARCHY"]:
         raise Refused("not a BVH file: expected HIERARCHY first")
     found = _MOTION.search(text)
-    names, parents, offsets, channels = _tree(text[: found.start() if found else len(text)])
+    end = found.start() if found else len(text)
+    names, parents, offsets, channels = _tree(text[:end])
     if found is None:
         raise Refused(
             "cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints"
@@ -84,7 +85,10 @@ def _tree(
 ) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "s 3"], list[list[str]]]:
     found = _WORD.finditer(text, len("HIERARCHY") + text.index("HIERARCHY"))
     words = ((match[1] or match[0], match[2]) for match in found)  # and the name that follows
-    number = lambda: _number(next(words)[0])
+
+    def number():
+        return _number(next(words)[0])
+
     names, parents, offsets, channels = [], [], [], []
     open_joints, waiting = [], None  # of the braces that are open; None for the end of a limb
     try:
@@ -125,9 +129,8 @@ def _tree(
     except StopIteration:
         raise Refused("cut short") from None
     if open_joints or waiting is not None or not names:
-        raise Refused(
-            "cut short: a brace of the joints is open" if names else "cut short: no joints"
-        )
+        what = "a brace of the joints is open" if names else "no joints"
+        raise Refused(f"cut short: {what}")
     if parents.count(-1) != 1:
         raise Refused(f"expected one ROOT, got {parents.count(-1)}")
     return tuple(names), tuple(parents), np.stack(offsets), channels
@@ -187,11 +190,10 @@ def _posed(
                 turn @ Rotation.from_euler(names[i][0], columns[:, [i]], degrees=True).as_matrix()
             )
         turns[:, joint] = turn if parent < 0 else turns[:, parent] @ turn
-        places[:, joint] = (
-            move
-            if parent < 0
-            else places[:, parent] + np.einsum("mab,mb->ma", turns[:, parent], move)
-        )
+        if parent < 0:
+            places[:, joint] = move
+        else:
+            places[:, joint] = places[:, parent] + np.einsum("mab,mb->ma", turns[:, parent], move)
     return turns, places
 
 
@@ -269,8 +271,12 @@ def _humanoid(content: dict[str, Any]) -> dict[int, str]:
     called anything.
     """
     extensions = content.get("extensions")
-    for each in extensions.values() if isinstance(extensions, dict) else ():
-        bones = each.get("humanoid", {}).get("humanBones", {}) if isinstance(each, dict) else {}
+    if not isinstance(extensions, dict):
+        extensions = {}
+    for each in extensions.values():
+        bones = {}
+        if isinstance(each, dict):
+            bones = each.get("humanoid", {}).get("humanBones", {})
         if isinstance(bones, list):  # of VRM 0
             bones = {str(bone.get("bone")): bone for bone in bones if isinstance(bone, dict)}
         named = {

@@ -69,7 +69,9 @@ def read_table(path: Path, options: Reading) -> Poses:
         lines = [row for row in rows if any(word.strip() for word in row)]
     except csv.Error as error:
         raise Refused(f"line {rows.line_num}: {error}") from None
-    names = [name.strip() for name in lines[0]] if lines else []
+    names = []
+    if lines:
+        names = [name.strip() for name in lines[0]]
     shapes = {arkit_name(name): i for i, name in reversed(list(enumerate(names)))}
     shapes.pop(None, None)
     if len(shapes) < FEWEST or len(names) > MOST_COLUMNS:
@@ -83,16 +85,19 @@ def read_table(path: Path, options: Reading) -> Poses:
         raise Refused("expected a line of numbers for each frame, got none")
     check_limit("frames", len(lines), "frames")
     plain = {re.sub(r"[^a-z]", "", name.lower()): i for i, name in enumerate(names)}
-    column = lambda i: np.asarray(
-        [_number(row, i, names[i], line) for line, row in enumerate(lines)]
-    )
+
+    def column(i):
+        return np.asarray([_number(row, i, names[i], line) for line, row in enumerate(lines)])
+
     values = np.zeros((len(lines), len(ARKIT)))
     for name, i in shapes.items():
         values[:, ARKIT.index(str(name))] = column(i)
     # the turn of the head, and the times, where the table has them
     turns = [column(plain[name]) if name in plain else 0.0 for name in HEAD_TURNS]
     head = np.stack([np.broadcast_to(turn, len(lines)) for turn in turns], axis=1)
-    codes = [row[plain["timecode"]] for row in lines] if "timecode" in plain else []
+    codes = []
+    if "timecode" in plain:
+        codes = [row[plain["timecode"]] for row in lines]
     fps, frames, said = _times(codes, options.fps)
     return _standing(
         values, Rotation.from_euler("YXZ", head[:, [1, 0, 2]]).as_rotvec(), fps, frames, said
@@ -112,17 +117,25 @@ def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray
     parts = [re.fullmatch(r"\s*(\d+):(\d+):(\d+)[:;.](\d+(?:\.\d+)?)\s*", code) for code in codes]
     if not parts or any(part is None for part in parts):
         said = NO_RATE.format(DEFAULT_FPS) + ", which --motion-fps (in Python fps=) changes"
-        return (DEFAULT_FPS, None, said) if asked is None else (asked, None, "")
+        if asked is None:
+            return DEFAULT_FPS, None, said
+        return asked, None, ""
     clock = np.asarray([[float(x) for x in part.groups()] for part in parts if part is not None])
     seconds, within = clock[:, :3] @ (3600.0, 60.0, 1.0), clock[:, 3]
     long_enough = np.ptp(seconds) >= 2
     fitting = [rate for rate in RATES if rate > np.floor(within.max())]
-    rate = fitting[0] if long_enough and fitting else LIVE_LINK_FPS
+    rate = LIVE_LINK_FPS
+    if long_enough and fitting:
+        rate = fitting[0]
     numbers = np.rint(seconds * rate + within)
     steps = np.diff(numbers)
     if not len(steps) or not (steps > 0).all():
-        return rate if asked is None else asked, None, ""
-    return rate / float(steps.min()) if asked is None else asked, numbers, ""
+        if asked is None:
+            asked = rate
+        return asked, None, ""
+    if asked is None:
+        asked = rate / float(steps.min())
+    return asked, numbers, ""
 
 
 def _standing(
@@ -173,7 +186,9 @@ def read_scores(path: Path, options: Reading) -> Poses:
         )  # frames in which nobody was seen lie between the others
         values = np.stack([np.interp(every, seen, column) for column in known.T], axis=1)
         fps, said = options.fps, ""
-        given = content.get("fps") if isinstance(content, dict) else None
+        given = None
+        if isinstance(content, dict):
+            given = content.get("fps")
         if fps is None and isinstance(given, int | float) and 0 < given < 1e6:
             fps = float(given)
         if fps is None:
@@ -187,7 +202,8 @@ def _frames_of(content: Any) -> list[dict[str, float]] | None:
     """
     if isinstance(content, dict):
         lists = [value for value in content.values() if isinstance(value, list)]
-        found = [frames for value in lists if (frames := _frames_of(value)) is not None]
+        read = [_frames_of(value) for value in lists]
+        found = [frames for frames in read if frames is not None]
         return found[0] if found else None
     if not isinstance(content, list):
         return None
@@ -217,7 +233,8 @@ def _scores_of(frame: Any, depth: int) -> dict[str, float]:
     else:
         return {}
     for each in inner[:MOST_COLUMNS]:
-        if found := _scores_of(each, depth + 1):
+        found = _scores_of(each, depth + 1)
+        if found:
             return found
     return {}
 
@@ -293,7 +310,9 @@ def _expression_tracks(
 ) -> Weights:
     """Of a VRMA file: the weight of an expression is how far its node is moved along x."""
     extension = (content.get("extensions") or {}).get("VRMC_vrm_animation", {})
-    expressions = extension.get("expressions", {}) if isinstance(extension, dict) else {}
+    expressions = {}
+    if isinstance(extension, dict):
+        expressions = extension.get("expressions", {})
     nodes = {
         entry["node"]: str(name)
         for group in ("preset", "custom")
@@ -327,7 +346,10 @@ def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[st
         times, values = _keys_of(content, binary, animation, channel)
         names = _target_names(mesh, values.shape[1])
         found.append({name: (times, values[:, i]) for i, name in enumerate(names)})
-    known = lambda tracks: sum(arkit_name(name) is not None for name in tracks)
+
+    def known(tracks):
+        return sum(arkit_name(name) is not None for name in tracks)
+
     return max(found, key=known, default={})
 
 
@@ -354,7 +376,9 @@ def face_alone(
     dense = max(inputs, key=len, default=np.zeros(0))
     if not len(dense) or not np.isfinite(dense).all() or not (np.diff(dense) > 0).all():
         return None
-    fps = (len(dense) - 1) / float(dense[-1] - dense[0]) if len(dense) > 1 else DEFAULT_FPS
+    fps = DEFAULT_FPS
+    if len(dense) > 1:
+        fps = (len(dense) - 1) / float(dense[-1] - dense[0])
     track, unknown = animated_face(content, binary, animation, dense)
     if track is None:
         return None

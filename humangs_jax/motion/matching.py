@@ -43,7 +43,8 @@ def matched(
     # by names first
     plain = _plain(names)
     source = _named(plain)
-    if hips := [source[name] for name in ("left_hip", "right_hip") if name in source][1:]:
+    hips = [source[name] for name in ("left_hip", "right_hip") if name in source][1:]
+    if hips:
         _place_pelvis(source, parents, (source["left_hip"], *hips))
     # where names do not tell, the tree tells which joints are arms and legs
     if any(name not in source for name in NEEDED) or not _descends(source, parents):
@@ -53,11 +54,9 @@ def matched(
         limbs = _limbs(plain, parents, lengths, posed)
         if limbs is None:
             missing = [name for name in NEEDED if name not in source]
-            what = (
-                f"no joint for {', '.join(missing)}"
-                if missing
-                else "joints that do not hang below each other"
-            )
+            what = "joints that do not hang below each other"
+            if missing:
+                what = f"no joint for {', '.join(missing)}"
             found = ", ".join(names[:SHOWN])
             raise Refused(f"{what}: {EXPECTED_NAMES}, got {found}")
         body = {
@@ -99,7 +98,8 @@ def _named(plain: Sequence[str]) -> dict[str, int]:
     def find(ours: str, theirs: Sequence[str]) -> None:
         taken = set(source.values())
         for name in theirs:
-            if name in plain and (index := plain.index(name)) not in taken:
+            index = plain.index(name) if name in plain else None
+            if index is not None and index not in taken:
                 source[ours] = index
                 return
 
@@ -169,12 +169,12 @@ def _limbs(
 
     def pair_below(joint: int) -> Pair | None:
         """The two longest limbs of like bones that hang on a joint, as their joints that bend."""
-        limbs = [
-            limb
-            for child in children[joint]
-            if (limb := _bends(_path(child, children, reach), lengths))
-        ]
-        bones = lambda limb: lengths[limb[1:3]]
+        paths = [_path(child, children, reach) for child in children[joint]]
+        limbs = [limb for limb in (_bends(path, lengths) for path in paths) if limb]
+
+        def bones(limb):
+            return lengths[limb[1:3]]
+
         pairs = [
             (a, b)
             for i, a in enumerate(limbs)
@@ -187,9 +187,8 @@ def _limbs(
 
     # the pelvis carries two limbs, and above it, but not below its legs, the chest carries two more
     above = [_ancestors(parents, joint) for joint in range(len(parents))]
-    found = [
-        (joint, pair) for joint in range(len(parents)) if (pair := pair_below(joint)) is not None
-    ]
+    pairs = [(joint, pair_below(joint)) for joint in range(len(parents))]
+    found = [(joint, pair) for joint, pair in pairs if pair is not None]
     for pelvis, legs in found:
         feet = {leg[0] for leg in legs}
         inside = [
@@ -211,11 +210,9 @@ def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
     if len(bones) < 2:
         return None
     first = int(np.argmax(np.minimum(bones[1:], bones[:-1])))
-    return (
-        [path[first], path[first + 1], path[first + 2], *path[first + 3 : first + 4]]
-        if bones[first] > 0
-        else None
-    )
+    if bones[first] > 0:
+        return [path[first], path[first + 1], path[first + 2], *path[first + 3 : first + 4]]
+    return None
 
 
 def _sided(
@@ -239,7 +236,10 @@ def _sided(
         sides = [_side(plain, limb) for limb in limbs]
         if sorted(sides) != sorted(SIDES):
             across = [float(posed[limb[0]] @ left) for limb in limbs]
-            sides = ["left", "right"] if across[0] > across[1] else ["right", "left"]
+            if across[0] > across[1]:
+                sides = ["left", "right"]
+            else:
+                sides = ["right", "left"]
         for side, limb in zip(sides, limbs, strict=True):
             source |= {f"{side}_{name}": joint for name, joint in zip(names, limb, strict=False)}
             above = parents[limb[0]]
@@ -297,7 +297,9 @@ def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[
         chains.append(chain)
     if chains:
         chain = max(chains, key=len)
-        source |= {"neck": chain[0]} | ({"head": chain[-1]} if len(chain) > 1 else {})
+        source["neck"] = chain[0]
+        if len(chain) > 1:
+            source["head"] = chain[-1]
 
 
 def _match_spine(source: dict[str, int], parents: Sequence[int]) -> None:
@@ -305,21 +307,20 @@ def _match_spine(source: dict[str, int], parents: Sequence[int]) -> None:
     last of the file's.
     """
     chain = []
-    at = (
-        parents[source["neck"]]
-        if "neck" in source
-        else parents[source["head"]]
-        if "head" in source
-        else -1
-    )
+    if "neck" in source:
+        at = parents[source["neck"]]
+    elif "head" in source:
+        at = parents[source["head"]]
+    else:
+        at = -1
     while at >= 0 and at != source.get("pelvis"):
         chain.insert(0, at)
         at = parents[at]
     last = len(chain) - 1
     if at >= 0:
-        ours = {
-            "spine3": last,
-            "spine1": 0 if last > 0 else -1,
-            "spine2": last // 2 if last > 1 else -1,
-        }
+        ours = {"spine3": last, "spine1": -1, "spine2": -1}
+        if last > 0:
+            ours["spine1"] = 0
+        if last > 1:
+            ours["spine2"] = last // 2
         source.update({name: chain[i] for name, i in ours.items() if i >= 0})

@@ -80,10 +80,8 @@ def read_people(path: Path) -> list[Person]:
 
     Raises: FileError; Refused if it has nothing of any format.
     """
-    files, alone = (
-        _files(path) if path.is_dir() else [path],
-        not path.is_dir() and path.suffix.lower() != ".json",
-    )
+    files = _files(path) if path.is_dir() else [path]
+    alone = not path.is_dir() and path.suffix.lower() != ".json"
     check_limit("frames", len(files), "files")
     if not alone and files[0].suffix.lower() not in OF_ONE:
         people = _stacked(_frames(files))
@@ -93,13 +91,12 @@ def read_people(path: Path) -> list[Person]:
             content, pickled = _content(file)
             found = _people(content, pickled)
             if alone and not found:
-                raise Refused(expected(content if isinstance(content, dict) else {}))
+                values = content if isinstance(content, dict) else {}
+                raise Refused(expected(values))
             name = (_numbers(file) or [file.stem])[-1]
-            people += (
-                [each._replace(name=name) for each in found]
-                if len(found) == 1 and not alone
-                else found
-            )
+            if len(found) == 1 and not alone:
+                found = [found[0]._replace(name=name)]
+            people += found
     if not people:
         raise Refused(expected({}))
     return people
@@ -111,7 +108,9 @@ def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
         return read_json(file), ()
     with open_file(file) as opened:
         start = opened.read(6)
-    array = read_npy(file) if start == np.lib.format.MAGIC_PREFIX else None
+    array = None
+    if start == np.lib.format.MAGIC_PREFIX:
+        array = read_npy(file)
     if array is not None:
         return values_of(array), ()
     archive = start.startswith(b"PK")
@@ -122,7 +121,9 @@ def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
 
 
 def _files(folder: Path) -> list[Path]:
-    natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
+    def natural(file):
+        return [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
+
     for place in (folder / name for name in FOLDERS):
         for suffix in (".json", ".npz", *OF_ONE):
             files = [
@@ -188,7 +189,9 @@ def _id_of(content: Any, number: int) -> str:
 
 def _word(value: Any) -> str:
     number = np.asarray(as_array(value)).reshape(-1)
-    return f"{number[0]:g}" if number.size == 1 and number.dtype.kind in "iuf" else str(value)[:40]
+    if number.size == 1 and number.dtype.kind in "iuf":
+        return f"{number[0]:g}"
+    return str(value)[:40]
 
 
 def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person]:
@@ -198,7 +201,9 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     place, key = next(iter(form.poses.items()))
     if place not in ("root", "all") or form.kind != "poses" or key not in values:
         return [Person(name, values)]
-    shape = np.shape(as_array(values[key])) if not isinstance(values[key], list) else ()
+    shape = ()
+    if not isinstance(values[key], list):
+        shape = np.shape(as_array(values[key]))
     turns = shape[1:] == (3, 3) and _off_rotations(as_array(values[key])) < NEARLY_ORTHONORMAL
     several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not turns
     several = several or (form.pivot == "head" and len(shape) == 3)
@@ -210,10 +215,16 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     arrays = {
         key: as_array(values[key]) for key in (*form.poses.values(), *form.moves) if key in values
     }
-    ids = ids if len(ids) == shape[0] else np.arange(shape[0])
+    if len(ids) != shape[0]:
+        ids = np.arange(shape[0])
     rest = {key: value for key, value in values.items() if key not in arrays}
-    of = lambda array, i: array[i] if place == "root" else array[i : i + 1]
-    own = lambda i: {key: of(array, i) for key, array in arrays.items() if len(array) == len(ids)}
+
+    def of(array, i):
+        return array[i] if place == "root" else array[i : i + 1]
+
+    def own(i):
+        return {key: of(array, i) for key, array in arrays.items() if len(array) == len(ids)}
+
     return [Person(str(number), rest | own(i)) for i, number in enumerate(ids.tolist())]
 
 
@@ -236,7 +247,9 @@ def _off_rotations(array: np.ndarray) -> float:
 def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
     key = next((key for key in FRAMES if key in values), None)
     try:
-        return None if key is None else np.ravel(as_array(values[key]))
+        if key is None:
+            return None
+        return np.ravel(as_array(values[key]))
     except ValueError:
         return None
 
@@ -256,7 +269,9 @@ def _listed_frames(content: Any) -> list[list[Person]] | None:
         and all(isinstance(objects(each), list) for each in content)
     ):
         return [_found(each, "", 1) for each in content]
-    images = list(content.values()) if isinstance(content, dict) else []
+    images = []
+    if isinstance(content, dict):
+        images = list(content.values())
     if not images or not all(
         isinstance(each, dict) and isinstance(objects(each.get("smpl")), list) for each in images
     ):
@@ -271,10 +286,13 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
     people = []
     for i, values in enumerate(lists["smpl"]):
         if isinstance(values, dict):
-            name = _word(tracks[i]) if isinstance(tracks, list) and i < len(tracks) else str(i)
-            camera = (
-                {"camera": cameras[i]} if isinstance(cameras, list) and i < len(cameras) else {}
-            )
+            if isinstance(tracks, list) and i < len(tracks):
+                name = _word(tracks[i])
+            else:
+                name = str(i)
+            camera = {}
+            if isinstance(cameras, list) and i < len(cameras):
+                camera = {"camera": cameras[i]}
             people.append(Person(name, values | camera))
     return people
 
@@ -315,7 +333,8 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
             key for key in (*form.poses.values(), *form.moves, *form.rates, *MORE) if key in first
         ]
         for i, values in seen:
-            if missing := set(keys) - set(values):
+            missing = set(keys) - set(values)
+            if missing:
                 raise Refused(
                     f"{frames[i][0]}: {min(missing)}: missing, but {frames[begin][0]} has it"
                 )

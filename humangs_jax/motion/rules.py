@@ -54,11 +54,9 @@ def _finger(finger: str, i: int) -> tuple[str, ...]:
         for w in words
         for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")
     ]
-    bones = (
-        (("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",))
-        if finger == "thumb"
-        else _BONES
-    )
+    bones = _BONES
+    if finger == "thumb":
+        bones = ("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",)
     plain += [w + bone for w in words for bone in bones[i - 1]]
     return (*plain, f"finger{number}{i - 1 or ''}")
 
@@ -271,11 +269,9 @@ def _floors(
         resting.append(level[-1] & (moves[np.arange(len(moves)), lowest] <= limit))
     rests, stays = ([float(x.mean()) for x in shares] for shares in (resting, level))
     # on a treadmill nothing rests
-    return (
-        rests
-        if max(rests) >= ON_THE_FLOOR
-        else [stays[0], stays[1] if stays[1] >= TREADMILL else 0.0]
-    )
+    if max(rests) >= ON_THE_FLOOR:
+        return rests
+    return [stays[0], stays[1] if stays[1] >= TREADMILL else 0.0]
 
 
 def _opposite(a: str, b: str) -> bool:
@@ -296,11 +292,10 @@ def joint_places(
     for j, parent in enumerate(PARENTS):
         own = Rotation.from_rotvec(rotations[:, j]).as_matrix()
         world.append(own if parent < 0 else world[parent] @ own)
-        places.append(
-            translations + joints[0]
-            if parent < 0
-            else places[parent] + world[parent] @ (joints[j] - joints[parent])
-        )
+        if parent < 0:
+            places.append(translations + joints[0])
+        else:
+            places.append(places[parent] + world[parent] @ (joints[j] - joints[parent]))
     return np.stack(places, axis=1)
 
 

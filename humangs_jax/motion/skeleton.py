@@ -75,7 +75,9 @@ def whole_rate(fps: float) -> float:
     """Frames per second, a whole number where they are one up to the rounding of the file: BVH has
     0.0083333 for 120.
     """
-    return float(round(fps)) if abs(fps - round(fps)) < rules.RATE_ROUNDING * fps else fps
+    if abs(fps - round(fps)) < rules.RATE_ROUNDING * fps:
+        return float(round(fps))
+    return fps
 
 
 @functools.cache
@@ -106,18 +108,18 @@ def retargeted(
     standing, said = _stands(clip, source), ""
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.places[0], source), 1e-9)
     if up == "auto":
-        up, said = (clip.up, "") if clip.up else _up_of(clip, source, scale, standing)
+        if clip.up:
+            up, said = clip.up, ""
+        else:
+            up, said = _up_of(clip, source, scale, standing)
     turn = upright_matrix(up)
     turns, places = turn @ clip.turns, clip.places @ turn.T
     # rotations of each joint in the axes of the one above it
     world = _body_turns(clip, source, joints, turns, places, by_motion=not standing)
-    rotations = np.stack(
-        [
-            _rotation(own if p < 0 else _transposed(world[p]) @ own)
-            for p, own in zip(PARENTS, world, strict=True)
-        ],
-        axis=1,
-    )
+    relative = [
+        own if p < 0 else _transposed(world[p]) @ own for p, own in zip(PARENTS, world, strict=True)
+    ]
+    rotations = np.stack([_rotation(turn) for turn in relative], axis=1)
     # the pelvis follows the file's, and the soles stand as high as the file's do
     moves = scale * places[:, source["pelvis"]]
     soles = _soles(clip, source, joints) if standing else None
@@ -135,7 +137,9 @@ def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[st
     """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people
     stand does.
     """
-    usual = nearest_axis(_spine(clip, source))[0] if standing else "y"
+    usual = "y"
+    if standing:
+        usual = nearest_axis(_spine(clip, source))[0]
     trunk = clip.places[:, source[_top(source)]] - clip.places[:, source["pelvis"]]
     axis, cosine = nearest_axis(unit(trunk).mean(axis=0))
     chosen = sampled_frames(len(clip.places))
@@ -174,7 +178,10 @@ def _body_turns(
     """G_j (m, 3, 3) of our joints in the world."""
     frames_of, world = [], []
     for j, (name, parent) in enumerate(zip(JOINT_NAMES, PARENTS, strict=True)):
-        align = _pelvis_frame(clip, source, joints) if parent < 0 else frames_of[parent]
+        if parent < 0:
+            align = _pelvis_frame(clip, source, joints)
+        else:
+            align = frames_of[parent]
         child = next((other for other in rules.NEXT.get(name, ()) if other in source), None)
         if parent < 0:
             world.append(_pelvis_turns(clip, source, turns, places) @ align)
@@ -227,7 +234,10 @@ def _pelvis_turns(
         the frame's.
         """
         axis = unit(line)
-        across = lambda v: v - np.sum(v * axis, axis=-1, keepdims=True) * axis
+
+        def across(v):
+            return v - np.sum(v * axis, axis=-1, keepdims=True) * axis
+
         a = across(candidate @ (clip.rest[top] - clip.rest[pelvis]))
         b = across(places[:, top] - places[:, pelvis])
         return np.arctan2(np.sum(np.cross(a, b) * axis, axis=-1), np.sum(a * b, axis=-1))
@@ -242,7 +252,9 @@ def _pelvis_turns(
         )
         other = meeting((a * Rotation.from_rotvec(0.5 * (a.inv() * b).as_rotvec())).as_matrix())
         own_tilt, tilt = (np.abs(tilts(x, top)).mean() for x in (own, other))
-        return other if tilt < own_tilt - rules.BETTER_TILT else own
+        if tilt < own_tilt - rules.BETTER_TILT:
+            return other
+        return own
     # a pelvis that does not turn with the trunk is turned after the lowest joint of the spine
     spine = [top]
     while clip.parents[spine[0]] not in (-1, pelvis):
@@ -302,7 +314,8 @@ def _leg_length(places: Float[np.ndarray, "s 3"], index: Source) -> float:
 
 def _feet(source: Source) -> list[list[str]]:
     """Our names of the joints that may touch the floor: of both sides by kind."""
-    return [found for kind in rules.FEET if (found := [name for name in kind if name in source])]
+    present = [[name for name in kind if name in source] for kind in rules.FEET]
+    return [found for found in present if found]
 
 
 def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:

@@ -57,7 +57,9 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
             f" and {_RENDER}"
         )
     if array.ndim == 3 and columns == 3:
-        whose = f" ({JOINTS[shape[1]]})" if shape[1] in JOINTS else ""
+        whose = ""
+        if shape[1] in JOINTS:
+            whose = f" ({JOINTS[shape[1]]})"
         wanted = "expected a row of axis-angles a frame"
         raise Refused(
             f"{shape[1]} joints in space{whose}, or axis-angles in three axes: {wanted}; {_RENDER}"
@@ -90,7 +92,8 @@ def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[
         raise Refused(f"{rotations}: expected shape (24, 6, frames), got {six.shape}")
     if six.dtype.kind not in "fiu":
         raise Refused(f"{rotations}: expected real numbers, got {six.dtype}")
-    six = six.transpose(2, 0, 1) if last else six
+    if last:
+        six = six.transpose(2, 0, 1)
     changed: dict[str, Any] = {rotations: matrices_of(six)}
     if moves in values:
         places = np.asarray(as_array(values[moves]))
