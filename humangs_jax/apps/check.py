@@ -169,8 +169,10 @@ def check_capture(
     be at fault.
     Raises: OSError if the sheet cannot be written.
     """
-    prepared = capture if isinstance(capture, PreparedCapture) else _prepared(capture)
-    capture = capture.given if isinstance(capture, PreparedCapture) else capture
+    if isinstance(capture, PreparedCapture):
+        prepared, capture = capture, capture.given
+    else:
+        prepared = _prepared(capture)
     right = keypoints is not None and not find_camera_errors(capture, keypoints)
     # faults look at the photos as they are, the sheet at smaller ones
     found = faults(capture)
@@ -220,7 +222,9 @@ def check_capture(
     farthest = 0.0
     if moves is not None:
         # the vertices of a skirt follow those of the body, and do not count
-        own = moves[: len(moves) - SKIRT_VERTICES] if skirt else moves
+        own = moves
+        if skirt:
+            own = moves[: len(moves) - SKIRT_VERTICES]
         farthest = float(np.linalg.norm(own, axis=1).max())
     registered = capture.displacement is not None
     return CheckReport(tuple(views), found.whole, farthest, registered, skirt)

@@ -92,7 +92,9 @@ def import_photos(
     images, files = photo_files(folder)
     choice = _Choice(person, keypoints, masks, out, others)
     with tempfile.TemporaryDirectory() as place:
-        smaller = _reduced(images, files, Path(place)) if reduce else None
+        smaller = None
+        if reduce:
+            smaller = _reduced(images, files, Path(place))
         if smaller:
             found = _look(Path(place), files, smaller, choice)
             if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
@@ -241,7 +243,10 @@ def _written(
     """Write the capture. Arguments: choice: whose masks are imported; None: no masks are."""
     photos, number, shown, seen, cropped = looked
     found = cameras_from_person(seen, height=height)
-    masks, others = (None, None) if choice is None else (choice.masks, choice.others)
+    if choice is None:
+        masks, others = None, None
+    else:
+        masks, others = choice.masks, choice.others
     calibration = _calibration(seen, found, images)
     report = import_calibration(
         calibration, images, out, masks=masks, others=others, scale=1.0, also=also

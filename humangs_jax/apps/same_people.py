@@ -191,7 +191,9 @@ def _with_those_apart(
     for frame in np.unique(frames):
         own = [int(v) for v in np.flatnonzero(frames == frame) if rows[v][person] is not None]
         numbers, counts = np.unique(source[own], return_counts=True)
-        most = numbers[counts == counts.max()] if len(own) else numbers
+        most = numbers
+        if len(own):
+            most = numbers[counts == counts.max()]
         for v in own:
             others = [rows[w][person] for w in own if source[w] != source[v]]
             points = [each.person.points for each in others if each is not None]

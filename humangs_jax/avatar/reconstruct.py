@@ -207,7 +207,9 @@ def reconstruct_many(
             with contextlib.suppress(ValueError):  # of one of them: which one is found below
                 avatars = iter(reconstruct_batch(variables, config, good))
         for each in done:
-            avatar = None if each.capture is None else next(avatars, None)
+            avatar = None
+            if each.capture is not None:
+                avatar = next(avatars, None)
             if avatar is not None:
                 yield each._replace(avatar=avatar)
             elif each.capture is not None:
@@ -505,7 +507,9 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
 
 
 def _views_of(capture: Capture | PreparedCapture) -> Capture:
-    return capture.capture if isinstance(capture, PreparedCapture) else capture
+    if isinstance(capture, PreparedCapture):
+        return capture.capture
+    return capture
 
 
 def _check(given: Capture | PreparedCapture, name: str) -> None:

@@ -180,7 +180,10 @@ class Reconstruct:
             captures = dict(list(captures.items())[part::parts])
             for name in done & captures.keys():
                 _check_source(out / f"{name}.npz", captures.pop(name))
-        views = settings.views if settings is not None and self.views is None else self.views
+        if settings is not None and self.views is None:
+            views = settings.views
+        else:
+            views = self.views
         sources: dict[str, str] = {}
 
         def photos_of(name: str, folder: Path) -> "PreparedCapture":
@@ -197,7 +200,8 @@ class Reconstruct:
             load = {name: lambda: photos}
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
-        config = config if settings is None else settings.network(config)
+        if settings is not None:
+            config = settings.network(config)
         said = {"tokens": self.tokens, "dtype": self.dtype}
         config = config.with_runtime(
             **{name: value for name, value in said.items() if value != "as_trained"}

@@ -412,7 +412,9 @@ class Start:
             keypoints = keypoints_of(
                 photos, material.keypoints, None if found_here else self.person
             )
-            against = find_contradiction(photos, keypoints) if photos.calibrated else None
+            against = None
+            if photos.calibrated:
+                against = find_contradiction(photos, keypoints)
             if against:
                 raise ValueError(
                     f"{material.cameras}: {against}: correct it, or go on without it by"

@@ -429,7 +429,9 @@ class Evaluate:
                 networks.append(load_lpips(net, *found))
         # scores of an interrupted run of the same command are used again
         keep = self._kept()
-        scored = 0 if keep is None else len(list(keep.glob("person_*.json")))
+        scored = 0
+        if keep is not None:
+            scored = len(list(keep.glob("person_*.json")))
         if scored:
             tell(f"going on: {scored} {'person is' if scored == 1 else 'people are'} scored")
         with stage("evaluating"):

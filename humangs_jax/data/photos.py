@@ -310,7 +310,9 @@ def read_photos(
     ]
     # what may be hidden counts as background, so that nothing is concluded from it; without masks
     # nothing is background, and it waits for them
-    unknown = None if masks is None else _read_unknown(folder, views, images.shape[1:3])
+    unknown = None
+    if masks is not None:
+        unknown = _read_unknown(folder, views, images.shape[1:3])
     if masks is not None and unknown is not None:
         images[unknown], masks[unknown] = 1, 0
     names = names_from_paths([view["image"] for view in views])

@@ -65,7 +65,9 @@ class PreparedCapture:
     def shown(self) -> Capture:
         """The views of `given` that show the person, as they came."""
         kept = [i for i, name in enumerate(self.given.names) if name not in self.left_out]
-        return self.given if len(kept) == self.given.view_count else self.given.select(kept)
+        if len(kept) == self.given.view_count:
+            return self.given
+        return self.given.select(kept)
 
     @property
     def turned(self) -> bool:
@@ -119,7 +121,8 @@ def prepare_capture(
         prepared = _prepared_photos(prepared, views)
     elif views is not None:
         chosen = _chosen(prepared.capture, views)
-        prepared = prepared if chosen is None else prepared.select(chosen)
+        if chosen is not None:
+            prepared = prepared.select(chosen)
     if config is None or prepared.network == _network_key(config):
         return prepared
     return _with_body(prepared, config)

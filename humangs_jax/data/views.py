@@ -394,7 +394,8 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     Intrinsics follow the pixels. Without masks only what the posed body covers will count as
     foreground. crop: cut to the person first, see `cropped`.
     """
-    capture = cropped(capture, size) if crop else capture
+    if crop:
+        capture = cropped(capture, size)
     height, width = capture.images.shape[1:3]
     side = max(height, width)
     boxes = [(-((side - width) // 2), -((side - height) // 2), side)] * capture.view_count

@@ -121,7 +121,9 @@ class _Looked:
 
         # what it takes from the stack: all behind the last mark, and so many before
         before = opcode.stack_before
-        below = before.index(pickletools.markobject) if pickletools.markobject in before else None
+        below = None
+        if pickletools.markobject in before:
+            below = before.index(pickletools.markobject)
         items: list[int | None] = []
         if below is not None:
             at = len(stack)
@@ -216,7 +218,9 @@ class RestrictedUnpickler(pickle.Unpickler):
             raise Refused(f"refused to load {module}.{name}: {self.purpose}")
         found = self.names[key]
         # its state is followed by bytes of this file
-        return type("_Joblib", (_Joblib,), {"looked": self.looked}) if found is _Joblib else found
+        if found is _Joblib:
+            return type("_Joblib", (_Joblib,), {"looked": self.looked})
+        return found
 
     def persistent_load(self, pid: Any) -> Any:
         """Torch's storages; nothing else has any."""
@@ -273,8 +277,11 @@ class _Array(StandIn):
 
     def to_array(self) -> np.ndarray:
         shape, data = self.state["shape"], self.state["data"]
-        data = data.encode("latin1") if isinstance(data, str) else data
-        dtype = self.state["dtype"].dtype if isinstance(self.state["dtype"], _Dtype) else None
+        if isinstance(data, str):
+            data = data.encode("latin1")
+        dtype = None
+        if isinstance(self.state["dtype"], _Dtype):
+            dtype = self.state["dtype"].dtype
         if dtype is None or not isinstance(data, bytes | bytearray):
             raise ValueError("expected numbers, got other objects")
         sizes = shape if isinstance(shape, tuple) else ()
@@ -300,7 +307,9 @@ def _scalar(dtype: Any, data: Any = b"") -> Any:
     """One number. An integer is Python's, as it may be the key of a dict."""
     array = _made_array((), dtype, False, data)
     plain = dtype.dtype if isinstance(dtype, _Dtype) else None
-    return int(array.to_array()) if plain is not None and plain.kind in "iu" else array
+    if plain is not None and plain.kind in "iu":
+        return int(array.to_array())
+    return array
 
 
 class _Joblib(_Array):

@@ -230,7 +230,10 @@ def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
     if f"{root}byteorder" in members and archive.read(f"{root}byteorder").strip() != b"little":
         raise Refused("only little-endian checkpoints are supported")
     check_limit("text_bytes", archive.getinfo(pickles[0]).file_size, "bytes of a pickle")
-    read = lambda name: archive.read(f"{root}data/{name}")
+
+    def read(name):
+        return archive.read(f"{root}data/{name}")
+
     return _TorchUnpickler(io.BytesIO(archive.read(pickles[0])), names, read).load()
 
 

@@ -231,7 +231,8 @@ def _apply(
         x = _pool(layer, x)
     else:
         x = _convolve(weights[layer.name], layer, x)
-    size = None if size is None else _size_after(layer, size)
+    if size is not None:
+        size = _size_after(layer, size)
     return _cleared(x, size), size
 
 

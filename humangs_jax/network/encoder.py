@@ -177,7 +177,8 @@ class PatchTransformer(Encoder):
                 "class_token", nn.initializers.truncated_normal(INIT_STD), (1, features)
             )
             tokens = jnp.concatenate([first.astype(tokens.dtype), tokens])
-            count = None if count is None else count + 1
+            if count is not None:
+                count = count + 1
 
         # maps of the layers that are read; patches without a token are 0
         depths = Transformer(self.transformer, run.runtime, name="transformer")(tokens, count)
