@@ -170,8 +170,7 @@ def _collar(
 def _top(outfit: Outfit, garment: Garment) -> None:
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
-    # looser tops stand off further, hang more, and have higher folds
-    # short sleeves stand away from the arm, and what hangs loose falls in other ways
+    # looser tops stand off further, hang more, and have higher folds; short sleeves stand off too
     least = 0.008 if "tucked" in details else 0.012
     hang = outfit.rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0
     wide = 0.035 if sleeve < 0.45 else 0.016
@@ -224,7 +223,7 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         ease=ease,
         hang=hang,
         sleeve=0.01 + 0.012 * loose,
-        fold=0.002 + folds,
+        fold=0.002 if padded or blazer else 0.002 + 0.003 * loose,
         hem=0.014,
         quilt=QUILT if padded else 0.0,
         skirted=True,
