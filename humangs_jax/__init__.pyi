@@ -13,6 +13,7 @@ from .data.prepared import PreparedCapture as PreparedCapture
 from .data.prepared import prepare_capture as prepare_capture
 from .avatar.reconstruct import stack_captures as stack_captures
 from .motion import load_motion as load_motion
+from .apps.video_motion import motion_from_video as motion_from_video
 
 # bodies
 from .body.model import BodyModel as BodyModel, BodyPose as BodyPose

@@ -194,7 +194,7 @@ def check_capture(
     for i, (name, warning, inside) in enumerate(
         zip(capture.names, found.views, found.inside, strict=True)
     ):
-        drawn = _body_image(
+        drawn = body_image(
             vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i]
         )
         iou = outside = None
@@ -207,12 +207,12 @@ def check_capture(
                 warning = WIDER.format(outside, *(FIXED if right else FREE))
         # the sheet shows the person close, the comparison is of the whole photo
         if shown is not capture:
-            drawn = _body_image(
+            drawn = body_image(
                 vertices[int(capture.frames[i])], capture.body.faces, tints, shown.cameras[i]
             )
         overlays.append(overlay(shown.images[i], drawn))
         if displaced is not None:
-            moved = _body_image(
+            moved = body_image(
                 displaced[int(capture.frames[i])], body.faces, moved_tints, shown.cameras[i]
             )
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
@@ -260,7 +260,7 @@ def draw_body(
     photo: Float[np.ndarray, "h w 3"],
 ) -> tuple[Float[np.ndarray, "h w 3"], BodyImage]:
     """The posed body over a photo of one camera, and the body alone."""
-    drawn = _body_image(
+    drawn = body_image(
         jax.jit(person_vertices)(body, betas, pose), body.faces, side_tints(body), camera
     )
     return overlay(photo, drawn), drawn
@@ -291,7 +291,7 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
 
 
 @jax.jit
-def _body_image(
+def body_image(
     vertices: Float[Array, "n 3"],
     faces: Int[Array, "f 3"],
     tints: Float[Array, "n 3"],

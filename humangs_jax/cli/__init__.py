@@ -63,6 +63,7 @@ GROUPS = {
         "import": "captures.ImportCameras",
         "fit": "fit.Fit",
         "check": "fit.Check",
+        "motion": "motion.MotionOfVideo",
     },
     "Research": {
         "evaluate": "training.Evaluate",

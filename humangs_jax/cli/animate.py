@@ -18,6 +18,7 @@ from humangs_jax.cli.options import (
     UsageError,
     chosen_settings,
     off,
+    option_of,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import LARGEST, Range, at_least
@@ -29,6 +30,7 @@ TURN_SECONDS = 4.0
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.body.model import BodyPose
+    from humangs_jax.body.motion import Motion
     from humangs_jax.geometry.camera import Camera
 
 RATE = Range(0.01, 1000.0)
@@ -37,6 +39,10 @@ FINITE = at_least(-LARGEST)
 """Range of any number."""
 VIDEO = Place(VIDEOS.suffixes, folder=True)
 _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
+MOTION_OR_VIDEO = (
+    f"{MOTIONS.listed()}; or a video, whose motion is kept beside it as NAME.motion.npz. Default:"
+    " the shipped walk."
+)
 FROM_THE_SIDE = Shot(azimuth=20.0)
 SPLATS = {
     suffix: each
@@ -69,9 +75,7 @@ class Animate:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
-    motion: Annotated[Path | None, arg(help=f"{MOTIONS.listed()}. Default: the shipped walk.")] = (
-        None
-    )
+    motion: Annotated[Path | None, arg(help=MOTION_OR_VIDEO)] = None
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
     out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path(
         "animation.mp4"
@@ -114,7 +118,7 @@ class Animate:
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
-            motion = self.part.load(self.motion, avatar.rest_joints)
+            motion = self._motion(avatar)
             avatar = with_face_for(avatar, motion)
             # cut and repeat the motion before cameras are made for its frames
             with reading(self.motion or "the motion", "motion"):
@@ -141,6 +145,21 @@ class Animate:
         suggest(
             "humangs export", self.avatar, "--html avatar.html", *self.part.options(self.motion)
         )
+
+    def _motion(self, avatar: "Avatar") -> "Motion":
+        """The motion of a file, or of a video."""
+        from humangs_jax.data.folders import is_video
+
+        if self.motion is None or not is_video(self.motion):
+            return self.part.load(self.motion, avatar.rest_joints)
+        for name, value in vars(self.part).items():
+            if value is not None and name != "person":
+                raise UsageError(f"{option_of(name)}: is for files of motions, not for a video")
+        import numpy as np
+
+        from humangs_jax.apps.video_motion import motion_beside
+
+        return motion_beside(self.motion, np.asarray(avatar.rest_joints), self.part.person)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ from humangs_jax.core.registry import alternatives
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
 from humangs_jax.data.formats import MOTIONS, MotionFormat
 from humangs_jax.geometry.axes import UPRIGHT, standing_axis
-from humangs_jax.io.arrays import write_npz
+from humangs_jax.io.arrays import read_npz, write_npz
 from humangs_jax.io.reading import FileError, check_limit, open_file, reading
 from humangs_jax.motion import rules, skeleton
 from humangs_jax.motion.face_tracks import FaceTrack, checked_track
@@ -32,12 +32,9 @@ __all__ = ["Motion", "MotionError", "load_motion", "save_motion"]
 
 
 logger = logging.getLogger(__name__)
-WALK = "walk.npz"
+WALK, MADE_FROM = "walk.npz", "made_from"
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif")
-_OF_A_VIDEO = (
-    ", a video: GVHMR, WHAM or TRAM find the motion of the person in it, and their files are read"
-    " (docs/motions.md)"
-)
+_OF_A_VIDEO = ", a video: `humangs motion` finds the motion of the person in it (docs/motions.md)"
 OTHERS = {
     **dict.fromkeys(VIDEOS, _OF_A_VIDEO),
     ".fbx": ": open it in Blender and export a .bvh or .glb",
@@ -254,14 +251,28 @@ def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
     return rules.up_axis(points, stands, usual, poses.fps, poses.also)
 
 
-def save_motion(path: str | Path, motion: Motion) -> None:
-    """Write our own format, compressed; the file appears whole or not at all."""
+def save_motion(path: str | Path, motion: Motion, *, made_from: str | None = None) -> None:
+    """Write our own format, compressed; the file appears whole or not at all.
+
+    Arguments: made_from: what the motion was made from, for `made_from_of`.
+    """
     arrays: dict[str, Any] = {
         "rotations": motion.rotations,
         "translations": motion.translations,
         "fps": motion.fps,
     }
+    if made_from is not None:
+        arrays[MADE_FROM] = made_from
     if motion.expressions is not None:
         arrays["expressions"] = motion.expressions
         arrays["expression_names"] = np.asarray(motion.expression_names)
     write_npz(path, arrays)
+
+
+def made_from_of(path: Path) -> str | None:
+    """What a motion of ours was made from, as `save_motion` was told; None for other files."""
+    try:
+        arrays, _ = read_npz(path)
+    except (ValueError, OSError):
+        return None
+    return str(arrays[MADE_FROM]) if MADE_FROM in arrays else None

@@ -436,10 +436,10 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
 
 
 def color_frames(
-    path: Path, longer_side: int, chosen: Sequence[int]
+    path: Path, longer_side: int, chosen: Sequence[int] | None
 ) -> Iterator[UInt[np.ndarray, "h w 3"]]:
-    """These frames of a video, counted from 0 and in order, in colors as stored, no larger than
-    that.
+    """These frames of a video, counted from 0 and in order, or all, in colors as stored, no larger
+    than that.
 
     Raises: CaptureError naming the video.
     """

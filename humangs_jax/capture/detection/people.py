@@ -135,38 +135,52 @@ def available() -> bool:
     return importlib.util.find_spec("ai_edge_litert") is not None
 
 
+def load_networks(folder: str, names: Sequence[str]) -> list[Any]:
+    """LiteRT's interpreters of the networks in a folder of `assets`.
+
+    Raises: ImportError, saying what to install, without LiteRT.
+    """
+    try:
+        with _silent():
+            # optional, and then unknown to type checkers
+            interpreter = importlib.import_module("ai_edge_litert.interpreter").Interpreter
+    except ImportError as error:
+        raise ImportError(
+            "finding people in photos needs LiteRT: pip install 'humangs_jax[photos]' (there is"
+            " none for Macs with Intel processors: give keypoints and masks of another program"
+            " there, see docs/your_photos.md)"
+        ) from error
+    place, found = resources.files("humangs_jax") / "assets" / folder, []
+    for name in names:
+        with _silent():
+            content = (place / name).read_bytes()
+            network = interpreter(model_content=content, num_threads=1)
+            network.allocate_tensors()
+        found.append(network)
+    return found
+
+
+def outputs_of(network: Any, values: Float[np.ndarray, "..."]) -> dict[str, np.ndarray]:
+    """The outputs of a network for one input, by name, without the axis of a batch where they have
+    one.
+    """
+    network.set_tensor(network.get_input_details()[0]["index"], values[None].astype(np.float32))
+    network.invoke()
+    outputs = {
+        output["name"]: network.get_tensor(output["index"])
+        for output in network.get_output_details()
+    }
+    return {name: each[0] if each.ndim > 1 else each for name, each in outputs.items()}
+
+
 class Networks:
     """The two networks. Raises: ImportError, saying what to install, without LiteRT."""
 
     def __init__(self) -> None:
-        try:
-            with _silent():
-                # optional, and then unknown to type checkers
-                interpreter = importlib.import_module("ai_edge_litert.interpreter").Interpreter
-        except ImportError as error:
-            raise ImportError(
-                "finding people in photos needs LiteRT: pip install 'humangs_jax[photos]' (there is"
-                " none for Macs with Intel processors: give keypoints and masks of another program"
-                " there, see docs/your_photos.md)"
-            ) from error
-        folder = resources.files("humangs_jax") / "assets" / "blazepose"
-        self._runs = [self._load(interpreter, folder / name) for name in (DETECTOR, LANDMARKS)]
-
-    @staticmethod
-    def _load(interpreter: Any, file: Any) -> Any:
-        with _silent():
-            network = interpreter(model_content=file.read_bytes(), num_threads=1)
-            network.allocate_tensors()
-        return network
+        self._runs = load_networks("blazepose", (DETECTOR, LANDMARKS))
 
     def _run(self, which: int, image: Float[np.ndarray, "size size 3"]) -> dict[str, np.ndarray]:
-        network = self._runs[which]
-        network.set_tensor(network.get_input_details()[0]["index"], image[None].astype(np.float32))
-        network.invoke()
-        return {
-            output["name"]: network.get_tensor(output["index"])[0]
-            for output in network.get_output_details()
-        }
+        return outputs_of(self._runs[which], image)
 
     def detect(self, photo: Float[np.ndarray, "h w 3"], window: Crop) -> list[Detection]:
         """People in an upright window of a photo with values in [0, 1]; black around it.

@@ -1,0 +1,369 @@
+"""The motion of a person in a video of one camera that stands still.
+
+The person is followed through all frames: where one frame has found the person, the landmark
+network alone looks at the next. What was seen is kept in a file beside the result while the work
+goes on, so that an interrupted run goes on where it was. Then one fit over all frames
+(`capture.fitting.motion_fit`).
+"""
+
+import itertools
+import logging
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.apps.check import body_image, overlay, side_tints
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.video import write_video
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel, person_vertices
+from humangs_jax.body.motion import Motion
+from humangs_jax.capture.calibration.videos import color_frames, frame_rate, frame_times
+from humangs_jax.capture.detection.people import (
+    LEAST_PRESENCE,
+    Detection,
+    Landmarks,
+    Networks,
+    find_people,
+)
+from humangs_jax.capture.fitting.motion_fit import MotionFit, betas_of_joints, fit_motion
+from humangs_jax.capture.fitting.person_moments import USUAL_FOCAL
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.core.progress import bar
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.arrays import checksum, read_npz, write_npz
+from humangs_jax.io.images import DIAGONAL_35MM
+from humangs_jax.io.reading import Refused, check_limit, reading
+from humangs_jax.motion import made_from_of, save_motion
+
+logger = logging.getLogger(__name__)
+LONGER_SIDE = 1920
+"""Pixels of the longer side of the frames that are looked at, at most."""
+SHOWN = 720
+"""Pixels of the longer side of a check video."""
+PATIENCE, RARELY = 8, 8
+"""Frames in a row without the person after which only every so many is searched, which takes ten
+times as long as to follow somebody."""
+FARTHEST, LARGEST_CHANGE = 0.6, 1.6
+"""Between two frames the hips of the same person move less than this share of the crop's side, and
+that side changes by less than this factor."""
+ALIKE = 0.6
+"""Somebody whose crop is at least this share of the largest may be meant as well."""
+SAVED = 15.0
+"""Seconds of work after which what was seen is kept."""
+TALLEST, SMALLEST = 2.5, 0.4
+"""Metres: heights of people."""
+
+
+class VideoFit(NamedTuple):
+    """The motion in a video, and what is needed to draw it over the video."""
+
+    fit: MotionFit
+    """The person's shape and poses, and the camera."""
+    body: BodyModel
+    """The body that was fitted."""
+    K: Float[np.ndarray, "3 3"]
+    """Of the camera, for frames of `size`."""
+    size: tuple[int, int]
+    """Width and height of the frames that were looked at, pixels."""
+
+
+@checked_arguments
+def motion_from_video(
+    video: str | Path,
+    *,
+    person: int | None = None,
+    height: float | int | None = None,
+    avatar: Avatar | None = None,
+    focal_mm: float | int | None = None,
+) -> Motion:
+    """The motion of a person in a video of one camera that stands still.
+
+    Args:
+        video: its file.
+        person: the number of the person, from 0, the largest first where several are seen in the
+            first frame that shows so many. None: the largest.
+        height: of the person, metres, which gives the motion its scale. None: as tall as people
+            usually are.
+        avatar: whose body is moved as the person moves, in place of a body with the person's own
+            shape: its size gives the scale.
+        focal_mm: focal length of the camera on 35-mm film. None: that of a telephone.
+
+    Returns:
+        Poses in a world with y up, whose floor is at 0, at the rate of the video.
+
+    Raises:
+        FileError: for a video that cannot be read, naming it.
+        ValueError: if nobody is found, or LiteRT is not installed.
+
+    Examples:
+        >>> motion = hg.motion_from_video("dance.mp4", height=1.72)
+    """
+    joints = None if avatar is None else np.asarray(avatar.rest_joints)
+    options = {"person": person, "height": height, "rest_joints": joints, "focal_mm": focal_mm}
+    return fit_video(Path(video), **options).fit.motion
+
+
+def fit_video(
+    video: Path,
+    *,
+    person: int | None = None,
+    height: float | int | None = None,
+    rest_joints: Float[np.ndarray, "j 3"] | None = None,
+    focal_mm: float | int | None = None,
+    kept: Path | None = None,
+) -> VideoFit:
+    """The motion as `motion_from_video`.
+
+    Arguments: rest_joints: of the avatar. kept: a file for what was seen, while the work goes on.
+    """
+    if height is not None and not SMALLEST <= height <= TALLEST:
+        raise ArgumentError("height", f"{height:g}: expected metres, {SMALLEST:g} to {TALLEST:g}")
+    if height is not None and rest_joints is not None:
+        raise ArgumentError("height", f"{height:g}: expected no avatar with it, which has a height")
+    if focal_mm is not None and not 5 <= focal_mm <= 2000:
+        raise ArgumentError("focal_mm", f"{focal_mm:g}: expected millimetres, 5 to 2000")
+    if person is not None and person < 0:
+        raise ArgumentError("person", f"{person}: expected a number from 0")
+    rate, count = _rate_and_count(video)
+    body = load_body()
+    betas = None if rest_joints is None else betas_of_joints(body, rest_joints)
+    seen, size = _watched(video, count, person, kept)
+    K = np.eye(3)
+    K[0, 0] = K[1, 1] = float(focal_mm or USUAL_FOCAL) / DIAGONAL_35MM * np.hypot(*size)
+    K[:2, 2] = np.asarray(size) / 2
+    keypoints = Keypoints(seen["points"], seen["confidences"], MEDIAPIPE_33, world=seen["world"])
+    lost = int((seen["confidences"].max(1) == 0).sum())
+    if lost:
+        logger.warning(
+            "%s: the person is not found in %d of %d frames, which are interpolated",
+            video,
+            lost,
+            count,
+        )
+    watch = lambda stages, total: bar(stages, desc="fitting the motion", unit="stage")
+    fit = fit_motion(body, keypoints, K, rate, betas=betas, height=height, watch=watch)
+    return VideoFit(fit, body, K, size)
+
+
+def _rate_and_count(video: Path) -> tuple[float, int]:
+    """Frames per second in the mean, and how many there are.
+
+    Raises: FileError naming the video.
+    """
+    times = frame_times(video)
+    count = len(times)
+    with reading(video, "video", CaptureError):
+        check_limit("frames", count, "frames")
+        if count < 2:
+            raise Refused("one frame: expected a video in which somebody moves")
+    seconds = times[-1] - times[0]
+    rate = (count - 1) / seconds if np.isfinite(seconds) and seconds > 0 else frame_rate(video)
+    if rate is None:
+        raise CaptureError(video, "", "says no times of its frames: expected a video with a rate")
+    return float(rate), count
+
+
+# Following
+# --------------------------------------------------------------------------------------------------
+
+
+def _watched(
+    video: Path, count: int, person: int | None, kept: Path | None
+) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
+    """What the detector sees of a person in each frame, and the size of the frames: `points`,
+    `confidences` and `world` as `Keypoints` has them, and `again`, where the detector's two points
+    are.
+    """
+    about = made_from(video, person=person, side=LONGER_SIDE)
+    rows, last = _earlier(kept, about), None
+    if rows:
+        logger.info("%s: %d frames were looked at before", video, len(rows))
+        if rows[-1]["confidences"].any():
+            hips, head = rows[-1]["again"]
+            last = Detection(1.0, hips, head)
+    frames = iter(color_frames(video, LONGER_SIDE, None))
+    size = (0, 0)
+    for frame in itertools.islice(frames, len(rows)):
+        size = frame.shape[1::-1]
+    shown = bar(frames, desc="following the person", unit="frame", total=count, initial=len(rows))
+    saved, follower = time.monotonic(), _Follower(person, last)
+    try:
+        for frame in shown:
+            size = frame.shape[1::-1]
+            rows.append(_row(follower.look(frame.astype(np.float32) / 255)))
+            if kept is not None and time.monotonic() - saved > SAVED:
+                _keep(kept, about, rows)
+                saved = time.monotonic()
+    except BaseException:  # Ctrl-C, too: the next run goes on from here
+        if kept is not None and rows:
+            _keep(kept, about, rows)
+        raise
+    if not any(row["confidences"].any() for row in rows):
+        raise ValueError(f"{video}: {follower.told()}")
+    for line in follower.lines:
+        logger.warning("%s: %s", video, line)
+    if kept is not None:
+        _keep(kept, about, rows)
+    return {key: np.stack([row[key] for row in rows]) for key in rows[0]}, size
+
+
+class _Follower:
+    """Finds one person in frame after frame."""
+
+    def __init__(self, person: int | None, last: Detection | None) -> None:
+        try:
+            self.networks = Networks()
+        except ImportError as error:
+            raise ValueError(str(error)) from error  # one line
+        self.person, self.last = person, last
+        self.most, self.missed, self.lines = 0, 0, []
+
+    def look(self, photo: Float[np.ndarray, "h w 3"]) -> Landmarks | None:
+        """The person in the next frame; None where nobody is found who may be the same."""
+        found = None
+        if self.last is not None and not self.missed:
+            found = self.networks.landmarks(photo, self.last.crop())
+            if found.presence < LEAST_PRESENCE or not self._same(found.again):
+                found = None
+        if found is None and (self.missed < PATIENCE or self.missed % RARELY == 0):
+            found = self._searched(photo)
+        self.missed = self.missed + 1 if found is None else 0
+        if found is not None:
+            self.last = found.again
+        return found
+
+    def _searched(self, photo: Float[np.ndarray, "h w 3"]) -> Landmarks | None:
+        people = find_people(self.networks, photo)
+        self.most = max(self.most, len(people))
+        if self.last is None:
+            number = self.person or 0
+            if number >= len(people):
+                return None
+            alike = [p for p in people if p.crop.side >= ALIKE * people[0].crop.side]
+            if self.person is None and len(alike) > 1:
+                self.lines.append(
+                    f"{len(alike)} people: the largest is followed; --person 1 is the next"
+                )
+            return people[number]
+        near, hips = [p for p in people if self._same(p.again, patience=2.0)], self.last.hips
+        distance = lambda each: float(np.hypot(*(each.again.hips - hips)))
+        return min(near, key=distance, default=None)
+
+    def _same(self, now: Detection, patience: float = 1.0) -> bool:
+        """Whether a detection may be of the person of the last frame."""
+        assert self.last is not None
+        before, after = self.last.crop(), now.crop()
+        ratio = max(before.side, after.side) / max(min(before.side, after.side), 1e-6)
+        away = float(np.hypot(*(after.center - before.center)))
+        return away < patience * FARTHEST * before.side and ratio < LARGEST_CHANGE
+
+    def told(self) -> str:
+        """Why nobody was followed, in a line."""
+        if self.most:
+            return f"--person {self.person}: at most {self.most} people are seen in a frame"
+        return "nobody is found: expected a person who is seen as a whole"
+
+
+def _row(found: Landmarks | None) -> dict[str, np.ndarray]:
+    """What is kept of a frame; zeros where nobody was found."""
+    if found is None:
+        shapes = {"points": (33, 2), "confidences": (33,), "world": (33, 3), "again": (2, 2)}
+        return {key: np.zeros(shape, np.float32) for key, shape in shapes.items()}
+    values = {
+        "points": found.pixels + 0.5,  # the centre of the network's first pixel is at 0
+        "confidences": found.visibility,
+        "world": found.world,
+        "again": np.stack([found.again.hips, found.again.head]),
+    }
+    return {key: np.asarray(value, np.float32) for key, value in values.items()}
+
+
+def made_from(video: Path, **options: Any) -> str:
+    """What a result depends on, as a checksum: the video as it is now, and options."""
+    status = video.stat()
+    known = {"name": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns}
+    return checksum({}, *(f"{key}={value}" for key, value in (known | options).items()))
+
+
+def _keep(kept: Path, about: str, rows: list[dict[str, np.ndarray]]) -> None:
+    arrays = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+    write_npz(kept, {"about": about, **arrays}, compressed=False)
+
+
+def _earlier(kept: Path | None, about: str) -> list[dict[str, np.ndarray]]:
+    """The rows of an interrupted run of the same video and person; none without one.
+
+    Raises: FileError for another file of that name.
+    """
+    if kept is None or not kept.exists():
+        return []
+    with reading(kept, "landmarks of a video"):
+        arrays, _ = read_npz(kept)
+        if not {"about", "points", "again"} <= set(arrays):
+            raise Refused("exists, and is not ours: expected no file of that name")
+    if str(arrays.pop("about")) != about:
+        return []
+    return [{key: each[i] for key, each in arrays.items()} for i in range(len(arrays["points"]))]
+
+
+# Results
+# --------------------------------------------------------------------------------------------------
+
+
+def write_check_video(out: Path, video: Path, found: VideoFit) -> int:
+    """Write the video with the body drawn over it; returns the number of frames."""
+    frames = color_frames(video, SHOWN, None)
+    poses = found.fit.motion
+    drawn = bar(
+        _drawn(frames, found), desc="drawing the body", unit="frame", total=len(poses.translations)
+    )
+    return write_video(out, drawn, poses.fps)
+
+
+def _drawn(
+    frames: Iterable[UInt[np.ndarray, "h w 3"]], found: VideoFit
+) -> Iterator[Float[np.ndarray, "h w 3"]]:
+    import jax
+
+    posed, tints = jax.jit(person_vertices), side_tints(found.body)
+    betas, motion = jnp.asarray(found.fit.betas, jnp.float32), found.fit.motion
+    for i, frame in enumerate(itertools.islice(frames, len(motion.translations))):
+        height, width = frame.shape[:2]
+        K = np.diag([width / found.size[0], height / found.size[1], 1.0]) @ found.K
+        camera = Camera.from_opencv(K, found.fit.cam_from_world, width, height)
+        vertices = posed(found.body, betas, motion.pose(i))
+        image = body_image(vertices, found.body.faces, tints, camera)
+        yield overlay(frame / 255.0, image).clip(0, 1)
+
+
+def motion_beside(video: Path, rest_joints: Float[np.ndarray, "j 3"], person: int | None) -> Motion:
+    """The motion of a video on the body of an avatar with these joints, kept beside the video as
+    NAME.motion.npz.
+
+    Raises: ValueError where another file has that name; as `motion_from_video`.
+    """
+    from humangs_jax.motion import load_motion
+
+    out = video.with_name(f"{video.stem}.motion.npz")
+    about = made_from(video, person=person, joints=checksum({"joints": rest_joints}))
+    known = made_from_of(out) if out.exists() else about
+    if known is None:
+        raise ValueError(
+            f"{out}: exists, and is not of this command: the motion of {video.name} belongs there:"
+            " move it away"
+        )
+    if known != about or not out.exists():
+        kept = out.with_suffix(".seen.npz")
+        found = fit_video(video, person=person, rest_joints=rest_joints, kept=kept)
+        save_motion(out, found.fit.motion, made_from=about)
+        kept.unlink(missing_ok=True)
+    return load_motion(out, rest_joints=rest_joints)

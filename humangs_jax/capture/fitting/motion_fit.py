@@ -1,0 +1,542 @@
+"""A motion from the keypoints of a video of one camera that stands still: one fit over all frames,
+with one shape.
+
+    start    the trunk of each frame by the detector's 3D landmarks, smoothed over time
+    shape    frames from all over the video, without their order: the shape, unless it is known
+    motion   windows of `WINDOW` frames that overlap: keypoints by their noise, the detector's
+             depths, the priors of poses, accelerations and jerk of the joints
+    feet     the same again, with the feet held that the motion shows to stand still
+    floor    the world turned so that whoever stands does so along y
+
+The unknowns of a window are u with x = S u, S = (1 + w D^T D)^(-1/2), D the third differences
+over time: in u the solver sees a problem whose jerk is about as stiff as its keypoints
+(preconditioning), and few steps carry a correction through all frames. All stages are one compiled
+program.
+
+After HTD-Refine (https://arxiv.org/abs/2605.26879) and GVHMR (https://arxiv.org/abs/2409.06662).
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from scipy.ndimage import gaussian_filter1d, median_filter
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import BODY_NAMES
+from humangs_jax.body.landmarks import LandmarkModel, landmark_model, pose_landmarks
+from humangs_jax.body.model import BodyModel, BodyPose, shape_body, without_expression
+from humangs_jax.body.motion import Motion
+from humangs_jax.capture.fitting.landmark_fit import accelerations, keypoint_problem
+from humangs_jax.capture.fitting.residuals.keypoints import (
+    Observations,
+    frame_residuals,
+    in_camera_axes,
+    make_observations,
+    trunk_weights,
+)
+from humangs_jax.capture.fitting.state import (
+    FitState,
+    frame_axes,
+    half_squares,
+    pose_of,
+    robust,
+    state_of,
+    zero_state,
+)
+from humangs_jax.capture.keypoints.keypoints import Keypoints
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
+
+WINDOW, OVERLAP = 120, 24
+"""Frames of a window, and those that it shares with the next."""
+STEPS, STEP_LENGTH = 120, 0.1
+"""Of gradient descent in a stage of a window: how many, and the length of the first in each
+unknown."""
+ACCELERATION, JERK = 10.0, 100.0
+"""Expected standard deviations of a joint's acceleration, m/s^2, and jerk, m/s^3: those of people
+who dance."""
+ROBUST_SCALE = 5.0
+"""Of accelerations and jerk, standard deviations."""
+LEVELS = ((30.0, 8.0), (10.0, 3.0), (5.0, 1.0))
+"""Of the stages of a motion: the robust scale of keypoints, and a multiple of the expected
+accelerations."""
+KEYPOINT_METRES = 0.008
+"""The noise of a keypoint at the person, for the preconditioning."""
+STATIC_SPEEDS = (0.25, 0.5)
+"""Metres a second: a point of the foot that is slower than the first stands still, one that is
+faster than the second moves."""
+HELD_SPEED = 0.03
+"""Metres a second, the standard deviation of a foot that stands still."""
+FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
+"""Landmarks that stand still while a foot does."""
+HEIGHT_STD = 0.005
+"""Metres: how exactly a person's height is known."""
+ANCHOR = 20.0
+"""How hard a window holds to frames that the one before has found, per unit of the state."""
+SMOOTHED = 0.1
+"""Seconds over which the start is smoothed."""
+LEAST_SEEN = 6
+"""Keypoints of a frame below which its start is interpolated."""
+LEAST_VISIBLE = 0.3
+"""Visibility of a keypoint from which on it counts for that."""
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
+"""Of the camera, in a world with y up and z towards it."""
+MOST_TILT = 50.0
+"""Degrees between the camera's upright and the direction in which a person stands; beyond it people
+are taken to lie, and the camera to be level."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MotionFit:
+    """A person in m frames of a video, in a world with y up whose floor is at 0."""
+
+    betas: Float[np.ndarray, " s"]
+    """The shape of the person."""
+    motion: Motion
+    """The poses."""
+    joints: Float[np.ndarray, "m j 3"]
+    """Joints in the world, metres."""
+    cam_from_world: Float[np.ndarray, "4 4"]
+    """The camera, which stands still, metres."""
+    static: Float[np.ndarray, "m f"]
+    """How surely each landmark of `FEET` stands still, 0 to 1."""
+
+
+@pytree_dataclass
+class _Window:
+    """What a window knows besides its keypoints, for `_solved`."""
+
+    poses: BodyPose
+    """Where zeros of its unknowns are, a batch of frames."""
+    betas: Float[Array, " s"]
+    """Where zeros of the shape are."""
+    smoother: Float[Array, "w w"]
+    """S, see the module's head."""
+    timed: Float[Array, " w"]
+    """1 for frames that follow the one before in time, 0 for others."""
+    held: Float[Array, "v f"]
+    """How surely points of the feet stand still from a frame to the next."""
+    anchored: Float[Array, " w"]
+    """1 for frames that stay as they are."""
+    height: Float[Array, "2"]
+    """The person's height, metres, and how much it counts, 0 or 1."""
+    tall: Float[Array, " s1"]
+    """The height of a body: of the mean one, then per unit of each coefficient, metres."""
+    rate: Float[Array, ""]
+    """Frames per second."""
+    scales: Float[Array, "2"]
+    """A row of `LEVELS`."""
+
+
+def fit_motion(
+    body: BodyModel,
+    keypoints: Keypoints,
+    K: Float[np.ndarray, "3 3"],
+    fps: float,
+    *,
+    betas: Float[np.ndarray, " s"] | None = None,
+    height: float | None = None,
+    watch: Callable[[Iterable[Any], int], Iterable[Any]] = lambda stages, count: stages,
+) -> MotionFit:
+    """The motion of a person in a video of one camera that stands still.
+
+    Arguments:
+        keypoints: of each frame, with the detector's 3D landmarks (`Keypoints.world`).
+        K: of the camera, pixels.
+        betas: the person's shape, if it is known; None: it is fitted.
+        height: of the person, metres; None: as the keypoints and the prior have it.
+        watch: shows the progress of an iterable of so many stages.
+    Raises: ValueError if no frame shows the person.
+    """
+    body = without_expression(body)
+    kind = keypoints.set
+    model = landmark_model(body, kind.names, kind.places, kind.certainty)
+    seen = _observations(keypoints, K)
+    m = len(seen.noise)
+    poses = _start(model, seen, fps)
+    shape = np.zeros(body.shape_directions.shape[-1]) if betas is None else np.asarray(betas)
+    tall = _tallness(body)
+    # one stage for the shape, then all levels and the feet of each window
+    windows = _windows(m)
+    stages = iter(watch(range(1 + len(windows) * (len(LEVELS) + 1)), len(windows)))
+
+    def run(
+        frames: np.ndarray, poses: BodyPose, scales: tuple[float, float], **options: Any
+    ) -> tuple[BodyPose, np.ndarray]:
+        next(stages, None)
+        return _run(model, seen, frames, poses, shape, tall, fps, scales, height, **options)
+
+    # the shape, from frames whose order is ignored
+    if betas is None:
+        spread = np.unique(np.linspace(0, m - 1, min(m, WINDOW)).round().astype(int))
+        found = poses
+        for scales in LEVELS[1:]:
+            found, shape = run(spread, found, scales, timed=False)
+    # the motion; then once more, with the feet held that stand still
+    for scales in LEVELS:
+        poses = _joined(windows, poses, functools.partial(run, scales=scales))
+    static = _static_feet(model, shape, poses, fps)
+    poses = _joined(
+        windows, poses, functools.partial(run, scales=LEVELS[-1]), lambda w: {"static": static[w]}
+    )
+    return _standing(model, body, shape, poses, static, fps)
+
+
+def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observations:
+    """The keypoints of m frames, a view each, with the detector's depths.
+
+    Raises: ValueError if no frame shows the person, or depths are missing.
+    """
+    if keypoints.world is None:
+        raise ValueError("expected keypoints of a detector that sees them in space, too")
+    points, confidences = keypoints.points[:, None], keypoints.confidences[:, None]
+    if not ((confidences > LEAST_VISIBLE).sum(-1) >= LEAST_SEEN).any():
+        raise ValueError("the person is seen in no frame")
+    cameras = np.broadcast_to(K, (len(points), 1, 3, 3))
+    world = in_camera_axes(keypoints.world[:, None], points, confidences, cameras)
+    places = np.broadcast_to(FLIP, (len(points), 1, 4, 4))
+    return make_observations(points, confidences, cameras, places, world)
+
+
+# The start
+# --------------------------------------------------------------------------------------------------
+
+
+def _start(model: LandmarkModel, seen: Observations, fps: float) -> BodyPose:
+    """Usual poses, turned and placed as the detector's 3D landmarks are, smoothed over time."""
+    problem = keypoint_problem(model)
+    resting, joints = problem.landmarks_and_joints(zero_state(problem.origin))
+    resting, pelvis = np.asarray(resting), np.asarray(joints[0])
+    usual = np.asarray(problem.origin.pose.rotations)
+    # trunks turn onto the detector's landmarks, whose axes are the camera's
+    weights = trunk_weights(model.names) * problem.known
+    world = np.asarray(seen.world)[:, 0] * np.diag(FLIP)[:3]
+    turns = [_turn(resting, points, weights).as_matrix() for points in world]
+    # sizes of the trunks say how large the detector's person is
+    size = lambda x: np.sqrt(np.average(np.square(x - x.mean(-2, keepdims=True)).sum(-1), axis=-1))
+    trunk = weights > 0.5
+    scale = size(resting[trunk]) / np.maximum(size(world[:, trunk]), 1e-3)
+    hips = [model.names.index(f"{side}_hip") for side in ("left", "right")]
+    offsets = (world - world[:, hips].mean(1, keepdims=True)) * scale[:, None, None]
+    views = (np.asarray(x)[:, 0] for x in (seen.points, seen.confidences, seen.K))
+    places = np.stack([_place(*each) for each in zip(*views, offsets, strict=True)])
+    # frames that show nothing lie between the others
+    shown = (np.asarray(seen.confidences)[:, 0] > LEAST_VISIBLE).sum(-1) >= LEAST_SEEN
+    shown &= places[:, 2] < 0
+    known, frames = np.flatnonzero(shown), np.arange(len(shown))
+    if not len(known):
+        raise ValueError("the person is seen in no frame")
+    nearest = known[np.searchsorted((known[1:] + known[:-1]) / 2, frames)]
+    between = lambda x: np.stack([np.interp(frames, known, c[known]) for c in x.T], axis=-1)
+    steady = lambda x: gaussian_filter1d(
+        median_filter(x, size=(5, *[1] * (x.ndim - 1)), mode="nearest"),
+        max(SMOOTHED * fps, 0.5),
+        axis=0,
+        mode="nearest",
+    )
+    places = steady(between(places))
+    matrices = steady(np.stack(turns)[nearest])
+    u, _, vt = np.linalg.svd(matrices)
+    u[..., -1] *= np.linalg.det(u @ vt)[:, None]  # the nearest rotations
+    roots = Rotation.from_matrix(u @ vt).as_rotvec()
+    rotations = np.tile(usual, (len(frames), 1, 1))
+    rotations[:, 0] = roots
+    return jax.vmap(BodyPose)(
+        jnp.asarray(rotations, jnp.float32), jnp.asarray(places - pelvis, jnp.float32)
+    )
+
+
+def _turn(
+    a: Float[np.ndarray, "k 3"], b: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
+) -> Rotation:
+    """The rotation about weighted middles that takes points a to b best."""
+    middle = lambda x: x - np.average(x, axis=0, weights=weights)
+    return Rotation.align_vectors(middle(b), middle(a), weights=weights)[0]
+
+
+def _place(
+    points: Float[np.ndarray, "k 2"],
+    confidences: Float[np.ndarray, " k"],
+    K: Float[np.ndarray, "3 3"],
+    offsets: Float[np.ndarray, "k 3"],
+) -> Float[np.ndarray, "3"]:
+    """The point from which points at these offsets are seen at their keypoints: with (x, y) a
+    keypoint over the focal length, x (z + t_z) = X + t_x, linear in t, and likewise y.
+    """
+    xy = (points - K[:2, 2]) / np.diagonal(K)[:2]
+    off = offsets * np.diag(FLIP)[:3]
+    rows = np.zeros((len(xy), 2, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+    rows[..., 2] = -xy
+    right = xy * off[:, 2:] - off[:, :2]
+    weights = np.sqrt(confidences)[:, None]
+    place = np.linalg.lstsq(
+        (rows * weights[..., None]).reshape(-1, 3), (right * weights).ravel(), rcond=None
+    )[0]
+    return place * np.diag(FLIP)[:3]
+
+
+def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
+    """The height of the mean body, then what a unit of each shape coefficient adds, metres."""
+    template = np.asarray(body.template)
+    top, bottom = template[:, 1].argmax(), template[:, 1].argmin()
+    directions = np.asarray(body.shape_directions)[:, 1]
+    return np.append(np.ptp(template[:, 1]), directions[top] - directions[bottom])
+
+
+# Windows
+# --------------------------------------------------------------------------------------------------
+
+
+def _windows(m: int) -> list[np.ndarray]:
+    """Numbers of the frames of each window, which overlap."""
+    starts = range(0, max(m - OVERLAP, 1), WINDOW - OVERLAP)
+    return [np.arange(start, min(start + WINDOW, m)) for start in starts]
+
+
+def _joined(
+    windows: list[np.ndarray],
+    poses: BodyPose,
+    run: Callable[..., tuple[BodyPose, np.ndarray]],
+    more: Callable[[np.ndarray], dict[str, Any]] = lambda window: {},
+) -> BodyPose:
+    """The poses after each window has been solved, from the first to the last. The frames that a
+    window shares with the one before are anchored in their first half.
+    """
+    for i, window in enumerate(windows):
+        anchored = np.zeros(len(window))
+        anchored[: OVERLAP // 2] = i > 0
+        poses, _ = run(window, poses, anchored=anchored, **more(window))
+    return poses
+
+
+def _run(
+    model: LandmarkModel,
+    seen: Observations,
+    frames: np.ndarray,
+    poses: BodyPose,
+    betas: Float[np.ndarray, " s"],
+    tall: Float[np.ndarray, " s1"],
+    fps: float,
+    scales: tuple[float, float],
+    height: float | None,
+    timed: bool = True,
+    static: Float[np.ndarray, "w f"] | None = None,
+    anchored: Float[np.ndarray, " w"] | None = None,
+) -> tuple[BodyPose, Float[np.ndarray, " s"]]:
+    """All poses, with those of these frames fitted, and the shape. timed: whether the frames follow
+    each other in time and have the shape already.
+    """
+    count = len(frames)
+    # windows have one length, so that one program does for all: what is added shows nothing
+    padded = np.append(frames, np.full(WINDOW - count, frames[-1]))
+    filled = lambda x: np.append(x, np.zeros((WINDOW - count, *np.shape(x)[1:])), axis=0)
+    own = jax.tree.map(lambda x: x[padded], seen)
+    own = replace(own, confidences=own.confidences * filled(np.ones(count))[:, None, None])
+    window = _Window(
+        poses=jax.tree.map(lambda x: x[padded], poses),
+        betas=jnp.asarray(betas, jnp.float32),
+        smoother=jnp.asarray(_smoother(fps) if timed else np.eye(WINDOW), jnp.float32),
+        timed=jnp.asarray(filled(np.ones(count)) * timed, jnp.float32),
+        held=jnp.asarray(filled(np.zeros((count, len(FEET))) if static is None else static)[1:]),
+        anchored=jnp.asarray(filled(np.zeros(count) if anchored is None else anchored)),
+        height=jnp.asarray([height or 0.0, height is not None], jnp.float32),
+        tall=jnp.asarray(tall, jnp.float32),
+        rate=jnp.asarray(fps, jnp.float32),
+        scales=jnp.asarray(scales, jnp.float32),
+    )
+    found, betas = _solved(model, own, window)
+    placed = lambda all_, new: all_.at[frames].set(new[:count])
+    return jax.tree.map(placed, poses, found), np.asarray(betas)
+
+
+@functools.cache
+def _smoother(fps: float) -> Float[np.ndarray, "w w"]:
+    """S of a window."""
+    third = np.diff(np.eye(WINDOW), n=3, axis=0)
+    values, vectors = np.linalg.eigh(third.T @ third)
+    weight = (KEYPOINT_METRES * fps**3 / JERK) ** 2
+    return (vectors / np.sqrt(1 + weight * np.maximum(values, 0))) @ vectors.T
+
+
+@jax.jit
+def _solved(
+    model: LandmarkModel, seen: Observations, window: _Window
+) -> tuple[BodyPose, Float[Array, " s"]]:
+    """The poses of a window and the shape, from those that it begins with."""
+    problem = keypoint_problem(model)
+    origin = replace(problem.origin, betas=jnp.zeros_like(window.betas))
+    usual = problem.origin.pose
+    # only the root and the place start from where they are: poses are measured from the usual one,
+    # which is where their prior is
+    starts = replace(
+        window.poses, rotations=usual.rotations.at[0].set(0) + _roots_of(window.poses.rotations)
+    )
+    origins = jax.vmap(lambda pose: replace(origin, pose=pose))(starts)
+    begun = jax.vmap(lambda own, pose: state_of(own, window.betas, pose))(origins, window.poses)
+    begun = replace(begun, betas=window.betas)
+    body = np.asarray([name in BODY_NAMES for name in model.joint_names])
+    feet = np.asarray([model.names.index(name) for name in FEET])
+
+    def smooth(state: FitState) -> FitState:
+        """x = begun + S u."""
+        moved = lambda old, u: old + jnp.einsum("vw,w...->v...", window.smoother, u)
+        return FitState(
+            begun.betas + state.betas * (1 - jnp.max(window.timed)),  # in time the shape is known
+            moved(begun.global_orient, state.global_orient),
+            moved(begun.transl, state.transl),
+            moved(begun.body_pose, state.body_pose),
+        )
+
+    def residuals(unknowns: FitState) -> dict[str, Any]:
+        state = smooth(unknowns)
+
+        def of_frame(seen, own, origin):
+            here = dataclasses.replace(problem, origin=origin)
+            found = frame_residuals(here, seen, own, window.scales[0])
+            return found, here.landmarks_and_joints(own)
+
+        by_frame = jax.vmap(of_frame, in_axes=(0, frame_axes(state), 0))
+        found, (landmarks, joints) = by_frame(seen, state, origins)
+        found["shape"] = state.betas
+        # how joints accelerate, between frames that follow each other
+        times = window.timed[1:, None, None]
+        second = accelerations(joints[:, body]) * times[1:] * window.rate**2
+        third = jnp.diff(second, axis=0) * window.rate
+        slack = window.scales[1]
+        found["acceleration"] = robust(second / (ACCELERATION * slack), ROBUST_SCALE)
+        found["jerk"] = robust(third * times[2:] / (JERK * slack), ROBUST_SCALE)
+        # feet that stand still
+        steps = jnp.diff(landmarks[:, feet], axis=0) * window.rate / HELD_SPEED
+        found["feet"] = robust(jnp.sqrt(window.held)[..., None] * steps, ROBUST_SCALE)
+        # frames that another window has solved
+        off = lambda x, y: (ANCHOR * window.anchored).reshape(-1, *[1] * (x.ndim - 1)) * (x - y)
+        found["anchor"] = [
+            off(getattr(state, name), getattr(begun, name))
+            for name in ("global_orient", "transl", "body_pose")
+        ]
+        tall = window.tall[0] + jnp.sum(window.tall[1:] * state.betas)
+        found["height"] = window.height[1] * (tall - window.height[0]) / HEIGHT_STD
+        return found
+
+    none = jax.tree.map(jnp.zeros_like, begun)
+    state = smooth(_descended(lambda unknowns: half_squares(residuals(unknowns)), none))
+    poses = jax.vmap(pose_of, in_axes=(0, frame_axes(state)))(origins, state)
+    return poses, state.betas
+
+
+def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitState:
+    """Where Adam gets in `STEPS` steps, whose length falls to 0 (cosine)."""
+    optimizer = optax.adam(optax.cosine_decay_schedule(STEP_LENGTH, STEPS), b1=0.9, b2=0.95)
+
+    def step(carry, _):
+        unknowns, memory = carry
+        updates, memory = optimizer.update(jax.grad(loss)(unknowns), memory)
+        return (optax.apply_updates(unknowns, updates), memory), None
+
+    (found, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), length=STEPS)
+    return found
+
+
+def _roots_of(rotations: Float[Array, "m j 3"]) -> Float[Array, "m j 3"]:
+    """The rotations of the roots, 0 for the other joints."""
+    return jnp.zeros_like(rotations).at[:, 0].set(rotations[:, 0])
+
+
+# Feet and floor
+# --------------------------------------------------------------------------------------------------
+
+
+@jax.jit
+def _landmarks(
+    model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose
+) -> tuple[Float[Array, "m k 3"], Float[Array, "m j 3"]]:
+    return jax.vmap(lambda pose: pose_landmarks(model, betas, pose))(poses)
+
+
+def _feet(model: LandmarkModel, landmarks: Float[Array, "m k 3"]) -> Float[np.ndarray, "m f 3"]:
+    return np.asarray(landmarks)[:, [model.names.index(name) for name in FEET]]
+
+
+def _static_feet(
+    model: LandmarkModel, betas: Float[np.ndarray, " s"], poses: BodyPose, fps: float
+) -> Float[np.ndarray, "m f"]:
+    """How surely each point of the feet stands still between a frame and the one before."""
+    points, _ = _landmarks(model, jnp.asarray(betas, jnp.float32), poses)
+    moved = np.diff(_feet(model, points), axis=0, prepend=np.nan) * fps
+    moved[..., 2] /= 2  # depths of a single camera are unsteady
+    speed = np.nan_to_num(np.linalg.norm(moved, axis=-1), nan=np.inf)
+    slow, fast = STATIC_SPEEDS
+    return np.clip((fast - speed) / (fast - slow), 0, 1)
+
+
+def _standing(
+    model: LandmarkModel,
+    body: BodyModel,
+    betas: Float[np.ndarray, " s"],
+    poses: BodyPose,
+    static: Float[np.ndarray, "m f"],
+    fps: float,
+) -> MotionFit:
+    """The motion in a world turned so that the person stands along y, with the floor at 0."""
+    shape = jnp.asarray(betas, jnp.float32)
+    joints = np.asarray(_landmarks(model, shape, poses)[1], np.float64)
+    rest = shape_body(body, shape)
+    pelvis = np.asarray(rest.joints[0], np.float64)
+    # whoever stands has the neck above the ankles, in the mean over frames with a foot that stands
+    named = {name: j for j, name in enumerate(model.joint_names)}
+    ankles = joints[:, [named["left_ankle"], named["right_ankle"]]].mean(1)
+    upwards = joints[:, named["neck"]] - ankles
+    weights = static.max(1) + 1e-3
+    upwards /= np.linalg.norm(upwards, axis=-1, keepdims=True)
+    up = np.average(upwards, axis=0, weights=weights)
+    up /= max(np.linalg.norm(up), 1e-9)
+    turn = Rotation.identity()
+    if np.degrees(np.arccos(np.clip(up[1], -1, 1))) < MOST_TILT:
+        turn = Rotation.align_vectors([[0.0, 1, 0]], [up])[0]
+    rotations = np.asarray(poses.rotations, np.float64).copy()
+    rotations[:, 0] = (turn * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
+    places = turn.apply(np.asarray(poses.translation, np.float64) + pelvis) - pelvis
+    # the soles are on the floor
+    sole = float(np.asarray(rest.joints)[:, 1].min() - np.asarray(rest.vertices)[:, 1].min())
+    joints = turn.apply(joints.reshape(-1, 3)).reshape(joints.shape)
+    floor = float(np.quantile(joints[..., 1].min(1), 0.05)) - sole
+    shift = np.asarray([0.0, floor, 0.0])
+    camera = FLIP.astype(np.float64) @ np.linalg.inv(_matrix(turn, -shift))
+    motion = Motion(
+        jnp.asarray(rotations, jnp.float32), jnp.asarray(places - shift, jnp.float32), float(fps)
+    )
+    return MotionFit(np.asarray(betas), motion, joints - shift, camera, static)
+
+
+def _matrix(turn: Rotation, shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), shift
+    return matrix
+
+
+def betas_of_joints(
+    body: BodyModel, rest_joints: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, " s"]:
+    """The shape whose joints in the T-pose are nearest to these, up to a translation: that of an
+    avatar.
+
+    Raises: ValueError for another number of joints.
+    """
+    body = without_expression(body)
+    mean = np.asarray(body.joint_regressor, np.float64) @ np.asarray(body.template, np.float64)
+    if np.shape(rest_joints) != mean.shape:
+        raise ValueError(f"expected {len(mean)} joints, got {len(rest_joints)}")
+    directions = np.einsum("jn,nas->jas", body.joint_regressor, body.shape_directions)
+    bones = lambda x: (x - x[:1])[1:].reshape(3 * (len(mean) - 1), -1)
+    a, b = bones(directions), bones(np.asarray(rest_joints, np.float64) - mean)[:, 0]
+    # a coefficient of 1 is usual; joints are known to a millimetre
+    ridge = 1e-3 * np.eye(a.shape[1])
+    right = np.append(b, np.zeros(len(ridge)))
+    return np.linalg.lstsq(np.concatenate([a, ridge]), right, rcond=None)[0]
