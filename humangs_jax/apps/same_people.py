@@ -210,7 +210,10 @@ def exchanged(found: Found) -> Found:
     """The person with left and right exchanged."""
     order = np.asarray(MEDIAPIPE_33.mirror)
     person = dataclasses.replace(
-        found.person, points=found.person.points[order], world=found.person.world[order]
+        found.person,
+        points=found.person.points[order],
+        world=found.person.world[order],
+        hands=None if found.person.hands is None else np.roll(found.person.hands, 21, axis=0),
     )
     return found._replace(person=person, mirrored=True)
 

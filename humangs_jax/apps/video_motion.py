@@ -6,6 +6,7 @@ goes on, so that an interrupted run goes on where it was. Then one fit over all 
 (`capture.fitting.motion_fit`).
 """
 
+import dataclasses
 import itertools
 import logging
 import time
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from humangs_jax.apps.check import body_image, overlay, side_tints
 from humangs_jax.avatar.avatar import Avatar
@@ -23,6 +25,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, person_vertices
 from humangs_jax.body.motion import Motion
 from humangs_jax.capture.calibration.videos import color_frames, frame_rate, frame_times
+from humangs_jax.capture.detection.face_and_hands import SHAPE_NAMES, FaceAndHands, hand_columns
 from humangs_jax.capture.detection.people import (
     LEAST_PRESENCE,
     Detection,
@@ -32,11 +35,13 @@ from humangs_jax.capture.detection.people import (
 )
 from humangs_jax.capture.fitting.motion_fit import MotionFit, betas_of_joints, fit_motion
 from humangs_jax.capture.fitting.person_moments import USUAL_FOCAL
-from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.capture.keypoints.formats import SeenPerson, columns_of
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_69, Keypoints
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum, read_npz, write_npz
@@ -59,6 +64,11 @@ ALIKE = 0.6
 """Somebody whose crop is at least this share of the largest may be meant as well."""
 SAVED = 15.0
 """Seconds of work after which what was seen is kept."""
+KEYPOINTS = len(MEDIAPIPE_69.names)
+NO_FACE = np.full(len(SHAPE_NAMES), np.nan, np.float32)
+FACE_SECONDS, LEAST_FACES = 0.025, 0.1
+"""Standard deviation of the smoothing of faces, seconds: a blink takes a tenth of a second; and the
+share of the frames that have to show a face."""
 TALLEST, SMALLEST = 2.5, 0.4
 """Metres: heights of people."""
 
@@ -108,8 +118,10 @@ def motion_from_video(
         >>> motion = hg.motion_from_video("dance.mp4", height=1.72)
     """
     joints = None if avatar is None else np.asarray(avatar.rest_joints)
-    options = {"person": person, "height": height, "rest_joints": joints, "focal_mm": focal_mm}
-    return fit_video(Path(video), **options).fit.motion
+    found = fit_video(
+        Path(video), person=person, height=height, rest_joints=joints, focal_mm=focal_mm
+    )
+    return found.fit.motion
 
 
 def fit_video(
@@ -133,14 +145,14 @@ def fit_video(
         raise ArgumentError("focal_mm", f"{focal_mm:g}: expected millimetres, 5 to 2000")
     if person is not None and person < 0:
         raise ArgumentError("person", f"{person}: expected a number from 0")
-    rate, count = _rate_and_count(video)
+    rate, count = rate_and_count(video)
     body = load_body()
     betas = None if rest_joints is None else betas_of_joints(body, rest_joints)
-    seen, size = _watched(video, count, person, kept)
+    seen, size = look_at_video(video, count, person, kept)
     K = np.eye(3)
     K[0, 0] = K[1, 1] = float(focal_mm or USUAL_FOCAL) / DIAGONAL_35MM * np.hypot(*size)
     K[:2, 2] = np.asarray(size) / 2
-    keypoints = Keypoints(seen["points"], seen["confidences"], MEDIAPIPE_33, world=seen["world"])
+    keypoints = Keypoints(seen["points"], seen["confidences"], MEDIAPIPE_69, world=seen["world"])
     lost = int((seen["confidences"].max(1) == 0).sum())
     if lost:
         logger.warning(
@@ -151,10 +163,29 @@ def fit_video(
         )
     watch = lambda stages, total: bar(stages, desc="fitting the motion", unit="stage")
     fit = fit_motion(body, keypoints, K, rate, betas=betas, height=height, watch=watch)
+    faces = smooth_faces(seen["face"], rate)
+    if faces is not None:
+        motion = replace(fit.motion, expressions=jnp.asarray(faces), expression_names=SHAPE_NAMES)
+        fit = dataclasses.replace(fit, motion=motion)
     return VideoFit(fit, body, K, size)
 
 
-def _rate_and_count(video: Path) -> tuple[float, int]:
+def smooth_faces(
+    faces: Float[np.ndarray, "m e"], rate: float | int
+) -> Float[np.ndarray, "m e"] | None:
+    """Scores of each frame as they change over time; frames without a face, NaN, lie between the
+    others. None if hardly any frame shows a face.
+    """
+    known = np.flatnonzero(np.isfinite(faces).all(1))
+    if len(known) < LEAST_FACES * len(faces):
+        return None
+    frames = np.arange(len(faces))
+    filled = np.stack([np.interp(frames, known, column[known]) for column in faces.T], axis=1)
+    smooth = gaussian_filter1d(filled, max(FACE_SECONDS * rate, 1e-3), axis=0, mode="nearest")
+    return smooth.clip(0, 1).astype(np.float32)
+
+
+def rate_and_count(video: Path) -> tuple[float, int]:
     """Frames per second in the mean, and how many there are.
 
     Raises: FileError naming the video.
@@ -176,7 +207,7 @@ def _rate_and_count(video: Path) -> tuple[float, int]:
 # --------------------------------------------------------------------------------------------------
 
 
-def _watched(
+def look_at_video(
     video: Path, count: int, person: int | None, kept: Path | None
 ) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
     """What the detector sees of a person in each frame, and the size of the frames: `points`,
@@ -195,11 +226,13 @@ def _watched(
     for frame in itertools.islice(frames, len(rows)):
         size = frame.shape[1::-1]
     shown = bar(frames, desc="following the person", unit="frame", total=count, initial=len(rows))
-    saved, follower = time.monotonic(), _Follower(person, last)
+    saved, follower, parts = time.monotonic(), _Follower(person, last), FaceAndHands()
     try:
         for frame in shown:
             size = frame.shape[1::-1]
-            rows.append(_row(follower.look(frame.astype(np.float32) / 255)))
+            photo = frame.astype(np.float32) / 255
+            found = follower.look(photo)
+            rows.append(_row(photo, found, parts))
             if kept is not None and time.monotonic() - saved > SAVED:
                 _keep(kept, about, rows)
                 saved = time.monotonic()
@@ -273,16 +306,24 @@ class _Follower:
         return "nobody is found: expected a person who is seen as a whole"
 
 
-def _row(found: Landmarks | None) -> dict[str, np.ndarray]:
-    """What is kept of a frame; zeros where nobody was found."""
+def _row(
+    photo: Float[np.ndarray, "h w 3"], found: Landmarks | None, parts: Any
+) -> dict[str, np.ndarray]:
+    """What is kept of a frame: zeros where nobody was found; a face that is not seen is NaN."""
     if found is None:
-        shapes = {"points": (33, 2), "confidences": (33,), "world": (33, 3), "again": (2, 2)}
-        return {key: np.zeros(shape, np.float32) for key, shape in shapes.items()}
+        shapes = {"points": (2,), "confidences": (), "world": (3,)}
+        row = {key: np.zeros((KEYPOINTS, *shape), np.float32) for key, shape in shapes.items()}
+        return row | {"again": np.zeros((2, 2), np.float32), "face": NO_FACE}
+    hands = hand_columns(parts.hands(photo, found.pixels, found.visibility), found.world)
+    face = parts.face(photo, found.pixels)
+    points = np.column_stack([found.pixels, found.visibility])
+    columns = columns_of(SeenPerson(points, found.world, found.presence, hands), hands=True)
     values = {
-        "points": found.pixels + 0.5,  # the centre of the network's first pixel is at 0
-        "confidences": found.visibility,
-        "world": found.world,
+        "points": columns[:, :2] + 0.5,  # the centre of the networks' first pixel is at 0
+        "confidences": columns[:, 2],
+        "world": columns[:, 3:],
         "again": np.stack([found.again.hips, found.again.head]),
+        "face": NO_FACE if face is None else face,
     }
     return {key: np.asarray(value, np.float32) for key, value in values.items()}
 

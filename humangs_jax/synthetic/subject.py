@@ -17,9 +17,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
 from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.synthetic import complexion, hair, surroundings, wardrobe
@@ -239,7 +240,15 @@ class SyntheticSubject:
         blended = (self.surface.weights @ transforms.reshape(-1, 12)).reshape(-1, 3, 4)
         return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
 
+    def vertices_of(self, piece: int) -> Bool[np.ndarray, " n"]:
+        """Which vertices belong to a piece, by the number of its material."""
+        found = np.zeros(len(self.surface.vertices), bool)
+        found[self.surface.faces[self.face_materials == piece]] = True
+        return found
 
+
+SKIN = 0
+"""The number of the skin's material."""
 _shape = jax.jit(shape_body)
 
 
@@ -362,6 +371,32 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
         0.035,
     )
     return Build(anatomy.joints.astype(np.float64), anatomy.parents, *radii)
+
+
+SAME_PLACE = 1e-6
+"""Metres in the template: a vertex of the skin is the body's there."""
+
+
+def expressed_subject(
+    subject: SyntheticSubject, body: BodyModel, coefficients: Float[np.ndarray, " e"]
+) -> SyntheticSubject:
+    """The person with another face: coefficients of the body's expressions. Eyes do not turn, and
+    there are no teeth.
+
+    Raises: ValueError for a body without expressions.
+    """
+    if body.expressions is None:
+        raise ValueError(f"body '{body.name}' has no expressions")
+    vertices, known = np.array(subject.surface.vertices), np.asarray(body.expressions.vertices)
+    # the skin's vertices, some of which are cut away, are found by their places in the template
+    template = np.asarray(body.template)[known]
+    distances, nearest = KDTree(template).query(subject.surface.attributes["template"])
+    rows = np.flatnonzero((distances < SAME_PLACE) & (subject.vertices_of(SKIN)))
+    moves = np.asarray(body.expressions.directions) @ np.asarray(coefficients, np.float32)
+    vertices[rows] += moves[nearest[rows]]
+    return dataclasses.replace(
+        subject, surface=dataclasses.replace(subject.surface, vertices=vertices)
+    )
 
 
 # Posed and rendered

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from humangs_jax.apps import video_motion
-from humangs_jax.apps.video_motion import LONGER_SIDE, fit_video, motion_beside
+from humangs_jax.apps.video_motion import LONGER_SIDE, fit_video, motion_beside, smooth_faces
 from humangs_jax.avatar.video import write_video
 from humangs_jax.body.motion import Motion
+from humangs_jax.capture.detection.face_and_hands import Hand
 from humangs_jax.capture.detection.people import Crop, Detection, Landmarks
 from humangs_jax.capture.fitting.motion_fit import MotionFit
 from humangs_jax.motion import load_motion, made_from_of, save_motion
@@ -45,6 +46,13 @@ class Scene:
         far = abs(near.crop.center[0] - crop.center[0]) > 8
         return near._replace(presence=0.0) if far else near
 
+    def face(self, photo, body):
+        return None if self.frame == 3 else np.full(51, 0.05 * self.frame, np.float32)
+
+    def hands(self, photo, body, visibility):
+        pixels = np.tile([body[0, 0] + 2, 20.0], (21, 1))
+        return Hand(pixels, np.zeros((21, 3)), 0.75), None
+
     def find(self, networks, photo):
         self._look(photo)
         return self.people()
@@ -63,6 +71,7 @@ def scene(tmp_path, monkeypatch):
     scene = Scene()
     monkeypatch.setattr(video_motion, "Networks", lambda: scene)
     monkeypatch.setattr(video_motion, "find_people", scene.find)
+    monkeypatch.setattr(video_motion, "FaceAndHands", lambda: scene)
 
     def fit(body, keypoints, K, fps, *, betas, height, watch):
         scene.keypoints, scene.K, scene.fps, scene.betas = keypoints, K, fps, betas
@@ -86,6 +95,32 @@ def test_the_largest_person_is_followed_from_frame_to_frame(scene, tmp_path):
     assert scene.looks == COUNT and scene.fps == pytest.approx(10)
     assert found.size == (64, 32) and max(found.size) <= LONGER_SIDE
     assert found.K[0, 0] == pytest.approx(np.hypot(64, 32), rel=1e-3)  # 35-mm film's diagonal
+
+
+def test_hands_and_face_are_found_with_the_body(scene, tmp_path):
+    motion = fit_video(tmp_path / "me.mp4").fit.motion
+    names = scene.keypoints.set.names
+    left, right = (names.index(f"{side}_index_tip") for side in ("left", "right"))
+    np.testing.assert_allclose(
+        scene.keypoints.points[:, left, 0], scene.keypoints.points[:, 0, 0] + 2
+    )
+    assert (scene.keypoints.confidences[:, left] == 0.75).all()
+    assert (scene.keypoints.confidences[:, right] == 0).all()  # this one was not seen
+    # the face of the frame that does not show it lies between the others
+    expected = 0.05 * np.arange(COUNT)
+    middle = slice(1, -1)  # the smoothing bends the ends
+    np.testing.assert_allclose(
+        np.asarray(motion.expressions_of(("jawOpen",)))[middle, 0], expected[middle], atol=1e-3
+    )
+    assert len(motion.expression_names) == 51
+
+
+def test_a_video_that_hardly_shows_a_face_has_no_expressions():
+    faces = np.full((40, 51), np.nan, np.float32)
+    faces[:3] = 0.5
+    assert smooth_faces(faces, 30.0) is None
+    faces[:5] = 0.5
+    np.testing.assert_allclose(smooth_faces(faces, 30.0), 0.5)
 
 
 def test_another_person_is_followed_by_number(scene, tmp_path):

@@ -28,7 +28,7 @@ import optax
 from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import BODY_NAMES
+from humangs_jax.body.joints import BODY_NAMES, FINGERS
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body, without_expression
 from humangs_jax.body.motion import Motion
@@ -73,6 +73,8 @@ STATIC_SPEEDS = (0.25, 0.5)
 faster than the second moves."""
 HELD_SPEED = 0.03
 """Metres a second, the standard deviation of a foot that stands still."""
+SMOOTH = {*BODY_NAMES, *(f"{side}_{each}3" for side in ("left", "right") for each in FINGERS)}
+"""Joints whose accelerations and jerk are expected: the body's, and the last of each finger."""
 FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
 """Landmarks that stand still while a foot does."""
 HEIGHT_STD = 0.005
@@ -381,7 +383,7 @@ def _solved(
     origins = jax.vmap(lambda pose: replace(origin, pose=pose))(starts)
     begun = jax.vmap(lambda own, pose: state_of(own, window.betas, pose))(origins, window.poses)
     begun = replace(begun, betas=window.betas)
-    body = np.asarray([name in BODY_NAMES for name in model.joint_names])
+    heavy = np.asarray([name in SMOOTH for name in model.joint_names])
     feet = np.asarray([model.names.index(name) for name in FEET])
 
     def smooth(state: FitState) -> FitState:
@@ -407,7 +409,7 @@ def _solved(
         found["shape"] = state.betas
         # how joints accelerate, between frames that follow each other
         times = window.timed[1:, None, None]
-        second = accelerations(joints[:, body]) * times[1:] * window.rate**2
+        second = accelerations(joints[:, heavy]) * times[1:] * window.rate**2
         third = jnp.diff(second, axis=0) * window.rate
         slack = window.scales[1]
         found["acceleration"] = robust(second / (ACCELERATION * slack), ROBUST_SCALE)

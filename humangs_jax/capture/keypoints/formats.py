@@ -24,6 +24,7 @@ import numpy as np
 from humangs_jax.capture.keypoints.keypoints import (
     KEYPOINT_SETS,
     MEDIAPIPE_33,
+    MEDIAPIPE_69,
     OPENPOSE_60,
     OPENPOSE_67,
     SETS_BY_COUNT,
@@ -34,6 +35,7 @@ from humangs_jax.capture.keypoints.keypoints import (
     Source,
     detections_of,
     triples,
+    with_hands,
 )
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import (
@@ -68,6 +70,7 @@ def read_own(source: Source, format: SourceFormat) -> Detections:
         return _saved(source.path)
     kind, images = read_people(source.path, source.json)
     nobody = np.zeros((len(kind.names), 6))
+<<<<<<< HEAD
     seen = []
     for image in images:
         people = tuple(
@@ -77,6 +80,18 @@ def read_own(source: Source, format: SourceFormat) -> Detections:
         seen.append(DetectedImage(image.image, source.path, people, image.size))
     somebody = any(any(image.people) for image in images)
     return Detections(kind if somebody else None, tuple(seen), offset=0.0)
+=======
+    columns = lambda each: nobody if each is None else np.column_stack([each.points, each.world])
+    if any(each is not None and each.hands is not None for i in images for each in i.people):
+        kind, columns = MEDIAPIPE_69, lambda each: columns_of(each, hands=True)
+    found = (tuple(map(columns, image.people)) for image in images)
+    seen = tuple(
+        DetectedImage(i.image, source.path, p, i.size) for i, p in zip(images, found, strict=True)
+    )
+    return Detections(
+        kind if any(any(image.people) for image in images) else None, seen, offset=0.0
+    )
+>>>>>>> bfbf0984 (Faces and hands of the people in videos and photos)
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
@@ -135,6 +150,22 @@ class SeenPerson:
     """Places of the points, (k, 3), metres."""
     presence: float
     """Presence of the person, in [0, 1]."""
+    hands: Float[np.ndarray, "42 6"] | None = None
+    """The 21 landmarks of the left and of the right hand: pixels, confidence, and places in metres;
+    0 for a hand that was not seen; None: hands were not looked for, or neither was seen."""
+
+
+def columns_of(person: SeenPerson | None, hands: bool) -> Float[np.ndarray, "k 6"]:
+    """Pixels, confidence and places of a person's points, 0 for nobody: those of `MEDIAPIPE_33`, or
+    with hands of `MEDIAPIPE_69`.
+    """
+    if person is None:
+        return np.zeros((len((MEDIAPIPE_69 if hands else MEDIAPIPE_33).names), 6))
+    body = np.column_stack([person.points, person.world])
+    if not hands:
+        return body
+    own = (None, None) if person.hands is None else np.split(person.hands, 2)
+    return with_hands(body, [each if each is not None and each.any() else None for each in own])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -170,14 +201,20 @@ def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
 
 
 def _described(person: SeenPerson) -> dict[str, Any]:
+<<<<<<< HEAD
     def rounded(values):
         return np.round(values, DECIMALS).tolist()
 
+=======
+    rounded = lambda values: np.round(values, DECIMALS).tolist()
+    hands = {} if person.hands is None else {"hands": rounded(person.hands)}
+>>>>>>> bfbf0984 (Faces and hands of the people in videos and photos)
     return {
         "presence": round(person.presence, DECIMALS),
         "pixels": rounded(person.points[:, :2]),
         "visibility": rounded(person.points[:, 2]),
         "world": rounded(person.world),
+        **hands,
     }
 
 
@@ -221,7 +258,10 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
         file_numbers(value, path, f"{field}.{key}", shape, nulls=True)
         for value, (key, shape) in zip(values, shapes.items(), strict=False)
     )
-    return SeenPerson(np.column_stack([pixels, visibility]), world, float(values[-1]))
+    hands = None
+    if count == len(MEDIAPIPE_33.names) and person.get("hands") is not None:
+        hands = file_numbers(person["hands"], path, f"{field}.hands", (42, 6), nulls=True)
+    return SeenPerson(np.column_stack([pixels, visibility]), world, float(values[-1]), hands)
 
 
 # OpenPose's --write_json

@@ -229,6 +229,16 @@ MEDIAPIPE_33 = _keypoint_set(
 are points of the face.
 """
 
+_COARSE = ("pinky_1", "index_1", "thumb_2")
+_HANDS = (*hand_names("left"), *hand_names("right"))
+MEDIAPIPE_69 = _keypoint_set(
+    "mediapipe69",
+    (*(name for name in MEDIAPIPE_33.names if name.split("_", 1)[-1] not in _COARSE), *_HANDS),
+    tuple(each for each in _BLAZEPOSE_PLACES if each.name.split("_", 1)[-1] not in _COARSE),
+)
+"""BlazePose's landmarks but those of hands, and mediapipe's 21 of the left and of the right hand.
+"""
+
 _DETECTORS = (
     COCO_17,
     HALPE_26,
@@ -238,6 +248,7 @@ _DETECTORS = (
     OPENPOSE_67,
     OPENPOSE_67B,
     MEDIAPIPE_33,
+    MEDIAPIPE_69,
 )
 KEYPOINT_SETS = {each.name: each for each in _DETECTORS}
 """The sets by name, as our npz files name them."""
@@ -372,3 +383,21 @@ def triples(
             file, field, f"expected a flat list of {wanted} numbers, got shape {array.shape}"
         )
     return array.reshape(-1, 3)
+
+
+def with_hands(
+    body: Float[np.ndarray, "33 *c"], hands: Sequence[Float[np.ndarray, "21 *c"] | None]
+) -> Float[np.ndarray, "69 *c"]:
+    """Values of `MEDIAPIPE_69` from those of BlazePose and of the left and the right hand; of a
+    hand that is not known, 0 but for what BlazePose has.
+    """
+    names = MEDIAPIPE_33.names
+    found = np.zeros((len(MEDIAPIPE_69.names), *body.shape[1:]), body.dtype)
+    shared = [name for name in MEDIAPIPE_69.names if name in names]
+    for name in shared:
+        found[MEDIAPIPE_69.names.index(name)] = body[names.index(name)]
+    for side, hand in zip(SIDES, hands, strict=True):
+        if hand is not None:
+            first = MEDIAPIPE_69.names.index(f"{side}_hand_root")
+            found[first : first + len(hand)] = hand
+    return found

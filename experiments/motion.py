@@ -1,0 +1,262 @@
+"""What the motion of a video is worth: faces and fingers of synthetic people, whose truth is known,
+and one camera of a real capture against all four.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from experiments.harness import Run, entry
+from experiments.results import markdown_table
+from humangs_jax.apps.video_motion import fit_video, look_at_video, rate_and_count
+from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.body.landmarks import landmark_model
+from humangs_jax.body.library import load_body
+from humangs_jax.capture.detection.face_and_hands import SHAPE_NAMES, FaceAndHands, hand_columns
+from humangs_jax.capture.detection.people import Networks, find_people
+from humangs_jax.geometry.camera import look_at
+from humangs_jax.synthetic.subject import FITTING, expressed_subject, make_subject, render_view
+from humangs_jax.synthetic.writer import sample_pose, stand
+
+STRONG = {
+    "jaw": ("jawOpen",),
+    "smile": ("mouthSmileLeft", "mouthSmileRight"),
+    "blink": ("eyeBlinkLeft", "eyeBlinkRight"),
+    "brows": ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"),
+    "frown": ("browDownLeft", "browDownRight"),
+    "pucker": ("mouthPucker",),
+}
+"""Expressions that are varied, and the shapes that move together in each."""
+FACE_SIDE, HEAD_PIXELS, HEAD_METRES = 512, 150, 0.24
+"""Pixels of a picture and of the head in it; a usual height of a head."""
+TRIANGULATED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+"""Landmarks that are joints of the body, too, up to some centimetres."""
+ARMS_DOWN = 1.25
+"""Radians of the shoulders."""
+
+
+@entry
+def motion_faces(run: Run, people: int = 8, faces: int = 12) -> None:
+    """Scores of expressions against the coefficients that synthetic faces were rendered with:
+    correlation, over all faces of a person, mean over people.
+
+    Faces have 150 pixels of 512. Of the strong shapes two or three are there at a time.
+
+    Options:
+    people: how many
+    faces: of each person
+    """
+    body, networks, parts = load_body(), Networks(), FaceAndHands()
+    assert body.expressions is not None
+    names = body.expressions.names
+    correlations, found = {name: [] for name in STRONG}, 0
+    for seed in list(FITTING)[100 : 100 + people]:
+        subject, rng = make_subject(seed, body), np.random.default_rng(seed)
+        truth, scores = [], []
+        for _ in range(faces):
+            amounts = rng.uniform(0, 1, len(STRONG)) * (rng.uniform(0, 1, len(STRONG)) < 0.4)
+            coefficients = np.zeros(len(names), np.float32)
+            for amount, shapes in zip(amounts, STRONG.values(), strict=True):
+                coefficients[[names.index(name) for name in shapes]] = amount
+            picture = face_picture(expressed_subject(subject, body, coefficients), rng)
+            seen = find_people(networks, picture)
+            score = parts.face(picture, seen[0].pixels) if seen else None
+            if score is not None:
+                truth.append(amounts)
+                scores.append(score)
+        found += len(scores)
+        for i, (name, shapes) in enumerate(STRONG.items()):
+            own = np.asarray(scores)[:, [SHAPE_NAMES.index(shape) for shape in shapes]].mean(1)
+            correlations[name].append(float(np.corrcoef(own, np.asarray(truth)[:, i])[0, 1]))
+    numbers = {
+        name: {"mean": float(np.nanmean(each)), "least": float(np.nanmin(each))}
+        for name, each in correlations.items()
+    }
+    rows = [[name, f"{each['mean']:.2f}", f"{each['least']:.2f}"] for name, each in numbers.items()]
+    header = ["expression", "correlation, mean over people", "least"]
+    share = found / (people * faces)
+    text = f"{markdown_table(header, rows)}\n\nFaces were found in {share:.0%} of the pictures."
+    run.show(text, {"expressions": numbers, "found": share, "people": people, "faces": faces})
+
+
+def face_picture(subject, rng):
+    """A picture of somebody's head and shoulders from the front, turned by up to 20 degrees."""
+    rotations = np.zeros((len(JOINT_NAMES), 3))
+    for side, sign in (("left", -1), ("right", 1)):
+        rotations[JOINT_NAMES.index(f"{side}_shoulder"), 2] = sign * ARMS_DOWN
+    posed = stand(subject, rotations)
+    top = posed.vertices[:, 1].max()
+    target = np.asarray([0.0, top - 1.4 * HEAD_METRES, 0.0])
+    azimuth, distance = np.radians(rng.uniform(-20, 20)), 1.6
+    eye = target + distance * np.asarray([np.sin(azimuth), 0.05, np.cos(azimuth)])
+    focal = HEAD_PIXELS * distance / HEAD_METRES
+    middle = FACE_SIDE / 2
+    K = jnp.asarray([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]])
+    place = [jnp.asarray(x, jnp.float32) for x in (eye, target, [0, 1, 0])]
+    return render_view(posed, look_at(*place, K, FACE_SIDE, FACE_SIDE))[0].astype(np.float32)
+
+
+FULL_SIDE, FULL_METRES = 1024, 2.1
+"""Pixels of a picture of a whole person, and metres that it shows."""
+HAND_VIEWS = (0.0, 50.0, -60.0, 120.0)
+"""Degrees around a person from which cameras see it."""
+
+
+@entry
+def motion_fingers(run: Run, people: int = 2, poses: int = 4) -> None:
+    """Joints of the fingers of synthetic people, fitted to photos of four known cameras: without
+    landmarks of hands, where the prior of poses alone says how fingers bend, and with them.
+
+    Errors are distances from the true joints, both measured from their wrist and turned to agree
+    with the true palm.
+
+    Options:
+    people: how many
+    poses: of each person
+    """
+    body, networks, parts = load_body(), Networks(), FaceAndHands()
+    errors, seen_hands = {"without": [], "with": []}, 0
+    for seed in list(FITTING)[200 : 200 + people]:
+        subject = make_subject(seed, body)
+        stood = [sample_pose(subject, index) for index in range(poses)]
+        rest = shape_body(body, jnp.asarray(subject.betas))
+        truth = [
+            np.asarray(
+                pose_body(
+                    body,
+                    rest,
+                    BodyPose(jnp.asarray(each.rotations), jnp.asarray(each.translation)),
+                ).joints
+            )
+            for each in stood
+        ]
+        cameras = [full_camera(posed, azimuth) for posed in stood for azimuth in HAND_VIEWS]
+        rows = []
+        for posed, camera in zip(np.repeat(stood, len(HAND_VIEWS)), cameras, strict=True):
+            picture = render_view(posed, camera)[0].astype(np.float32)
+            person = next(iter(find_people(networks, picture)), None)
+            if person is None:
+                rows.append((None, None))
+                continue
+            hands = parts.hands(picture, person.pixels, person.visibility)
+            seen_hands += sum(hand is not None for hand in hands)
+            points = np.column_stack([person.pixels, person.visibility])
+            own = hand_columns(hands, person.world)
+            rows.append((SeenPerson(points, person.world, 1.0, own), own))
+        for name, kind in (("without", MEDIAPIPE_33), ("with", MEDIAPIPE_69)):
+            columns = [columns_of(seen, kind is MEDIAPIPE_69) for seen, _ in rows]
+            columns = np.asarray(columns).reshape(poses, len(HAND_VIEWS), len(kind.names), 6)
+            stacked = lambda x: np.asarray(x).reshape(poses, len(HAND_VIEWS), *x[0].shape)
+            observations = make_observations(
+                columns[..., :2] + 0.5,
+                columns[..., 2],
+                stacked([np.asarray(camera.K) for camera in cameras]),
+                stacked([np.asarray(camera.cam_from_world) for camera in cameras]),
+            )
+            model = landmark_model(body, kind.names, kind.places)
+            joints = np.asarray(fit_landmarks(model, observations).joints)
+            errors[name] += [finger_errors(*pair) for pair in zip(joints, truth, strict=True)]
+    numbers = {name: 1000 * float(np.mean(each)) for name, each in errors.items()}
+    rows = [[f"{name} landmarks of hands", f"{value:.1f}"] for name, value in numbers.items()]
+    shown = seen_hands / (2 * people * poses * len(HAND_VIEWS))
+    text = markdown_table(["fit", "finger joints, mean error, mm"], rows)
+    text += f"\n\nOf all hands in the photos {shown:.0%} were found."
+    run.show(text, {"mm": numbers, "hands_found": shown, "people": people, "poses": poses})
+
+
+def full_camera(posed, azimuth):
+    """A camera that sees a whole person from the front, or from so many degrees beside it."""
+    target = (posed.vertices.min(0) + posed.vertices.max(0)) / 2
+    angle, distance = np.radians(azimuth), 3.0
+    eye = target + distance * np.asarray([np.sin(angle), 0.1, np.cos(angle)])
+    focal, middle = FULL_SIDE * distance / FULL_METRES, FULL_SIDE / 2
+    K = jnp.asarray([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]])
+    place = [jnp.asarray(x, jnp.float32) for x in (eye, target, [0, 1, 0])]
+    return look_at(*place, K, FULL_SIDE, FULL_SIDE)
+
+
+def finger_errors(joints, truth):
+    """Mean distance of the finger joints of both hands from the true ones, metres, with the palms
+    on each other.
+    """
+    found = []
+    for side in ("left", "right"):
+        number = lambda name, side=side: JOINT_NAMES.index(f"{side}_{name}")
+        palm = [number("wrist"), *(number(f"{each}1") for each in FINGERS if each != "thumb")]
+        fingers = [number(f"{each}{k}") for each in FINGERS for k in (2, 3)]
+        middle, true_middle = joints[palm].mean(0), truth[palm].mean(0)
+        turn, _ = Rotation.align_vectors(truth[palm] - true_middle, joints[palm] - middle)
+        moved = turn.apply(joints[fingers] - middle) + true_middle
+        found.append(np.linalg.norm(moved - truth[fingers], axis=-1))
+    return float(np.mean(found))
+
+
+@entry
+def motion_cameras(run: Run, folder: Path, height: float = 1.75) -> None:
+    """The motion that each of four cameras finds alone in the real capture of `real_capture`, a man
+    on a treadmill, against triangulated landmarks of all four: joints, how far they jitter.
+
+    Options:
+    folder: with the unpacked wheel of pose2sim, see real_capture
+    height: the man's, metres: as the triangulated landmarks have it
+    """
+    demo = unpacked(folder)
+    lenses, rows, numbers = read_cameras(demo / "calibration" / "Calib.qca.txt"), [], {}
+    found = {}
+    for name in CAMERAS:
+        lens, video = lenses[name], demo / "videos" / f"{name}.mp4"
+        seen, size = watched(video, None)
+        focal = DIAGONAL_35MM * lens.K[0, 0] / np.hypot(*size)
+        found[name] = (lens, seen, fit_video(video, height=height, focal_mm=focal))
+    truth, names = triangulated([(lens, seen) for lens, seen, _ in found.values()])
+    for name, (lens, _, fit) in found.items():
+        joints = fit.fit.joints[: len(truth)]
+        own = np.stack([joints[:, JOINT_NAMES.index(each)] for each in names], axis=1)
+        # in the axes of the camera, from the middle of the hips
+        theirs = truth @ lens.cam_from_world[:3, :3].T
+        ours = own @ fit.fit.cam_from_world[:3, :3].T
+        error = np.linalg.norm(from_hips(ours, names) - from_hips(theirs, names), axis=-1)
+        jitter = lambda x: np.linalg.norm(np.diff(x, n=3, axis=0), axis=-1).mean()
+        body = fit.fit.joints[:, : len(BODY_NAMES)]
+        numbers[name] = {
+            "mm": 1000 * float(np.nanmean(error)),
+            "third_difference_mm": 1000 * float(jitter(body)),
+            "third_difference_of_triangulated_mm": 1000 * float(np.nanmean(jitter(truth))),
+        }
+        rows.append([name, *(f"{value:.1f}" for value in numbers[name].values())])
+    header = ["camera", "joints, mm", "third differences, mm a frame^3", "of triangulated points"]
+    run.show(markdown_table(header, rows), {"cameras": numbers})
+
+
+def from_hips(joints, names):
+    """Joints measured from the middle of the hips."""
+    hips = [names.index("left_hip"), names.index("right_hip")]
+    return joints - joints[:, hips].mean(1, keepdims=True)
+
+
+def watched(video, person):
+    """What the detector sees in all frames of a video, and their size."""
+    _, count = rate_and_count(video)
+    return look_at_video(video, count, person, None)
+
+
+def triangulated(cameras):
+    """Joints (m, j, 3) of all cameras, metres in the world of the calibration, by least squares
+    with the landmarks as weights, and their names.
+    """
+    names = [f"{side}_{part}" for side in ("left", "right") for part in TRIANGULATED]
+    columns = [MEDIAPIPE_69.names.index(name) for name in names]
+    count = min(len(seen["points"]) for _, seen in cameras)
+    points = np.zeros((count, len(names), 3))
+    projections = [lens.K @ lens.cam_from_world[:3] for lens, _ in cameras]
+    for i in range(count):
+        for j, column in enumerate(columns):
+            equations = []
+            for (lens, seen), projection in zip(cameras, projections, strict=True):
+                x, y = lens.undistorted(seen["points"][i, column].astype(float)[None])[0]
+                weight = seen["confidences"][i, column]
+                rows = [x * projection[2] - projection[0], y * projection[2] - projection[1]]
+                equations += [weight * row / np.linalg.norm(row[:3]) for row in rows]
+            point = np.linalg.svd(np.asarray(equations))[2][-1]
+            points[i, j] = point[:3] / point[3]
+    return points, names
