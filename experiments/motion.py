@@ -2,19 +2,28 @@
 and one camera of a real capture against all four.
 """
 
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments.harness import Run, entry
+from experiments.real_capture import CAMERAS, read_cameras, unpacked
 from experiments.results import markdown_table
 from humangs_jax.apps.video_motion import fit_video, look_at_video, rate_and_count
-from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.body.joints import BODY_NAMES, FINGERS, JOINT_NAMES
 from humangs_jax.body.landmarks import landmark_model
 from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.capture.detection.face_and_hands import SHAPE_NAMES, FaceAndHands, hand_columns
 from humangs_jax.capture.detection.people import Networks, find_people
+from humangs_jax.capture.fitting.landmark_fit import fit_landmarks
+from humangs_jax.capture.fitting.residuals.keypoints import make_observations
+from humangs_jax.capture.keypoints.formats import SeenPerson, columns_of
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, MEDIAPIPE_69
 from humangs_jax.geometry.camera import look_at
+from humangs_jax.io.images import DIAGONAL_35MM
 from humangs_jax.synthetic.subject import FITTING, expressed_subject, make_subject, render_view
 from humangs_jax.synthetic.writer import sample_pose, stand
 

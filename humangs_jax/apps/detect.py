@@ -357,8 +357,10 @@ def detect_photos(
     return found
 
 
-def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"], parts: FaceAndHands) -> Found:
-    """The person with a mask whose edges are the photo's.
+def _found(
+    person: Landmarks, photo: Float[np.ndarray, "h w 3"], parts: FaceAndHands | None = None
+) -> Found:
+    """The person with a mask whose edges are the photo's, and with hands if `parts` looks for them.
 
     Nothing of the size of the photo is made.
     """
@@ -370,7 +372,10 @@ def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"], parts: FaceAndH
     corner = (window[0].start + top, window[1].start + left)
     # the first pixel's centre is at 0 for the network, and at one half here
     points = np.column_stack([person.pixels + 0.5, person.visibility]).astype(np.float64)
-    hands = hand_columns(parts.hands(photo, person.pixels, person.visibility), person.world)
+    both = (None, None)
+    if parts is not None:
+        both = parts.hands(photo, person.pixels, person.visibility)
+    hands = hand_columns(both, person.world)
     if hands is not None:
         hands[hands[:, 2] > 0, :2] += 0.5
     area = float((cut > 255 * SEEN).sum())

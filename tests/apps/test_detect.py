@@ -130,8 +130,9 @@ def test_keypoints_and_masks_of_photos(photos, tmp_path, capsys):
         mask = read_grey(tmp_path / "found" / "masks" / f"{truth.names[view]}.png") > 0.5
         expected = truth.masks[view] > 0.5
         assert (mask & expected).sum() / (mask | expected).sum() > 0.9
-        x, y = np.floor(keypoints.points[i]).astype(int).T
-        assert expected[y, x].mean() > 0.9
+        seen = keypoints.points[i][keypoints.confidences[i] > 0]  # a hand may be hidden
+        x, y = np.floor(seen).astype(int).T
+        assert len(seen) >= 27 and expected[y, x].mean() > 0.9
 
 
 def test_without_litert_it_is_one_line(tmp_path, capsys, monkeypatch):
