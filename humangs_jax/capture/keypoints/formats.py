@@ -69,29 +69,15 @@ def read_own(source: Source, format: SourceFormat) -> Detections:
     if source.path.suffix.lower() == ".npz":
         return _saved(source.path)
     kind, images = read_people(source.path, source.json)
-    nobody = np.zeros((len(kind.names), 6))
-<<<<<<< HEAD
-    seen = []
+    everybody = [each for image in images for each in image.people if each is not None]
+    hands = any(each.hands is not None for each in everybody)
+    if hands:
+        kind = MEDIAPIPE_69
+    nobody, seen = np.zeros((len(kind.names), 6)), []
     for image in images:
-        people = tuple(
-            nobody if each is None else np.column_stack([each.points, each.world])
-            for each in image.people
-        )
+        people = tuple(nobody if each is None else columns_of(each, hands) for each in image.people)
         seen.append(DetectedImage(image.image, source.path, people, image.size))
-    somebody = any(any(image.people) for image in images)
-    return Detections(kind if somebody else None, tuple(seen), offset=0.0)
-=======
-    columns = lambda each: nobody if each is None else np.column_stack([each.points, each.world])
-    if any(each is not None and each.hands is not None for i in images for each in i.people):
-        kind, columns = MEDIAPIPE_69, lambda each: columns_of(each, hands=True)
-    found = (tuple(map(columns, image.people)) for image in images)
-    seen = tuple(
-        DetectedImage(i.image, source.path, p, i.size) for i, p in zip(images, found, strict=True)
-    )
-    return Detections(
-        kind if any(any(image.people) for image in images) else None, seen, offset=0.0
-    )
->>>>>>> bfbf0984 (Faces and hands of the people in videos and photos)
+    return Detections(kind if everybody else None, tuple(seen), offset=0.0)
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
@@ -201,14 +187,10 @@ def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
 
 
 def _described(person: SeenPerson) -> dict[str, Any]:
-<<<<<<< HEAD
-    def rounded(values):
+    def rounded(values: np.ndarray) -> list:
         return np.round(values, DECIMALS).tolist()
 
-=======
-    rounded = lambda values: np.round(values, DECIMALS).tolist()
     hands = {} if person.hands is None else {"hands": rounded(person.hands)}
->>>>>>> bfbf0984 (Faces and hands of the people in videos and photos)
     return {
         "presence": round(person.presence, DECIMALS),
         "pixels": rounded(person.points[:, :2]),
