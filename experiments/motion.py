@@ -139,9 +139,10 @@ def motion_fingers(run: Run, people: int = 2, poses: int = 4) -> None:
             )
             for each in stood
         ]
+        shown = [posed for posed in stood for _ in HAND_VIEWS]
         cameras = [full_camera(posed, azimuth) for posed in stood for azimuth in HAND_VIEWS]
         rows = []
-        for posed, camera in zip(np.repeat(stood, len(HAND_VIEWS)), cameras, strict=True):
+        for posed, camera in zip(shown, cameras, strict=True):
             picture = render_view(posed, camera)[0].astype(np.float32)
             person = next(iter(find_people(networks, picture)), None)
             if person is None:
@@ -167,10 +168,10 @@ def motion_fingers(run: Run, people: int = 2, poses: int = 4) -> None:
             errors[name] += [finger_errors(*pair) for pair in zip(joints, truth, strict=True)]
     numbers = {name: 1000 * float(np.mean(each)) for name, each in errors.items()}
     rows = [[f"{name} landmarks of hands", f"{value:.1f}"] for name, value in numbers.items()]
-    shown = seen_hands / (2 * people * poses * len(HAND_VIEWS))
+    share = seen_hands / (2 * people * poses * len(HAND_VIEWS))
     text = markdown_table(["fit", "finger joints, mean error, mm"], rows)
-    text += f"\n\nOf all hands in the photos {shown:.0%} were found."
-    run.show(text, {"mm": numbers, "hands_found": shown, "people": people, "poses": poses})
+    text += f"\n\nOf all hands in the photos {share:.0%} were found."
+    run.show(text, {"mm": numbers, "hands_found": share, "people": people, "poses": poses})
 
 
 def full_camera(posed, azimuth):
