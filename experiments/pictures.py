@@ -35,6 +35,7 @@ from humangs_jax.geometry.camera import look_at, project
 from humangs_jax.io.images import to_uint8
 from humangs_jax.motion import load_motion
 from humangs_jax.network.weights import load_weights
+from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine
 from humangs_jax.rendering.splatting import render
 
@@ -250,7 +251,8 @@ def failure_picture(
             seed, load_body(), (4,), size, HeldOut(views=1, poses=1, pose_views=4)
         )
         photos, held_out = person.inputs(4), person.held_out
-        avatar = refine(reconstruct(variables, config, photos), photos, steps=0)
+        avatar = reconstruct(variables, config, photos)
+        avatar = refine(avatar, photos, RefineConfig(head_steps=0), steps=0)
         (_, views) = task_views(held_out).values()
         view = frontal_view(photos, held_out, views.tolist())
         pose = held_out.pose(int(np.asarray(held_out.frames)[view]))
