@@ -94,3 +94,15 @@ def test_pages_use_the_words_of_the_field():
     ]
     found = {page.name: DIALECT.findall(written(page.read_text())) for page in by_hand}
     assert len(found) > 20 and not {name: words for name, words in found.items() if words}
+
+
+DOCS_WORDS = 16_200
+"""Of all pages that are written by hand, without code and what scripts write: read in an hour."""
+
+
+def test_the_pages_by_hand_are_short():
+    pages = (REPOSITORY / "docs").rglob("*.md")
+    by_hand = [
+        page for page in pages if not page.relative_to(REPOSITORY).as_posix().startswith(GENERATED)
+    ]
+    assert sum(len(written(page.read_text()).split()) for page in by_hand) <= DOCS_WORDS
