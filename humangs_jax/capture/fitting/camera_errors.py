@@ -9,6 +9,7 @@ As few cameras are turned as explain the residuals, because turning all of them 
 """
 
 import dataclasses
+import functools
 from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -104,7 +105,7 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
         return ()
     # the cameras that explain most are turned one after the other, as long as each is clear
     gradients, matrices = seen.equations()
-    solved = lambda cameras: _solved(gradients, matrices, cameras)
+    solved = functools.partial(_solved, gradients, matrices)
     chosen: list[int] = []
     gain = 0.0
     while len(chosen) < seen.count - 2:
@@ -182,19 +183,22 @@ class _Seen:
         ]
         observations, views = group_by_frame(photos, keypoints)
         some = np.unique(np.linspace(0, len(views) - 1, FRAMES).round().astype(int))
-        as_double = lambda name: np.asarray(getattr(observations, name), np.float64)[some]
+
+        def as_double(name: str) -> Float[np.ndarray, "..."]:
+            """A field of the observations, of those moments."""
+            return np.asarray(getattr(observations, name), np.float64)[some]
+
         weights = as_double("confidences")[..., kinds]
         weights = weights * ((weights > 0).sum(1, keepdims=True) >= 2)
-        if ((weights > 0).any((0, 1))).sum() < 8:
+        if (weights > 0).any((0, 1)).sum() < 8:
             return None
-        points, count = as_double("points")[:, :, kinds], int(camera_of.max()) + 1
         return cls(
-            points,
-            weights,
-            as_double("K"),
-            as_double("cam_from_world"),
-            camera_of[views[some]],
-            count,
+            points=as_double("points")[:, :, kinds],
+            weights=weights,
+            K=as_double("K"),
+            matrices=as_double("cam_from_world"),
+            camera=camera_of[views[some]],
+            count=int(camera_of.max()) + 1,
         )
 
     def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
@@ -222,9 +226,8 @@ class _Seen:
         centers = -np.einsum("mcba,mcb->mca", self.matrices[..., :3, :3], self.matrices[..., :3, 3])
         across = np.eye(3) - axes[..., :, None] * axes[..., None, :]
         total, right = across.sum((0, 1)), np.einsum("mcab,mcb->a", across, centers)
-        return np.broadcast_to(
-            np.linalg.solve(total + 1e-6 * np.eye(3), right), (len(axes), self.points.shape[2], 3)
-        )
+        middle = np.linalg.solve(total + 1e-6 * np.eye(3), right)
+        return np.broadcast_to(middle, (len(axes), self.points.shape[2], 3))
 
     def _project(
         self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
@@ -238,14 +241,8 @@ class _Seen:
         local = np.einsum("mcab,mkb->mcka", rotation, points) + shift[:, :, None]
         depth = np.maximum(local[..., 2], 0.05)
         focal, slope = self.K[:, :, None, [0, 1], [0, 1]], local[..., :2] / depth[..., None]
-        return (
-            rotation,
-            local,
-            depth,
-            slope,
-            focal,
-            slope * focal + self.K[:, :, None, :2, 2] - self.points,
-        )
+        errors = slope * focal + self.K[:, :, None, :2, 2] - self.points
+        return rotation, local, depth, slope, focal, errors
 
     def _linear(
         self,
@@ -273,9 +270,8 @@ class _Seen:
         )
         # a step of Gauss and Newton for each point, with the cameras held still
         own = np.einsum("mck,mckia,mckib->mkab", weights, by_point, by_point)
-        inverse = np.linalg.inv(
-            own + (1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]) * np.eye(3)
-        )
+        ridge = 1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]
+        inverse = np.linalg.inv(own + ridge * np.eye(3))
         step = np.einsum(
             "mkab,mck,mckib,mcki->mka", inverse, weights, by_point, errors, optimize=True
         )

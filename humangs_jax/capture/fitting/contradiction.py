@@ -73,10 +73,10 @@ class Contradiction:
         off = f"landmarks miss each other by {self.found.pixels:.0f} px"
         share = f"{off}, {self.found.missed:.0%} of the person's size"
         what = "the person would be behind the cameras" if self.found.behind else share
-        told = f"the calibration contradicts the people in the photos: {what}"
+        line = f"the calibration contradicts the people in the photos: {what}"
         if self.remedy is None or self.after is None:
-            return told
-        return f"{told}; {self.remedy} they agree ({self.after.pixels:.0f} px)"
+            return line
+        return f"{line}; {self.remedy} they agree ({self.after.pixels:.0f} px)"
 
 
 def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | None:
@@ -107,7 +107,8 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
     if best is not None:
         return Contradiction(found, *best)
     # one photo that does not agree with the others is of somebody else, or one camera is off
-    for view in range(len(K)) if len(K) >= LEAST_VIEWS else ():
+    candidates = range(len(K)) if len(K) >= LEAST_VIEWS else range(0)
+    for view in candidates:
         others = dataclasses.replace(keypoints, confidences=keypoints.confidences.copy())
         others.confidences[view] = 0
         rest = agreement(K, matrices, frames, others)
@@ -183,7 +184,9 @@ def agreement(
     keypoints: Keypoints,
 ) -> Agreement | None:
     """How well cameras and keypoints agree; None where too few landmarks are in several views."""
-    errors, sizes, plain, mirrored, behind, count = [], [], 0.0, 0.0, [], 0
+    errors, sizes, behind = [], [], []
+    plain = mirrored = 0.0
+    count = 0
     for frame in np.unique(frames):
         # landmarks where the rays of the views of one moment meet
         own = np.flatnonzero(frames == frame)
@@ -217,9 +220,12 @@ def agreement(
     if count < LEAST_LANDMARKS:
         return None
     distances = np.concatenate(errors)
-    inverted, turned = mirrored < MIRRORED * plain, np.mean(np.concatenate(behind)) > 0.5
-    missed = float(np.median(distances / np.concatenate(sizes)))
-    return Agreement(missed, float(np.median(distances)), bool(inverted), bool(turned))
+    return Agreement(
+        missed=float(np.median(distances / np.concatenate(sizes))),
+        pixels=float(np.median(distances)),
+        mirrored=bool(mirrored < MIRRORED * plain),
+        behind=bool(np.mean(np.concatenate(behind)) > 0.5),
+    )
 
 
 def _triangulated(

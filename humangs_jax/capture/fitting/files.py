@@ -71,13 +71,15 @@ class FitRecord:
 
     def of_views(self, names: Sequence[str]) -> Keypoints:
         """The keypoints of views, in their order. Raises: UnknownViewError."""
-        if missing := [name for name in names if name not in self.names]:
+        missing = [name for name in names if name not in self.names]
+        if missing:
             raise UnknownViewError(f"the capture's fit knows no view {few(missing)}: fit it again")
         rows = [self.names.index(name) for name in names]
-        points, confidences = (
-            getattr(self.keypoints, name)[rows] for name in ("points", "confidences")
+        return dataclasses.replace(
+            self.keypoints,
+            points=self.keypoints.points[rows],
+            confidences=self.keypoints.confidences[rows],
         )
-        return dataclasses.replace(self.keypoints, points=points, confidences=confidences)
 
 
 def write_fit_record(path: str | Path, record: FitRecord) -> None:
@@ -100,11 +102,16 @@ def read_fit_record(path: str | Path) -> FitRecord:
     path = Path(path)
     with reading(path, "fit.npz", CaptureError):
         file = ArrayFile.open(path, CaptureError)
-        if missing := [key for key in KEYS if key not in file and key not in file.pickled]:
+        missing = [key for key in KEYS if key not in file and key not in file.pickled]
+        if missing:
             raise CaptureError(
                 path, missing[0], "missing: expected a file that `humangs fit` wrote"
             )
-        own = lambda key, shape=None: numbers(file.array(key), path, key, shape)
+
+        def own(key: str, shape: tuple[int | None, ...] | None = None) -> np.ndarray:
+            """The numbers under a key."""
+            return numbers(file.array(key), path, key, shape)
+
         # the set says how many keypoints the arrays have to have
         name, names = str(file.array("set")), tuple(map(str, file.array("names")))
         if name not in KEYPOINT_SETS:
@@ -149,10 +156,11 @@ def check_place(
     source = capture_folder(source)
     target = source if out is None else Path(out)
     description = read_description(source / "capture.json")
+    body = target / description["body"]
     if target.resolve() != source.resolve():
         photos = (source / file for file in _photo_files(description))
         check_replaceable(target, overwrite, "capture.json", (source, *inputs, *photos))
-    elif (body := target / description["body"]).exists() and not overwrite:
+    elif body.exists() and not overwrite:
         raise ArgumentError("overwrite", f"is needed: {body} exists; or another folder for the fit")
     check_writable(target)
     return target
@@ -197,10 +205,10 @@ def write_fitted(
         write_fit(folder)
 
     if target.resolve() == source.resolve():
-        invalid = () if record is not None else (FIT_FILE,)  # a record of other cameras
-        add_files(
-            target, write_fit, invalid=invalid, last=name
-        )  # `humangs start` asks for the body
+        # without a record, the one that is there is of other cameras; the body comes last, because
+        # `humangs start` asks for it
+        invalid = () if record is not None else (FIT_FILE,)
+        add_files(target, write_fit, invalid=invalid, last=name)
     else:
         check_place(source, target, overwrite=True)
         replace_folder(target, write, mark="capture.json")

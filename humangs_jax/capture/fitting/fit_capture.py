@@ -196,10 +196,8 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         )
     observations, views = group_by_frame(capture, keypoints)
     # errors of the body's landmarks, frame by frame
-    expected, poses = (
-        np.asarray(observations.noise),
-        jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses),
-    )
+    expected = np.asarray(observations.noise)
+    poses = jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
     kind = keypoints.set
     model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
     errors = np.asarray(
@@ -209,11 +207,9 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
     # noise of the detections: from the fit, or else from the errors themselves
+    undetermined = ()
     if record is None:
-        noise, undetermined = (
-            np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)),
-            (),
-        )
+        noise = np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise))
     else:
         noise, shown = record.noise[: len(views)], np.flatnonzero(compared.any((1, 2)))
         undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
@@ -221,22 +217,23 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
 
     # back from frames to the order of the views
     frame_of, slot_of = np.argwhere(views >= 0)[np.argsort(views[views >= 0])].T
-    by_view = lambda values: values[frame_of, slot_of]
-    numbers = zip(
-        capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True
-    )
-    rows = tuple(_view_report(*own) for own in numbers)
+    at = frame_of, slot_of
+    of_views = zip(capture.names, frame_of.tolist(), lengths[at], outliers[at], strict=True)
+    rows = tuple(_view_report(*own) for own in of_views)
     # exchanged hands are reported once, not again as exchanged sides of their view
     violations = limit_violations(names, poses)
     hands = find_exchanged_hands(keypoints, capture.names)
     explained = {swap.views[0] for swap in hands}
-    others = find_swaps(observations, kind, views, capture.names)
-    others = (
+    others = [
         swap
-        for swap in others
+        for swap in find_swaps(observations, kind, views, capture.names)
         if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead))
-    )
+    ]
     swaps = (*others, *hands)
+    turned = [
+        f"{error}, as the keypoints show: `humangs fit` turns it back"
+        for error in find_camera_errors(capture, keypoints)
+    ]
     report = FitReport(
         fitted="keypoints",
         errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},
@@ -245,16 +242,10 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         swaps=swaps,
         undetermined=undetermined,
         notes=_worst_frame(frames),
-        warnings=(
-            *(
-                f"{error}, as the keypoints show: `humangs fit` turns it back"
-                for error in find_camera_errors(capture, keypoints)
-            ),
-            *keypoint_warnings(rows, expected, violations, swaps),
-        ),
+        warnings=(*turned, *keypoint_warnings(rows, expected, violations, swaps)),
     )
-    landmarks = by_view(errors + np.asarray(observations.points))
-    return Examination(report, landmarks, by_view(compared), by_view(outliers))
+    landmarks = errors + np.asarray(observations.points)
+    return Examination(report, landmarks[at], compared[at], outliers[at])
 
 
 def _worst_frame(frames: Float[np.ndarray, " m"]) -> tuple[str, ...]:
@@ -343,12 +334,13 @@ def fit_photos(
             f"body '{body.name}': expected the root to be its first joint, got joint"
             f" {body.parents.index(-1)}"
         )
-    # cameras that the keypoints show to be turned are turned back first
-    fixed_cameras = (
-        fixed_cameras or not photos.calibrated
-    )  # found from such keypoints, which tell nothing new about them
-    errors = () if fixed_cameras else find_camera_errors(photos, keypoints)
-    photos = mended(photos, errors) if errors else photos
+    # cameras that the keypoints show to be turned are turned back first; those that were found from
+    # such keypoints learn nothing new from them
+    errors = ()
+    if photos.calibrated and not fixed_cameras:
+        errors = find_camera_errors(photos, keypoints)
+    if errors:
+        photos = mended(photos, errors)
     kind = keypoints.set
     # the fit, and how well its result is known
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)

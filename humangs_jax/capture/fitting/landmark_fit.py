@@ -118,11 +118,9 @@ def fit_landmarks(
     the prior's usual pose, or with smooth motion are interpolated.
     """
     fit = _fit_frames(model, observations)
-    return (
-        smooth_motion(model, observations, fit, smoothness)
-        if smoothness and len(fit.noise) > 2
-        else fit
-    )
+    if smoothness and len(fit.noise) > 2:
+        return smooth_motion(model, observations, fit, smoothness)
+    return fit
 
 
 @jax.jit
@@ -134,14 +132,11 @@ def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit
     model = replace(model, certainty=_certainty_found(problem, observations, states))
     problem = keypoint_problem(model)
     groups = len({group for group, _ in model.groups})
-    many = (
-        groups
-        and observations.points.shape[0] >= PLACED_FRAMES
-        and observations.points.shape[1] > 1
-    )
-    places = jnp.zeros((groups, 3)) if many else None
+    frames, views = observations.points.shape[:2]
+    placed = groups and frames >= PLACED_FRAMES and views > 1
+    places = jnp.zeros((groups, 3)) if placed else None
     start = replace(states, betas=jnp.median(states.betas, axis=0), places=places)
-    residuals = lambda state: _person_residuals(problem, observations, state)
+    residuals = functools.partial(_person_residuals, problem, observations)
     state, _ = solve(residuals, start, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
     return _result(problem, observations.noise, state, jnp.zeros(()))
 
@@ -185,7 +180,10 @@ def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
 
     def run(state, stage):
         weighted = replace(seen, confidences=seen.confidences * stage.views)
-        residuals = lambda y: frame_residuals(problem, weighted, y, stage.scale, stage.targets)
+
+        def residuals(y):
+            return frame_residuals(problem, weighted, y, stage.scale, stage.targets)
+
         return solve(residuals, state, STEPS, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
 
     states, costs = jax.vmap(lambda start: jax.lax.scan(run, start, stages))(starts)
@@ -229,11 +227,14 @@ def _rigid_starts(
     )(rotations)
     # each candidate as a state
     vectors = quaternion.to_axis_angle(quaternion.from_matrix(rotations))
-    start = lambda vector, position: replace(
-        resting,
-        global_orient=vector / math.radians(FREE.global_orient),
-        transl=(position - pelvis) / FREE.transl,
-    )
+
+    def start(vector, position):
+        return replace(
+            resting,
+            global_orient=vector / math.radians(FREE.global_orient),
+            transl=(position - pelvis) / FREE.transl,
+        )
+
     starts = jax.vmap(start)(vectors, positions)
 
     def cost(state):
@@ -328,21 +329,27 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
     trunk = jnp.asarray(trunk_weights(model.names))
     body = np.asarray([model.joint_names[j] in BODY for j in problem.origin.joints])[:, None]
     ones, none = jnp.ones_like(trunk), jnp.zeros_like(trunk)
-    free = lambda shape, joints: replace(
-        resting,
-        betas=jnp.full(resting.betas.shape, shape),
-        global_orient=jnp.ones(3, bool),
-        transl=jnp.ones(3, bool),
-        body_pose=jnp.broadcast_to(jnp.asarray(joints), resting.body_pose.shape),
-    )
-    triangulated = jnp.any(targets.known)
-    in_space = lambda share: replace(targets, known=targets.known * share)
-    scale = lambda stage: jnp.asarray(ROBUST_SCALES[stage])
+
+    def free(shape, joints):
+        """What moves: orientation and position always, the shape and joints if asked for."""
+        return replace(
+            resting,
+            betas=jnp.full(resting.betas.shape, shape),
+            global_orient=jnp.ones(3, bool),
+            transl=jnp.ones(3, bool),
+            body_pose=jnp.broadcast_to(jnp.asarray(joints), resting.body_pose.shape),
+        )
+
+    # stages in space pull the body to the points and not to the keypoints, if there are points
+    points = replace(targets, known=targets.known * 1.0)
+    unused = replace(targets, known=targets.known * 0.0)
+    beside_points = jnp.where(jnp.any(targets.known), none, ones)
+    scales = [jnp.asarray(scale) for scale in ROBUST_SCALES]
     stages = [
-        _Stage(trunk, in_space(0.0), scale(0), free(False, False)),
-        _Stage(jnp.where(triangulated, none, ones), in_space(1.0), scale(1), free(True, body)),
-        _Stage(ones, in_space(0.0), scale(2), free(True, body)),
-        _Stage(ones, in_space(0.0), scale(3), free(True, True)),
+        _Stage(trunk, unused, scales[0], free(False, False)),
+        _Stage(beside_points, points, scales[1], free(True, body)),
+        _Stage(ones, unused, scales[2], free(True, body)),
+        _Stage(ones, unused, scales[3], free(True, True)),
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
 
@@ -351,12 +358,10 @@ def _noise_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " m"]:
     def of_frame(seen, state):
-        lengths = jnp.linalg.norm(
-            keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1
-        )
-        return found_noise(
-            jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan), seen.noise
-        )
+        errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0])
+        known = seen.confidences * problem.known > 0
+        lengths = jnp.where(known, jnp.linalg.norm(errors, axis=-1), jnp.nan)
+        return found_noise(lengths, seen.noise)
 
     return jax.vmap(of_frame)(observations, states)
 
@@ -367,10 +372,8 @@ def _certainty_found(
     """(k,) of landmarks, from the errors of the first stages in the frames that several views show:
     a robust noise of each pair, over that of all. The fewer there are, the nearer to the usual.
     """
-    model, pair = (
-        problem.model,
-        np.asarray([problem.model.names.index(mirrored_name(n)) for n in problem.model.names]),
-    )
+    model = problem.model
+    pair = np.asarray([model.names.index(mirrored_name(name)) for name in model.names])
 
     def lengths(seen, state):
         errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0]) / seen.noise
@@ -391,7 +394,10 @@ def _person_residuals(
     problem: KeypointProblem, observations: Observations, state: FitState
 ) -> dict[str, Float[Array, "..."]]:
     """All frames at once with one shape."""
-    of_frame = lambda seen, own: frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
+
+    def of_frame(seen, own):
+        return frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
+
     found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
     found["shape"] = state.betas  # once, whatever the number of frames
     if state.places is not None:
@@ -436,13 +442,12 @@ def smooth_motion(
 
     def costs(state):
         """(m,) of the keypoints of each frame."""
-        landmarks = jax.vmap(lambda own: problem.landmarks_and_joints(own)[0], in_axes=(axes,))(
-            state
-        )
-        errors = lambda each, points: half_squares(
-            keypoint_residuals(problem.model, each, points, ROBUST_SCALES[-1])
-        )
-        return jax.vmap(errors)(seen, landmarks)
+
+        def cost(each, points):
+            return half_squares(keypoint_residuals(problem.model, each, points, ROBUST_SCALES[-1]))
+
+        landmarks = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(state)[0]
+        return jax.vmap(cost)(seen, landmarks)
 
     # how much worse the keypoints of a frame may become, see above
     observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
@@ -452,7 +457,7 @@ def smooth_motion(
         state, kept, held = carry
 
         def residuals(y):
-            joints = jax.vmap(lambda own: problem.landmarks_and_joints(own)[1], in_axes=(axes,))(y)
+            joints = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(y)[1]
             motion = robust(accelerations(joints) / std, MOTION_SCALE)
             return _person_residuals(problem, seen, y) | {"motion": motion}
 
@@ -466,9 +471,8 @@ def smooth_motion(
     # frames without keypoints begin between their neighbours; levels follow each other from weak to
     # strong, and the last good one is kept
     start = _bridged(problem, seen, fit.state)
-    kept = jax.tree.map(
-        lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state
-    )
+    bridges = jnp.all(costs(start) <= limit)
+    kept = jax.tree.map(lambda new, old: jnp.where(bridges, new, old), start, fit.state)
     carry = (start, kept, jnp.zeros(()))
     (_, state, held), _ = jax.lax.scan(run, carry, smoothness * jnp.asarray(MOTION_LEVELS))
     return _result(problem, fit.noise, state, held)
@@ -500,9 +504,8 @@ def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> F
         translation=translations[low] + share[:, None] * (translations[high] - translations[low]),
     )
     bridged = jax.vmap(lambda pose: state_of(problem.origin, betas, pose))(between)
-    pick = lambda new, old: jnp.where(shown.reshape(m, *[1] * (old.ndim - 1)), old, new)
-    moved = {
-        name: pick(getattr(bridged, name), getattr(state, name))
-        for name in ("global_orient", "transl", "body_pose")
-    }
+    moved = {}
+    for name in ("global_orient", "transl", "body_pose"):
+        new, old = getattr(bridged, name), getattr(state, name)
+        moved[name] = jnp.where(shown.reshape(m, *[1] * (old.ndim - 1)), old, new)
     return replace(state, **moved)

@@ -120,12 +120,12 @@ def align_views(
     """Generalised Kabsch: the mean shape (k, 3) of landmarks that are turned together, and the
     rotations (c, 3, 3) from it to each view's axes.
     """
-    shape, rotations = (
-        worlds[int(np.argmax(weights.sum(1)))],
-        np.tile(np.eye(3), (len(worlds), 1, 1)),
-    )
+    shape = worlds[int(np.argmax(weights.sum(1)))]
+    rotations = np.tile(np.eye(3), (len(worlds), 1, 1))
+    if len(worlds) == 1:
+        return shape, rotations
     total = np.maximum(weights.sum(0), 1e-9)[:, None]
-    for _ in range(ALTERNATIONS if len(worlds) > 1 else 0):
+    for _ in range(ALTERNATIONS):
         rotations = turns_onto(shape, worlds, weights)
         shape = np.einsum("ck,cba,ckb->ka", weights, rotations, worlds) / total
     return shape, rotations
@@ -163,11 +163,15 @@ def place_person(
     rows[..., 2] = -xy
     right = xy * offsets[:, 2:] - offsets[:, :2]
     w = np.sqrt(weights)[:, None]
-    place = np.linalg.lstsq((w[..., None] * rows).reshape(-1, 3), (w * right).ravel(), rcond=None)[
-        0
-    ]
+    matrix = (w[..., None] * rows).reshape(-1, 3)
+    place = np.linalg.lstsq(matrix, (w * right).ravel(), rcond=None)[0]
     share = weights / weights.sum()
-    spread = lambda p: float(np.sqrt(share @ np.sum((p - share @ p) ** 2, axis=1)))
+
+    def spread(p: Float[np.ndarray, "k 2"]) -> float:
+        """Root mean square of the distances from the mean."""
+        return float(np.sqrt(share @ np.sum((p - share @ p) ** 2, axis=1)))
+
+    # by the size: farther away the person is smaller in the photo
     distance = spread(offsets[:, :2]) / max(spread(xy), 1e-9)
     if distance / 3 < place[2] < 3 * distance:
         return place
@@ -215,9 +219,8 @@ class Derivatives:
 def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "c k 2"]:
     """Landmarks as the cameras see them, less those detected, pixels."""
     seen = _turned(rig) + rig.places[:, None]
-    return (
-        rig.focal[:, None, None] * seen[..., :2] / np.maximum(seen[..., 2:], NEAR) - evidence.points
-    )
+    slopes = seen[..., :2] / np.maximum(seen[..., 2:], NEAR)
+    return rig.focal[:, None, None] * slopes - evidence.points
 
 
 def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
@@ -227,8 +230,11 @@ def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
     errors = errors * scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True))
     share = _shares(evidence)
     centered = turned - np.sum(share * turned, axis=1, keepdims=True)
-    radius = lambda points: 0.5 * np.log(np.sum(share * points**2) + 1e-12)
-    size = (radius(centered) - radius(evidence.world)) / SIZE
+
+    def log_radius(points: Float[np.ndarray, "c k 3"]) -> float:
+        return 0.5 * np.log(np.sum(share * points**2) + 1e-12)
+
+    size = (log_radius(centered) - log_radius(evidence.world)) / SIZE
     lengths = np.linalg.norm(_bones(evidence, rig), axis=-1)
     return Rows(
         seen=np.concatenate([root * errors, root * (centered - evidence.world) / WORLD], axis=-1),
@@ -354,19 +360,15 @@ class Step:
 
 def moved(evidence: Evidence, rig: Rig, step: Step) -> Rig:
     """A rig after a step."""
-    turns, sideways, deeper = (
-        step.views[:, :3],
-        step.views[:, 3:5],
-        np.clip(step.views[:, 5:6], -FURTHEST, FURTHEST),
-    )
+    turns, sideways = step.views[:, :3], step.views[:, 3:5]
+    deeper = np.clip(step.views[:, 5:6], -FURTHEST, FURTHEST)
     depth = rig.places[:, 2:] * np.exp(deeper)  # never behind the camera
     factors = (_factors(evidence, rig) + step.focal)[evidence.kinds]
+    aside = (rig.places[:, :2] / rig.places[:, 2:] + sideways) * depth
     return Rig(
         landmarks=rig.landmarks + step.landmarks,
         rotations=Rotation.from_rotvec(turns).as_matrix() @ rig.rotations,
-        places=np.concatenate(
-            [(rig.places[:, :2] / rig.places[:, 2:] + sideways) * depth, depth], axis=1
-        ),
+        places=np.concatenate([aside, depth], axis=1),
         focal=evidence.focal * np.exp(np.clip(evidence.focal_std * factors, -FURTHEST, FURTHEST)),
     )
 

@@ -8,15 +8,13 @@ Which photos are of that moment, and the cameras up to that similarity: `person_
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import shape_body
-from humangs_jax.capture.fitting.person_bundle import (
-    Rig,
-)
+from humangs_jax.capture.fitting.person_bundle import Rig
 from humangs_jax.capture.fitting.person_moments import (
     FEWEST,
     SEEN,
@@ -121,12 +119,15 @@ def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCam
         [np.median(e[w > SEEN]) for e, w in zip(trial.pixels, trial.evidence.weights, strict=True)]
     )
     cameras, landmarks = _in_world(seen, rig, height)
-    views, every = (
-        tuple(range(len(cameras))),
-        np.broadcast_to(landmarks, (len(cameras), *landmarks.shape)),
+    return PersonCameras(
+        views=tuple(range(len(cameras))),
+        cameras=cameras,
+        landmarks=np.broadcast_to(landmarks, (len(cameras), *landmarks.shape)),
+        mirrored=trial.mirrored,
+        moments=1,
+        errors=medians,
+        warnings=tuple(_warnings(seen, trial.mirrored, height)),
     )
-    warnings = tuple(_warnings(seen, trial.mirrored, height))
-    return PersonCameras(views, cameras, every, trial.mirrored, 1, medians, warnings)
 
 
 # What is given
@@ -197,16 +198,10 @@ def _in_world(
     # metres: the stature is estimated from the lengths of trunk and legs
     scale = 1.0
     if height is not None:
-        part = lambda a, b: np.mean(
-            [
-                np.linalg.norm(points[names.index(f"{s}_{a}")] - points[names.index(f"{s}_{b}")])
-                for s in ("left", "right")
-            ]
-        )
-        scale = height / (
-            STATURE
-            * (np.linalg.norm(shoulders - hips) + part("hip", "knee") + part("knee", "ankle"))
-        )
+        thigh = _bone_length(points, names, "hip", "knee")
+        shin = _bone_length(points, names, "knee", "ankle")
+        trunk = float(np.linalg.norm(shoulders - hips))
+        scale = height / (STATURE * (trunk + thigh + shin))
     # the origin under the hips, on the lowest landmark
     turned = scale * points @ world_from_rig.T
     middle = scale * world_from_rig @ hips
@@ -222,6 +217,15 @@ def _in_world(
             )
         )
     return tuple(cameras), turned - origin
+
+
+def _bone_length(points: Float[np.ndarray, "k 3"], names: Sequence[str], a: str, b: str) -> float:
+    """The mean distance of two parts on the left and on the right."""
+    lengths = [
+        np.linalg.norm(points[names.index(f"{side}_{a}")] - points[names.index(f"{side}_{b}")])
+        for side in ("left", "right")
+    ]
+    return float(np.mean(lengths))
 
 
 def _warnings(

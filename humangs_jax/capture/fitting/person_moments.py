@@ -102,11 +102,16 @@ class PersonViews:
 
     def select(self, views: Sequence[int]) -> "PersonViews":
         """Some of the photos, in this order."""
-        rows, few = list(views), lambda values: tuple(values[view] for view in views)
-        arrays = {
-            name: getattr(self, name)[rows] for name in ("points", "visibility", "world", "focal")
-        }
-        return dataclasses.replace(self, sizes=few(self.sizes), photos=few(self.photos), **arrays)
+        rows = list(views)
+        return dataclasses.replace(
+            self,
+            points=self.points[rows],
+            visibility=self.visibility[rows],
+            world=self.world[rows],
+            sizes=tuple(self.sizes[view] for view in rows),
+            focal=self.focal[rows],
+            photos=tuple(self.photos[view] for view in rows),
+        )
 
 
 def known_landmarks(seen: PersonViews) -> Bool[np.ndarray, "c k"]:
@@ -200,11 +205,9 @@ def explain(seen: PersonViews) -> Explanation:
     # from one side the landmarks of one photo decide nothing about the others
     angle = _angle(trial.rig)
     if len(every) > 1 and angle < LEAST_ANGLE:
-        which = (
-            "all photos"
-            if len(views) == len(every)
-            else ", ".join(seen.photos[view] for view in views)
-        )
+        which = ", ".join(seen.photos[view] for view in views)
+        if len(views) == len(every):
+            which = "all photos"
         side = (
             f"{which} are from one side (directions differ by {angle:.1f} degrees, expected"
             f" {LEAST_ANGLE:.0f} or more)"
@@ -282,9 +285,8 @@ def best_trial(seen: PersonViews) -> Trial:
     if views > 1:
         found = _least(seen, found)
         if found.error > DOUBTFUL:
-            found = min(
-                found, _least(seen, _try(seen, np.ones(views, bool))), key=lambda each: each.cost
-            )
+            other = _least(seen, _try(seen, np.ones(views, bool)))
+            found = min(found, other, key=lambda each: each.cost)
         if handedness(found.rig.landmarks, seen.names) < 0:
             found = _try(seen, ~found.mirrored)
     return _polished(found)
@@ -352,9 +354,9 @@ def _focal_lengths(
     """
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)
-    usual = (
-        np.median((seen.focal / diagonals)[known]) if known.any() else USUAL_FOCAL / DIAGONAL_35MM
-    )
+    usual = USUAL_FOCAL / DIAGONAL_35MM
+    if known.any():
+        usual = np.median((seen.focal / diagonals)[known])
     std = np.where(known, EXIF_STD, USUAL_STD)
     cameras = [
         () if own else tuple(sorted(size)) for own, size in zip(known, seen.sizes, strict=True)
@@ -369,30 +371,35 @@ def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Ev
     focal, std, kinds = _focal_lengths(seen)
     mirror = [seen.names.index(mirrored_name(name)) for name in seen.names]
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
-    pick = lambda values: np.take_along_axis(
-        values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1
-    )
+
+    def pick(values: np.ndarray) -> np.ndarray:
+        """Values (c, k, ...) in the order of each view."""
+        at = order.reshape(*order.shape, *[1] * (values.ndim - 2))
+        return np.take_along_axis(values, at, axis=1)
+
     points, weights = pick(seen.points - np.asarray(seen.sizes)[:, None] / 2), pick(seen.visibility)
     world = pick(seen.world)
     for own, flipped in zip(world, mirrored, strict=True):
-        if (
-            flipped and handedness(own, seen.names) < 0
-        ):  # the detector saw the body turned round as well
+        # the detector saw the body turned round as well
+        if flipped and handedness(own, seen.names) < 0:
             own[:, 2] *= -1
     # 3D landmarks in the axes of their camera, centred, and of one size in all views
     K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
     hips = np.asarray([name in ("left_hip", "right_hip") for name in seen.names])
-    middle = np.where((weights * hips).all(1, where=hips, keepdims=True), weights * hips, weights)
+    both_hips = (weights * hips).all(1, where=hips, keepdims=True)
+    middle = np.where(both_hips, weights * hips, weights)
     world = in_camera_axes(world, points, middle, K)
-    world = np.asarray(
-        [x - (w[:, None] * x).sum(0) / w.sum() for x, w in zip(world, weights, strict=True)]
-    )
+    means = (weights[..., None] * world).sum(1) / weights.sum(1)[:, None]
+    world = world - means[:, None]
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]
     # cameras to start from: the views turned together, each placed where its pixels are
     shape, rotations = align_views(world, weights)
-    size = lambda p, w: float(np.ptp(np.quantile(p[w > 0], OUTER, axis=0), axis=0).max())
-    noise = np.asarray([size(p, w) * NOISE for p, w in zip(points, weights, strict=True)])
+    sizes = [
+        float(np.ptp(np.quantile(p[w > 0], OUTER, axis=0), axis=0).max())
+        for p, w in zip(points, weights, strict=True)
+    ]
+    noise = NOISE * np.asarray(sizes)
     offsets = np.einsum("cab,kb->cka", rotations, shape)
     places = np.stack(
         [place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)]
@@ -440,8 +447,11 @@ def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.n
 
 def across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
     """From the right side of the trunk to the left one."""
-    side = lambda part: points[names.index(f"left_{part}")] - points[names.index(f"right_{part}")]
-    return side("shoulder") + side("hip")
+    to_left = [
+        points[names.index(f"left_{part}")] - points[names.index(f"right_{part}")]
+        for part in ("shoulder", "hip")
+    ]
+    return to_left[0] + to_left[1]
 
 
 def handedness(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> float:

@@ -137,23 +137,18 @@ def usual_config(
     bare: the body is to fill the masks. tight: the person wears tight clothes. calibrated: False
     for cameras that were found from the person.
     """
-    start = FITTED if calibrated else FROM_PERSON
-    std = start if fitted else StateStd()
-    config = CaptureRefineConfig(
-        fixed_cameras=fixed_cameras,
-        independent=100.0 if fitted else CaptureRefineConfig.independent,
-    )
-    if (
-        bare or tight or not calibrated
-    ):  # the masks are believed; cameras were fitted to these very keypoints
+    std, config = StateStd(), CaptureRefineConfig(fixed_cameras=fixed_cameras)
+    if fitted:
+        std = FITTED if calibrated else FROM_PERSON
+        config = dataclasses.replace(config, independent=100.0)
+    # the masks are believed, or cameras were fitted to these very keypoints
+    if bare or tight or not calibrated:
         config = dataclasses.replace(config, keypoints_worse=math.inf)
     if tight:
         std = dataclasses.replace(std, clothing=TIGHT, betas=2.0, body_pose=10.0)
     if bare:
-        std, config = (
-            dataclasses.replace(std, clothing=SKIN),
-            dataclasses.replace(config, robust_scales=(1.0, 1.0)),
-        )
+        std = dataclasses.replace(std, clothing=SKIN)
+        config = dataclasses.replace(config, robust_scales=(1.0, 1.0))
     return dataclasses.replace(config, std=std)
 
 
@@ -173,10 +168,8 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
     body = capture.body
     named = [j for j, name in enumerate(body.joint_names) if name in BODY_NAMES]
     joints = tuple(j for j in named or range(len(body.parents)) if body.parents[j] >= 0)
-    wanted = max(
-        len(capture.betas),
-        min(config.coefficients, without_expression(body).shape_directions.shape[-1]),
-    )
+    known = without_expression(body).shape_directions.shape[-1]
+    wanted = max(len(capture.betas), min(config.coefficients, known))
     return Origin(
         betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
         pose=capture.poses,
@@ -259,30 +252,26 @@ def evidence_residuals(
         seen = jnp.matmul(posed, matrix[:3, :3].T, precision=EXACT) + matrix[:3, 3]
         focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
         clothes = clothing_thickness(origin, state, points.weights) * focal.mean() / depth[:, 0]
-        pixels, scales = (
-            seen[:, :2] / depth * focal + K[:2, 2],
-            (evidence.scales[0], evidence.scales[1]),
-        )
+        pixels = seen[:, :2] / depth * focal + K[:2, 2]
+        scales = evidence.scales[0], evidence.scales[1]
         return silhouettes.silhouette_residuals(
             matches, pixels, clothes, evidence.noise, scales, independent
         )
 
-    parts = {
-        "silhouettes": jax.vmap(silhouette)(
-            evidence.points, evidence.matches, frame, K, cam_from_world
-        )
-    }
+    views = evidence.points, evidence.matches, frame, K, cam_from_world
+    parts = {"silhouettes": jax.vmap(silhouette)(*views)}
     # keypoints of each view alone, under the camera of the state
     if evidence.keypoints is not None:
 
         def landmarks(features, transforms, joints):
-            return landmarks_from(
-                model, joints, pose_points(model.points, betas, features, transforms)
-            )
+            points = pose_points(model.points, betas, features, transforms)
+            return landmarks_from(model, joints, points)
+
+        def compare(own, points):
+            return keypoint_residuals(model, own, points, KEYPOINT_SCALE)
 
         seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
         points = jax.vmap(landmarks)(features, transforms, joints)[frame]
-        compare = lambda own, points: keypoint_residuals(model, own, points, KEYPOINT_SCALE)
         parts["keypoints"] = jax.vmap(compare)(seen, points)
     return parts
 
@@ -322,9 +311,9 @@ def solve_round(
         return evidence_residuals(model, origin, y, evidence, independent), counted
 
     many = sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS
-    return solve(
-        residuals, state, PATIENCE * STEPS if many else STEPS, method="lbfgs" if many else "lm"
-    )[0]
+    if many:
+        return solve(residuals, state, PATIENCE * STEPS, method="lbfgs")[0]
+    return solve(residuals, state, STEPS, method="lm")[0]
 
 
 # Iterations
@@ -363,10 +352,8 @@ class Scene:
         small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
         looked_at = capture if small else capture.resized(LONGEST_SIDE)
         empty = np.zeros(looked_at.images.shape[:3], np.float32)
-        self.cameras, self.masks = (
-            looked_at.cameras,
-            empty if looked_at.masks is None else looked_at.masks,
-        )
+        self.cameras = looked_at.cameras
+        self.masks = empty if looked_at.masks is None else looked_at.masks
         # silhouettes: the mesh's edges, and the masks' boundaries away from whoever stands in front
         self.faces = np.asarray(capture.body.faces)
         self.edges = silhouettes.body_edges(self.faces)
@@ -377,14 +364,15 @@ class Scene:
             for mask, hidden in zip(self.masks, self.hidden, strict=True)
         ]
         # keypoints: in pixels of the photos for scores, in those that are looked at for the solver
-        kind = None if keypoints is None else keypoints.set
-        known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
-        self.model = landmark_model(capture.body, *known)
         self.scale = self.cameras.width / capture.cameras.width
-        seen_by = lambda cameras: (
-            None if keypoints is None else scaled_observations(cameras, keypoints, capture.cameras)
-        )
-        self.keypoints, self.observations = seen_by(capture.cameras), seen_by(self.cameras)
+        if keypoints is None:
+            self.model = landmark_model(capture.body, ())
+            self.keypoints = self.observations = None
+        else:
+            kind, photos = keypoints.set, capture.cameras
+            self.model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
+            self.keypoints = scaled_observations(photos, keypoints, photos)
+            self.observations = scaled_observations(self.cameras, keypoints, photos)
         self.height = _person_height(self.masks, self.observations)
         self.origin = capture_origin(capture, self.cameras, config)
 
@@ -395,10 +383,8 @@ class Scene:
         config, state, move = self.config, start_state(self.origin, self.config), 0.0
         first, last = REACH
         for turn in range(config.iterations):
-            evidence = self.look(
-                state,
-                self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)),
-            )
+            share = turn / max(config.iterations - 1, 1)
+            evidence = self.look(state, self.height * first * (last / first) ** share)
             before = state
             state = solve_round(
                 self.model, self.origin, evidence, state, config.independent, self.memory
@@ -470,14 +456,14 @@ class Scene:
         known = [None] * len(self.masks) if self.unknown is None else list(~self.unknown)
         pairs = zip(self.body_views(capture), self.masks, known, strict=True)
         ious = np.asarray([overlap(view.covered, mask, seen) for view, mask, seen in pairs])
-        iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
+        iou = None if np.isnan(ious).all() else float(np.nanmean(ious))
         loss = 0.0 if iou is None else 1 - iou
-        if (
-            self.keypoints is not None
-            and np.isfinite(errors := self._errors(capture, self.keypoints)).any()
-        ):
-            keypoints = float(np.nanmedian(errors))
-            loss += keypoints * self.scale / self.height
+        keypoints = None
+        if self.keypoints is not None:
+            errors = self._errors(capture, self.keypoints)
+            if np.isfinite(errors).any():
+                keypoints = float(np.nanmedian(errors))
+                loss += keypoints * self.scale / self.height
         return Score(ious, iou, keypoints, loss)
 
 
@@ -508,9 +494,9 @@ def overlap(
     person = mask > 0.5
     if known is not None:
         covered = covered & known
-    return (
-        float((covered & person).sum() / (covered | person).sum()) if person.any() else float("nan")
-    )
+    if not person.any():
+        return float("nan")
+    return float((covered & person).sum() / (covered | person).sum())
 
 
 @jax.jit
@@ -528,15 +514,15 @@ def _noise(
     """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a
     body that is not yet there.
     """
-    off = [
-        np.asarray(silhouettes.distances(m, jnp.asarray(boundary.positions, jnp.float32)))[
-            np.asarray(m.weights) > 0
-        ]
-        for boundary, m in zip(boundaries, matches, strict=True)
-        if len(boundary.positions)
-    ]
-    off = np.concatenate([np.zeros(0), *off])
-    return max(NORMAL_MAD * float(np.median(np.abs(off))), LEAST_NOISE) if len(off) else 1.0
+    found = [np.zeros(0)]
+    for boundary, own in zip(boundaries, matches, strict=True):
+        if len(boundary.positions):
+            off = silhouettes.distances(own, jnp.asarray(boundary.positions, jnp.float32))
+            found.append(np.asarray(off)[np.asarray(own.weights) > 0])
+    distances = np.abs(np.concatenate(found))
+    if not len(distances):
+        return 1.0
+    return max(NORMAL_MAD * float(np.median(distances)), LEAST_NOISE)
 
 
 def _person_height(
@@ -617,8 +603,8 @@ def refine_capture(
     kept = _better(found, before, config.keypoints_worse)
     best, score = (tried, found) if kept else (capture, before)
     # what happened, in one line
-    kinds = {"silhouettes": before.iou, "keypoints": before.keypoints}
-    kinds = " and ".join(name for name, value in kinds.items() if value is not None)
+    scores = {"silhouettes": before.iou, "keypoints": before.keypoints}
+    kinds = " and ".join(name for name, value in scores.items() if value is not None)
     verdict = "kept" if kept else "no sufficient improvement, the start is kept"
     note = (
         f"{kinds}: loss {before.loss:.4f} -> {found.loss:.4f}, {verdict} (last move {move:.2g}"
@@ -656,7 +642,11 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, note: st
             notes.append(
                 "the displacement of body.npz is left out: it was made for the shape before"
             )
-    apart = after.iou is not None and after.iou < LEAST_IOU
+    warnings = []
+    if after.iou is not None and after.iou < LEAST_IOU:
+        warnings.append(
+            "body and masks do not agree: the start was too far off; `humangs check` shows why"
+        )
     return FitReport(
         fitted="refinement",
         kept=kept,
@@ -667,9 +657,5 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, note: st
         moved=moved,
         violations=limit_violations(best.body.joint_names, best.poses),
         notes=tuple(notes),
-        warnings=(
-            ("body and masks do not agree: the start was too far off; `humangs check` shows why",)
-            if apart
-            else ()
-        ),
+        warnings=tuple(warnings),
     )

@@ -143,34 +143,28 @@ def _plain(value: Any) -> Any:
 
 
 def _view_rows(views: Sequence[ViewReport]) -> list[str]:
-    error = lambda view: np.nan_to_num(
-        view.median if view.iou_after is None else 1 - view.iou_after, nan=np.inf
-    )
     # of many views only those that fit worst, in their order
-    worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
+    errors = [view.median if view.iou_after is None else 1 - view.iou_after for view in views]
+    worst = np.argsort(-np.nan_to_num(errors, nan=np.inf), kind="stable")[:ROWS]
     masks = views[0].iou_after is not None
-    rows = [
-        (
-            ["view", "IoU before", "after"]
-            if masks
-            else ["view", "keypoints", "median error", "90 % below", "outliers"]
-        )
-    ]
+    rows = [["view", "keypoints", "median error", "90 % below", "outliers"]]
+    if masks:
+        rows = [["view", "IoU before", "after"]]
     for view in (views[i] for i in sorted(worst)):
         if not masks:
-            errors = (
-                [f"{view.median:.1f} px", f"{view.high:.1f} px"] if view.keypoints else ["-", "-"]
-            )
-            rows.append([view.name, str(view.keypoints), *errors, f"{view.outliers:.0%}"])
+            median, high = f"{view.median:.1f} px", f"{view.high:.1f} px"
+            if not view.keypoints:
+                median = high = "-"
+            rows.append([view.name, str(view.keypoints), median, high, f"{view.outliers:.0%}"])
         elif np.isfinite(view.iou_before):
             rows.append([view.name, f"{view.iou_before:.3f}", f"{view.iou_after:.3f}"])
         else:
             rows.append([view.name, "no mask"])
     # views that are not shown are counted
     lines = text_table(rows)
-    return (
-        lines if len(views) <= ROWS else [*lines, f"...  {len(views) - ROWS} more that fit better"]
-    )
+    if len(views) > ROWS:
+        lines.append(f"...  {len(views) - ROWS} more that fit better")
+    return lines
 
 
 # What points to a mistake
@@ -303,18 +297,28 @@ def how_far(start: Capture, refined: Capture) -> dict[str, float]:
     joint_degrees of the joints' rotations, transl_cm of the root.
     """
     a, b = start.cameras, refined.cameras
-    turns = lambda cameras: Rotation.from_matrix(
-        np.asarray(cameras.cam_from_world[:, :3, :3], float)
-    )
-    joints = lambda capture: Rotation.from_rotvec(
-        np.asarray(capture.poses.rotations, float).reshape(-1, 3)
-    )
-    degrees = lambda first, second: float(np.degrees((first.inv() * second).magnitude().mean()))
-    length = lambda x: float(np.linalg.norm(np.asarray(x), axis=-1).mean())
+    camera_turns = [
+        Rotation.from_matrix(np.asarray(cameras.cam_from_world[:, :3, :3], float))
+        for cameras in (a, b)
+    ]
+    joint_turns = [
+        Rotation.from_rotvec(np.asarray(capture.poses.rotations, float).reshape(-1, 3))
+        for capture in (start, refined)
+    ]
     return {
         "focal_factor": float(np.mean(np.asarray(b.K[:, 0, 0] / a.K[:, 0, 0]))),
-        "camera_degrees": degrees(turns(a), turns(b)),
-        "camera_cm": 100 * length(b.center - a.center),
-        "joint_degrees": degrees(joints(start), joints(refined)),
-        "transl_cm": 100 * length(refined.poses.translation - start.poses.translation),
+        "camera_degrees": _mean_degrees(*camera_turns),
+        "camera_cm": 100 * _mean_length(b.center - a.center),
+        "joint_degrees": _mean_degrees(*joint_turns),
+        "transl_cm": 100 * _mean_length(refined.poses.translation - start.poses.translation),
     }
+
+
+def _mean_degrees(first: Rotation, second: Rotation) -> float:
+    """The mean angle between rotations, degrees."""
+    return float(np.degrees((first.inv() * second).magnitude().mean()))
+
+
+def _mean_length(vectors: Any) -> float:
+    """The mean length of vectors (..., 3)."""
+    return float(np.linalg.norm(np.asarray(vectors), axis=-1).mean())

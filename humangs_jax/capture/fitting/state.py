@@ -85,12 +85,17 @@ def solve(
     import optimistix
 
     with jax.default_matmul_precision("highest"):  # the solvers' own products, too
-        flat, unravel = ravel_pytree(
-            start
-        )  # programs over one vector compile in half the time of those over trees
+        # programs over one vector compile in half the time of those over trees
+        flat, unravel = ravel_pytree(start)
         moving = None if free is None else ravel_pytree(free)[0]
-        hold = lambda y: y if moving is None else jnp.where(moving, y, flat)
-        of = lambda y: residuals(unravel(hold(y)))
+
+        def held(y):
+            """The unknowns, where those that are not free stay as they are."""
+            return y if moving is None else jnp.where(moving, y, flat)
+
+        def of(y):
+            return residuals(unravel(held(y)))
+
         if method == "lbfgs":
             lbfgs = optimistix.LBFGS(tolerance, tolerance, history_length=20)
             found = optimistix.minimise(
@@ -100,11 +105,13 @@ def solve(
             lm = optimistix.LevenbergMarquardt(
                 tolerance, tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
             )
-            vector = lambda y, _: ravel_pytree(of(y))[0]
-            found = optimistix.least_squares(vector, lm, flat, max_steps=steps, throw=False)
+            found = optimistix.least_squares(
+                lambda y, _: ravel_pytree(of(y))[0], lm, flat, max_steps=steps, throw=False
+            )
         before, after = half_squares(of(flat)), half_squares(of(found.value))
         better = after <= before  # False for NaN
-        return unravel(hold(jnp.where(better, found.value, flat))), jnp.where(better, after, before)
+        solution = jnp.where(better, found.value, flat)
+        return unravel(held(solution)), jnp.where(better, after, before)
 
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
@@ -346,10 +353,13 @@ def zero_state(origin: Origin) -> FitState:
     """The state of the origin, without the scale of a scan."""
     frames, a = origin.pose.translation.shape[:-1], len(origin.joints)
     cameras = None
-    if (views := origin.cameras) is not None:
-        count = int(views.camera.max()) + 1
+    views = origin.cameras
+    if views is not None:
+        count, focals = int(views.camera.max()) + 1, int(views.focal.max()) + 1
         cameras = CameraState(
-            jnp.zeros((count, 3)), jnp.zeros((count, 3)), jnp.zeros(int(views.focal.max()) + 1)
+            rotations=jnp.zeros((count, 3)),
+            centers=jnp.zeros((count, 3)),
+            log_focals=jnp.zeros(focals),
         )
     return FitState(
         betas=jnp.zeros(len(origin.betas)),
@@ -479,8 +489,9 @@ def camera_numbers(
     """(v,) from 0, equal for views of one camera that stood still. same: largest difference, see
     below.
     """
-    focal, flat = K[:, :1, 0], lambda values: values.reshape(len(K), -1)
-    return _numbered(np.concatenate([np.log(focal), flat(K) / focal, flat(matrices)], axis=1), same)
+    focal = K[:, :1, 0]
+    rows = [np.log(focal), K.reshape(len(K), -1) / focal, matrices.reshape(len(K), -1)]
+    return _numbered(np.concatenate(rows, axis=1), same)
 
 
 def _numbered(rows: Float[np.ndarray, "n d"], same: float) -> Int[np.ndarray, " n"]:
@@ -488,6 +499,9 @@ def _numbered(rows: Float[np.ndarray, "n d"], same: float) -> Int[np.ndarray, " 
     numbers, known = np.zeros(len(rows), np.int32), np.empty((0, rows.shape[1]))
     for i, row in enumerate(rows):
         alike = np.flatnonzero(np.abs(known - row).max(axis=1) < same)
-        numbers[i] = alike[0] if len(alike) else len(known)
-        known = known if len(alike) else np.concatenate([known, row[None]])
+        if len(alike):
+            numbers[i] = alike[0]
+        else:
+            numbers[i] = len(known)
+            known = np.concatenate([known, row[None]])
     return numbers

@@ -108,9 +108,8 @@ def find_swaps(
             exchanges.append(_cameras(best, tried, views, names))
             order = order.exchanged(best.frames, best.a, best.b)
         elif flips:
-            frames, slots = (
-                np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("frames", "a")
-            )
+            frames = np.concatenate([flip.frames for flip in flips.values()])
+            slots = np.concatenate([flip.a for flip in flips.values()])
             order = order.exchanged(frames, slots, None)
         else:
             return (*exchanges, *_sides(observations, views, order, names))
@@ -170,12 +169,16 @@ def arranged(
     """The keypoints of m frames in an order. mirror: index of each keypoint's mirror image."""
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
-    pick = lambda values: jnp.asarray(
-        np.asarray(values)[rows[..., None], order.source[..., None], columns]
-    )
+
+    def pick(values):
+        """Values of the keypoints in the order."""
+        return jnp.asarray(np.asarray(values)[rows[..., None], order.source[..., None], columns])
+
     # where left and right are exchanged the detector may have seen the body turned round: its
     # depths say nothing then
-    world = None if observations.world is None or order.mirrored.any() else pick(observations.world)
+    world = None
+    if observations.world is not None and not order.mirrored.any():
+        world = pick(observations.world)
     return replace(
         observations,
         points=pick(observations.points),
@@ -212,11 +215,10 @@ def _agreements(
 
         def near(keypoints, confidences):
             """Agreement (c,) of all views if each had these keypoints (k, 2)."""
-            everywhere = lambda own, of: jnp.broadcast_to(own, of.shape)
             alike = replace(
                 seen,
-                points=everywhere(keypoints, seen.points),
-                confidences=everywhere(confidences, seen.confidences),
+                points=jnp.broadcast_to(keypoints, seen.points.shape),
+                confidences=jnp.broadcast_to(confidences, seen.confidences.shape),
             )
             return jnp.sum((counts >= 2) * agreement(alike, points), axis=-1)
 
@@ -260,12 +262,8 @@ class _Search:
         cameras: Int[np.ndarray, "m c"],
         order: Order,
     ) -> None:
-        self.observations, self.mirror, self.cameras, self.order = (
-            observations,
-            mirror,
-            cameras,
-            order,
-        )
+        self.observations, self.mirror = observations, mirror
+        self.cameras, self.order = cameras, order
         seen = arranged(observations, mirror, order)
         found = jax.tree.map(np.asarray, _agreements(seen, mirror))
         self.confidences = np.asarray(seen.confidences)
@@ -297,9 +295,14 @@ class _Search:
         seen = (self.confidences > 0) & of
         shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
         slots = [slot for slot in (trial.a, trial.b) if slot is not None]
-        total = lambda values: float(sum(values[trial.frames, slot].sum() for slot in slots))
-        most, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
-        return trial.gain / max(most, 1e-6) > LEAST_GAIN + CHANCE / max(count, 1) ** 0.5
+
+        def total(values: np.ndarray) -> float:
+            """The sum over the views that are exchanged."""
+            return float(sum(values[trial.frames, slot].sum() for slot in slots))
+
+        attainable, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
+        least = LEAST_GAIN + CHANCE / max(count, 1) ** 0.5
+        return trial.gain / max(attainable, 1e-6) > least
 
     def flips(self) -> dict[int, _Trial]:
         """The view of each frame whose sides are exchanged most clearly, by frame."""
@@ -317,24 +320,26 @@ class _Search:
     def exchanges(self) -> list[_Trial]:
         """Exchanges of two cameras in all of their frames together, and in each alone."""
         # pairs of cameras that look exchanged in some frame are tried in all of their frames
-        cameras = lambda frame, a, b: tuple(sorted(self.cameras[frame, [a, b]].tolist()))
-        suspected = {cameras(*at) for at in np.argwhere(self.pairs)}
+        suspected = {self._pair(*at) for at in np.argwhere(self.pairs).tolist()}
         tried: dict[tuple[int, ...], list[_Trial]] = {}
         for a, b in itertools.combinations(range(self.views.shape[1]), 2):
-            frames = np.flatnonzero(self.several[:, a] & self.several[:, b])
-            frames = np.asarray(
-                [frame for frame in frames if cameras(frame, a, b) in suspected], int
-            )
-            if len(frames):
-                slots = [np.full(len(frames), slot) for slot in (a, b)]
-                for row, gain in enumerate(self.gains(frames, *slots).tolist()):
-                    one = _Trial(gain, frames[[row]], *(slot[[row]] for slot in slots))
-                    tried.setdefault(cameras(frames[row], a, b), []).append(one)
+            both = np.flatnonzero(self.several[:, a] & self.several[:, b])
+            frames = [m for m in both.tolist() if self._pair(m, a, b) in suspected]
+            if frames:
+                slots = np.full(len(frames), a), np.full(len(frames), b)
+                gains = self.gains(np.asarray(frames), *slots)
+                for frame, gain in zip(frames, gains.tolist(), strict=True):
+                    one = _Trial(gain, np.asarray([frame]), np.asarray([a]), np.asarray([b]))
+                    tried.setdefault(self._pair(frame, a, b), []).append(one)
         # an exchange of cameras concerns all frames; one of photos a single frame
         together = [_together(trials) for trials in tried.values()]
         alone = [trial for trials in tried.values() if len(trials) > 1 for trial in trials]
         every = np.ones(len(self.mirror), bool)
         return [trial for trial in (*together, *alone) if self.is_clear(trial, every)]
+
+    def _pair(self, frame: int, a: int, b: int) -> tuple[int, ...]:
+        """The numbers of two cameras of a frame, sorted."""
+        return tuple(sorted(self.cameras[frame, [a, b]].tolist()))
 
 
 def _together(trials: Sequence[_Trial]) -> _Trial:
@@ -349,14 +354,17 @@ def _cameras(
     best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]
 ) -> Swap:
     """The swap of the best exchange, and the others of the same frames that gain as much."""
-    name = lambda trial: tuple(
-        names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]])
-    )
+
+    def named(trial: _Trial) -> tuple[str, ...]:
+        """The two views in the first frame of an exchange."""
+        assert trial.b is not None
+        return tuple(names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]]))
+
     alike = [each for each in tried if each is not best and each.gain > ALIKE * best.gain]
     others = [
-        " and ".join(name(each)) for each in alike if np.array_equal(each.frames, best.frames)
+        " and ".join(named(each)) for each in alike if np.array_equal(each.frames, best.frames)
     ]
-    return Swap("cameras", name(best), tuple(others), len(best.frames))
+    return Swap("cameras", named(best), tuple(others), len(best.frames))
 
 
 def _sides(

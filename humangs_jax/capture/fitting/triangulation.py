@@ -52,11 +52,8 @@ def triangulate(
     points = _nearest(origins, directions, weights)
     for _ in range(REWEIGHTED):
         distance = jnp.sum(directions * (points - origins[:, None]), axis=-1)
-        points = _nearest(
-            origins,
-            directions,
-            weights * jnp.square(focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1)),
-        )
+        pixels_per_metre = focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1)
+        points = _nearest(origins, directions, weights * jnp.square(pixels_per_metre))
     return points, jnp.sum(weights > 0, axis=0).astype(jnp.float32)
 
 
@@ -84,9 +81,8 @@ def triangulate_robustly(
     # agreement of every view
     proposals, agreed = jax.lax.map(propose, jnp.asarray(chosen), batch_size=PAIRS_AT_ONCE)
     best = jnp.argmax(agreed, axis=0)
-    weights = agreement(
-        observations, jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0]
-    )
+    points = jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0]
+    weights = agreement(observations, points)
     weights = jnp.where(jnp.sum(weights > 0, axis=0) >= 2, weights, 0.0)
     points, count = triangulate(observations, weights)
     return points, count, weights
@@ -117,10 +113,8 @@ def reprojection_errors(
 
 
 def _rays(observations: Observations) -> tuple[Float[Array, "c 3"], Float[Array, "c k 3"]]:
-    rotation, translation = (
-        observations.cam_from_world[:, :3, :3],
-        observations.cam_from_world[:, :3, 3],
-    )
+    rotation = observations.cam_from_world[:, :3, :3]
+    translation = observations.cam_from_world[:, :3, 3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
     local = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
     directions = safe_normalize(
@@ -341,9 +335,8 @@ def _gathered(
     for v in set(range(len(views))) - {v for v, _ in pair}:
         trials = []
         for p, row in enumerate(views[v].people):
-            plain, exchanged = (
-                _error(views[v], each, points, known) for each in (row, row[mirror])
-            )
+            plain = _error(views[v], row, points, known)
+            exchanged = _error(views[v], row[mirror], points, known)
             flipped = _is_exchanged(plain, exchanged)
             trials.append((exchanged if flipped else plain, (v, p), flipped))
         best = min(trials, default=None)
@@ -359,7 +352,8 @@ def _is_exchanged(plain: float, exchanged: float) -> bool:
 
     Left and right of a small or thin person hardly differ: then nothing is exchanged.
     """
-    return exchanged < (CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain))
+    most = CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain)
+    return exchanged < most
 
 
 def _match(
@@ -369,10 +363,10 @@ def _match(
     mirrored = [False] * len(views)
     for (v, p), flipped in group.items():
         members[v], mirrored[v] = p, flipped
-    rows = {
-        v: views[v].people[p][mirror] if flipped else views[v].people[p]
-        for (v, p), flipped in group.items()
-    }
+    rows = {}
+    for (v, p), flipped in group.items():
+        row = views[v].people[p]
+        rows[v] = row[mirror] if flipped else row
     center = np.full(3, np.nan)
     if len(rows) > 1:
         points, known = _triangulated(views, rows)
@@ -417,9 +411,8 @@ def _error(
     if np.median(local[:, 2]) <= 0:
         return float("inf")
     pixels = local @ view.K.T
-    distances = np.linalg.norm(
-        pixels[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan) - row[seen, :2], axis=-1
-    )
+    depths = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
+    distances = np.linalg.norm(pixels[:, :2] / depths - row[seen, :2], axis=-1)
     size = np.ptp(row[row[:, 2] >= SEEN, :2], axis=0).max()
     return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
 
@@ -480,20 +473,19 @@ def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tu
     """People and their matches: those with the shortest ways of all together, where any others are
     plainly longer.
     """
-    ways = np.fmin(
-        ways, FAR * longest
-    )  # longer ones, and those that are not known, are all as unlikely
-    pairs = list(zip(*(each.tolist() for each in linear_sum_assignment(ways)), strict=True))
+    # longer ways, and those that are not known, are all as unlikely
+    ways = np.fmin(ways, FAR * longest)
+    rows, columns = linear_sum_assignment(ways)
+    pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
+    without_match = sorted(set(range(len(ways))) - set(rows.tolist()))
+    of_nobody = sorted(set(range(ways.shape[1])) - set(columns.tolist()))
     chosen = []
     for j, i in pairs:
+        # how much longer the ways are if another pair exchanges its matches with this one
         longer = [ways[j, k] + ways[m, i] - ways[j, i] - ways[m, k] for m, k in pairs if m != j]
         # whoever has no match now, or is nobody's match, could have this one
-        longer += [
-            ways[m, i] - ways[j, i] for m in range(len(ways)) if m not in {m for m, _ in pairs}
-        ]
-        longer += [
-            ways[j, k] - ways[j, i] for k in range(ways.shape[1]) if k not in {k for _, k in pairs}
-        ]
+        longer += [ways[m, i] - ways[j, i] for m in without_match]
+        longer += [ways[j, k] - ways[j, i] for k in of_nobody]
         if ways[j, i] < longest and min(longer, default=np.inf) >= SHORTER * longest:
             chosen.append((j, i))
     return chosen
@@ -512,15 +504,13 @@ def _moved_in_photos(
         p, q = first.members[v], second.members[w]
         if p is None or q is None or not _stands_still(before[v], now[w]):
             continue
-        (place, size), (other, other_size) = (
-            _box(row) for row in (before[v].people[p], now[w].people[q])
-        )
-        resized = max(size, other_size) > RESIZED * min(size, other_size)
-        moved.append(
-            float("inf")
-            if resized
-            else float(np.linalg.norm(other - place)) / max(size, other_size, 1e-9)
-        )
+        place, size = _box(before[v].people[p])
+        other, other_size = _box(now[w].people[q])
+        larger, smaller = max(size, other_size), min(size, other_size)
+        if larger > RESIZED * smaller:
+            moved.append(float("inf"))
+        else:
+            moved.append(float(np.linalg.norm(other - place)) / max(larger, 1e-9))
     return max(moved, default=float("inf"))
 
 

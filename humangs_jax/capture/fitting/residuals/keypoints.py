@@ -84,7 +84,9 @@ def make_observations(
 ) -> Observations:
     """A batch of m frames from arrays (m, c, ...), with the noise that is expected of them."""
     noise = expected_noise(np.asarray(points), np.asarray(confidences))
-    given = (points, confidences, K, cam_from_world, noise, *(() if world is None else (world,)))
+    given = [points, confidences, K, cam_from_world, noise]
+    if world is not None:
+        given.append(world)
     return jax.vmap(Observations)(*(jnp.asarray(x, jnp.float32) for x in given))
 
 
@@ -120,18 +122,18 @@ def group_by_frame(
     points = np.where(confidences[..., None] > 0, keypoints.points[views], 0.0)
     cameras = photos.cameras
     world = None
-    if (
-        keypoints.world is not None and views.shape[1] == 1
-    ):  # several views say more than any of them alone
+    # several views say more than what the detector sees in any of them
+    if keypoints.world is not None and views.shape[1] == 1:
         # the ray goes through the hips, or through all landmarks where no hip is seen
         hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
-        middle = np.where(
-            (confidences * hips).any(-1, keepdims=True), confidences * hips, confidences
-        )
-        world = in_camera_axes(keypoints.world[views], points, middle, np.asarray(cameras.K)[views])
-    return make_observations(
+        of_hips = confidences * hips
+        weights = np.where(of_hips.any(-1, keepdims=True), of_hips, confidences)
+        K = np.asarray(cameras.K)[views]
+        world = in_camera_axes(keypoints.world[views], points, weights, K)
+    observations = make_observations(
         points, confidences, cameras.K[views], cameras.cam_from_world[views], world
-    ), views
+    )
+    return observations, views
 
 
 def in_camera_axes(
@@ -184,10 +186,8 @@ def found_noise(lengths: Array, expected: Array) -> Array:
 
 def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:
     """Points of the world in the coordinates of every camera."""
-    rotation, translation = (
-        observations.cam_from_world[:, :3, :3],
-        observations.cam_from_world[:, :3, 3],
-    )
+    rotation = observations.cam_from_world[:, :3, :3]
+    translation = observations.cam_from_world[:, :3, 3]
     return jnp.einsum("cab,kb->cka", rotation, points, precision=EXACT) + translation[:, None]
 
 
@@ -242,9 +242,8 @@ def keypoint_residuals(
     errors = (
         keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
     )
-    return _roots(observations.confidences * np.asarray(model.known, np.float32))[
-        ..., None
-    ] * robust(errors, scale)
+    weights = observations.confidences * np.asarray(model.known, np.float32)
+    return _roots(weights)[..., None] * robust(errors, scale)
 
 
 def _roots(weights: Float[Array, "c k"]) -> Float[Array, "c k"]:
@@ -262,13 +261,17 @@ def world_residuals(
     standard deviations.
     """
     weights = observations.confidences * np.asarray(model.known, np.float32)
-    centered = lambda x: (
-        x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
-    )
-    size = lambda x: jnp.sqrt(
-        jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total + NEAR**2
-    )[:, None]
     total = jnp.maximum(jnp.sum(weights, axis=1), 1e-6)
+
+    def centered(x):
+        """Points about their weighted mean."""
+        return x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
+
+    def size(x):
+        """Root mean square of the distances from the mean, (c, 1)."""
+        square = jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total
+        return jnp.sqrt(square + NEAR**2)[:, None]
+
     ours, theirs = centered(in_cameras(observations, landmarks)), centered(observations.world)
     errors = ours[..., 2] / size(ours) - theirs[..., 2] / size(theirs)
     return _roots(weights) * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
@@ -335,7 +338,6 @@ def frame_residuals(
         found["world"] = world_residuals(problem.model, observations, landmarks, scale)
     if targets is not None:
         known = (targets.known * problem.known)[:, None]
-        found["points"] = known * robust(
-            (landmarks - targets.points) / (targets.pixel * observations.noise), scale
-        )
+        std = targets.pixel * observations.noise
+        found["points"] = known * robust((landmarks - targets.points) / std, scale)
     return found

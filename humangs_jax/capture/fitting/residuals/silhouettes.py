@@ -158,9 +158,8 @@ def mask_boundary(
     from skimage.filters import gaussian
     from skimage.measure import find_contours
 
-    contours = [
-        contour[:, ::-1] + 0.5 for contour in find_contours(mask, 0.5)
-    ]  # rows, columns of centres -> pixels
+    # rows and columns of pixel centres become pixels
+    contours = [contour[:, ::-1] + 0.5 for contour in find_contours(mask, 0.5)]
     # contours that are long enough, as pieces of lines
     steps = [np.linalg.norm(np.diff(contour, axis=0), axis=1) for contour in contours]
     longest = max((step.sum() for step in steps), default=0.0)
@@ -250,14 +249,16 @@ def match(
     how far points look.
     hidden: where the mask says nothing, since somebody may be in front.
     """
-    pairs = zip(
-        _ends_of_mask(body, mask, reach, hidden), _nearest(body, boundary, reach), strict=True
-    )
-    rows = [np.concatenate(pair) for pair in pairs]
+    of_body, of_mask = _ends_of_mask(body, mask, reach, hidden), _nearest(body, boundary, reach)
+    rows = [np.concatenate(pair) for pair in zip(of_body, of_mask, strict=True)]
     points, normals, offsets = (padded(x, 2 * count) for x in rows)
     weights = np.arange(2 * count) < len(rows[0])
-    to = lambda x: jnp.asarray(x, jnp.float32)
-    return Matches(jnp.asarray(points, jnp.int32), to(normals), to(offsets), to(weights))
+    return Matches(
+        points=jnp.asarray(points, jnp.int32),
+        normals=jnp.asarray(normals, jnp.float32),
+        offsets=jnp.asarray(offsets, jnp.float32),
+        weights=jnp.asarray(weights, jnp.float32),
+    )
 
 
 Pairs = tuple[Int[np.ndarray, " e"], Float[np.ndarray, "e 2"], Float[np.ndarray, " e"]]
