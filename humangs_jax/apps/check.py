@@ -128,7 +128,9 @@ class CheckReport:
         # views with a warning end in an exclamation mark
         rows = [["view", "silhouette IoU", "body outside mask", "body in frame"]]
         for view in self.views:
-            iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
+            iou = "no mask"
+            if view.iou is not None:
+                iou = f"{view.iou:.3f}"
             outside = ""
             if view.outside is not None:
                 outside = f"{view.outside:.1%}"
@@ -336,7 +338,9 @@ def _boundary(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _label(view: ViewCheck) -> str:
-    iou = "" if view.iou is None else f"  IoU {view.iou:.2f}"
+    iou = ""
+    if view.iou is not None:
+        iou = f"  IoU {view.iou:.2f}"
     return f"{'! ' if view.warning else ''}{view.name}{iou}"
 
 

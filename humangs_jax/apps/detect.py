@@ -553,7 +553,9 @@ def write_found(
         # the chosen person alone: `humangs fit` need not choose again
         write_people(temporary / KEYPOINTS_FILE, images)
         write_sheet(temporary / SHEET_FILE, photos, person)
-        with_mask = zip(photos, files, strict=True) if masks else ()
+        with_mask = ()
+        if masks:
+            with_mask = zip(photos, files, strict=True)
         for photo, file in with_mask:
             (temporary / file).parent.mkdir(parents=True, exist_ok=True)
             write_png(temporary / file, person_mask(photo, person), mark=MASK)
@@ -570,8 +572,10 @@ def write_found(
                 if "unknown" in view:  # what was known before anybody was found stays
                     known = read_mask(folder / view["unknown"], "its photo", *photo.size)
                     known = known >= LEAST_UNKNOWN
-                    if hidden is not None:
-                        hidden = hidden | known if (hidden & ~known).any() else None
+                    if hidden is not None and (hidden & ~known).any():
+                        hidden = hidden | known
+                    else:
+                        hidden = None
                 if hidden is not None:
                     named["unknown"] = f"{UNKNOWN}/{Path(file).relative_to(MASKS).as_posix()}"
                     (temporary / named["unknown"]).parent.mkdir(parents=True, exist_ok=True)

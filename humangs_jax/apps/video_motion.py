@@ -117,7 +117,9 @@ def motion_from_video(
     Examples:
         >>> motion = hg.motion_from_video("dance.mp4", height=1.72)
     """
-    joints = None if avatar is None else np.asarray(avatar.rest_joints)
+    joints = None
+    if avatar is not None:
+        joints = np.asarray(avatar.rest_joints)
     found = fit_video(
         Path(video), person=person, height=height, rest_joints=joints, focal_mm=focal_mm
     )
@@ -147,7 +149,9 @@ def fit_video(
         raise ArgumentError("person", f"{person}: expected a number from 0")
     rate, count = rate_and_count(video)
     body = load_body()
-    betas = None if rest_joints is None else betas_of_joints(body, rest_joints)
+    betas = None
+    if rest_joints is not None:
+        betas = betas_of_joints(body, rest_joints)
     seen, size = look_at_video(video, count, person, kept)
     K = np.eye(3)
     K[0, 0] = K[1, 1] = float(focal_mm or USUAL_FOCAL) / DIAGONAL_35MM * np.hypot(*size)
@@ -161,7 +165,10 @@ def fit_video(
             lost,
             count,
         )
-    watch = lambda stages, total: bar(stages, desc="fitting the motion", unit="stage")
+
+    def watch(stages, total):
+        return bar(stages, desc="fitting the motion", unit="stage")
+
     fit = fit_motion(body, keypoints, K, rate, betas=betas, height=height, watch=watch)
     faces = smooth_faces(seen["face"], rate)
     if faces is not None:
@@ -197,7 +204,10 @@ def rate_and_count(video: Path) -> tuple[float, int]:
         if count < 2:
             raise Refused("one frame: expected a video in which somebody moves")
     seconds = times[-1] - times[0]
-    rate = (count - 1) / seconds if np.isfinite(seconds) and seconds > 0 else frame_rate(video)
+    if np.isfinite(seconds) and seconds > 0:
+        rate = (count - 1) / seconds
+    else:
+        rate = frame_rate(video)
     if rate is None:
         raise CaptureError(video, "", "says no times of its frames: expected a video with a rate")
     return float(rate), count
@@ -288,7 +298,10 @@ class _Follower:
                 )
             return people[number]
         near, hips = [p for p in people if self._same(p.again, patience=2.0)], self.last.hips
-        distance = lambda each: float(np.hypot(*(each.again.hips - hips)))
+
+        def distance(each):
+            return float(np.hypot(*(each.again.hips - hips)))
+
         return min(near, key=distance, default=None)
 
     def _same(self, now: Detection, patience: float = 1.0) -> bool:

@@ -150,7 +150,9 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
     if not isinstance(rate, int | float) or not rate > 0 or not all(n.isdigit() for n in numbers):
         return None
     seconds = np.asarray([int(number) / rate for number in numbers])
-    return seconds if np.all(np.diff(seconds) > 0) else None
+    if np.all(np.diff(seconds) > 0):
+        return seconds
+    return None
 
 
 def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:

@@ -135,7 +135,9 @@ def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
 
 def faced(avatar: Avatar) -> Avatar:
     """The avatar with a face where its body is known, else as it is."""
-    found = body_of(avatar) if avatar.face is None else None
+    found = None
+    if avatar.face is None:
+        found = body_of(avatar)
     if found is None:
         return avatar
     return with_face(avatar, found)
@@ -161,7 +163,10 @@ def _face(avatar: Avatar, body: BodyModel, of_arkit: bool) -> Face:
     row_of_vertex = np.full(count, len(vertices))
     row_of_vertex[vertices] = np.arange(len(vertices))
     row = row_of_vertex[_vertex_of_gaussians(avatar)]
-    eyes = _eyes(avatar) if of_arkit else np.zeros((len(row), 2), np.float32)
+    if of_arkit:
+        eyes = _eyes(avatar)
+    else:
+        eyes = np.zeros((len(row), 2), np.float32)
     row[eyes.sum(axis=1) > 0.5] = len(vertices)  # what shows the eye does not go with the lids
     beside, stretching = _stretching(avatar, vertices, row_of_vertex)
     hidden = _hidden(avatar, body, row < len(vertices)) if of_arkit else _nothing(expressions)

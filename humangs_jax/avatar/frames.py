@@ -483,7 +483,6 @@ def circle_cameras(
     radius = 1.0
     if len(means):
         radius = np.quantile(np.linalg.norm(means - middle, axis=1), SHOWN)
-    if len(means):
         low, high = np.quantile(means, [1 - NEARLY_ALL, NEARLY_ALL], axis=0)
         whole = np.quantile(np.linalg.norm(means - (low + high) / 2, axis=1), NEARLY_ALL)
         if whole < COMPACT * radius:

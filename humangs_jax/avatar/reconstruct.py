@@ -456,7 +456,10 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
             turned_normals(normals, blend_transforms(fixed.skinning_weights, joints)[:, :3, :3])
         )
 
-    count = len(views.images) if views.view_count is None else views.view_count
+    if views.view_count is None:
+        count = len(views.images)
+    else:
+        count = views.view_count
     share = (jnp.arange(len(views.images)) < count) / count
     terms = jnp.sum(
         share[:, None, None] * jax.vmap(terms_in)(views.rotations, views.translations), axis=0

@@ -173,7 +173,9 @@ def _mirrored(name: str) -> str:
     """The name of the joint on the other side."""
     side, _, part = name.partition("_")
     other = {"left": "right", "right": "left"}
-    return f"{other[side]}_{part}" if side in other else name
+    if side in other:
+        return f"{other[side]}_{part}"
+    return name
 
 
 def guessed(

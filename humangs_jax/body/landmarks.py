@@ -75,7 +75,9 @@ def mirrored_name(name: str) -> str:
     if kind == "face":
         return f"face_{_mirrored_face(int(rest))[0]}"
     other = {"left": "right", "right": "left"}
-    return f"{other[kind]}_{rest}" if kind in other else name
+    if kind in other:
+        return f"{other[kind]}_{rest}"
+    return name
 
 
 def side_of(name: str) -> int:

@@ -273,7 +273,10 @@ class _Mesh:
     def __init__(self, vertices, faces, uv_faces, importance):
         self.positions = vertices.tolist()
         self.faces = faces.tolist()
-        self.uv_faces = faces.tolist() if uv_faces is None else uv_faces.tolist()
+        if uv_faces is None:
+            self.uv_faces = faces.tolist()
+        else:
+            self.uv_faces = uv_faces.tolist()
         self.importance = importance.tolist()
         self.around = [set() for _ in self.positions]
         self.beside = [set() for _ in self.positions]

@@ -79,7 +79,9 @@ class Demo:
             from humangs_jax.refinement.config import RefineConfig
 
         settings = chosen_settings(self.preset, None)
-        refine = None if limits is None else RefineConfig(**limits)
+        refine = None
+        if limits is not None:
+            refine = RefineConfig(**limits)
         if settings is not None and self.refine is None:
             refine = settings.refinement
         report = run_demo(self.out, self.weights, self.size, refine, settings)
@@ -169,7 +171,9 @@ class Reconstruct:
             from humangs_jax.refinement.config import RefineConfig
 
             settings = chosen_settings(self.preset, self.config)
-        how = None if limits is None else RefineConfig(**limits)
+        how = None
+        if limits is not None:
+            how = RefineConfig(**limits)
         if self.refine is None and settings is not None:
             how = settings.refinement
         if several:

@@ -178,7 +178,10 @@ def _options(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any, Any, 
     hints = get_type_hints(command, include_extras=True)
     for field in dataclasses.fields(command):
         hint = hints[field.name]
-        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        if get_origin(hint) is Annotated:
+            kind = get_args(hint)[0]
+        else:
+            kind = hint
         yield field, hint, kind, Positional in getattr(hint, "__metadata__", ())
 
 

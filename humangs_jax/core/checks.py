@@ -157,7 +157,9 @@ def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
     needed = [
         p.name for p in parameters if p.kind in kinds and p.default is inspect.Parameter.empty
     ]
-    more = ["..."] if len(needed) < len(parameters) else []
+    more = []
+    if len(needed) < len(parameters):
+        more = ["..."]
     return f"{getattr(function, '__name__', 'function')}({', '.join(needed + more)})"
 
 

@@ -126,7 +126,8 @@ def record_values(
         if annotated.values is None:
             continue
         known = not isinstance(array, Tracer)
-        array = np.asarray(array) if on_host and known else array
+        if on_host and known:
+            array = np.asarray(array)
         found[label] = array, annotated.values
         for part in annotated.parts if known else ():
             found[f"{label} {part.words}"] = part.take(np.asarray(array)), part.values

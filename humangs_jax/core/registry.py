@@ -47,7 +47,9 @@ class Formats(dict[str, F]):
 
     def of(self, path: Path) -> "Formats[F]":
         """Those whose files are called like this one, or are folders."""
-        suffix = FOLDER if path.is_dir() else path.suffix.lower()
+        suffix = FOLDER
+        if not path.is_dir():
+            suffix = path.suffix.lower()
         return self.where(lambda each: suffix in each.suffixes)
 
     def recognized(self, path: Path) -> F | None:

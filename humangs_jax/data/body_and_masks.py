@@ -158,8 +158,11 @@ def skinned(
     turns = Rotation.from_rotvec(np.asarray(poses.rotations[frame], float)).as_matrix()
     moves = np.zeros((len(joints), 3, 4))
     for j, parent in enumerate(body.parents):  # parents come first
-        turn = turns[j] if parent < 0 else moves[parent, :, :3] @ turns[j]
-        place = joints[j] if parent < 0 else moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
+        if parent < 0:
+            turn, place = turns[j], joints[j]
+        else:
+            turn = moves[parent, :, :3] @ turns[j]
+            place = moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
         moves[j] = np.concatenate([turn, (place - turn @ joints[j])[:, None]], axis=1)
     blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
     linear, offset = blended[..., :3], blended[..., 3] + np.asarray(poses.translation[frame], float)
@@ -440,7 +443,9 @@ def _share_outside(
         for view in views:
             pixels, per_metre, within = view.seen(rest)
             found |= within & outside(view, pixels, per_metre)
-        return float(found[free].mean()) if free.any() else 0.0
+        if free.any():
+            return float(found[free].mean())
+        return 0.0
 
     few = share(
         lambda view, pixels, _: at(view.coverage, pixels) < MASK_THRESHOLD
@@ -487,7 +492,10 @@ def _crossing(
     for inside, order in ((True, slice(zero, None)), (False, slice(zero, None, -1))):
         rows = np.flatnonzero(starts_inside == inside)
         values, places = depths[rows][:, order], reach[order]
-        crossed = (values[:, 1:] <= 0) if inside else (values[:, 1:] > 0)
+        if inside:
+            crossed = values[:, 1:] <= 0
+        else:
+            crossed = values[:, 1:] > 0
         unknown = np.isnan(values).cumsum(1)[:, 1:] > 0
         first = np.argmax(crossed & ~unknown, axis=1)
         hit = (crossed & ~unknown)[np.arange(len(rows)), first]

@@ -154,7 +154,9 @@ class Calibration:
             new = np.full(len(self.cameras), -1)
             new[list(kept)] = np.arange(len(kept))
             own = new[seen.cameras] >= 0
-            colors = None if seen.colors is None else seen.colors[own]
+            colors = None
+            if seen.colors is not None:
+                colors = seen.colors[own]
             seen = Observations(seen.points[own], new[seen.cameras[own]], seen.pixels[own], colors)
             if not own.any():
                 seen = None

@@ -145,7 +145,9 @@ class Capture:
         def resize(images):
             return np.stack([resized(image, *size) for image in images])
 
-        masks = None if self.masks is None else resize(self.masks)
+        masks = None
+        if self.masks is not None:
+            masks = resize(self.masks)
         unknown = None
         if self.unknown is not None:
             unknown = resize(self.unknown.astype(np.float32)) > 0

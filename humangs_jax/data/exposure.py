@@ -334,7 +334,10 @@ def _robust_differences(
         found = np.linalg.lstsq(scales * rows, scales * target, rcond=None)[0]
         left = np.linalg.norm(differences @ found - values, axis=1) / errors
         robust = step >= FITS - REDESCENDING
-        weights = 1 / (1 + left**2) if robust else 1 / np.maximum(left, 1)
+        if robust:
+            weights = 1 / (1 + left**2)
+        else:
+            weights = 1 / np.maximum(left, 1)
     return found
 
 

@@ -65,7 +65,9 @@ def with_hidden_parts(capture: Capture) -> Capture:
     if found is None:
         return capture
     assert capture.masks is not None
-    unknown = found if capture.unknown is None else capture.unknown | found
+    unknown = found
+    if capture.unknown is not None:
+        unknown = capture.unknown | found
     return dataclasses.replace(
         capture,
         images=np.where(unknown[..., None], np.float32(1), capture.images),
@@ -80,7 +82,10 @@ def hidden_line(before: Capture, after: Capture) -> str | None:
     """
     if after.unknown is None:
         return None
-    known = np.zeros_like(after.unknown) if before.unknown is None else before.unknown
+    if before.unknown is None:
+        known = np.zeros_like(after.unknown)
+    else:
+        known = before.unknown
     new = (after.unknown & ~known).any(axis=(1, 2))
     names = [name for name, hidden in zip(after.names, new, strict=True) if hidden]
     told = "the mask has a hole where the body is: something is in front, and unknown there"
@@ -133,7 +138,9 @@ def _hidden_part(
     pixels = (seen / seen[:, 2:] @ K.T)[:, :2]
     per_metre = float(np.sqrt(K[0, 0] * K[1, 1]) / np.median(seen[:, 2]))
     body = silhouette(pixels, faces, mask.shape) > 0
-    outside = ndimage.distance_transform_edt(~body) if body.any() else np.inf
+    outside = np.inf
+    if body.any():
+        outside = ndimage.distance_transform_edt(~body)
     beside = mask & (outside > LOOSE * per_metre)
     on_body = (mask & body).sum()
     if beside.sum() > (1 - AGREES) * mask.sum() or on_body <= SHOWN * (body & known).sum():

@@ -362,7 +362,9 @@ def world_up(roots: Float[np.ndarray, "v 3"], cameras: Camera) -> str:
     if up in (None, "y"):
         return "y"
     camera_up = -np.asarray(cameras.cam_from_world)[:, 1, :3].mean(axis=0)
-    return up if nearest_axis(camera_up)[0] == up else "y"
+    if nearest_axis(camera_up)[0] == up:
+        return up
+    return "y"
 
 
 def turned_world(

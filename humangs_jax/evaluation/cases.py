@@ -324,7 +324,10 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
             raise ValueError(
                 f"one avatar for {people} people: expected a folder with PERSON.npz for each"
             )
-        loaded = avatar if isinstance(avatar, Avatar) else Avatar.load(avatar)
+        if isinstance(avatar, Avatar):
+            loaded = avatar
+        else:
+            loaded = Avatar.load(avatar)
         return lambda case, background: draw_views(loaded, case.truth, background)
 
     def one_of(case: Case, background: float) -> Predicted:

@@ -75,7 +75,9 @@ def tree_key(tree: Any) -> str:
 
 def file_key(file: Path) -> str:
     """A checksum of the bytes of a file; of one that is not there, that it is not."""
-    return file_checksum(file) if file.is_file() else "none"
+    if file.is_file():
+        return file_checksum(file)
+    return "none"
 
 
 def case_key(case: Case) -> str:
@@ -153,7 +155,10 @@ def method_key(
         return file_key(place)[:SHORT], nothing
     if isinstance(weights, str | Path):
         return file_key(Path(weights))[:SHORT], nothing
-    variables, config = shipped_weights() if weights is None else weights
+    if weights is None:
+        variables, config = shipped_weights()
+    else:
+        variables, config = weights
     return checksum({}, tree_key(variables), repr(config))[:SHORT], nothing
 
 

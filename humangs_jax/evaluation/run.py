@@ -367,7 +367,10 @@ def evaluate(
     if isinstance(protocol, str) and protocol not in PROTOCOLS:
         raise ValueError(f"no protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
     # how images are compared, and by which networks
-    rules = PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
+    if isinstance(protocol, str):
+        rules = PROTOCOLS[protocol]
+    else:
+        rules = protocol
     networks = {network.net: network for network in lpips}
     networks |= {
         net: load_lpips(net)
@@ -489,7 +492,9 @@ def _score_person(
         raise ValueError(f"{name}: {error}") from error
     # a row for each image, and its place in the gallery
     for i, scores in enumerate(scored):
-        mask = None if truth.masks is None else truth.masks[i]
+        mask = None
+        if truth.masks is not None:
+            mask = truth.masks[i]
         shot = functools.partial(
             _shot, on_background(truth.images[i], mask, rules), predicted.images[i]
         )
@@ -540,7 +545,9 @@ def _counted(count: int, one: str, many: str) -> str:
 def _plain(value: Any) -> Any:
     """Settings as JSON; the kind of a crop by the name of its class."""
     if not dataclasses.is_dataclass(value):
-        return list(value) if isinstance(value, tuple) else value
+        if isinstance(value, tuple):
+            return list(value)
+        return value
     fields = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, EvaluationProtocol):
         return fields

@@ -212,7 +212,9 @@ def _light_in_srgb(light: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float
 
 
 def _encode(encoding: Encoding) -> Curve:
-    return light_to_bt709 if encoding.camera else light_to_srgb
+    if encoding.camera:
+        return light_to_bt709
+    return light_to_srgb
 
 
 STEPS = 1 << 18
@@ -293,7 +295,10 @@ def read_profile(data: bytes) -> Profile:
         if space == "CMYK" or b"A2B0" in tags:
             return Profile(space, None)
         with np.errstate(all="ignore"):
-            encoding = _of_grey(tags) if space == "greys" else _of_colors(tags)
+            if space == "greys":
+                encoding = _of_grey(tags)
+            else:
+                encoding = _of_colors(tags)
             steps = np.linspace(0, 1, 256)
             if not all(np.isfinite(curve(steps)).all() for curve in encoding.curves):
                 raise Refused("its curves are no numbers")

@@ -511,7 +511,9 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
     """
     kept = kept_photos()
     with open_image(path) as (image, data):
-        key = b"" if kept is None else content_key(data, as_stored)
+        key = b""
+        if kept is not None:
+            key = content_key(data, as_stored)
         if kept is not None and (found := kept.find(key)) is not None:
             return found
         levels, most = _levels(image, data)
@@ -613,7 +615,9 @@ def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
     nclx = image.info.get("nclx_profile")
     if image.format == "HEIF" and isinstance(nclx, dict):
         points = int(nclx.get("color_primaries", 1)), int(nclx.get("transfer_characteristics", 13))
-    return None if points is None else of_code_points(*points)
+    if points is None:
+        return None
+    return of_code_points(*points)
 
 
 def _by_tables(

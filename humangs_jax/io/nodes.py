@@ -65,7 +65,10 @@ def world_matrices(
         local = _local(
             nodes[i], {path: tracks[i, path] for path in PATHS if (i, path) in tracks}, times
         )
-        world[i] = local if parents[i] == -1 else world[parents[i]] @ local
+        if parents[i] == -1:
+            world[i] = local
+        else:
+            world[i] = world[parents[i]] @ local
     return world
 
 

@@ -264,7 +264,10 @@ def _why(kind: str, error: Exception) -> str:
         says_little = isinstance(
             error, LookupError | AssertionError | AttributeError | TypeError
         ) or not str(error)
-        reason = f"{type(error).__name__} {error}" if says_little else str(error)
+        if says_little:
+            reason = f"{type(error).__name__} {error}"
+        else:
+            reason = str(error)
     return f"not a readable {kind}: {_one_line(reason, LONGEST_REASON)}"
 
 

@@ -106,7 +106,9 @@ class _Looked:
         """Does to `stack` and `memo` what an instruction does to those of the unpickler."""
         name, stack = opcode.name, self.stack
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
-            index = len(self.memo) if name == "MEMOIZE" else argument
+            index = argument
+            if name == "MEMOIZE":
+                index = len(self.memo)
             # the unpickler makes a list with a place for each index: there is none without a value
             if not 0 <= index <= self.count or not stack:
                 raise Refused("refused an index of the memo that is beyond its values")

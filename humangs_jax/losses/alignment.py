@@ -149,7 +149,9 @@ def _sampled(
 def person_height(mask: Float[np.ndarray, "h w"]) -> int:
     """Rows from the first to the last of a mask; those of the image if it is empty."""
     rows = np.flatnonzero((mask > 0.5).any(axis=1))
-    return int(np.ptp(rows)) + 1 if len(rows) else len(mask)
+    if len(rows):
+        return int(np.ptp(rows)) + 1
+    return len(mask)
 
 
 def sizes(height: float) -> tuple[int, int]:

@@ -64,7 +64,9 @@ def added_variance(low_pass: Float[Array, " g"] | None, eps2d: float) -> float:
     """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the
     scales contain a low-pass.
     """
-    return eps2d if low_pass is None else min(eps2d, MIP_EPS2D)
+    if low_pass is None:
+        return eps2d
+    return min(eps2d, MIP_EPS2D)
 
 
 def widened(

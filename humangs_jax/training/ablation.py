@@ -95,7 +95,10 @@ class Ablation:
         head = ["variant", "seeds", self.metric, "difference", f"{CONFIDENCE:.0%} interval"]
         cells = []
         for row in self.rows:
-            difference = ("", "") if row.name == BASE else _shown(row)
+            if row.name == BASE:
+                difference = "", ""
+            else:
+                difference = _shown(row)
             cells.append([row.name, str(row.seeds), f"{row.mean:.2f}", *difference])
         return "\n".join([*text_table([head, *cells]), *self._missing_told()])
 
@@ -309,7 +312,10 @@ def _unusable(make: MakeSource, config: TrainConfig) -> dict[str, str]:
     problems: dict[str, str] = {}
     for first, _ in config.spans(0, config.steps):
         source = make(config.at(first))
-        parts = source.sources if isinstance(source, Mixture) else (source,)
+        if isinstance(source, Mixture):
+            parts = source.sources
+        else:
+            parts = (source,)
         for part in parts:
             if isinstance(part, CaptureSource):
                 problems |= part.unusable()

@@ -73,7 +73,9 @@ class Leaf:
         first = ()
         if wrong.any():
             first = tuple(np.argwhere(wrong)[0].tolist())
-        mean = float(np.abs(finite).mean()) if finite.size else 0.0
+        mean = 0.0
+        if finite.size:
+            mean = float(np.abs(finite).mean())
         extremes = float(finite.min(initial=np.inf)), float(finite.max(initial=-np.inf))
         return cls(name, int(wrong.sum()), first, *extremes, mean, float(np.linalg.norm(finite)))
 

@@ -68,7 +68,10 @@ def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     most, capacity = max(config.views.input_counts), config.model.runtime.token_capacity
     if views == most:
         return config.model
-    share = (views + 1) / (most + 1) if views < most else views / most
+    if views < most:
+        share = (views + 1) / (most + 1)
+    else:
+        share = views / most
     return config.model.with_runtime(token_capacity=math.ceil(capacity * share))
 
 

@@ -45,7 +45,9 @@ def stage_loader(
 ) -> Loader:
     """Batches from a step on, until the end of the stage that holds there."""
     part = config.at(step)
-    sharding = None if mesh is None else batch_sharding(mesh)
+    sharding = None
+    if mesh is not None:
+        sharding = batch_sharding(mesh)
     before = config.examples_before(step)
     return Loader(
         make_source(part),

@@ -258,7 +258,9 @@ def _check_version(path: object, form: ExportFormat, version: int | None) -> Non
 
 
 def _versioned(version: int | None) -> dict[str, int]:
-    return {} if version is None else {"version": version}
+    if version is None:
+        return {}
+    return {"version": version}
 
 
 def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
@@ -423,7 +425,9 @@ def export(
         )
     _check_version(path, form, version)
     # one file for each frame, unless one holds a whole motion
-    frames = 1 if motion is None else len(motion.translations)
+    frames = 1
+    if motion is not None:
+        frames = len(motion.translations)
     if not form.animated and frames != (1 if numbers is None else len(numbers)):
         given = "no numbers"
         if numbers is not None:
@@ -454,6 +458,8 @@ def export(
         if form.backwards:  # before up is elsewhere: the half turn is about the vertical axis
             gaussians = rotated(gaussians, BACKWARDS)
         gaussians = turned(gaussians, up or form.up)
-        options = {"rest_fields": True} if rest_fields else {}
+        options = {}
+        if rest_fields:
+            options = {"rest_fields": True}
         form(file, gaussians, **options, **_versioned(version))
     return files

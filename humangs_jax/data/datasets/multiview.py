@@ -181,7 +181,9 @@ def numbered(folder: Path) -> dict[int, Path]:
     """Frame -> its file, of the photos in a folder that are called by a number; empty if it does
     not exist.
     """
-    listed = os.listdir(folder) if folder.is_dir() else ()
+    listed = ()
+    if folder.is_dir():
+        listed = os.listdir(folder)
     names = [name for name in listed if name.lower().endswith(PHOTO_SUFFIXES)]
     matches = {name: PHOTO.fullmatch(name) for name in names}
     return {int(found[1]): folder / name for name, found in matches.items() if found}
@@ -545,7 +547,9 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
         masks.append(
             {int(name): f"{masked}/{name}" for name in notes.names(masked) if name.isdecimal()}
         )
-        first = shown[-1][min(shown[-1])] if shown[-1] else None
+        first = None
+        if shown[-1]:
+            first = shown[-1][min(shown[-1])]
         cameras.append(_camera(notes, number, photos, first))
 
     def read(photo: str, mask: str) -> Photo:

@@ -394,7 +394,10 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
     transform = scan_alignment(scan.vertices, fitted.joints[PELVIS], fitted.joints[NECK])
     vertices = moved(transform, scan.vertices)
     radius = float(np.linalg.norm(vertices, axis=1).max())
-    number = int(name) if name.isdecimal() else zlib.crc32(os.fsencode(name))
+    if name.isdecimal():
+        number = int(name)
+    else:
+        number = zlib.crc32(os.fsencode(name))
     cameras = scan_cameras(number, radius, settings.views, settings.factors)
     renderer, K = ScanRenderer.of(scan, vertices), intrinsics(settings.size)
 

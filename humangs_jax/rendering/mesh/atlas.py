@@ -343,7 +343,9 @@ def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
     for row, column in np.argwhere(mask):
         fits &= free[row : row + rows, column : column + columns]
     place = int(np.argmax(fits))
-    return divmod(place, columns) if fits.flat[place] else None
+    if fits.flat[place]:
+        return divmod(place, columns)
+    return None
 
 
 def _bitmaps(flat: _Flat, scale: float, cell: int) -> list[np.ndarray]:
