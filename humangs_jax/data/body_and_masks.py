@@ -28,6 +28,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from humangs_jax.body.joints import bones_of, posed_tree
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.capture import Capture
@@ -156,14 +157,9 @@ def skinned(
     are those of all vertices.
     """
     turns = Rotation.from_rotvec(np.asarray(poses.rotations[frame], float)).as_matrix()
-    moves = np.zeros((len(joints), 3, 4))
-    for j, parent in enumerate(body.parents):  # parents come first
-        if parent < 0:
-            turn, place = turns[j], joints[j]
-        else:
-            turn = moves[parent, :, :3] @ turns[j]
-            place = moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
-        moves[j] = np.concatenate([turn, (place - turn @ joints[j])[:, None]], axis=1)
+    world, places = posed_tree(turns, bones_of(joints, body.parents), body.parents)
+    offsets = places - np.einsum("jab,jb->ja", world, joints)
+    moves = np.concatenate([world, offsets[..., None]], axis=-1)
     blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
     linear, offset = blended[..., :3], blended[..., 3] + np.asarray(poses.translation[frame], float)
     if corrected and body.pose_directions is not None:

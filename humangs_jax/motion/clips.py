@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import DEFAULT_FPS
+from humangs_jax.body.joints import DEFAULT_FPS, posed_tree
 from humangs_jax.core.array_types import Float
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.io.nodes import (
@@ -77,7 +77,9 @@ def read_bvh(path: Path, options: object = None) -> Clip:
         )
     check_unpacked(len(text), bytes_of_clip(int(count), len(names)))
     turns, places = _posed(parents, offsets, channels, numbers.reshape(int(count), width))
-    return Clip(names, parents, _chained(parents, offsets), turns, places, 1 / seconds)
+    bones = np.where(np.asarray(parents)[:, None] < 0, 0.0, offsets)
+    rest = posed_tree(np.tile(np.eye(3), (len(parents), 1, 1)), bones, parents)[1]
+    return Clip(names, parents, rest, turns, places, 1 / seconds)
 
 
 def _tree(
@@ -158,16 +160,6 @@ def _numbers(text: str) -> Float[np.ndarray, " n"]:
     return values
 
 
-def _chained(
-    parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]
-) -> Float[np.ndarray, "s 3"]:
-    places = np.zeros_like(offsets)
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            places[joint] = places[parent] + offsets[joint]
-    return places
-
-
 def _posed(
     parents: tuple[int, ...],
     offsets: Float[np.ndarray, "s 3"],
@@ -175,26 +167,22 @@ def _posed(
     numbers: Float[np.ndarray, "m n"],
 ) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
     frames = len(numbers)
-    turns, places = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
+    turns, moves = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
     at = 0
-    for joint, parent in enumerate(parents):
-        names, columns = channels[joint], numbers[:, at : at + len(channels[joint])]
+    for joint, names in enumerate(channels):
+        columns = numbers[:, at : at + len(names)]
         at += len(names)
         move = np.tile(offsets[joint], (frames, 1))
-        turning = [i for i, name in enumerate(names) if name.endswith("rotation")]
-        for i in set(range(len(names))) - set(turning):
-            move[:, "xyz".index(names[i][0])] = columns[:, i]
         turn = np.tile(np.eye(3), (frames, 1, 1))
-        for i in turning:
-            turn = (
-                turn @ Rotation.from_euler(names[i][0], columns[:, [i]], degrees=True).as_matrix()
-            )
-        turns[:, joint] = turn if parent < 0 else turns[:, parent] @ turn
-        if parent < 0:
-            places[:, joint] = move
-        else:
-            places[:, joint] = places[:, parent] + np.einsum("mab,mb->ma", turns[:, parent], move)
-    return turns, places
+        for i, name in enumerate(names):
+            axis = name[0]
+            if name.endswith("rotation"):
+                angles = columns[:, [i]]
+                turn = turn @ Rotation.from_euler(axis, angles, degrees=True).as_matrix()
+            else:
+                move[:, "xyz".index(axis)] = columns[:, i]
+        turns[:, joint], moves[:, joint] = turn, move
+    return posed_tree(turns, moves, parents)
 
 
 # GLB

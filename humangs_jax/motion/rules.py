@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import BODY_NAMES, DEFAULT_FPS, FINGERS, JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import (
+    BODY_NAMES,
+    DEFAULT_FPS,
+    FINGERS,
+    JOINT_NAMES,
+    PARENTS,
+    bones_of,
+    posed_tree,
+)
 from humangs_jax.body.motion import PELVIS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE
@@ -288,15 +296,10 @@ def joint_places(
     translations: Float[np.ndarray, "m 3"],
 ) -> Float[np.ndarray, "m j 3"]:
     """Joints in space of a body of SMPL-X's joints."""
-    world, places = [], []
-    for j, parent in enumerate(PARENTS):
-        own = Rotation.from_rotvec(rotations[:, j]).as_matrix()
-        world.append(own if parent < 0 else world[parent] @ own)
-        if parent < 0:
-            places.append(translations + joints[0])
-        else:
-            places.append(places[parent] + world[parent] @ (joints[j] - joints[parent]))
-    return np.stack(places, axis=1)
+    turns = Rotation.from_rotvec(rotations.reshape(-1, 3)).as_matrix()
+    turns = turns.reshape(*rotations.shape, 3)
+    bones = np.broadcast_to(bones_of(joints, PARENTS), rotations.shape)
+    return posed_tree(turns, bones, PARENTS)[1] + translations[:, None]
 
 
 def page_rules() -> dict[str, Any]:

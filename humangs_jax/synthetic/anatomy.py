@@ -13,6 +13,7 @@ import functools
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from humangs_jax.body.joints import bones_of, posed_tree
 from humangs_jax.core.array_types import Float
 from humangs_jax.synthetic.surfaces import (
     Boundaries,
@@ -132,14 +133,8 @@ def joint_positions(
     build: Build, rotations: Rotations
 ) -> tuple[Float[np.ndarray, "j 3 3"], Rotations]:
     """World rotations (j, 3, 3) and positions (j, 3) of all joints for rotation vectors (j, 3)."""
-    world, positions = rotation_matrix(rotations), np.array(build.joints, np.float64)
-    for j, parent in enumerate(build.parents):
-        if parent >= 0:  # parents come before their children
-            world[j] = world[parent] @ world[j]
-            positions[j] = positions[parent] + world[parent] @ (
-                build.joints[j] - build.joints[parent]
-            )
-    return world, positions
+    bones = bones_of(np.asarray(build.joints, np.float64), build.parents)
+    return posed_tree(rotation_matrix(rotations), bones, build.parents)
 
 
 def limited(rotations: Rotations) -> Rotations:
