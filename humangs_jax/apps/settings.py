@@ -177,6 +177,7 @@ def reconstruct_with(
                 f"settings {settings!r}: expected Settings or one of {', '.join(PRESETS)}"
             )
         settings = PRESETS[settings]
+    # the settings choose the photos, the size of the network, and whether it is refined
     photos = settings.photos(capture)
     avatar = reconstruct(variables, settings.network(config), photos)
     if settings.refinement is not None:

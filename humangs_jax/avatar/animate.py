@@ -158,6 +158,7 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
             f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch"
             " of poses"
         )
+    # values that are not finite would only show as an empty image
     moves = {
         "pose.rotations": (pose.rotations, FINITE),
         "pose.translation": (pose.translation, FINITE),

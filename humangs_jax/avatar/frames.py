@@ -479,6 +479,7 @@ def circle_cameras(
     means = np.asarray(gaussians.means)[
         np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
     ]
+    # most of what is opaque; all of it where nothing lies far away, as of a person
     middle = np.median(means, axis=0) if len(means) else np.zeros(3)
     radius = 1.0
     if len(means):
@@ -488,6 +489,7 @@ def circle_cameras(
         if whole < COMPACT * radius:
             middle, radius = (low + high) / 2, max(radius, whole)
     distance = ROOM * max(float(radius), 1e-3) / np.sin(np.arctan(min(shot.tangents)))
+    # cameras stand around it in the world of the file, whose up axis may be another
     turn = world_matrix(form)
     cameras = orbit(
         jnp.asarray(middle @ turn, jnp.float32),

@@ -153,6 +153,7 @@ def reconstruct_batch(
     _check_all(captures)
     everybody = [prepare_capture(capture, config) for capture in captures]
     together = [prepared for prepared in everybody if not prepared.skirt]
+    # people without a skirt share a mesh, and are reconstructed together
     batch = iter(())
     if together:
         body, views, sized = _stacked(config, together)
@@ -162,6 +163,7 @@ def reconstruct_batch(
             )
         batch = iter(avatars)
 
+    # the others have meshes of several sizes
     found = []
     for prepared in everybody:
         if prepared.skirt:
@@ -258,6 +260,7 @@ def stack_captures(
     _check_all(captures)
     everybody = [prepare_capture(capture, config) for capture in captures]
     body, views, config = _stacked(config, everybody)
+    # light needs to know which way is up
     turned = [prepared.turned for prepared in everybody]
     if config.conventions.light and any(turned):
         if not all(turned):
@@ -361,6 +364,7 @@ def reconstruct_views(
         >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
         >>> avatars, dropped = batched(variables, config, body, views)
     """
+    # a body or photos of another size would give an avatar without an error
     made = "body, views, config = stack_captures(config, captures) makes what it wants"
     (height, width), side = views.images.shape[1:3], config.image_size
     if {height, width, views.cameras.height, views.cameras.width} != {side}:
@@ -445,6 +449,7 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
 
     Gradients do not pass through the light.
     """
+    # normals of the Gaussians as each photo has them
     fixed, views = jax.lax.stop_gradient((avatar, views))
     vertices, gaussians = fixed.rest_vertices, fixed.gaussians
     per_vertex = len(gaussians.means) // len(vertices)
@@ -456,6 +461,7 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
             turned_normals(normals, blend_transforms(fixed.skinning_weights, joints)[:, :3, :3])
         )
 
+    # the mean over the real views of what light depends on
     if views.view_count is None:
         count = len(views.images)
     else:
@@ -473,6 +479,7 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
     def mean(values):
         return pooled(values * gaussians.opacities[:, None]) / jnp.maximum(weights, 1e-6)
 
+    # the coefficients are fitted to the vertices, as the mean of their Gaussians
     coefficients = light_coefficients(vertices, mean(gaussians.colors), weights[:, 0], mean(terms))
     return replace(avatar, light=Light(coefficients, normals, log_brightness(terms, coefficients)))
 

@@ -56,6 +56,7 @@ def check_video(
             "path",
             f"{path}: expected a name ending in {alternatives(VIDEOS.suffixes)} for PNG files",
         )
+    # what the format cannot hold
     if transparent and not form.transparent:
         others = alternatives(VIDEOS.where(lambda each: each.transparent).suffixes)
         raise ArgumentError(
@@ -68,6 +69,7 @@ def check_video(
             f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or"
             " .webm",
         )
+    # what is there already
     if suffix and path.is_dir():
         raise ArgumentError("path", f"{path}: is a folder: expected a file name")
     if not suffix and path.is_file():

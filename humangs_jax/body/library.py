@@ -81,6 +81,7 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
                 content.read(2) == b"PK"
                 and "format" in read_npz(file, lambda name: name == "format")[0]
             )
+        # options say how much of an SMPL-X file is kept
         if not own:
             return load_smplx(file, **smplx_options)
         if smplx_options:
@@ -90,6 +91,7 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
             raise TypeError(
                 f"options of SMPL-X files do not apply to {which}: {sorted(smplx_options)}"
             )
+        # the shipped body has its expressions in another file
         body = read_body(file)
         if path:
             return body

@@ -381,6 +381,7 @@ def _read_capture(
         if line is not None:
             warn(line)
         photos = seen
+    # where nobody is found, the check still says what is likely wrong
     prepared, nobody = None, None
     with stage("preparing the photos"):
         try:

@@ -292,6 +292,7 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
         known = field_paths(config)
         if path not in known:
             last = path.rpartition(".")[2]
+            # a path that ends alike is most likely meant, else one that is spelt alike
             same = [each for each in known if each.rpartition(".")[2] == last]
             like = same or difflib.get_close_matches(path, known, cutoff=0.7)
             meant = ""

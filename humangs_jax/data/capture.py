@@ -309,6 +309,7 @@ def load_capture(
     """
     folder = capture_folder(path)
     with reading(folder / "capture.json", "capture", CaptureError):
+        # the description, the parameters of the body, then the photos that both agree on
         description = read_description(folder / "capture.json")
         parameter_file = folder / description["body"]
         body_file, parameters = read_parameters(parameter_file)

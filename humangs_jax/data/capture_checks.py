@@ -203,6 +203,7 @@ def body_parameters(
     betas = numbers(betas, file, "betas")
     if displacement is not None:
         displacement = numbers(displacement, file, "displacement", body.template.shape)
+    # larger numbers are of another unit, or damaged
     for field, array, largest in (
         ("rotations", rotations, LARGEST_TURN),
         ("translations", translations, LARGEST_DISTANCE),

@@ -116,6 +116,7 @@ def prepare_capture(
         >>> photos = hg.prepare_capture(hg.load_capture("demo_capture"), config)
         >>> avatar = hg.refine(hg.reconstruct(variables, config, photos), photos)
     """
+    # a capture that is prepared already is only narrowed to the views
     prepared = capture
     if isinstance(prepared, Capture):
         prepared = _prepared_photos(prepared, views)

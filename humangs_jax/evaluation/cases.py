@@ -123,6 +123,7 @@ def find_people(
     """
     if isinstance(source, Case):
         return People((source.name,), lambda index: source)
+    # captures: one, or a folder of them
     choice = Choice(inputs, indices, reconstructs)
     if isinstance(source, Capture):
         return People(("capture",), lambda index: _split("capture", source, choice))
@@ -136,11 +137,13 @@ def find_people(
         if unknown:
             raise ValueError(f"indices: {unknown[0]!r} is no capture in {source}")
         return People(names, lambda index: _load(folders[index], choice, body))
+    # what training reads
     if isinstance(source, Source):
         names = tuple(f"{index:04d}" for index in range(len(source)))
         return People(
             names, lambda index: _from_source(source, index, names[index], inputs, _model(body))
         )
+    # cases as they are
     cases = list(source)
     others = [type(case).__name__ for case in cases if not isinstance(case, Case)]
     if others:

@@ -141,6 +141,7 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
             return _mask_of_labels(
                 np.asarray(image), np.pad(colors, ((0, 256 - len(colors)), (0, 0)))
             )
+    # a mask in the alpha channel, in grey, or as one color on black
     colors, alpha = _colors_and_alpha(_read_pixels(path, as_stored=True))
     with reading(path, "mask"):
         if alpha is not None and alpha.min() < 1:

@@ -123,6 +123,7 @@ def load_motion(
     """
     if up not in ("auto", *UPRIGHT):
         raise ValueError(f"up: expected auto, {', '.join(UPRIGHT)}, got {up!r}")
+    # the walk that comes with the package
     if path is None:
         with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
             return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)

@@ -209,6 +209,7 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     several = several or (form.pivot == "head" and len(shape) == 3)
     if not several:
         return [Person(name, values)]
+    # a row or a block of the arrays for each person
     ids = next(
         (np.ravel(as_array(values[key])) for key in IDS if key in values), np.arange(shape[0])
     )

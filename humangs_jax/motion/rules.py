@@ -239,6 +239,7 @@ def up_axis(
     """
     if stands is None or stands == usual:
         return usual, ""
+    # the floor decides where it speaks clearly
     here, there = _floors(points, (usual, stands), fps)
     if here < ON_THE_FLOOR <= there and here <= 0.5 * there:
         return (
@@ -248,6 +249,7 @@ def up_axis(
                 " floor below it"
             ),
         )
+    # else the axis along which people stand, unless they are on their hands
     contradicted = there < ON_THE_FLOOR <= here and there <= 0.5 * here
     if (
         stands in also

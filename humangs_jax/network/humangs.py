@@ -141,6 +141,7 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     def after(part, variables, *given):
         return zeros(jax.eval_shape(lambda v: part.apply(v, *given, run), variables))
 
+    # each part is initialized on the shapes of what the part before it gives
     made = {"encoder": parts.encoder.init(encoder_key, inputs, run)}
     encoding = after(parts.encoder, made["encoder"], inputs)
     made["reader"] = parts.reader.init(jax.random.fold_in(key, 2), encoding, inputs, run)
@@ -155,6 +156,7 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
         target = Target(pose, inputs.canonical_vertices, jnp.repeat(pixels, 9, axis=-1))
         made["driver"] = parts.driver.init(jax.random.fold_in(key, 3), outputs, target, run)
 
+    # variables by their kind, then by the name of the part
     def collect(kind):
         return {name: own[kind] for name, own in made.items() if kind in own}
 

@@ -193,12 +193,14 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
     with reading(path, "file of Gaussians"):
         suffix = os.path.splitext(path)[1].lower()
         data = read_bytes(path, "array_bytes")
+        # what a file begins with says more than its name
         begun = (each for each in EXPORTS.values() if data.startswith(each.magic))
         read_only = (each for each in READ_ONLY.values() if suffix in each.suffixes)
         form = next(begun, None) or next(read_only, None) or chosen_format(suffix)
         if form is None or not form.reader:
             known = alternatives((*_written().suffixes, *READ_ONLY.suffixes))
             raise Refused(OTHERS.get(suffix, f"not known: expected a file ending in {known}"))
+        # what the file holds and is not used is said in one line
         said: list[str] = []
         gaussians = imported(form.reader)(data, said)
         if said:

@@ -115,6 +115,7 @@ def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     check_values("export", own | {"gaussians.colors": (avatar.gaussians.colors, BOUNDED)})
     normals = np.asarray(vertex_normals(avatar.rest_vertices, avatar.faces))
     ones = np.ones(len(faces), np.float32)
+    # a texture of the body, whose texels have the mean color of the Gaussians there
     atlas = unwrap(vertices, faces, np.zeros(len(faces), np.int64), texture_size, ones)
     ids, shares = texels(atlas)
     known = ids >= 0
@@ -126,6 +127,7 @@ def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     colors = np.zeros((*ids.shape, 3), np.float32)
     colors[known] = skin_colors(avatar, mixed(vertices), mixed(normals))
     texture = np.rint(255 * np.clip(fill_gaps(colors, known), 0, 1)).astype(np.uint8)
+    # a vertex on a seam is there once for each of its charts
     at = atlas.vertices
     weights = vertex_weights(avatar)[at]
     faces = np.asarray(atlas.faces)
