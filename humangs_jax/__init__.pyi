@@ -26,6 +26,7 @@ from .avatar.reconstruct import reconstruct_batch as reconstruct_batch
 from .avatar.reconstruct import reconstruct_views as reconstruct_views
 from .refinement.refine import refine as refine
 from .refinement.config import RefineConfig as RefineConfig
+from .apps.from_photos import avatar_from_photos as avatar_from_photos
 from .apps.settings import reconstruct_with as reconstruct_with
 from .apps.settings import Settings as Settings
 from .apps.settings import PRESETS as PRESETS

@@ -230,7 +230,7 @@ def _failed(error: Exception, verbose: bool) -> int:
     if isinstance(error, UnicodeEncodeError):  # of a library that takes names in UTF-8 only
         error = ValueError(f"{error.object[:200]}: expected a name in UTF-8")
     if isinstance(error, ArgumentError):
-        error = UsageError(f"{option_of(error.argument)} {error.problem}").with_traceback(
+        error = UsageError(error.line(option_of(error.argument))).with_traceback(
             error.__traceback__
         )
     screen.fail(error, verbose)

@@ -112,8 +112,12 @@ class ArgumentError(ValueError):
     """
 
     def __init__(self, argument: str, problem: str) -> None:
-        super().__init__(f"{argument} {problem}")
         self.argument, self.problem = argument, problem
+        super().__init__(self.line(argument))
+
+    def line(self, name: str) -> str:
+        """The message, with this name of the argument."""
+        return f"{name}{self.problem}" if self.problem.startswith(":") else f"{name} {self.problem}"
 
 
 class UnknownPresetError(KeyError):

@@ -15,6 +15,7 @@ from experiments.your_photos import landmarks_in, write_material
 from humangs_jax import cli
 from humangs_jax.apps import detect, photos_alone, start
 from humangs_jax.apps.detect import Found, PhotoPeople, detect_photos
+from humangs_jax.apps.from_photos import FromPhotos, avatar_from_photos
 from humangs_jax.apps.start import better_body, held_out_psnr, look, missing
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.video import write_video
@@ -29,7 +30,7 @@ from humangs_jax.capture.fitting.person_moments import PersonViews
 from humangs_jax.capture.fitting.refine import usual_config
 from humangs_jax.capture.keypoints.formats import SeenPerson
 from humangs_jax.capture.keypoints.keypoints import COCO_17, MEDIAPIPE_33
-from humangs_jax.cli.start import Start
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data import exposure
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.capture_checks import CaptureError
@@ -213,10 +214,11 @@ def detected(mine, monkeypatch):
     def stop(self, material):
         told.append(material)
         raise ValueError("the fit")
+        yield
 
     monkeypatch.setattr(blazepose, "available", lambda: True)
     monkeypatch.setattr(detect, "found_in_capture", lambda folder: shown)
-    monkeypatch.setattr(Start, "_fit", stop)
+    monkeypatch.setattr(FromPhotos, "_fit", stop)
     return told
 
 
@@ -525,9 +527,9 @@ def test_a_run_that_was_interrupted_while_it_wrote_can_be_run_again(
 def test_a_body_that_other_options_made_is_not_taken(mine, detected, capsys):
     """The same command goes on from the body; one with another height would have had no effect."""
     without(mine, "cameras")
-    first = Start(mine, Path("me"), height=1.7)
+    first = FromPhotos(mine, Path("me"), height=1.7)
     Path("me").mkdir()
-    for name, content in {"capture.json": {}, "fit.json": {}, **first._mark()}.items():
+    for name, content in {"capture.json": {}, "fit.json": {}, **first.mark()}.items():
         write_json(Path("me") / name, content)
     Path("me/body.npz").touch()
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.8"]) == cli.BAD_USAGE
@@ -651,6 +653,23 @@ def test_masks_that_are_there_may_be_left_out(mine, capsys):
         assert cli.execute(["start", str(mine), "--out", "me", "--without-masks"]) == cli.BAD_DATA
         assert "masks:     missing" in capsys.readouterr().out
         assert load_photos("me").masks is None
+
+
+def test_a_notebook_reads_the_same_steps(mine, detected):
+    """Each is printed as `humangs start` shows it; what is wrong is an error with the argument."""
+    shutil.rmtree(mine)
+    write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
+    without(mine, "keypoints")
+    steps = []
+    with pytest.raises(ValueError, match="the fit"):
+        for step in avatar_from_photos(str(mine), "me", person=1):
+            steps.append(step)
+    assert "cameras:" in str(steps[0]) and steps[0].file is None and steps[0].avatar is None
+    assert "keypoints found in the photos: me/people.png shows them" in [str(x) for x in steps]
+    with pytest.raises(ArgumentError, match="height: is for photos without cameras"):
+        list(avatar_from_photos(mine, "me", height=1.7, overwrite=True))
+    with pytest.raises(ArgumentError, match="masks m: does not go with without_masks"):
+        list(avatar_from_photos(mine, "me", masks="m", without_masks=True))
 
 
 @pytest.mark.slow

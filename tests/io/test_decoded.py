@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from humangs_jax.apps import detect
-from humangs_jax.cli.start import Start
+from humangs_jax.apps.from_photos import FromPhotos
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE, capture_folder, load_photos
 from humangs_jax.io import images
@@ -106,15 +106,16 @@ def test_the_steps_of_start_decode_each_photo_of_a_capture_once(tmp_path, monkey
             pass
         return []
 
-    def steps(start, material, limits):
+    def steps(start, material):
         detect.found_in_capture(folder)
         load_photos(folder)
         load_capture(folder)
+        yield from ()
 
     monkeypatch.setattr(detect, "detect_photos", looked_at)
     monkeypatch.setattr(detect, "with_masked", lambda found, *_: found)
     monkeypatch.setattr(detect, "same_people", lambda photos, *_: photos)
-    monkeypatch.setattr(Start, "_go_on", steps)
+    monkeypatch.setattr(FromPhotos, "_go_on", steps)
     photos = folder / "images"
-    Start(photos, tmp_path / "out", browser=False).run()
+    list(FromPhotos(photos, tmp_path / "out").steps())
     assert decodings and set(decodings.values()) == {1}

@@ -1,0 +1,566 @@
+"""From a folder of photos or a video to an avatar: cameras, masks and keypoints are used where they
+are there, and found where they are not. What `humangs start` does, as a function.
+"""
+
+import dataclasses
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+from humangs_jax.apps import detect, photos_alone
+from humangs_jax.apps import start as material_of
+from humangs_jax.apps.check import check_capture
+from humangs_jax.apps.start import HeldOut, Material, held_out_psnr, missing, photos_to_read
+from humangs_jax.apps.video_photos import photos_of_video, seconds_of_photos, video_of
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.unseen import guess_line
+from humangs_jax.body.library import load_body
+from humangs_jax.capture.calibration.importing import ImportReport, import_cameras
+from humangs_jax.capture.detection import people as detection
+from humangs_jax.capture.fitting.contradiction import find_contradiction
+from humangs_jax.capture.fitting.files import FitRecord, write_fitted
+from humangs_jax.capture.fitting.fit_capture import FittedCapture, fit_photos
+from humangs_jax.capture.fitting.own_poses import (
+    find_movement,
+    fit_own_poses,
+    movement_line,
+    record_of_photos,
+)
+from humangs_jax.capture.fitting.person_cameras import scaled_to_height
+from humangs_jax.capture.fitting.refine import (
+    RefinedCapture,
+    cameras_are_unseen,
+    refine_capture,
+    usual_config,
+)
+from humangs_jax.capture.keypoints.keypoints import Keypoints
+from humangs_jax.capture.keypoints.reading import read_keypoints
+from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.core.progress import stage
+from humangs_jax.data.capture import Capture, load_capture
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.formats import START_MARK
+from humangs_jax.data.hidden import with_hidden_parts
+from humangs_jax.data.photos import Photos, load_photos
+from humangs_jax.data.prepared import PreparedCapture, prepare_capture
+from humangs_jax.io.atomic import (
+    check_replaceable,
+    check_writable,
+    contents,
+    only_writer,
+    remove_abandoned_lock,
+)
+from humangs_jax.io.decoded import decoded_once, forget_decoded
+from humangs_jax.io.reading import read_json
+from humangs_jax.network.weights import load_weights
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.refine import refine_with_report
+from humangs_jax.viewer.page import write_page
+
+ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None, image_size=512)
+"""Refinement where nothing is asked for: some seconds, however large the photos."""
+IGNORE = "ignore"
+"""As `cameras`: the calibration in the folder of photos is not used."""
+
+
+class MissingError(ValueError):
+    """Something has to be made before there can be an avatar; the steps before say how."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Step:
+    """What `avatar_from_photos` has found or made; `str(step)` is how `humangs start` shows it."""
+
+    text: str
+    """What there is to say, in one line or several."""
+    file: Path | None = None
+    """The file that was written; None: none was."""
+    warning: bool = False
+    """Whether something looks wrong."""
+    photos: PreparedCapture | None = None
+    """The capture, with its fitted body, as it is used; None until photos are prepared."""
+    avatar: Avatar | None = None
+    """The finished avatar, in the last step; None before."""
+
+    def __str__(self) -> str:
+        """The text, after the name of the file or the word "warning"."""
+        if self.warning:
+            return f"warning: {self.text}"
+        return self.text if self.file is None else f"{self.file}: {self.text}"
+
+
+def avatar_from_photos(
+    photos: str | Path,
+    out: str | Path,
+    *,
+    cameras: str | Path | None = None,
+    masks: str | Path | None = None,
+    others: str | Path | None = None,
+    keypoints: str | Path | None = None,
+    person: int | None = None,
+    height: float | None = None,
+    scale: float | None = None,
+    up: str | None = None,
+    without_masks: bool = False,
+    fit_masks: bool = True,
+    refinement: RefineConfig | None = ITERATIONS_ALONE,
+    overwrite: bool = False,
+) -> Iterator[Step]:
+    """From photos or a video of a person to an avatar, step by step, as `humangs start` does.
+
+    Files are written into `out`: the capture with its body, check.png, avatar.npz and avatar.html.
+    A call that was interrupted goes on from a body that it finds there.
+
+    Args:
+        photos: folder of photos, perhaps with cameras, masks and keypoints in it; or a video.
+        out: the capture folder to write.
+        cameras: the calibration, if it is elsewhere; "ignore": find the cameras from the person.
+        masks: folder of the masks, if it is elsewhere.
+        others: folder of masks of what is in front of the person, if it is elsewhere.
+        keypoints: their file or folder, if it is elsewhere.
+        person: number of the person, if several are seen.
+        height: of the person, metres: the scale where there is no calibration.
+        scale: metres per unit of the calibration.
+        up: the axis of the calibration's world that points up, as "+z".
+        without_masks: use none; behind the person is nothing but white.
+        fit_masks: move masks to the edges in the photos.
+        refinement: how the avatar is refined; None: not at all.
+        overwrite: begin anew where `out` has a body or an avatar.
+
+    Yields:
+        What was found and made, one after the other; the last step has the avatar.
+
+    Raises:
+        ValueError: one line that names the file or argument and what is missing or wrong.
+
+    Examples:
+        >>> for step in hg.avatar_from_photos("photos", "me", height=1.78):
+        ...     print(step)
+        >>> hg.show(step.avatar)
+    """
+    as_path = lambda value: None if value is None else Path(value)
+    run = FromPhotos(
+        photos=Path(photos),
+        out=Path(out),
+        cameras=as_path(cameras),
+        masks=as_path(masks),
+        others=as_path(others),
+        keypoints=as_path(keypoints),
+        person=person,
+        height=height,
+        scale=scale,
+        up=up,
+        without_masks=without_masks,
+        fit_masks=fit_masks,
+        refinement=refinement,
+        overwrite=overwrite,
+    )
+    yield from run.steps()
+
+
+@dataclasses.dataclass(frozen=True)
+class FromPhotos:
+    """The arguments of `avatar_from_photos`, and its parts. Each yields what it has found."""
+
+    photos: Path
+    """Folder of photos, or a video."""
+    out: Path
+    """The capture folder to write."""
+    cameras: Path | None = None
+    """The calibration, or `IGNORE`; None: what the folder has."""
+    masks: Path | None = None
+    """Folder of masks; None: what the folder has."""
+    others: Path | None = None
+    """Folder of masks of what is in front of the person; None: what the folder has."""
+    keypoints: Path | None = None
+    """Keypoints; None: what the folder has."""
+    person: int | None = None
+    """Number of the person; None: there is one."""
+    height: float | None = None
+    """Height of the person, metres; None: an average person's."""
+    scale: float | None = None
+    """Metres per unit of the calibration; None: 1."""
+    up: str | None = None
+    """The axis of the calibration's world that points up; None: the format's."""
+    without_masks: bool = False
+    """Whether no masks are used."""
+    fit_masks: bool = True
+    """Whether masks are moved to the edges in the photos."""
+    refinement: RefineConfig | None = ITERATIONS_ALONE
+    """How the avatar is refined; None: not at all."""
+    overwrite: bool = False
+    """Whether to begin anew where `out` has a body or an avatar."""
+
+    def steps(self) -> Iterator[Step]:
+        """From the photos to the page."""
+        if self.masks is not None and self.without_masks:
+            raise ArgumentError("masks", f"{self.masks}: does not go with without_masks")
+        self.resumes()  # what is wrong with the folder is reported before the work
+        folder = yield from self._folder()
+        ignored = self.cameras == Path(IGNORE)
+        material = material_of.look(
+            folder,
+            cameras=None if ignored else self.cameras,
+            masks=self.masks,
+            keypoints=self.keypoints,
+            others=self.others,
+        )
+        if ignored:
+            material = dataclasses.replace(material, cameras=None)
+        if self.without_masks:
+            material = dataclasses.replace(material, masks=None)
+        self._check_lengths(material)
+        yield Step(str(material))
+        with only_writer(self.out, replaced=True), decoded_once():
+            yield from self._go_on(material)
+
+    def _check_lengths(self, material: Material) -> None:
+        """Raises: ArgumentError for a scale or a direction that something else sets."""
+        if material.cameras is not None and self.height is not None:
+            raise ArgumentError(
+                "height", ": is for photos without cameras: the calibration has a scale (--scale)"
+            )
+        if material.cameras is None:
+            for argument, value in (("scale", self.scale), ("up", self.up)):
+                if value is not None:
+                    problem = ": is for a calibration, and there is none (--height sets the scale)"
+                    raise ArgumentError(argument, problem)
+
+    def mark(self, **more: Any) -> dict[str, dict[str, Any]]:
+        """The file that says which run made the folder: its photos, and the options that a later
+        run has to repeat.
+        """
+        return {
+            START_MARK: {"photos": str(self.photos.resolve()), "options": self._decisive(), **more}
+        }
+
+    def _decisive(self) -> dict[str, Any]:
+        """Options that decide what the body is, as plain values."""
+        names = (
+            "cameras",
+            "masks",
+            "others",
+            "keypoints",
+            "person",
+            "height",
+            "scale",
+            "up",
+            "without_masks",
+            "fit_masks",
+        )
+        values = {name: getattr(self, name) for name in names}
+        return {
+            name: str(value.resolve()) if isinstance(value, Path) else value
+            for name, value in values.items()
+        }
+
+    def _check_same_options(self, mark: Any) -> None:
+        """Raises: ArgumentError if the body of the earlier run was made with other options."""
+        earlier = mark.get("options") if isinstance(mark, dict) else None
+        if not isinstance(earlier, dict):  # of a version that did not record them
+            return
+        for name, value in self._decisive().items():
+            if name in earlier and earlier[name] != value:
+                how = "without it" if earlier[name] is None else f"with {earlier[name]}"
+                problem = f": the body in {self.out} was made {how}: --overwrite begins anew"
+                raise ArgumentError(name, problem)
+
+    def _go_on(self, material: Material) -> Iterator[Step]:
+        """From where an earlier run came to an end, if there was one."""
+        # a body that is there is used again
+        if self.resumes():
+            self._check_same_options(read_json(self.out / START_MARK))
+            with stage("reading the fit of an earlier run"):
+                capture = with_hidden_parts(load_capture(self.out, fit_masks=self.fit_masks))
+            yield Step(f"{self.out} has a body: going on from there (--overwrite begins anew)")
+            yield from self._finish(capture, None)
+            return
+        if self.overwrite:
+            deleted = contents(self.out)
+            if deleted:
+                told = f"once the work is done, {self.out} is replaced; this is deleted: {deleted}"
+                yield Step(f"--overwrite: {told}")
+        # without cameras the person gives them
+        if material.cameras is None and detection.available():
+            material = yield from self._photos_alone(material)
+        else:
+            material = yield from self._with_cameras(material)
+        capture, estimate = yield from self._fit(material)
+        yield from self._finish(capture, estimate)
+
+    def _with_cameras(self, material: Material) -> Generator[Step, None, Material]:
+        """Import photos and cameras, find keypoints and masks that are missing, and name what else
+        is to be made.
+
+        Raises: MissingError.
+        """
+        report = None
+        if material.cameras is not None:
+            report = yield from self._import(material)
+        changed = report is not None and (report.undistorted or report.turned or report.heic)
+        masked = self.without_masks or (report is not None and report.masks)
+        needed = [
+            each
+            for each in missing(material, self.out / "images" if changed else None)
+            if not (masked and each.name == "masks")
+        ]
+        # what the detector finds is not asked for
+        findable = ("masks", "keypoints") if detection.available() else ()
+        detected = [each.name for each in needed if each.name in findable]
+        needed = [each for each in needed if each.name not in detected]
+        if needed:
+            yield Step("\nto be made:\n" + "\n".join(map(str, needed)))
+            if detected:
+                found = " and ".join(detected)
+                yield Step(f"{found}: found in the photos, once the rest is there")
+            names = " and ".join(", ".join(each.name for each in needed).rsplit(", ", 1))
+            raise MissingError(
+                f"{self.photos}: {names} missing: make them as above and run the same command again"
+            )
+        if detected:
+            material = yield from self._detect(material, detected)
+        return material
+
+    def _photos_alone(self, material: Material) -> Generator[Step, None, Material]:
+        """Find the person and the cameras in the photos."""
+        with stage("finding the person and the cameras"):
+            given = (material.keypoints, material.masks, material.alpha, material.others)
+            own_masks = not (self.without_masks or material.alpha or material.masks)
+            found = photos_alone.import_photos(
+                material.images,
+                self.out,
+                person=self.person,
+                height=self.height,
+                keypoints=material.keypoints,
+                masks=material.masks,
+                others=material.others,
+                own_masks=own_masks,
+                reduce=not any(given),
+                also=self.mark(),
+            )
+        yield Step("\n".join(found.lines))
+        for remark in (*detect.remarks(found.people, found.person), *found.warnings):
+            yield Step(remark, warning=True)
+        yield Step("who was found in the photos", file=self.out / detect.SHEET_FILE)
+        return self._with_found(material, own_masks)
+
+    def _detect(self, material: Material, wanted: list[str]) -> Generator[Step, None, Material]:
+        """Find keypoints or masks in the photos of the capture."""
+        with stage("finding the person"):
+            photos = load_photos(self.out)
+            given = _keypoints(photos, material.keypoints, self.person)
+            people, person = detect.person_in_capture(self.out, photos, given, self.person)
+        with stage("writing what was found"):
+            detect.write_found(self.out, people, person, masks="masks" in wanted, to_capture=True)
+        for remark in detect.remarks(people, person):
+            yield Step(remark, warning=True)
+        sheet = self.out / detect.SHEET_FILE
+        yield Step(f"{' and '.join(wanted)} found in the photos: {sheet} shows them")
+        return self._with_found(material, "masks" in wanted)
+
+    def _with_found(self, material: Material, masks: bool) -> Material:
+        """The material with what was found in the photos: keypoints where there are none, and
+        perhaps masks.
+        """
+        keypoints = material.keypoints or self.out / detect.KEYPOINTS_FILE
+        found = self.out / detect.MASKS if masks else material.masks
+        return dataclasses.replace(material, keypoints=keypoints, masks=found)
+
+    def _folder(self) -> Generator[Step, None, Path]:
+        """The folder of photos; that of a video is beside `out`."""
+        video = video_of(self.photos)
+        if video is None:
+            return self.photos
+        out = self.out if self.out.name not in ("", "..") else self.out.resolve()
+        folder = out.with_name(f"{out.name}_photos")
+        with stage("choosing frames of the video"):
+            told = photos_of_video(video, folder)
+        yield Step(str(told))
+        return folder
+
+    def resumes(self) -> bool:
+        """Whether an earlier run left a body to go on from.
+
+        Raises: ArgumentError if the folder may not be replaced.
+        """
+        ours = (self.out / START_MARK).is_file()
+        begun = ours and not (self.out / "body.npz").exists()
+        finished = begun or self.overwrite or (self.out / "avatar.html").exists()
+        fitted = ours and (self.out / "fit.json").exists() and not finished
+        cameras = None if self.cameras == Path(IGNORE) else self.cameras
+        inputs = (self.photos, cameras, self.masks, self.others, self.keypoints)
+        replaced = self.overwrite or begun or fitted
+        if self.out.exists() and not self.out.is_dir():
+            raise ArgumentError("out", f"{self.out}: is a file: expected the name of a folder")
+        try:
+            check_writable(self.out)
+            check_replaceable(self.out, replaced, "capture.json", inputs)
+        except (OSError, ValueError) as error:
+            remove_abandoned_lock(self.out)  # a killed run may have left it after its last file
+            raise ArgumentError("out", str(error)) from error
+        return fitted
+
+    def _import(self, material: Material) -> Generator[Step, None, ImportReport]:
+        """Import photos and cameras into the capture."""
+        with stage("importing photos and cameras"):
+            assert material.cameras is not None
+            report = import_cameras(
+                material.cameras,
+                material.images,
+                self.out,
+                masks=material.masks,
+                others=material.others,
+                scale=self.scale,
+                up=self.up,
+                overwrite=True,
+                also=self.mark(),
+            )
+        # the folder scan has named these files already
+        told = {each.path for each in material.unused}
+        unused = tuple(each for each in report.unused if each.path not in told)
+        yield Step(str(dataclasses.replace(report, unused=unused)))
+        # keypoints of the photos before the import do not fit those after it
+        images, keypoints = self.out / "images", material.keypoints
+        if report.undistorted and keypoints is not None:
+            should = f"{keypoints} should be of the photos in {images}"
+            yield Step(f"lens distortion was removed: {should}", warning=True)
+        if report.turned and keypoints is not None:
+            should = f"{keypoints} should be of those in {images}"
+            yield Step(f"photos were turned upright: {should}", warning=True)
+        return report
+
+    def _fit(self, material: Material) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
+        """Fit the body to keypoints and masks, and write it into the capture."""
+        with stage("fitting the body"):
+            assert material.keypoints is not None
+            # the detector's own masks are at the photos' edges already
+            own_masks = material.masks == self.out / detect.MASKS
+            photos = load_photos(self.out, fit_masks=self.fit_masks and not own_masks)
+            found_here = material.keypoints.parent == self.out  # of the one person who was chosen
+            person = None if found_here else self.person
+            keypoints = _keypoints(photos, material.keypoints, person)
+            assert keypoints is not None
+            against = find_contradiction(photos, keypoints) if photos.calibrated else None
+            if against:
+                raise ValueError(
+                    f"{material.cameras}: {against}: correct it, or go on without it by"
+                    " --cameras ignore"
+                )
+            fitted = fit_photos(photos, keypoints, load_body())
+        with stage("examining the fit"):
+            report = fitted.report
+            report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
+        yield Step(f"\n{report}")
+        capture, record, estimate = fitted.capture, fitted.record, None
+        if capture.masks is not None and (capture.masks > 0.5).any():
+            with stage("refining the body by the masks"):
+                bodies = _bodies_to_masks(fitted)
+            bodies, record = yield from self._with_own_poses(material.folder, bodies, record)
+            with stage("comparing bodies by a held-out photo"):
+                loose, tight = bodies
+                capture, estimate = material_of.better_body(
+                    *load_weights(), loose.capture, tight.capture, ITERATIONS_ALONE
+                )
+            report = (tight if capture is tight.capture else loose).report
+            yield Step(f"\n{report}")
+        if self.height is not None:
+            capture = scaled_to_height(capture, self.height)
+        write_fitted(self.out, self.out, capture, report, record)
+        # the refined body shows more exactly where something is in front of it
+        return with_hidden_parts(capture), estimate
+
+    def _with_own_poses(
+        self, photos: Path, bodies: list[RefinedCapture], record: FitRecord
+    ) -> Generator[Step, None, tuple[list[RefinedCapture], FitRecord]]:
+        """Bodies with a pose for each photo, and the record of the fit to match, if photos that
+        share a pose show that the person moved between them; else what was given.
+        """
+        first = bodies[0].capture
+        if first.frame_count > 1 or first.view_count < 2:
+            return bodies, record
+        with stage("looking for movement between the photos"):
+            seconds = seconds_of_photos(photos, first.names)
+            if not find_movement(first, record.keypoints, seconds).shown:
+                return bodies, record
+        with stage("fitting a pose for each photo"):
+            moved = [fit_own_poses(each.capture, record.keypoints, seconds) for each in bodies]
+        yield Step(movement_line(moved[0].capture))
+        return moved, record_of_photos(record, first.frames)
+
+    def _finish(self, capture: Capture, estimate: HeldOut | None) -> Iterator[Step]:
+        """Check the capture, then make, refine and write the avatar."""
+        forget_decoded()  # the capture has the photos
+        with stage("preparing the photos"):
+            weights = load_weights()
+            nobody, photos = None, None
+            try:
+                photos = prepare_capture(capture)
+            except CaptureError as error:
+                nobody = error
+        # where no view shows the person, the sheet shows why
+        if photos is None:
+            yield from self._check(capture)
+            assert nobody is not None
+            raise nobody
+        with stage("preparing the body"):
+            read = prepare_capture(photos_to_read(photos), weights[1])
+        yield from self._check(read)
+        with stage("reconstructing"):
+            avatar = reconstruct(*weights, read)
+        # refinement compares with masks, and is left out without them
+        if self.refinement is not None and photos.capture.masks is not None:
+            with stage("refining"):
+                refined = refine_with_report(avatar, photos, self.refinement, progress=True)
+                avatar = refined.avatar
+            yield Step(refined.summary(), photos=photos)
+            if refined.interrupted:
+                raise KeyboardInterrupt
+        # the number tells a user what to expect of views that no photo shows
+        alike = self.refinement is not None
+        if estimate is None or not alike:
+            with stage("holding one photo out"):
+                how = ITERATIONS_ALONE if alike else None
+                estimate = held_out_psnr(*weights, photos, how)
+        if estimate is not None:
+            yield Step(str(estimate), photos=photos)
+        # name the parts that no photo shows
+        guess = guess_line(photos.capture)
+        if guess is not None:
+            yield Step(guess, photos=photos)
+        with stage("writing the page"):
+            file, page = self.out / "avatar.npz", self.out / "avatar.html"
+            avatar.save(file)
+            write_page(page, avatar, title=self.photos.resolve().name)
+        made = f"{len(avatar.gaussians.means):,} Gaussians from {photos.capture.view_count} photos"
+        yield Step(made, file=file, photos=photos)
+        yield Step("the avatar in a browser", file=page, photos=photos, avatar=avatar)
+
+    def _check(self, capture: Capture | PreparedCapture) -> Iterator[Step]:
+        """Draw the body over the photos."""
+        with stage("checking"):
+            report = check_capture(capture, self.out / "check.png")
+        yield Step(f"\n{report}")
+        yield Step("the body over the photos: look at it", file=self.out / "check.png")
+
+
+def _bodies_to_masks(fitted: FittedCapture) -> list[RefinedCapture]:
+    """The fitted body, refined by the masks: as of someone in loose clothes, and in tight ones."""
+    capture = fitted.capture
+    # calibrated cameras move where the keypoints have shown that they are off
+    fixed = not fitted.camera_errors if capture.calibrated else cameras_are_unseen(capture)
+    found = []
+    for tight in (False, True):
+        config = usual_config(
+            fitted=True, fixed_cameras=fixed, tight=tight, calibrated=capture.calibrated
+        )
+        found.append(refine_capture(capture, keypoints=fitted.record.keypoints, config=config))
+    return found
+
+
+def _keypoints(photos: Photos, file: Path | None, person: int | None) -> Keypoints | None:
+    """The keypoints of some photos; None if there is no file."""
+    if file is None:
+        return None
+    height, width = photos.images.shape[1:3]
+    return read_keypoints(file, photos.names, width, height, person=person)
