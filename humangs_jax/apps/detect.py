@@ -410,7 +410,7 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
 
 
 def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
-    """Write the sheet that an error speaks of.
+    """Writes the sheet of people that an error refers to.
 
     Raises: ValueError where a picture of others has its name.
     """

@@ -97,7 +97,7 @@ class Faults(NamedTuple):
 
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:
-    """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it
+    """Warns in one line each about what looks wrong in a capture; what concerns all views comes
     first.
     """
     some = np.unique(

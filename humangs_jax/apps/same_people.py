@@ -25,7 +25,7 @@ from humangs_jax.core.array_types import Bool, Float, Int, UInt
 from humangs_jax.geometry.camera import Camera
 
 RIVAL = 0.35
-"""Somebody with this share of the pixels of the largest person may be meant as well as he."""
+"""Somebody with this share of the pixels of the largest person could be the intended person too."""
 
 
 class Found(NamedTuple):
@@ -113,7 +113,7 @@ def same_people(
 
 
 def _large(people: Sequence[Found | None]) -> list[int]:
-    """The people of a photo who may be meant as well as its largest."""
+    """Gives the people of a photo who could be the intended person as well as its largest."""
     areas = [0.0 if each is None else each.area for each in people]
     return [
         i for i, each in enumerate(people) if each is not None and areas[i] > RIVAL * max(areas)
@@ -219,7 +219,7 @@ def exchanged(found: Found) -> Found:
 
 
 def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
-    """People who may be meant as well as the first, by number."""
+    """Gives the numbers of people who could be the intended person as well as the first."""
     areas = _areas(photos)
     return [i for i in range(1, len(areas)) if areas[i] > RIVAL * areas[0]]
 

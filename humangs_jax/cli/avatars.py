@@ -95,9 +95,9 @@ class Reconstruct:
     """Reconstruct avatars from capture folders.
 
     A capture is photos, cameras and body poses. Several captures, or a folder of them, become
-    OUT/NAME.npz. Those that are there are kept, so that the same command goes on after an
-    interruption. One whose capture has other contents now is named, and nothing is made. A capture
-    that fails does not stop the others. docs: capture_format.
+    OUT/NAME.npz. Avatars that exist are kept, so that the same command goes on after an
+    interruption. If the capture of one was changed since, it is named and nothing is made. A
+    capture that fails does not stop the others. docs: capture_format.
     """
 
     examples: ClassVar[tuple[str, ...]] = (

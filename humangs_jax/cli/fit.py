@@ -41,8 +41,8 @@ class Detections:
         return keypoints_of(views, self.keypoints, self.person)
 
     def read_or_recorded(self, capture: Path, views: Any) -> tuple[Any, Any]:
-        """The keypoints of the views; without a file of them those of the fit in the capture's
-        folder, and its record.
+        """Reads the keypoints of the views from --keypoints, else from the fit in the capture's
+        folder, whose record comes with them.
         """
         from humangs_jax.capture.fitting.files import FIT_FILE, read_fit_record
         from humangs_jax.data.photos import capture_folder

@@ -224,7 +224,7 @@ def quoted(path: Path) -> str:
 
 
 def finish() -> None:
-    """The command is done: its stages and their seconds, and what to do next."""
+    """Prints the stages of the command with their seconds, and what to do next."""
     shown = progress.current()
     if not shown.quiet and shown.seconds:
         parts = ", ".join(f"{name} {took:.1f}" for name, took in shown.seconds.items())

@@ -165,9 +165,7 @@ def _annotations(cls: Any) -> dict[str, Any]:
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Whether a value is what an annotation says, as far as that is plain; parts and arrays may be
-    anything.
-    """
+    """Whether a value has the annotated type; parts and arrays are not checked here."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, option) for option in arguments)

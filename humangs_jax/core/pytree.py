@@ -332,7 +332,7 @@ def _advice(dtype: Any) -> str:
 
 
 def _size_fault(tree: Any) -> str | None:
-    """The first static field that should be an integer and is none."""
+    """Finds the first static field that should be an integer and is not."""
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
         if (

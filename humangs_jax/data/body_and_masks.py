@@ -394,9 +394,9 @@ def _window(
     linear: Float[np.ndarray, "n 3 3"],
     offset: Points,
 ) -> MaskedView:
-    """A view, cut to the person and brought to one size.
+    """Cuts a view to the person and brings it to one size.
 
-    Beyond the border of the photo the mask goes on as it ends there.
+    Outside of the photo the mask repeats the values at the photo's border.
     """
     (top, bottom), (left, right) = box_of(mask > MASK_THRESHOLD).tolist()
     margin = int(np.ceil(MARGIN * max(bottom - top, right - left)))

@@ -80,9 +80,7 @@ def equal_exposure(capture: Capture) -> Capture:
 
 
 def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """By what to multiply the colors of an avatar of these photos, so that it is rendered as each
-    camera exposed it.
-    """
+    """Gain per view and channel with which a rendered avatar looks as each camera exposed it."""
     if capture.gains is not None:
         return 1 / capture.gains
     apart, found = unusable_views(capture), np.ones((capture.view_count, 3))
@@ -93,8 +91,9 @@ def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
 
 
 def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """By what to multiply the colors of each view, see `gains_of` and `gains_between`; ones without
-    masks, and for photos that have been made equal.
+    """Gain per view and channel that equalises exposure, see `gains_of` and `gains_between`.
+
+    All are 1 without masks, and for photos that have been made equal.
 
     capture: photos on white, all of which show the person.
     """

@@ -53,7 +53,7 @@ class SourceFormat(Format):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Usual names of files, without folders."""
+        """Lists the usual names of files, without those of folders."""
         return tuple(dict.fromkeys(Path(file).name for file in self.files))
 
 

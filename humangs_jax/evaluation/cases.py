@@ -198,8 +198,8 @@ def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path |
 
 
 def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """The last parts of the paths, as many as tell all of them apart: ActorsHQ has a Sequence1 of
-    every actor.
+    """Shortens paths to their last parts, as many as are needed so that no two are equal: ActorsHQ
+    has a Sequence1 of every actor.
     """
     for parts in range(1, 1 + max(len(path.parts) for path in paths)):
         names = tuple("_".join(path.parts[-parts:]) for path in paths)

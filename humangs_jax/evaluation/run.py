@@ -117,7 +117,7 @@ class Gallery:
         self._shots: list[tuple[float, int, dict[str, str]]] = []  # a heap, best first
 
     def add(self, row: int, psnr: float | None, images: Callable[[], dict[str, str]]) -> None:
-        """An image, see `_shot`; row: its number among the rows."""
+        """Adds an image, see `_shot`. row: its number among the rows."""
         key = 0.0 if psnr is None else -psnr
         if len(self._shots) >= self.limit and (not self._shots or key <= self._shots[0][0]):
             return

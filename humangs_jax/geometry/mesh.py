@@ -45,8 +45,9 @@ def vertex_crosses(
 def mesh_edges(
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
-    """Undirected edges (e, 2), and which of them each side, corner i to i + 1, of each face is (f,
-    3).
+    """Finds the undirected edges (e, 2) of a mesh.
+
+    Also gives, for the side from corner i to i + 1 of each face, the number of its edge (f, 3).
     """
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
     edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)

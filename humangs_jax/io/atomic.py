@@ -359,13 +359,13 @@ def check_ours(
 
 @contextlib.contextmanager
 def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Generator[None]:
-    """Keeps other processes out of a folder that one writes to for long. The lock ends with the
-    process, however that ends.
+    """Keeps other processes out of a folder while this one writes to it.
 
-    Where there are no locks (Windows, some network disks), nothing is checked.
+    The lock ends with the process, however that ends. Where there are no locks (Windows, some
+    network disks), nothing is checked.
 
-    Arguments: replaced: the work makes or replaces the folder: what is locked is a file beside it,
-    there until the work ends.
+    Arguments: replaced: whether the work makes or replaces the folder. Then a file beside it is
+    locked, which is removed at the end.
     Raises: BlockingIOError, an OSError, if another process holds the folder; OSError, naming it, if
     it cannot be locked.
     """

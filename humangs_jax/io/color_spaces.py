@@ -187,7 +187,7 @@ SAME = 0.5 / 255
 
 
 def is_srgb(encoding: Encoding) -> bool:
-    """Whether values in sRGB are the file's own."""
+    """Whether the file's values are sRGB already."""
     steps = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     return bool(np.abs(in_srgb(grid, encoding) - grid).max() < SAME)

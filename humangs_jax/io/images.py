@@ -597,8 +597,9 @@ PROFILE_OF_MODE = {"CMYK": ("CMYK",), "RGB": ("colors",), "RGBA": ("colors",), "
 
 
 def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
-    """What stands in a photo's header besides an ICC profile, and before it: the newest of PNG's
-    ways goes first.
+    """Reads the color encoding that a photo's header states; it wins over an ICC profile.
+
+    None if it states none. Of PNG's ways the newest wins.
     """
     if image.format == "PNG":
         chunks = png_chunks(data)

@@ -169,9 +169,7 @@ class _Shown(reprlib.Repr):
         return f"an integer of {x.bit_length():,} bits"
 
     def repr_instance(self, x: object, level: int) -> str:
-        """Of other types: those of numpy that are Python's too as these, else the name of the
-        type.
-        """
+        """Shows numpy scalars like Python's; any other object by the name of its type."""
         if isinstance(x, str):
             return self.repr_str(str(x), level)
         if x is None or isinstance(x, bool | float):

@@ -57,7 +57,7 @@ class _Looked:
         self.memo: dict[int, int] = {}
 
     def read(self, count: int) -> bytes:
-        """The next bytes, which have been looked at."""
+        """Reads the next bytes, after they were checked."""
         # a frame is handed out as a whole: it may have several looks in it
         while self.file.tell() + count > self.seen:
             self.look()

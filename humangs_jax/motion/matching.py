@@ -168,7 +168,7 @@ def _limbs(
         reach[i] += max((reach[child] for child in children[i]), default=0.0)
 
     def pair_below(joint: int) -> Pair | None:
-        """The two longest limbs of like bones that hang on a joint, as their joints that bend."""
+        """Gives the bending joints of the two longest limbs below a joint with matching bones."""
         paths = [_path(child, children, reach) for child in children[joint]]
         limbs = [limb for limb in (_bends(path, lengths) for path in paths) if limb]
 

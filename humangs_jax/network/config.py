@@ -138,7 +138,7 @@ class HumanGSConfig:
         )
 
     def with_parts(self, **changes: Any) -> "HumanGSConfig":
-        """Another network: parts exchanged."""
+        """Gives the network with some parts replaced by others."""
         return dataclasses.replace(
             self, architecture=dataclasses.replace(self.architecture, **changes)
         )

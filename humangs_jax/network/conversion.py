@@ -146,8 +146,7 @@ def release_name(path: str) -> tuple[str, Layout]:
 
 
 def to_release(variables: Variables) -> StateDict:
-    """Variables as the state dict that the release would have of them (without the body's skinning
-    weights).
+    """Converts variables to the release's state dict, without the body's skinning weights.
 
     Raises: KeyError for a part of a network that the release does not have.
     """

@@ -100,8 +100,9 @@ def sample_nearest(grid: Float[Array, "h w"], indices: Float[Array, "*p 2"]) -> 
 def sample_neighborhoods(
     grid: Float[Array, "h w c"], indices: Float[Array, "p 2"]
 ) -> tuple[Float[Array, "p 3*3*c"], Float[Array, " p"]]:
-    """(neighbourhoods, coverage): the two sums over c above, taps row-major with channels fastest,
-    and sum_c w_c.
+    """Samples the 3 x 3 texels around each position: the two sums over c in the module's docstring.
+
+    Returns the neighbourhoods, taps row-major with channels fastest, and the coverage sum_c w_c.
 
     indices: texel indices (x, y), see `network.maps`. Positions that are outside by a texel or
     more, infinite or NaN give zeros with zero gradient.

@@ -78,9 +78,9 @@ class TileGrid:
         return self.tile_size**2
 
     def offsets(self, dtype: np.dtype | type = np.float32) -> np.ndarray:
-        """(2, pixels): x and y of a tile's pixel centres, from the tile's centre.
+        """Gives x and y of a tile's pixel centres, (2, pixels), relative to the tile's centre.
 
-        Small: moments stay accurate.
+        Such small numbers keep the moments of the backward pass accurate.
         """
         pixel = np.arange(self.pixels)
         offsets = (

@@ -359,8 +359,8 @@ def _key_pose(
 
 
 def _clear_of(build: kin.Build, rotations: kin.Rotations, side: int) -> float:
-    """`arm_clearance`; while the left arm (side 0) is placed, the right one is held out of the
-    way.
+    """Gives `arm_clearance` of an arm; for the left one (side 0), which is placed first, the right
+    one is held out of the way.
     """
     if side == 0:
         rotations = rotations.copy()

@@ -165,8 +165,8 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
 
 
 def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
-    """The masks that a calibration names, by camera: in its folder, in that of the photos or in the
-    one around. All or none.
+    """Finds the masks that a calibration names, by camera: in its folder, in that of the photos or
+    in the one around it. All have to be there, else there are none.
     """
     found: dict[int, Path] = {}
     for i, camera in enumerate(calibration.cameras):
@@ -289,9 +289,7 @@ def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]
 
 
 def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
-    """Name of the frame -> photo, for each camera, in the first of the layouts of which there is a
-    photo.
-    """
+    """Maps for each camera the names of frames to photos, by the first layout that any photo fits."""
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         checked_path(images, name, images)
@@ -498,7 +496,7 @@ def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
 
 
 def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str], list[str]]:
-    """What was done, and warnings about what sizes cannot tell; a line each."""
+    """Says which photos were turned, and warns where sizes do not show whether cameras were too."""
     flagged = [(photo, turn) for photo, turn in zip(photos, turns, strict=True) if turn.photo != 1]
     if not flagged:
         return [], []

@@ -260,8 +260,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, file: Path) -> Any:
-    """The value of a node; numbers are read here, because YAML takes the camera's name 01 for
-    one.
+    """Reads the value of a node. Numbers are read here and not by YAML, which would take a camera's
+    name 01 for one.
     """
     if isinstance(node, yaml.ScalarNode):
         value = _scalar(node.value) if node.style is None else node.value

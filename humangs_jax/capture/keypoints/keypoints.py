@@ -388,8 +388,9 @@ def triples(
 def with_hands(
     body: Float[np.ndarray, "33 *c"], hands: Sequence[Float[np.ndarray, "21 *c"] | None]
 ) -> Float[np.ndarray, "69 *c"]:
-    """Values of `MEDIAPIPE_69` from those of BlazePose and of the left and the right hand; of a
-    hand that is not known, 0 but for what BlazePose has.
+    """Joins the values of BlazePose and of the left and the right hand to those of `MEDIAPIPE_69`.
+
+    A hand that is None has zeros, except for the points that BlazePose has.
     """
     names = MEDIAPIPE_33.names
     found = np.zeros((len(MEDIAPIPE_69.names), *body.shape[1:]), body.dtype)
