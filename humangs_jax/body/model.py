@@ -339,8 +339,10 @@ def without_expression(body: BodyModel) -> BodyModel:
 def expressed(
     expressions: Expressions | None, rest: RestBody, pose: BodyPose
 ) -> tuple[RestBody, BodyPose]:
-    """The rest body with the face that the pose makes, and the pose without it but with the joints
-    that it turns.
+    """Applies a pose's expression to the rest body.
+
+    Returns the changed body, and the pose without the expression, but with the joints turned that
+    the expression turns.
 
     Raises: ValueError if the pose has other expressions than the body.
     """

@@ -203,7 +203,7 @@ FOR_TRAINING = {"size": 256, "poses": 2, "views": 12, "close_views": 0}
 
 @dataclasses.dataclass(frozen=True)
 class Extras:
-    """Besides the photos."""
+    """What is written besides the photos."""
 
     held_out: Annotated[int, at_least(0)] = 0
     """Views of the first pose from other cameras, in the sub-folder held_out/."""

@@ -238,7 +238,7 @@ def check_options(command: Any) -> None:
 
 
 def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = ()) -> None:
-    """Results of that kind can be written to that path. read: what the command reads.
+    """Checks that results of a kind can be written to a path. read: what the command reads.
 
     Raises: UsageError.
     """

@@ -289,7 +289,7 @@ def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]
 
 
 def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
-    """Maps for each camera the names of frames to photos, by the first layout that any photo fits."""
+    """Maps for each camera the names of frames to photos, by the first layout that fits one."""
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         checked_path(images, name, images)

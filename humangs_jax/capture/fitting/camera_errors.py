@@ -176,7 +176,7 @@ class _Seen:
         keypoints: Keypoints,
         camera_of: Int[np.ndarray, " v"],
     ) -> "_Seen | None":
-        """None if there is too little to say anything."""
+        """Gathers what the cameras see of the person; None if that is too little."""
         kinds = [
             name.removeprefix("left_").removeprefix("right_") in PARTS
             for name in keypoints.set.names

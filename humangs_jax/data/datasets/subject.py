@@ -232,8 +232,9 @@ def _shape_solvers(
 ) -> tuple[
     tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...
 ]:
-    """(pseudo-inverse, columns, which vertices) of the least-squares problem of `recover_shape`: of
-    all vertices, then without the hands.
+    """Prepares the least-squares problem of `recover_shape`: of all vertices, then without hands.
+
+    Each is (pseudo-inverse, columns, which vertices).
     """
     columns = np.concatenate([body.arrays[0][..., None], body.arrays[1]], axis=-1)
     of_hands = np.asarray(body.model.skinning_weights)[:, FIRST_HAND_JOINT:].sum(axis=1) > 1e-6

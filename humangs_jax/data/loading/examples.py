@@ -206,8 +206,9 @@ def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray
 def subject_views(
     subject: StoredSubject, indices: Sequence[int], size: int, depths: bool = False
 ) -> SubjectViews:
-    """Some views of a stored subject at size x size pixels, numpy leaves. depths: whether they have
-    any, all unknown.
+    """Gives some views of a stored subject at size x size pixels, with numpy leaves.
+
+    depths: whether the views get depths, all of them unknown.
 
     Raises: ValueError, see `shrink`.
     """
