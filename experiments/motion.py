@@ -2,6 +2,7 @@
 and one camera of a real capture against all four.
 """
 
+import tempfile
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -213,11 +214,14 @@ def motion_cameras(run: Run, folder: Path, height: float = 1.75) -> None:
     demo = unpacked(folder)
     lenses, rows, numbers = read_cameras(demo / "calibration" / "Calib.qca.txt"), [], {}
     found = {}
-    for name in CAMERAS:
-        lens, video = lenses[name], demo / "videos" / f"{name}.mp4"
-        seen, size = watched(video, None)
-        focal = DIAGONAL_35MM * lens.K[0, 0] / np.hypot(*size)
-        found[name] = (lens, seen, fit_video(video, height=height, focal_mm=focal))
+    with tempfile.TemporaryDirectory() as place:
+        for name in CAMERAS:
+            lens, video = lenses[name], demo / "videos" / f"{name}.mp4"
+            kept = Path(place) / f"{name}.npz"  # each video is looked at once
+            seen, size = look_at_video(video, rate_and_count(video)[1], None, kept)
+            focal = DIAGONAL_35MM * lens.K[0, 0] / np.hypot(*size)
+            fitted = fit_video(video, height=height, focal_mm=focal, kept=kept)
+            found[name] = (lens, seen, fitted)
     truth, names = triangulated([(lens, seen) for lens, seen, _ in found.values()])
     for name, (lens, _, fit) in found.items():
         joints = fit.fit.joints[: len(truth)]
@@ -242,12 +246,6 @@ def from_hips(joints, names):
     """Joints measured from the middle of the hips."""
     hips = [names.index("left_hip"), names.index("right_hip")]
     return joints - joints[:, hips].mean(1, keepdims=True)
-
-
-def watched(video, person):
-    """What the detector sees in all frames of a video, and their size."""
-    _, count = rate_and_count(video)
-    return look_at_video(video, count, person, None)
 
 
 def triangulated(cameras):

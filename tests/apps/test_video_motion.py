@@ -1,9 +1,13 @@
 """The motion of a video: who is followed, interrupted runs, and what is written."""
 
+import dataclasses
+import types
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from humangs_jax import cli
 from humangs_jax.apps import video_motion
 from humangs_jax.apps.video_motion import LONGER_SIDE, fit_video, motion_beside, smooth_faces
 from humangs_jax.avatar.video import write_video
@@ -11,7 +15,10 @@ from humangs_jax.body.motion import Motion
 from humangs_jax.capture.detection.face_and_hands import Hand
 from humangs_jax.capture.detection.people import Crop, Detection, Landmarks
 from humangs_jax.capture.fitting.motion_fit import MotionFit
+from humangs_jax.cli.animate import Animate
+from humangs_jax.cli.options import PartOfMotion, UsageError
 from humangs_jax.motion import load_motion, made_from_of, save_motion
+from humangs_jax.motion.skeleton import shipped_joints
 
 COUNT = 12
 
@@ -172,8 +179,6 @@ def test_options_out_of_range_are_refused_before_the_work(scene, tmp_path, optio
 
 
 def test_the_motion_beside_a_video_is_found_once_for_an_avatar(scene, tmp_path):
-    from humangs_jax.motion.skeleton import shipped_joints
-
     joints = np.asarray(shipped_joints(), np.float32)
     motion = motion_beside(tmp_path / "me.mp4", joints, None)
     assert len(motion.translations) == COUNT and scene.betas is not None
@@ -198,3 +203,33 @@ def test_a_motion_knows_what_it_was_made_from(tmp_path):
     assert made_from_of(tmp_path / "b.npz") is None
     (tmp_path / "c.npz").write_text("no archive")
     assert made_from_of(tmp_path / "c.npz") is None
+
+
+def test_the_command_writes_the_motion_and_refuses_the_files_of_others(scene, tmp_path, capsys):
+    video, out = str(tmp_path / "me.mp4"), tmp_path / "m.npz"
+    assert cli.execute(["motion", video, "--out", str(out), "--height", "1.7"]) == 0
+    said = capsys.readouterr().out
+    assert f"{COUNT} frames at 10 a second" in said and "--motion" in said
+    assert len(load_motion(out).translations) == COUNT and not list(tmp_path.glob("*.seen.npz"))
+    # the same again replaces it; a motion that somebody else made stays
+    assert cli.execute(["motion", video, "--out", str(out)]) == 0
+    save_motion(tmp_path / "theirs.npz", load_motion())
+    code = cli.execute(["motion", video, "--out", str(tmp_path / "theirs.npz")])
+    assert code == cli.BAD_USAGE and "was not found in a video" in capsys.readouterr().err
+    # what cannot be a video is one line, before any work
+    looks = scene.looks
+    (tmp_path / "text.mp4").write_text("no video")
+    for name in ("text.mp4", "missing.mp4"):
+        assert cli.execute(["motion", str(tmp_path / name), "--out", str(out)]) == cli.BAD_DATA
+        said = capsys.readouterr().err
+        assert name in said and said.strip().count("\n") == 0
+    assert scene.looks == looks
+
+
+def test_an_avatar_is_moved_by_a_video_and_its_file_options_are_refused(scene, tmp_path):
+    avatar = types.SimpleNamespace(rest_joints=shipped_joints())
+    command = Animate(avatar=tmp_path / "a.npz", motion=tmp_path / "me.mp4")
+    assert len(command._motion(avatar).translations) == COUNT
+    wrong = dataclasses.replace(command, part=PartOfMotion(motion_fps=30.0))
+    with pytest.raises(UsageError, match="--motion-fps: is for files of motions"):
+        wrong._motion(avatar)
