@@ -143,10 +143,14 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Keeps one slice of the tests.
+    """Keeps one slice of the tests, and with --core-alone those that need no wing.
 
     A test's slice hangs on its name alone, so that N runs see all.
     """
+    if config.getoption("--core-alone"):
+        dropped = [item for item in items if item.get_closest_marker("wings")]
+        items[:] = [item for item in items if not item.get_closest_marker("wings")]
+        config.hook.pytest_deselected(items=dropped)
     wish = config.getoption("--slice")
     if wish is None:
         return

@@ -153,6 +153,7 @@ def test_what_is_far_away_of_a_scene_does_not_make_it_small():
     assert np.linalg.norm(far.center) < 1.5 * np.linalg.norm(near.center)
 
 
+@pytest.mark.wings
 def test_cameras_of_a_file_are_in_the_world_of_the_gaussians(tmp_path, monkeypatch):
     gaussians, pose = ball(), np.eye(4)
     pose[:3, 3] = [1, 2, 8]  # OpenGL's axes: looks along -z

@@ -427,8 +427,21 @@ def honest(tmp_path_factory):
     return folder
 
 
+OF_CAPTURE = ("avatarrex", "thuman4")
+"""Layouts whose calibration a reader in capture/ reads."""
+
+
+def marks(layout):
+    return [pytest.mark.wings] if layout in OF_CAPTURE else []
+
+
 @pytest.mark.parametrize(
-    ("layout", "name"), [(layout, name) for layout, cases in CASES.items() for name in cases]
+    ("layout", "name"),
+    [
+        pytest.param(layout, name, marks=marks(layout))
+        for layout, cases in CASES.items()
+        for name in cases
+    ],
 )
 def test_damage_is_one_line_that_names_file_and_key(layout, name, honest, body, tmp_path):
     damage, *words = CASES[layout][name]
@@ -442,13 +455,14 @@ def test_damage_is_one_line_that_names_file_and_key(layout, name, honest, body, 
     assert all(word in line for word in words), f"{words} in {line}"
 
 
-@pytest.mark.parametrize("layout", WRITE)
+@pytest.mark.parametrize("layout", [pytest.param(layout, marks=marks(layout)) for layout in WRITE])
 def test_honest_sets_are_read(layout, honest, body):
     assert read(layout, honest(layout), body) == (
         {"listed as missing": 1} if layout == "thuman4" else {}
     )
 
 
+@pytest.mark.wings
 def test_preprocessing_names_all_damage_and_makes_the_rest(honest, body, tmp_path):
     """All of a layout's damage at once: each case is a subject of its own, beside an honest one."""
     shutil.copytree(honest("avatarrex"), tmp_path / "in" / "honest")

@@ -56,7 +56,17 @@ def body(tmp_path_factory):
 VIDEOS = {"avatarrex": write_avatarrex, "thuman4": write_thuman4, "actorshq": write_actorshq}
 
 
-@pytest.mark.parametrize("layout", VIDEOS)
+OF_CAPTURE = ("avatarrex", "thuman4")
+"""Layouts whose calibration a reader in capture/ reads."""
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        pytest.param(layout, marks=[pytest.mark.wings] if layout in OF_CAPTURE else [])
+        for layout in VIDEOS
+    ],
+)
 def test_a_video_is_read_as_it_was_written(layout, tmp_path, body):
     (person,) = open_people(VIDEOS[layout](tmp_path / "set"), body, SIZE)
     subject = person.subject
@@ -106,6 +116,7 @@ def test_a_video_is_read_as_it_was_written(layout, tmp_path, body):
     assert capture.view_count == 2 and capture.names[0].endswith("00000000")
 
 
+@pytest.mark.wings
 def test_photos_without_mask_or_pose_and_missing_ones_are_counted(tmp_path, body):
     folder = write_avatarrex(tmp_path / "a")
     (folder / "22010708" / "00000000.jpg").unlink()
@@ -191,6 +202,7 @@ def test_evaluation_indices_are_read_and_checked(tmp_path):
         read_evaluation(tmp_path / "e.json")
 
 
+@pytest.mark.wings
 def test_scans_without_a_fit_are_skipped_with_the_reason(tmp_path):
     folder = write_thuman(tmp_path / "t", model_arrays())
     (folder / "smplx" / "0001" / "smplx_param.pkl").unlink()
@@ -219,6 +231,7 @@ def test_a_turned_world_moves_the_posed_body_along(body):
     np.testing.assert_allclose(after, before @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5)
 
 
+@pytest.mark.wings
 def test_opening_people_reads_no_photo(tmp_path, body, monkeypatch):
     folder = write_avatarrex(tmp_path / "a")
     read = []
@@ -232,6 +245,7 @@ def test_opening_people_reads_no_photo(tmp_path, body, monkeypatch):
     assert person.subject.photo(0, SIZE)[0].shape == (SIZE, SIZE, 3) and len(read) == 2
 
 
+@pytest.mark.wings
 def test_every_data_set_is_a_source_of_the_loader(tmp_path, body):
     folders = {layout: write(tmp_path / layout) for layout, write in VIDEOS.items()}
     folders["scenes"] = write_scenes(tmp_path / "scenes", model_arrays())[0]
@@ -260,6 +274,7 @@ def test_every_data_set_is_a_source_of_the_loader(tmp_path, body):
     assert "00000001.jpg" in problem and len(read_scene_list(folders["scenes"])) == 1
 
 
+@pytest.mark.wings
 def test_training_takes_a_scene_list_and_a_data_set(tmp_path, body):
     config = tiny()
     model = config.model.with_conventions(image_size=SIZE)
