@@ -20,7 +20,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
+from humangs_jax.data.views import gaussian_body, prepare_inputs, to_network_views
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.refine import refine
@@ -142,7 +142,7 @@ def check(small: bool) -> Iterator[Measurement]:
         variables, config = load_weights()
         body, views = (
             gaussian_body(load_body(), config),
-            standardize(load_capture(DEMO_CAPTURE), 256),
+            to_network_views(load_capture(DEMO_CAPTURE), 256),
         )
         inputs = jax.jit(prepare_inputs, static_argnames="config")(body, views, config)
         return errors(

@@ -17,7 +17,7 @@ from experiments.results import cells, markdown_table
 from experiments.subjects import TASKS, People, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
-from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
+from humangs_jax.data.views import gaussian_body, prepare_inputs, to_network_views
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.losses.perceptual import lpips
@@ -131,7 +131,7 @@ def appearance(
 
 def looseness(photos: Any, config: Any) -> float:
     """Share of the person in the photos that is beside the body."""
-    views = standardize(photos, config.image_size)
+    views = to_network_views(photos, config.image_size)
     inputs = _prepared(gaussian_body(photos.body, config), views, config)
     mask = np.asarray(views.masks) > MASK_THRESHOLD
     return 1 - float((np.asarray(inputs.depth_maps >= 0) & mask).sum() / mask.sum())

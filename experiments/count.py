@@ -277,7 +277,7 @@ def all_walks() -> dict[str, list[str]]:
     import humangs_jax as hg
     from humangs_jax.data.loading import Example
     from humangs_jax.data.prepared import PreparedCapture
-    from humangs_jax.data.views import SubjectViews, gaussian_body, standardize
+    from humangs_jax.data.views import SubjectViews, gaussian_body, to_network_views
     from humangs_jax.network.parts import Drawn, HumanGSInputs
     from humangs_jax.training import step
     from humangs_jax.training.config import tiny
@@ -285,7 +285,7 @@ def all_walks() -> dict[str, list[str]]:
 
     config, capture = tiny(), hg.load_capture("demo_capture").resized(64)
     state = init_state(config)
-    body, views = gaussian_body(capture.body, config.model), standardize(capture, 32)
+    body, views = gaussian_body(capture.body, config.model), to_network_views(capture, 32)
     batch = jax.tree.map(lambda x: x[None], Example(views, hg.replace(views, depths=views.masks)))
     avatar: list[hg.Avatar] = []
     photos = lambda: avatar.append(hg.reconstruct(state.variables, config.model, capture))

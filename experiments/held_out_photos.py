@@ -19,7 +19,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import camera_gains, multiplied
+from humangs_jax.data.exposure import apply_gain, camera_gains
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import mean_scores
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
@@ -57,7 +57,7 @@ def held_out_scores(
         )
         for pose, drawn in (("own", shown), ("shared", in_shared_pose(rest, shown))):
             found = draw_views(avatar, drawn)
-            images = multiplied(found.images, np.asarray(found.alpha), (factor / gains[view])[None])
+            images = apply_gain(found.images, np.asarray(found.alpha), (factor / gains[view])[None])
             rows[pose].append(photo_scores(images, told))
     return {
         pose: mean_scores(scores) | {"each": [row["psnr_fg"] for row in scores]}

@@ -20,7 +20,7 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.hidden import with_hidden_parts
 from humangs_jax.data.view_choice import view_quality
-from humangs_jax.data.views import standardize
+from humangs_jax.data.views import to_network_views
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.refinement.config import RefineConfig
@@ -216,14 +216,14 @@ def covered_vertices(
     vertices = body_of(photos)
     size = photos.images.shape[1]
     hidden = np.zeros(len(vertices), bool)
-    quality = np.asarray(view_quality(body, standardize(photos, size)))
+    quality = np.asarray(view_quality(body, to_network_views(photos, size)))
     near = [ndimage.binary_dilation(each) for each in covered]
     for i, camera in enumerate(cameras(photos)):
         x, y = projected(camera, vertices).astype(int).clip(0, size - 1).T
         hidden |= (quality[i] > 0) & near[i][y, x]
     assert others.masks is not None
     shown = np.zeros(others.masks.shape, bool)
-    quality = np.asarray(view_quality(body, standardize(others, size)))
+    quality = np.asarray(view_quality(body, to_network_views(others, size)))
     for i, camera in enumerate(cameras(others)):
         visible = np.flatnonzero(quality[i] > 0)
         rows, columns = np.nonzero(others.masks[i] > 0.5)

@@ -33,7 +33,7 @@ from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.data.cameras import distort
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import camera_gains, multiplied
+from humangs_jax.data.exposure import apply_gain, camera_gains
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.photos import on_white_background, write_description
 from humangs_jax.evaluation.cases import draw_views
@@ -366,7 +366,7 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
         # of the others alone the gains are the same but for one factor
         factor = np.exp(np.mean(np.log(gains[others] / camera_gains(body.select(others))), axis=0))
         drawn = draw_views(avatar, shown)
-        images = multiplied(drawn.images, np.asarray(drawn.alpha), (factor / gains[view])[None])
+        images = apply_gain(drawn.images, np.asarray(drawn.alpha), (factor / gains[view])[None])
         truth = dataclasses.replace(
             shown, images=photos.truth()[[view]], masks=photos.careful[[view]]
         )

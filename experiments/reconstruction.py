@@ -22,7 +22,7 @@ from experiments.timing import medians
 from humangs_jax.avatar.reconstruct import reconstruct_views, stack_captures
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
+from humangs_jax.data.views import gaussian_body, prepare_inputs, to_network_views
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import needed_tokens
 from humangs_jax.network.humangs import apply_humangs
@@ -44,7 +44,7 @@ def benchmark_inputs(config: Any, views: int, size: int) -> Any:
     this configuration wants them.
     """
     capture = load_capture(DEMO_CAPTURE)
-    photos = standardize(capture.select([i % capture.view_count for i in range(views)]), size)
+    photos = to_network_views(capture.select([i % capture.view_count for i in range(views)]), size)
     prepare = jax.jit(prepare_inputs, static_argnames="config")
     return jax.block_until_ready(prepare(gaussian_body(capture.body, config), photos, config))
 

@@ -22,7 +22,7 @@ from humangs_jax.avatar.reconstruct import fit_buffers
 from humangs_jax.body.library import load_body
 from humangs_jax.core.progress import bar
 from humangs_jax.data.loading import Example
-from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
+from humangs_jax.data.views import gaussian_body, prepare_inputs, to_network_views
 from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights
@@ -377,7 +377,8 @@ def shipped_cases(count):
         person = make_evaluation_subject(seed, whole, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0))
         examples.append(
             Example(
-                standardize(person.inputs(changes.VIEWS), size), standardize(person.held_out, size)
+                to_network_views(person.inputs(changes.VIEWS), size),
+                to_network_views(person.held_out, size),
             )
         )
     inputs = [prepare_inputs(body, example.inputs, config) for example in examples]

@@ -25,7 +25,7 @@ from humangs_jax.data.views import (
     SubjectViews,
     gaussian_body,
     prepare_inputs,
-    standardize,
+    to_network_views,
 )
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
@@ -174,7 +174,9 @@ def reconstructed(
     buffers that fit.
     """
     body = gaussian_body(inputs.body, config)
-    views = standardize(prepare_capture(inputs).capture, config.image_size, config.runtime.crop)
+    views = to_network_views(
+        prepare_capture(inputs).capture, config.image_size, config.runtime.crop
+    )
     prepared = _prepare(body, views, config)
     config = fit_buffers(prepared.foreground, prepared.view_count, config)
     return _outputs(variables, prepared, config), body, views, config

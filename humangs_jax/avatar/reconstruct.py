@@ -47,8 +47,8 @@ from humangs_jax.data.views import (
     has_mesh_of,
     pad_views,
     prepare_inputs,
-    standardize,
     subject_rest,
+    to_network_views,
 )
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import require_pinhole
@@ -318,7 +318,7 @@ def _check_all(captures: Sequence) -> None:
 
 def network_views(prepared: PreparedCapture, config: HumanGSConfig) -> SubjectViews:
     """The photos as the network wants them, and how far the body moves."""
-    views = standardize(prepared.capture, config.image_size, config.runtime.crop)
+    views = to_network_views(prepared.capture, config.image_size, config.runtime.crop)
     if prepared.displacement is not None:
         views = replace(views, displacement=jnp.asarray(prepared.displacement))
     return views

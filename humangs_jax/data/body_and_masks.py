@@ -50,13 +50,13 @@ POINTS = 1000
 """The number of points on the skin."""
 
 
-def usable_views(capture: Capture) -> Capture:
-    """The capture with the views that show the person: all but those of `unusable_views`, which a
-    warning names.
+def drop_views_without_person(capture: Capture) -> Capture:
+    """The capture with the views that show the person: all but those of `views_without_person`,
+    which a warning names.
 
     The same object where these are all, and without masks. Raises: as `without_views`.
     """
-    return without_views(capture, unusable_views(capture))
+    return without_views(capture, views_without_person(capture))
 
 
 def without_views(capture: Capture, reasons: dict[int, str]) -> Capture:
@@ -80,7 +80,7 @@ def without_views(capture: Capture, reasons: dict[int, str]) -> Capture:
     return capture.select([view for view in range(capture.view_count) if view not in reasons])
 
 
-def unusable_views(capture: Capture) -> dict[int, str]:
+def views_without_person(capture: Capture) -> dict[int, str]:
     """The views whose mask is empty or hardly meets what of the posed body is in the frame, and
     which of the two.
 
@@ -239,7 +239,7 @@ PerVertex = Float[np.ndarray, " n"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Reach:
+class OffsetFitConfig:
     """How a surface moves to the edges of the masks. The defaults are those of bodies: the network
     adds clothes on top, and knows naked ones.
     """
@@ -302,10 +302,10 @@ class MaskedView:
         return pixels, np.linalg.norm(self.project[0, :3]) / depth, within
 
 
-def displacement(
+def fit_vertex_offsets(
     body: BodyModel,
     capture: Capture,
-    inset: tuple[float, float] = Reach.inset,
+    inset: tuple[float, float] = OffsetFitConfig.inset,
     *,
     always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
@@ -332,14 +332,14 @@ def displacement(
     )
     if not always and _share_outside(views, rest, held < HELD / 2) < MISFIT:
         return total.astype(np.float32)
-    total += to_edges(views, rest, faces, held, Reach(inset=inset))
+    total += to_edges(views, rest, faces, held, OffsetFitConfig(inset=inset))
     moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
     total -= _outside(views, moved, normals, faces, inset, held < HELD / 2)[:, None] * normals
     return total.astype(np.float32)
 
 
 def to_edges(
-    views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: Reach
+    views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: OffsetFitConfig
 ) -> Points:
     """How far the vertices of a surface in the T-pose move along its normals to the masks' edges,
     smoothly.
@@ -452,7 +452,7 @@ def _share_outside(
 
 
 def _targets(
-    views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: Reach
+    views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: OffsetFitConfig
 ) -> tuple[PerVertex, PerVertex]:
     """For each vertex the number of photos that show it on the silhouette, and the sum of the
     distances to the masks' edges.
@@ -530,7 +530,7 @@ def _spread(
     count: PerVertex,
     summed: PerVertex,
     held: PerVertex,
-    reach: Reach,
+    reach: OffsetFitConfig,
 ) -> PerVertex:
     """The smooth displacement that is nearest to the targets."""
     areas = np.maximum(vertex_areas(vertices, faces), 1e-9)

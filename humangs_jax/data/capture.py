@@ -93,7 +93,7 @@ class Capture:
     centimetres off.
     """
     gains: Float[np.ndarray, "v 3"] | None = None
-    """The factors of red, green and blue by which `data.exposure.equal_exposure` has multiplied
+    """The factors of red, green and blue by which `data.exposure.equalize_exposure` has multiplied
     each view, (v, 3); None: the colors are as they were photographed.
     """
     unknown: Bool[np.ndarray, "v h w"] | None = None

@@ -29,9 +29,9 @@ from scipy.sparse.csgraph import connected_components
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.data.body_and_masks import unusable_views
+from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import standardize
+from humangs_jax.data.views import to_network_views
 from humangs_jax.geometry.camera import Camera, project
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
@@ -63,7 +63,7 @@ are: loose clothes and shadows make 0.3 to 0.9 in photos of equal exposure (eigh
 NORMAL_MAD = 1.4826
 
 
-def equal_exposure(capture: Capture) -> Capture:
+def equalize_exposure(capture: Capture) -> Capture:
     """The capture in equal exposure, which is what network and refinement see, with the gains
     recorded; the same object where they are recorded already.
 
@@ -75,7 +75,7 @@ def equal_exposure(capture: Capture) -> Capture:
     gains = camera_gains(capture)
     images = capture.images
     if (gains != 1).any():
-        images = multiplied(images, capture.masks, gains)
+        images = apply_gain(images, capture.masks, gains)
     return dataclasses.replace(capture, images=images, gains=gains)
 
 
@@ -83,7 +83,7 @@ def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
     """Gain per view and channel with which a rendered avatar looks as each camera exposed it."""
     if capture.gains is not None:
         return 1 / capture.gains
-    apart, found = unusable_views(capture), np.ones((capture.view_count, 3))
+    apart, found = views_without_person(capture), np.ones((capture.view_count, 3))
     usable = [i for i in range(capture.view_count) if i not in apart]
     if usable:
         found[usable] = 1 / camera_gains(capture.select(usable))
@@ -116,7 +116,7 @@ def points_of(
 
     capture: photos on white, with masks, all of which show the person.
     """
-    views = standardize(capture, EXPOSURE_SIZE, crop=True)
+    views = to_network_views(capture, EXPOSURE_SIZE, crop=True)
     rest, per_view = (
         shape_body(capture.body, views.betas),
         (views.images, views.masks, views.cameras),
@@ -344,7 +344,7 @@ def _robust_differences(
 # --------------------------------------------------------------------------------------------------
 
 
-def multiplied(
+def apply_gain(
     images: Float[np.ndarray, "v h w 3"],
     alpha: Float[np.ndarray, "v h w"],
     gains: Float[np.ndarray, "v 3"],

@@ -20,7 +20,7 @@ from humangs_jax.data.body_and_masks import (
     shaped,
     silhouette,
     skinned,
-    unusable_views,
+    views_without_person,
 )
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
@@ -103,7 +103,7 @@ def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:
     joints = np.asarray(body.joint_regressor, float) @ rest
     weights, faces = np.asarray(body.skinning_weights, float), np.asarray(body.faces)
     found, posed = np.zeros(capture.masks.shape, bool), {}
-    unusable = unusable_views(capture)
+    unusable = views_without_person(capture)
     for i, frame in enumerate(np.asarray(capture.frames).tolist()):
         if i in unusable:
             continue

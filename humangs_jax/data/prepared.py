@@ -16,10 +16,10 @@ from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import short_repr
-from humangs_jax.data.body_and_masks import displacement, unusable_views, without_views
+from humangs_jax.data.body_and_masks import fit_vertex_offsets, views_without_person, without_views
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import equal_exposure
-from humangs_jax.data.skirt import with_skirt
+from humangs_jax.data.exposure import equalize_exposure
+from humangs_jax.data.skirt import add_skirt
 from humangs_jax.data.view_choice import best_views
 from humangs_jax.data.views import (
     gaussian_body,
@@ -131,12 +131,12 @@ def prepare_capture(
 
 def _prepared_photos(given: Capture, views: int | str | None) -> PreparedCapture:
     """The views that show the person, or the best of them, in equal exposure and with y up."""
-    reasons = unusable_views(given)
+    reasons = views_without_person(given)
     capture = without_views(given, reasons)
     chosen = _chosen(capture, views)
     if chosen is not None:
         capture = capture.select(chosen)
-    capture = equal_exposure(capture)
+    capture = equalize_exposure(capture)
 
     # the world with y up, if person and cameras stand along another axis
     up = world_up(np.asarray(capture.poses.rotations)[capture.frames, 0], capture.cameras)
@@ -165,11 +165,11 @@ def _with_body(prepared: PreparedCapture, config: HumanGSConfig) -> PreparedCapt
     if allows_vertex_offsets(config) and capture.displacement is not None:
         moved = np.asarray(on_gaussian_body(capture.displacement, capture.body, config))
     elif allows_vertex_offsets(config) and capture.masks is not None:
-        moved = displacement(body, capture, always=config.runtime.displacement is True)
+        moved = fit_vertex_offsets(body, capture, always=config.runtime.displacement is True)
 
     # a skirt, where the masks show one
     if moved is not None:
-        skirted = with_skirt(body, capture, moved)
+        skirted = add_skirt(body, capture, moved)
     if skirted is not None:
         body, moved = skirted
     return dataclasses.replace(

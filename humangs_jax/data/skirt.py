@@ -22,8 +22,8 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import (
     MASK_THRESHOLD,
+    OffsetFitConfig,
     Points,
-    Reach,
     at,
     empty_views,
     masked_views,
@@ -64,12 +64,12 @@ CLEAR = 0.06
 """Metres that such a point is beside both legs."""
 LONG_CLEAR = 0.1
 """The same where no photo shows the legs apart below the hem."""
-REACH = Reach(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
+REACH = OffsetFitConfig(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
 """Weight of no displacement of the body, in the fit of the skirt."""
 
 
-def with_skirt(
+def add_skirt(
     body: BodyModel, capture: Capture, displacement: Float[np.ndarray, "n 3"]
 ) -> tuple[BodyModel, Float[np.ndarray, "m 3"]] | None:
     """The body with a skirt, and the displacement of both, metres; None where the photos show no

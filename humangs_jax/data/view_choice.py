@@ -8,9 +8,9 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
-from humangs_jax.data.body_and_masks import unusable_views, without_views
+from humangs_jax.data.body_and_masks import views_without_person, without_views
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
+from humangs_jax.data.views import SubjectViews, prepare_inputs, to_network_views
 from humangs_jax.network import presets
 from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.reader import project_vertices, visible_vertices
@@ -37,7 +37,7 @@ def select_views(capture: Capture, count: int | None) -> list[int]:
     """
     if count is not None and count < 1:
         raise ValueError(f"select_views: expected at least 1 photo, got {count}")
-    unusable = unusable_views(capture)
+    unusable = views_without_person(capture)
     shown = without_views(capture, unusable)
     usable = [view for view in range(capture.view_count) if view not in unusable]
     return [usable[view] for view in best_views(shown, count)]
@@ -61,7 +61,7 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
     body = capture.body
     if len(body.template) > SELECTION_VERTICES:
         body = decimate(body, SELECTION_VERTICES)
-    quality = np.asarray(view_quality(body, standardize(capture, SELECTION_SIZE)))
+    quality = np.asarray(view_quality(body, to_network_views(capture, SELECTION_SIZE)))
     area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
     least = LEAST_GAIN if count is None else 0.0
     most = capture.view_count if count is None else count

@@ -389,7 +389,7 @@ def turned_world(
     return turned, replace(cameras, cam_from_world=matrices)
 
 
-def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews:
+def to_network_views(capture: Capture, size: int, crop: bool = False) -> SubjectViews:
     """A capture's photos as the network wants them: padded with white to a centred square and
     resized to `size`.
 

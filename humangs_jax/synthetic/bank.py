@@ -31,7 +31,7 @@ from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.core.records import array_fields
-from humangs_jax.data.body_and_masks import displacement, silhouette
+from humangs_jax.data.body_and_masks import fit_vertex_offsets, silhouette
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import project
 from humangs_jax.io.arrays import check_array, check_indices, check_joints, read_npz, write_npz
@@ -450,7 +450,7 @@ def to_silhouettes(
     frames, names = np.zeros(SILHOUETTES, int), tuple(map(str, range(SILHOUETTES)))
     poses = jax.tree.map(lambda x: x[None], BodyPose(jnp.asarray(rotations), jnp.asarray(nowhere)))
     images = np.broadcast_to(masks[..., None], (*masks.shape, 3))
-    return displacement(
+    return fit_vertex_offsets(
         body, Capture(images, masks, cameras, frames, body, subject.betas, poses, names)
     ).astype(np.float16)
 

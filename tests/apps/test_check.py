@@ -174,7 +174,7 @@ def test_the_displacement_of_a_capture_is_drawn(tmp_path, masks):
 
 def test_a_skirt_of_the_avatar_is_said(tmp_path, monkeypatch):
     assert "skirt" not in str(check_capture(capture(), tmp_path / "check.png"))
-    monkeypatch.setattr(prepared, "with_skirt", lambda body, capture, moves: (body, moves))
+    monkeypatch.setattr(prepared, "add_skirt", lambda body, capture, moves: (body, moves))
     assert "reconstruct will put a skirt around the legs" in str(
         check_capture(capture(), tmp_path / "check.png")
     )

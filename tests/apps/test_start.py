@@ -34,7 +34,7 @@ from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data import exposure
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.exposure import equal_exposure, multiplied
+from humangs_jax.data.exposure import apply_gain, equalize_exposure
 from humangs_jax.data.photos import load_photos
 from humangs_jax.geometry.camera import Camera, orbit
 from humangs_jax.io.images import read_image, to_uint8, write_png
@@ -756,10 +756,10 @@ def test_photos_are_made_equal_once_before_one_is_held_out(body, toy, monkeypatc
     reconstructed(monkeypatch, body, lambda others: given.append(others) or 0.0)
     held_out_psnr({}, tiny(), toy, None)
     others = given[0]
-    assert equal_exposure(others) is others
+    assert equalize_exposure(others) is others
     own = [toy.names.index(name) for name in others.names]
     np.testing.assert_array_equal(others.gains, gains[own])
-    once = multiplied(toy.images, toy.masks, gains)[own]
+    once = apply_gain(toy.images, toy.masks, gains)[own]
     np.testing.assert_array_equal(others.images, once)
 
 

@@ -24,7 +24,7 @@ from humangs_jax.body.model import BodyPose, person_vertices, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import skirt
-from humangs_jax.data.body_and_masks import displacement
+from humangs_jax.data.body_and_masks import fit_vertex_offsets
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
 from humangs_jax.data.prepared import prepare_capture
@@ -34,7 +34,7 @@ from humangs_jax.data.views import (
     gaussian_body,
     pad_views,
     prepare_inputs,
-    standardize,
+    to_network_views,
     world_up,
 )
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
@@ -178,7 +178,7 @@ def capture(body, height, width, views=2):
 
 def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
     photos = capture(body, 48, 36)
-    views = standardize(photos, SIZE)
+    views = to_network_views(photos, SIZE)
     assert views.images.shape == (2, SIZE, SIZE, 3) and views.cameras.width == SIZE
     assert np.allclose(views.images[:, :, :3], 1, atol=1e-3)  # padded columns are white
     point = jnp.asarray([0.2, 1.1, 0.1])
@@ -193,7 +193,7 @@ def test_photos_reach_the_network_as_in_training(body):
     photos = capture(body, 2 * SIZE, 2 * SIZE)
     levels = np.rint(255 * photos.images).astype(np.uint8)
     photos.images[:], photos.masks[:, :, SIZE:] = levels / np.float32(255), 0
-    views = standardize(photos, SIZE)
+    views = to_network_views(photos, SIZE)
     np.testing.assert_allclose(views.images, shrink(levels, SIZE), atol=1e-6)
     np.testing.assert_array_equal(views.masks, photos.masks[:, ::2, ::2])
 
@@ -201,7 +201,7 @@ def test_photos_reach_the_network_as_in_training(body):
 def test_small_people_that_are_enlarged_stay_within_the_range(body):
     photos = capture(body, 48, 36)
     photos.masks[:, :, 9:] = photos.masks[:, :12] = 0  # 36 x 9 pixels, which the body meets
-    for larger in (photos.resized(101), standardize(photos, 60, crop=True)):
+    for larger in (photos.resized(101), to_network_views(photos, 60, crop=True)):
         for values in (larger.images, larger.masks):
             assert values.min() >= 0 and values.max() <= 1
 
@@ -228,7 +228,7 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     as_it_is, upright = prepare_capture(photos), prepare_capture(turned)
     assert as_it_is.up == "y" and as_it_is.capture.cameras is photos.cameras
     assert upright.up == "z" and upright.turned
-    own, views = (standardize(x.capture, SIZE) for x in (as_it_is, upright))
+    own, views = (to_network_views(x.capture, SIZE) for x in (as_it_is, upright))
     for got, expected in zip(jax.tree.leaves(views), jax.tree.leaves(own), strict=True):
         np.testing.assert_allclose(got, expected, atol=TURNED)
     avatars = [reconstruct(*network, x).gaussians for x in (photos, turned)]
@@ -409,7 +409,7 @@ def test_the_token_capacity_follows_the_photos(body, network):
     photos = capture(
         body, SIZE, SIZE, views=4
     )  # full masks: 4 x 16 patches, more than the configuration's 48
-    views = standardize(photos, SIZE)
+    views = to_network_views(photos, SIZE)
     _, dropped = jax.jit(reconstruct_views, static_argnames="config")(
         variables, config, body, views
     )
@@ -541,7 +541,7 @@ def test_a_kept_displacement_gives_the_avatar_of_one_that_is_computed(body, netw
         network[1].with_conventions(pixels="person").with_runtime(displacement=True),
     )
     photos = capture_of(body, 0, 2)
-    kept = dataclasses.replace(photos, displacement=displacement(body, photos))
+    kept = dataclasses.replace(photos, displacement=fit_vertex_offsets(body, photos))
     assert kept.displacement.any()
     computed, programs = reconstruct(variables, config, photos), _reconstruct._cache_size()
     jax.tree.map(np.testing.assert_array_equal, reconstruct(variables, config, kept), computed)

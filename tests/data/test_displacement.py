@@ -15,7 +15,7 @@ from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import views
-from humangs_jax.data.body_and_masks import HELD_JOINTS, WRAP, Reach, displacement
+from humangs_jax.data.body_and_masks import HELD_JOINTS, WRAP, OffsetFitConfig, fit_vertex_offsets
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.views import gaussian_body, on_gaussian_body, subject_rest
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -25,7 +25,7 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 SIZE, COAT = 384, 0.01
 FOUND = 0.003
 """Metres: a pixel of these masks shows 6 mm, and its edge is known to half of that."""
-BOUND = 2 * max(Reach.inwards, Reach.outwards) + WRAP
+BOUND = 2 * max(OffsetFitConfig.inwards, OffsetFitConfig.outwards) + WRAP
 POSES = 2
 
 
@@ -100,7 +100,7 @@ def along_normals(body, capture, moved):
 @pytest.fixture(scope="module")
 def filled(body, dressed):
     """The displacement that fills the masks."""
-    return displacement(body, dressed[0], inset=(0.0, 0.0))
+    return fit_vertex_offsets(body, dressed[0], inset=(0.0, 0.0))
 
 
 def test_a_coat_is_found(body, dressed, filled):
@@ -117,7 +117,7 @@ def test_the_inset_is_kept(body, dressed, filled):
     capture, worn = dressed[0], free(body) > 0.99
     near, deep = (
         along_normals(body, capture, x)[worn]
-        for x in (filled, displacement(body, capture, (0.004, 0.004)))
+        for x in (filled, fit_vertex_offsets(body, capture, (0.004, 0.004)))
     )
     assert np.median(near - deep) == pytest.approx(0.004, abs=FOUND / 2)
 
@@ -125,10 +125,12 @@ def test_the_inset_is_kept(body, dressed, filled):
 def test_only_a_body_that_sticks_out_of_the_masks_needs_it(body, dressed):
     """Clothes put no body outside of a mask; a body that is too heavy lies there."""
     capture, _ = dressed
-    assert not displacement(body, capture, always=False).any()
+    assert not fit_vertex_offsets(body, capture, always=False).any()
     heavy = capture.betas + 3.0 * np.asarray([name == "weight" for name in body.shape_names])
     wrong = dataclasses.replace(capture, betas=heavy)
-    inwards = along_normals(body, wrong, displacement(body, wrong, always=False))[free(body) > 0.99]
+    inwards = along_normals(body, wrong, fit_vertex_offsets(body, wrong, always=False))[
+        free(body) > 0.99
+    ]
     assert np.percentile(inwards, 10) < -COAT / 2
 
 
@@ -195,7 +197,7 @@ SPOILED = {
 @pytest.mark.parametrize("spoiled", SPOILED)
 def test_bad_masks_do_bounded_harm(body, dressed, spoiled):
     capture = SPOILED[spoiled](dressed[0])
-    moved = displacement(body, capture)
+    moved = fit_vertex_offsets(body, capture)
     assert moved.shape == body.template.shape and moved.dtype == np.float32
     assert np.isfinite(moved).all() and np.linalg.norm(moved, axis=-1).max() < BOUND
     if spoiled in ("all masks empty", "masks of all", "a body that is not finite"):
@@ -210,7 +212,8 @@ def test_the_border_of_a_photo_is_no_edge_of_the_person(body, dressed):
         capture, images=capture.images[:, :half], masks=capture.masks[:, :half], cameras=cameras
     )
     found, true = (
-        along_normals(body, capture, x) for x in (displacement(body, upper, inset=(0.0, 0.0)), coat)
+        along_normals(body, capture, x)
+        for x in (fit_vertex_offsets(body, upper, inset=(0.0, 0.0)), coat)
     )
     errors = np.abs(found - true)
     assert (

@@ -15,13 +15,13 @@ from humangs_jax.data.exposure import (
     LEAST_OF_PART,
     LEAST_POINTS,
     PARTS,
+    apply_gain,
     body_parts,
     camera_gains,
-    equal_exposure,
+    equalize_exposure,
     gains_between,
     gains_of,
     linked_views,
-    multiplied,
     points_of,
 )
 
@@ -169,10 +169,10 @@ def test_front_and_back_of_the_demo_on_two_days_get_one_color(front_and_back, ba
     logs = np.stack([np.asarray(balance), -np.asarray(balance)])
     changed = dataclasses.replace(
         front_and_back,
-        images=multiplied(front_and_back.images, front_and_back.masks, np.exp(-logs)),
+        images=apply_gain(front_and_back.images, front_and_back.masks, np.exp(-logs)),
     )
     np.testing.assert_array_equal(gains_of(*points_of(changed)), 1)  # no common point
-    gains = np.log(equal_exposure(changed).gains)
+    gains = np.log(equalize_exposure(changed).gains)
     left, before = (tints(x[0] - x[1]) for x in (logs - gains, logs))
     assert np.linalg.norm(left) < np.linalg.norm(before) / 3
 

@@ -9,7 +9,7 @@ from changes import edit_json
 from humangs_jax.capture.fitting.refine import overlap
 from humangs_jax.capture.fitting.residuals.silhouettes import mask_boundary
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.body_and_masks import displacement, unusable_views
+from humangs_jax.data.body_and_masks import fit_vertex_offsets, views_without_person
 from humangs_jax.data.capture import CaptureError, load_capture, save_capture
 from humangs_jax.data.hidden import hidden_line, hidden_parts, with_hidden_parts
 from humangs_jax.data.prepared import prepare_capture
@@ -55,9 +55,9 @@ def test_an_image_of_what_is_unknown_is_checked(hidden, tmp_path):
 
 @pytest.mark.slow  # three displacements
 def test_a_body_is_not_carved_where_somebody_stands_in_front(hidden, demo):
-    whole = displacement(demo.body, demo)
-    carved = displacement(demo.body, dataclasses.replace(hidden, unknown=None))
-    kept = displacement(demo.body, hidden)
+    whole = fit_vertex_offsets(demo.body, demo)
+    carved = fit_vertex_offsets(demo.body, dataclasses.replace(hidden, unknown=None))
+    kept = fit_vertex_offsets(demo.body, hidden)
     off = lambda moves: float(np.linalg.norm(moves - whole, axis=1).mean())
     assert off(kept) < 0.25 * off(carved)
 
@@ -70,8 +70,8 @@ def test_a_view_is_judged_by_what_it_shows(hidden):
     masks = np.where(unknown, np.float32(0), hidden.masks)
     masks[0, :8, :8] = 1
     nearly = dataclasses.replace(hidden, unknown=unknown, masks=masks)
-    assert 0 in unusable_views(nearly)
-    assert not unusable_views(hidden)
+    assert 0 in views_without_person(nearly)
+    assert not views_without_person(hidden)
 
 
 def test_silhouettes_end_where_the_person_does(hidden):

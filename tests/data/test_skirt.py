@@ -21,8 +21,8 @@ from humangs_jax.data.skirt import (
     LEGS,
     ROWS,
     TOP,
+    add_skirt,
     find_hem,
-    with_skirt,
     with_tube,
 )
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -138,7 +138,7 @@ def test_a_skirt_is_found_and_lies_on_the_masks(body, monkeypatch):
     points, faces = cone(body, hem)
     capture = in_clothes(body, worn=(points, faces))
     assert abs(find_hem(body, capture) - hem) <= HEM
-    worn, moved = with_skirt(body, capture, np.zeros(body.template.shape))
+    worn, moved = add_skirt(body, capture, np.zeros(body.template.shape))
     count = len(body.template)
     assert not moved[:count].any() and np.isfinite(worn.spacing).all()
     own = np.asarray(worn.template)[count:] + moved[count:]

@@ -17,19 +17,23 @@ from humangs_jax.apps.settings import Settings
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import view_choice as module
-from humangs_jax.data.body_and_masks import _sampling, unusable_views, usable_views
+from humangs_jax.data.body_and_masks import (
+    _sampling,
+    drop_views_without_person,
+    views_without_person,
+)
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import (
     EXPECTED,
+    apply_gain,
     camera_gains,
-    equal_exposure,
+    equalize_exposure,
     exposures,
     gains_of,
-    multiplied,
 )
 from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.data.view_choice import greedy_cover, select_views
-from humangs_jax.data.views import standardize
+from humangs_jax.data.views import to_network_views
 from humangs_jax.refinement.photos import crop_to_person
 
 
@@ -73,7 +77,7 @@ def test_a_spoiled_mask_leaves_its_view_out_by_name(demo, spoiled, caplog):
     change, reason = SPOILED[spoiled]
     capture = with_mask(demo, 1, change(demo.masks[1]))
     with caplog.at_level(logging.WARNING):
-        left = usable_views(capture)
+        left = drop_views_without_person(capture)
     assert left.names == tuple(np.delete(demo.names, 1))
     (record,) = caplog.records
     assert (
@@ -89,12 +93,12 @@ def test_other_masks_are_kept(demo, mask):
         if mask is None
         else with_mask(demo, 1, KEPT[mask](demo.masks[1]))
     )
-    assert usable_views(capture) is capture
+    assert drop_views_without_person(capture) is capture
 
 
 def test_exact_masks_hold_the_body(demo, monkeypatch):
     monkeypatch.setattr("humangs_jax.data.body_and_masks.LEAST_SHARE", 0.95)
-    assert not unusable_views(demo)
+    assert not views_without_person(demo)
 
 
 def test_points_are_spread_by_the_area_of_the_skin():
@@ -109,7 +113,7 @@ def test_points_are_spread_by_the_area_of_the_skin():
 def test_a_body_that_is_out_of_the_frame_meets_no_mask(demo):
     poses = replace(demo.poses, translation=demo.poses.translation + jnp.asarray([50.0, 0, 0]))
     with pytest.raises(CaptureError, match=r"no view is left that shows the person: .*hardly meet"):
-        usable_views(dataclasses.replace(demo, poses=poses))
+        drop_views_without_person(dataclasses.replace(demo, poses=poses))
 
 
 def test_all_that_reads_photos_leaves_it_out(demo):
@@ -131,7 +135,7 @@ def test_all_that_reads_photos_leaves_it_out(demo):
 def test_no_view_left_is_an_error_that_names_them(demo):
     nobody = dataclasses.replace(demo, masks=0 * demo.masks)
     for read in (
-        usable_views,
+        drop_views_without_person,
         lambda c: select_views(c, 2),
         prepare_capture,
     ):
@@ -207,7 +211,9 @@ def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
         doubled, cameras=replace(doubled.cameras, cam_from_world=jnp.asarray(matrices))
     )
     body = decimate(capture.body, module.SELECTION_VERTICES)
-    quality = np.asarray(module.view_quality(body, standardize(capture, module.SELECTION_SIZE)))
+    quality = np.asarray(
+        module.view_quality(body, to_network_views(capture, module.SELECTION_SIZE))
+    )
     for far, near in ((0, 1), (2, 3)):
         both = (quality[far] > 0) & (quality[near] > 0)
         distance = matrices[near, 2, 3]
@@ -297,7 +303,7 @@ def test_outliers_do_not_count():
 
 
 def test_a_synthetic_capture_stays_as_it_is(demo):
-    equal = equal_exposure(demo)
+    equal = equalize_exposure(demo)
     assert equal.images is demo.images
     np.testing.assert_array_equal(equal.gains, 1)
 
@@ -305,7 +311,7 @@ def test_a_synthetic_capture_stays_as_it_is(demo):
 def exposed(capture, logs):
     """The capture as if each camera had metered for itself."""
     return dataclasses.replace(
-        capture, images=multiplied(capture.images, capture.masks, np.exp(-logs))
+        capture, images=apply_gain(capture.images, capture.masks, np.exp(-logs))
     )
 
 
@@ -318,11 +324,11 @@ def test_a_capture_in_different_exposures_is_made_equal(demo):
     left, before = (np.sqrt(np.mean(np.square(x))) for x in (np.log(gains) - logs, logs))
     assert left < 0.6 * before
     np.testing.assert_allclose(exposures(changed) * gains, 1, rtol=1e-12)
-    equal = equal_exposure(changed)
+    equal = equalize_exposure(changed)
     outside = demo.masks == 0
     np.testing.assert_array_equal(equal.images[outside], 1)
     # what a camera would have shown: the gains undone
-    back = multiplied(equal.images, equal.masks, 1 / gains)
+    back = apply_gain(equal.images, equal.masks, 1 / gains)
     unclipped = (equal.images < 1).all(-1) & (demo.masks > 0)
     np.testing.assert_allclose(back[unclipped], changed.images[unclipped], atol=1e-5)
 
@@ -334,18 +340,18 @@ def test_a_capture_in_different_exposures_is_made_equal(demo):
 @settings(max_examples=4)
 def test_gains_are_found_once_for_a_capture_whatever_its_exposures(demo, logs, views):
     """Equal photos, some of them, and smaller ones are never given gains again."""
-    equal = equal_exposure(exposed(demo, logs))
-    assert equal_exposure(equal) is equal
+    equal = equalize_exposure(exposed(demo, logs))
+    assert equalize_exposure(equal) is equal
     some = equal.select(views)
-    assert equal_exposure(some) is some
-    assert equal_exposure(some.resized(64)).gains is some.gains
+    assert equalize_exposure(some) is some
+    assert equalize_exposure(some.resized(64)).gains is some.gains
     np.testing.assert_array_equal(camera_gains(some), 1)
     np.testing.assert_array_equal(exposures(some), 1 / equal.gains[views])
 
 
 def test_without_masks_nothing_is_changed(demo):
     bare = dataclasses.replace(demo, masks=None)
-    assert equal_exposure(bare) is bare
+    assert equalize_exposure(bare) is bare
     np.testing.assert_array_equal(exposures(bare), 1)
     nobody = dataclasses.replace(demo, masks=np.zeros_like(demo.masks))
     np.testing.assert_array_equal(exposures(nobody), 1)

@@ -42,7 +42,7 @@ edges by a pixel.
 """
 NEARER = 0.85
 """Of the distance to the clothes before: what is left of it where the body moved by more than 5 mm.
-Up to 2.5 cm may be left everywhere (`Reach.inset`). Measured: 0.66 and 0.75."""
+Up to 2.5 cm may be left everywhere (`OffsetFitConfig.inset`). Measured: 0.66 and 0.75."""
 LIKE_RENDERED = 30
 """PSNR against `render_view` in the same light, dB; textures of 1 cm texels, other normals at
 folds. Measured 34 or more.

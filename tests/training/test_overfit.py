@@ -14,7 +14,7 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import Example
-from humangs_jax.data.views import gaussian_body, standardize
+from humangs_jax.data.views import gaussian_body, to_network_views
 from humangs_jax.network import presets
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.transformer import TransformerConfig
@@ -63,7 +63,7 @@ def configuration() -> TrainConfig:
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("people") / "person"
     write_person(folder, 0, load_body(), Layout(SIZE, views=4))
-    return jax.tree.map(jnp.asarray, standardize(load_capture(folder), SIZE))
+    return jax.tree.map(jnp.asarray, to_network_views(load_capture(folder), SIZE))
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from target_cases import DRIVEN, PIXELS, small
 from experiments.systems.surface_map import SurfaceMap
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import Example
-from humangs_jax.data.views import gaussian_body, standardize
+from humangs_jax.data.views import gaussian_body, to_network_views
 from humangs_jax.evaluation.cases import Case
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.network.weights import load_weights
@@ -63,7 +63,7 @@ def configuration(name: str) -> TrainConfig:
 def test_one_person_is_learnt_and_shown_by_the_evaluator(name, body, captures):
     config, capture = configuration(name), load_capture(captures[0], body=body)
     chosen = capture.select(range(VIEWS))
-    views = jax.tree.map(jnp.asarray, standardize(chosen, SIZE))
+    views = jax.tree.map(jnp.asarray, to_network_views(chosen, SIZE))
     mapped = gaussian_body(body, config.model)
     batch = jax.tree.map(lambda x: x[None], Example(views, views))
     state, errors = init_state(config), []
