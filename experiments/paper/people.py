@@ -26,7 +26,7 @@ from humangs_jax.synthetic.poses import sample_rotations
 from humangs_jax.synthetic.subject import Person, PosedSubject, describe, make_subject, seeds_of
 from humangs_jax.synthetic.surroundings import cameras_around, sample_lights, spread_azimuths
 from humangs_jax.synthetic.writer import HELD_OUT, View, capture_views, stand
-from humangs_jax.training.sources import MakeSource
+from humangs_jax.training.sources import SourceFactory
 
 SIZE, POSES = 32, 8
 """Pixels a side; poses that all people share."""
@@ -155,7 +155,7 @@ class Recolored(CaptureSource):
         return replace(example, inputs=change(example.inputs), targets=change(example.targets))
 
 
-def on_disk(folder: Path, one_pose: bool = False, recolored: bool = False) -> MakeSource:
+def on_disk(folder: Path, one_pose: bool = False, recolored: bool = False) -> SourceFactory:
     """The people of a folder as a run's source. one_pose: of the first pose alone."""
     body, kind, source = (
         load_body(),

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from experiments.systems.targets import GaussianDriver
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.configuration import Few, Layers, Spread, Width, part
+from humangs_jax.core.configuration import Count, Layers, Spread, Width, part
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.parts import HumanGSOutputs, Pass, Target, VertexFeatures
+from humangs_jax.network.parts import ForwardContext, HumanGSOutputs, Target, VertexFeatures
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -88,16 +88,18 @@ class CorrectionMLP(GaussianDriver):
     hidden: Width = 512
     layers: Layers = 3
     """Hidden ones."""
-    joints: Few = 55
+    joints: Count = 55
     """Of the body."""
     offset_scale: Spread = 0.05
     """Metres, bound of the offsets."""
-    gaussians_per_vertex: Few = 1
+    gaussians_per_vertex: Count = 1
     """K."""
 
     @nn.compact
-    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
-        """See `parts.Driver`.
+    def __call__(
+        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+    ) -> HumanGSOutputs:
+        """See `parts.TargetDecoder`.
 
         Raises: ValueError for other features or another K; see `pose_vector`.
         """

@@ -16,8 +16,8 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import Layers, Ratio, Width, part
 from humangs_jax.network.parts import (
     Encoding,
+    ForwardContext,
     HumanGSInputs,
-    Pass,
     Reader,
     VertexFeatures,
     subject_unit,
@@ -46,7 +46,9 @@ class CrossAttentionReader(Reader):
         check_heads("reader", self.width, self.head_width)
 
     @nn.compact
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+    def __call__(
+        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+    ) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for an encoder with an upsampler."""
         tokens, count = image_tokens(encoding, inputs)
         canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)

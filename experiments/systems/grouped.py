@@ -26,9 +26,9 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.network.parts import (
     Decoder,
     Encoding,
+    ForwardContext,
     HumanGSInputs,
     HumanGSOutputs,
-    Pass,
     Reader,
     subject_unit,
 )
@@ -61,7 +61,7 @@ class GroupReader(Reader):
 
     @nn.compact
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: Pass
+        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
     ) -> Float[Array, "a r d"]:
         """Tokens of the 5 attributes of r groups.
 
@@ -97,7 +97,7 @@ class GroupDecoder(Decoder):
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "a r d"], inputs: HumanGSInputs, run: Pass
+        self, features: Float[Array, "a r d"], inputs: HumanGSInputs, run: ForwardContext
     ) -> HumanGSOutputs:
         """A Gaussian a vertex. Raises ValueError for a body of more vertices than the groups
         have.

@@ -41,9 +41,9 @@ from humangs_jax.network.maps import Convolution
 from humangs_jax.network.parts import (
     Decoder,
     Encoding,
+    ForwardContext,
     HumanGSInputs,
     HumanGSOutputs,
-    Pass,
     Reader,
     Target,
 )
@@ -61,7 +61,7 @@ class NoReader(Reader):
     encoding.
     """
 
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Encoding:
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
         return encoding
 
 
@@ -76,7 +76,9 @@ class Photos(NamedTuple):
 class PhotoDecoder(Decoder):
     """No Gaussians: the photos, for a `QueryDriver`."""
 
-    def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+    ) -> HumanGSOutputs:
         return HumanGSOutputs(
             no_gaussians(), scene=Photos(encoder_pixels(inputs, run), inputs.view_count)
         )
@@ -125,7 +127,9 @@ class QueryDriver(PixelDriver):
             )
 
     @nn.compact
-    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> Float[Array, "i j 3"]:
+    def __call__(
+        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+    ) -> Float[Array, "i j 3"]:
         """The image of a target in [0, 1], on white; its sides are multiples of the patch size."""
         photos: Photos = outputs.scene
         patch, dtype, width = self.patch_size, run.runtime.compute_dtype, self.transformer.width

@@ -31,9 +31,9 @@ from humangs_jax.network.parts import (
     Decoder,
     Encoder,
     Encoding,
+    ForwardContext,
     HumanGSInputs,
     HumanGSOutputs,
-    Pass,
     Reader,
     subject_unit,
 )
@@ -66,7 +66,7 @@ class PlainPhotos(Encoder):
 
     patch_size: Patch = 1
 
-    def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
+    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
         return Encoding(inputs.images, None, jnp.zeros((), jnp.int32))
 
 
@@ -86,7 +86,9 @@ class ShellTextureReader(Reader):
                 f"reader.shells {self.shells}: expected ascending distances, the first 0"
             )
 
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> ShellTextures:
+    def __call__(
+        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+    ) -> ShellTextures:
         """Textures of the shells.
 
         Raises: ValueError if the inputs lack the map of the surface or posed normals.
@@ -182,7 +184,9 @@ class ShellDecoder(Decoder):
         check_scales("decoder.widths", self.widths)
 
     @nn.compact
-    def __call__(self, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, features: ShellTextures, inputs: HumanGSInputs, run: ForwardContext
+    ) -> HumanGSOutputs:
         """A Gaussian a texel of every shell; those that show no point of the body, or were not
         seen, are transparent.
 

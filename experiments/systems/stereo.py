@@ -25,7 +25,7 @@ from experiments.systems.pixel_queries import no_gaussians
 from experiments.systems.targets import drawn, reconstructed
 from experiments.systems.unet import UNet, check_scales
 from humangs_jax.core.array_types import Array, Bool, Float, PyTree
-from humangs_jax.core.configuration import Few, Spread, Width, part
+from humangs_jax.core.configuration import Count, Spread, Width, part
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
@@ -34,11 +34,11 @@ from humangs_jax.network.maps import sample_bilinear, texel_indices
 from humangs_jax.network.parts import (
     Decoder,
     Drawn,
-    Driver,
+    ForwardContext,
     HumanGSInputs,
     HumanGSOutputs,
-    Pass,
     Target,
+    TargetDecoder,
     subject_unit,
 )
 from humangs_jax.network.reader import project_vertices
@@ -77,7 +77,7 @@ class StereoDecoder(Decoder):
 
     widths: tuple[Width, ...] = (32, 48, 96)
     """Of both U-Nets; the first is the number of features that are compared."""
-    planes: Few = 64
+    planes: Count = 64
     """Distances."""
     margin: Spread = 0.15
     """Of the range of distances around the body, normalised units."""
@@ -88,7 +88,9 @@ class StereoDecoder(Decoder):
         check_scales("decoder.widths", self.widths)
 
     @nn.compact
-    def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+    ) -> HumanGSOutputs:
         """See `parts.Decoder`. A photo without another one is compared with itself."""
         images, cameras, vertices = inputs.images, inputs.cameras, inputs.posed_vertices
         size, grid, unit = (
@@ -168,12 +170,14 @@ class StereoDecoder(Decoder):
 
 
 @part
-class NearestPairDriver(Driver):
+class NearestPairDriver(TargetDecoder):
     """Draws the Gaussians of the two photos that are nearest to a target. Nothing is learned."""
 
     moves = False
 
-    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+    ) -> HumanGSOutputs:
         """The outputs: which photos are near, their cameras say."""
         return outputs
 
@@ -188,7 +192,10 @@ class NearestPairDriver(Driver):
     def show(
         self, variables, config, inputs, targets, background
     ) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
-        """See `parts.Driver`. The pose of a target changes nothing; their world has to be y-up."""
+        """See `parts.TargetDecoder`.
+
+        The pose of a target changes nothing; their world has to be y-up.
+        """
         scene = reconstructed(variables, config, inputs)[0].scene
         return drawn(
             (nearest_pair(scene, center) for center in targets.cameras.center),

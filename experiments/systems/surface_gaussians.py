@@ -34,7 +34,7 @@ from experiments.systems.targets import GaussianDriver
 from experiments.systems.unet import UNet, check_scales
 from humangs_jax.body.model import Texels
 from humangs_jax.core.array_types import Array, Float, PyTree
-from humangs_jax.core.configuration import Few, Spread, Weight, Width, part
+from humangs_jax.core.configuration import Count, Spread, Weight, Width, part
 from humangs_jax.core.numerics import safe_divide, safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
@@ -43,9 +43,9 @@ from humangs_jax.network.maps import sample_bilinear, texel_indices
 from humangs_jax.network.parts import (
     Decoder,
     Encoding,
+    ForwardContext,
     HumanGSInputs,
     HumanGSOutputs,
-    Pass,
     Reader,
     Target,
     subject_unit,
@@ -97,7 +97,9 @@ class TextureReader(Reader):
     sharpness: Weight = 5.0
     """Of the softmax over the cosines of visible views; larger: the best view."""
 
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> SurfaceTexture:
+    def __call__(
+        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+    ) -> SurfaceTexture:
         """The texture. Raises: ValueError if the inputs lack the map of the surface or posed
         normals.
         """
@@ -147,7 +149,9 @@ class SurfaceDecoder(Decoder):
 
     surface_map: SurfaceMap = SurfaceMap()
 
-    def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+    ) -> HumanGSOutputs:
         """See `parts.Decoder`.
 
         Raises: ValueError if the inputs lack the map, the normals or the weights of the body.
@@ -200,8 +204,8 @@ class TextureDriver(GaussianDriver):
     """Of the U-Net."""
     pose_width: Width = 1024
     """Of the MLP of the pose, as `pose_tokens`."""
-    pose_tokens: Few = 16
-    joints: Few = 55
+    pose_tokens: Count = 16
+    joints: Count = 55
     """Of the body."""
     offset_scale: Spread = 0.1
     """Metres, bound of the offsets."""
@@ -212,8 +216,10 @@ class TextureDriver(GaussianDriver):
         check_scales("driver.widths", self.widths)
 
     @nn.compact
-    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
-        """See `parts.Driver`.
+    def __call__(
+        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+    ) -> HumanGSOutputs:
+        """See `parts.TargetDecoder`.
 
         Raises: ValueError for a decoder without a texture; see `correction.pose_vector`.
         """
@@ -249,7 +255,9 @@ class PoseMapDriver(GaussianDriver):
         check_scales("driver.widths", self.widths)
 
     @nn.compact
-    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+    ) -> HumanGSOutputs:
         surface: Surface = outputs.scene
         upright = quaternion.matrix_from_axis_angle(target.pose.rotations[0])
         middle = jnp.mean(target.vertices, axis=0)

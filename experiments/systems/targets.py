@@ -31,14 +31,14 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import encoder_pixels
 from humangs_jax.network.humangs import apply_humangs, part_variables
-from humangs_jax.network.parts import Drawn, Driver, HumanGSOutputs, Target, Variables
+from humangs_jax.network.parts import Drawn, HumanGSOutputs, Target, TargetDecoder, Variables
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training.forward import draw_posed
 
 
-class GaussianDriver(Driver):
+class GaussianDriver(TargetDecoder):
     """Corrects the canonical Gaussians for every pose."""
 
     @nn.nowrap
@@ -73,7 +73,7 @@ class GaussianDriver(Driver):
     def show(
         self, variables, config, inputs, targets, background
     ) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
-        """See `parts.Driver`. Their world has to be y-up, unlike that of `reconstruct`."""
+        """See `parts.TargetDecoder`. Their world has to be y-up, unlike that of `reconstruct`."""
         outputs, body, views, config = reconstructed(variables, config, inputs)
         own = part_variables(variables, "driver")
         posed = (
@@ -82,7 +82,7 @@ class GaussianDriver(Driver):
         return drawn(posed, targets.cameras, background, config)
 
 
-class PixelDriver(Driver):
+class PixelDriver(TargetDecoder):
     """Makes the images of targets without Gaussians: on white, the background is not known to it,
     and there is no alpha.
 
@@ -125,7 +125,7 @@ class PixelDriver(Driver):
 
     @nn.nowrap
     def show(self, variables, config, inputs, targets, background) -> tuple[np.ndarray, None]:
-        """See `parts.Driver`. Raises: ValueError for another background than white."""
+        """See `parts.TargetDecoder`. Raises: ValueError for another background than white."""
         if background != 1:
             raise ValueError(
                 f"a network that draws pixels shows people on white; background {background:g} was"

@@ -21,12 +21,12 @@ import jax.numpy as jnp
 
 from experiments.systems.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.configuration import Few, Layers, Ratio, Vertices, Width, part
+from humangs_jax.core.configuration import Count, Layers, Ratio, Vertices, Width, part
 from humangs_jax.geometry.transform import along_curve
 from humangs_jax.network.parts import (
     Encoding,
+    ForwardContext,
     HumanGSInputs,
-    Pass,
     Reader,
     VertexFeatures,
     subject_unit,
@@ -52,7 +52,7 @@ class TwoStreamReader(Reader):
     head_width: Width = 64
     pooling: Vertices = 1
     """Vertices that share a point; 1: every vertex is one."""
-    most_views: Few | None = None
+    most_views: Count | None = None
     """More photos than this are refused, None: none are (LHM takes 1)."""
 
     def __post_init__(self):
@@ -61,7 +61,9 @@ class TwoStreamReader(Reader):
         check_heads("reader", self.width, self.head_width)
 
     @nn.compact
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+    def __call__(
+        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+    ) -> VertexFeatures:
         """Features of the n vertices.
 
         Raises ValueError for too many views, or an encoder with an upsampler.

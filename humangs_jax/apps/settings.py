@@ -21,7 +21,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import (
-    Few,
+    Count,
     Iterations,
     PhotoSide,
     Presets,
@@ -53,7 +53,7 @@ class Settings:
     screen.
     """
 
-    views: Few | None = knob(
+    views: Count | None = knob(
         None, cost="what the other photos show", gain="time in proportion", measured=MEASURED
     )
     """The most photos that are used, chosen by `select_views`; None for all."""

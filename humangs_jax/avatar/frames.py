@@ -123,7 +123,7 @@ def splatting_of(shot: Shot, avatar: Avatar) -> SplatConfig:
     return drawn_as(config, avatar.rendering)
 
 
-def image_of(
+def composite_over(
     rendering: Rendering, color: tuple[float, float, float] | None
 ) -> Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 4"]:
     """A rendering onto black as an image in [0, 1]: over a color, or with straight alpha for None,
@@ -265,7 +265,7 @@ def _paths(
 # --------------------------------------------------------------------------------------------------
 
 
-def excerpt(
+def trim_and_resample(
     motion: Motion,
     start: float = 0.0,
     stop: float | None = None,
@@ -396,7 +396,7 @@ def images(
     avatar: Avatar, poses: BodyPose, cameras: Camera, shot: Shot, progress: str | None = None
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """One image per pose and camera, drawn when asked for, (h, w, 3) or with alpha (h, w, 4), see
-    `image_of`.
+    `composite_over`.
 
     progress: what a progress bar says; None: no bar.
     """
@@ -409,7 +409,7 @@ def images(
         first=COMPILING,
         shown=progress is not None,
     )
-    return (image_of(rendering, shot.color()) for rendering in shown)
+    return (composite_over(rendering, shot.color()) for rendering in shown)
 
 
 @checked_arguments
@@ -516,7 +516,7 @@ def splat_images(
         render_in_bands(gaussians, camera, config, jnp.zeros(3)) for camera in cameras.values()
     )
     for rendering in bar(drawn, total=len(cameras), desc="render", unit="view", first=COMPILING):
-        yield image_of(rendering, shot.color())
+        yield composite_over(rendering, shot.color())
 
 
 def write_splat_views(

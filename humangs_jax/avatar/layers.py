@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar, surface_normals, turned_normals
-from humangs_jax.avatar.frames import draw, image_of, posed, splatting_of
+from humangs_jax.avatar.frames import composite_over, draw, posed, splatting_of
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
@@ -142,7 +142,9 @@ def write_views(
         for i, rendering in enumerate(
             bar(drawn, total=count, desc="render", unit="view", first=COMPILING, shown=progress)
         ):
-            write_png(folder / f"{names[i]}.png", image_of(rendering, shot.color()), mark=DRAWN)
+            write_png(
+                folder / f"{names[i]}.png", composite_over(rendering, shot.color()), mark=DRAWN
+            )
             if exr is not None:
                 views.append(
                     exr_view(names[i], avatar, poses[i], cameras[i], rendering, exr.layers, how)

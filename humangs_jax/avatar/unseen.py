@@ -27,7 +27,7 @@ from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD, shaped, skinned
 from humangs_jax.data.capture import Capture
-from humangs_jax.geometry.mesh import unit, vertex_areas, vertex_crosses
+from humangs_jax.geometry.mesh import unit, vertex_area_vectors, vertex_areas
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs, subject_unit
@@ -299,7 +299,7 @@ def unseen_sides(capture: Capture) -> list[str]:
     """
     body, rest = capture.body, shaped(capture.body, capture.betas)
     faces, weights = np.asarray(body.faces), np.asarray(body.skinning_weights)
-    normals, areas = unit(vertex_crosses(rest, faces)), vertex_areas(rest, faces)
+    normals, areas = unit(vertex_area_vectors(rest, faces)), vertex_areas(rest, faces)
     joints = np.asarray(body.joint_regressor, float) @ rest
 
     # A vertex is shown where it faces the camera and lies in the frame and in the mask.

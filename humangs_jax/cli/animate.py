@@ -110,7 +110,12 @@ class Animate:
             from humangs_jax.avatar.attach_face import with_face_for
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.avatar.camera_paths import camera_path, file_cameras, one_size
-            from humangs_jax.avatar.frames import excerpt, images, motion_poses, motion_views
+            from humangs_jax.avatar.frames import (
+                images,
+                motion_poses,
+                motion_views,
+                trim_and_resample,
+            )
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.io.reading import reading
 
@@ -122,7 +127,7 @@ class Animate:
             avatar = with_face_for(avatar, motion)
             # cut and repeat the motion before cameras are made for its frames
             with reading(self.motion or "the motion", "motion"):
-                motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
+                motion = trim_and_resample(motion, self.start, self.stop, self.fps, self.loop)
             frames = len(motion.translations)
             if self.camera is None:
                 # without a camera file the camera goes along, or circles

@@ -70,11 +70,11 @@ Ratio = Annotated[int, Range(1, 64)]
 Patch = Annotated[int, Range(1, 256)]
 """Side of a patch of a photo, pixels."""
 Layers = Annotated[int, Range(1, 256)]
-Few = Annotated[int, Range(1, 1024)]
+Count = Annotated[int, Range(1, 1024)]
 """Views, joints, heads, subjects: things of which there are some."""
-Slots = Annotated[int, Range(1, 1 << 31)]
+Capacity = Annotated[int, Range(1, 1 << 31)]
 """Of a buffer."""
-Room = Annotated[int, Range(0, 1 << 31)]
+CapacityOrAuto = Annotated[int, Range(0, 1 << 31)]
 """Slots, or 0 for as many as may be needed."""
 Chunk = Annotated[int, Range(1, 65_536)]
 """What is worked on at once."""

@@ -34,7 +34,7 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.masks import box_of, signed_distance
-from humangs_jax.geometry.mesh import face_areas, unit, vertex_areas, vertex_crosses
+from humangs_jax.geometry.mesh import face_areas, unit, vertex_area_vectors, vertex_areas
 from humangs_jax.io.images import resized
 
 logger = logging.getLogger(__name__)
@@ -333,7 +333,7 @@ def fit_vertex_offsets(
     if not always and _share_outside(views, rest, held < HELD / 2) < MISFIT:
         return total.astype(np.float32)
     total += to_edges(views, rest, faces, held, OffsetFitConfig(inset=inset))
-    moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
+    moved, normals = rest + total, unit(vertex_area_vectors(rest + total, faces))
     total -= _outside(views, moved, normals, faces, inset, held < HELD / 2)[:, None] * normals
     return total.astype(np.float32)
 
@@ -348,7 +348,7 @@ def to_edges(
     """
     total = np.zeros_like(rest)
     for _ in range(reach.iterations):
-        moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
+        moved, normals = rest + total, unit(vertex_area_vectors(rest + total, faces))
         count, summed = _targets(views, moved, normals, faces, reach)
         total += _spread(moved, faces, count, summed, held, reach)[:, None] * normals
     return total

@@ -29,7 +29,7 @@ def vertex_areas(
     return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), len(vertices))
 
 
-def vertex_crosses(
+def vertex_area_vectors(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """The sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of it.

@@ -12,7 +12,7 @@ import jax
 
 from humangs_jax.core.configuration import configuration
 from humangs_jax.network.encoder import PatchTransformer
-from humangs_jax.network.parts import Decoder, Driver, Encoder, Pass, Reader
+from humangs_jax.network.parts import Decoder, Encoder, ForwardContext, Reader, TargetDecoder
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.runtime import Conventions, Runtime, TokenSelection
 from humangs_jax.network.vertex_decoder import VertexDecoder
@@ -31,7 +31,7 @@ class Architecture:
     """Reads the features at the body's vertices."""
     decoder: Decoder = VertexDecoder()
     """Makes Gaussians of the features."""
-    driver: Driver | None = None
+    driver: TargetDecoder | None = None
     """Draws every target anew; None: skinning alone moves the Gaussians."""
 
     def __post_init__(self):
@@ -113,9 +113,9 @@ class HumanGSConfig:
         """The selection of tokens in force."""
         return self.run().tokens
 
-    def run(self, train: bool = False, axis_name: Any = None) -> Pass:
+    def run(self, train: bool = False, axis_name: Any = None) -> ForwardContext:
         """How one pass of this network runs."""
-        return Pass(self.conventions, self.runtime, train, axis_name)
+        return ForwardContext(self.conventions, self.runtime, train, axis_name)
 
     @property
     def image_size(self) -> int:

@@ -21,7 +21,14 @@ from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.configuration import Patch, Side, Width, configuration, knob, part
 from humangs_jax.geometry.camera import plucker_rays
 from humangs_jax.network.maps import sample_bilinear
-from humangs_jax.network.parts import Encoder, Encoding, HumanGSInputs, Packing, Pass, subject_unit
+from humangs_jax.network.parts import (
+    Encoder,
+    Encoding,
+    ForwardContext,
+    HumanGSInputs,
+    Packing,
+    subject_unit,
+)
 from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.network.upsampler import Upsampler, UpsamplerConfig
 
@@ -140,7 +147,7 @@ class PatchTransformer(Encoder):
             raise ValueError(f"layers must be even and at least 4, to have quarters; got {layers}")
 
     @nn.compact
-    def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
+    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
         """See `parts.Encoder`.
 
         Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
@@ -200,7 +207,7 @@ class PatchTransformer(Encoder):
         return Encoding(upsampled, global_token, dropped, packing, self.patch_size)
 
 
-def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
+def encoder_pixels(inputs: HumanGSInputs, run: ForwardContext) -> Float[Array, "v h w 12"]:
     """What the encoder sees of every pixel: rgb, ray (moment, direction), canonical position.
 
     Raises ValueError if images and cameras differ in size.
@@ -219,7 +226,7 @@ def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]
     return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
 
 
-def photo_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
+def photo_pixels(inputs: HumanGSInputs, run: ForwardContext) -> Float[Array, "v h w 12"]:
     """What an encoder without cameras and poses sees of every pixel: rgb, then its place (x, y) in
     [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
     """

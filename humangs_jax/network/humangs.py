@@ -26,10 +26,10 @@ from humangs_jax.network.parts import (
     Decoder,
     Encoder,
     Encoding,
+    ForwardContext,
     HumanGSInputs,
     HumanGSOutputs,
     Parameters,
-    Pass,
     Reader,
     Target,
     Variables,
@@ -52,7 +52,7 @@ class HumanGS(nn.Module):
     keeps_features: bool = False
     """Whether a driver works from the features."""
 
-    def __call__(self, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> HumanGSOutputs:
         """The pass."""
         encoding = self.encoder(inputs, run)
         features = self.reader(encoding, inputs, run)

@@ -8,8 +8,8 @@ passes between them.
 A part is a Linen module: its fields are its configuration, which weights files record by the name
 of the class. It gets what the part before it has made, the inputs, and how this pass runs; it knows
 no other part. A new part is a new file with a class that derives from `Encoder`, `Reader`,
-`Decoder` or `Driver` and has the decorator `core.configuration.part`, and one line of a preset that
-names it: see `experiments/systems`.
+`Decoder` or `TargetDecoder` and has the decorator `core.configuration.part`, and one line of a
+preset that names it: see `experiments/systems`.
 
 A part that works on a map of the body's surface has it in a field `surface_map`: its `shape`, and
 `texels(body)`, which `data.views.gaussian_body` asks for; the inputs carry them. A driver for
@@ -98,7 +98,7 @@ def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
     return (jnp.max(y) - jnp.min(y)) / TARGET_HEIGHT
 
 
-class Pass(NamedTuple):
+class ForwardContext(NamedTuple):
     """How one pass of the network runs: all that a part knows besides its fields. See
     `HumanGSConfig.run`.
     """
@@ -252,7 +252,7 @@ class Encoder(Part, nn.Module):
     patch_size: Patch = 1
     """The side of photos is a multiple of it, pixels."""
 
-    def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
+    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
         """The encoding."""
         raise NotImplementedError
 
@@ -260,7 +260,7 @@ class Encoder(Part, nn.Module):
 class Reader(Part, nn.Module):
     """`Encoding` -> features of the body, in whatever form the decoder takes."""
 
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> PyTree:
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext) -> PyTree:
         """Features."""
         raise NotImplementedError
 
@@ -268,12 +268,14 @@ class Reader(Part, nn.Module):
 class Decoder(Part, nn.Module):
     """Features of the body -> canonical Gaussians."""
 
-    def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(
+        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+    ) -> HumanGSOutputs:
         """Gaussians; `dropped_tokens` is set by the pass."""
         raise NotImplementedError
 
 
-class Driver(Part, nn.Module):
+class TargetDecoder(Part, nn.Module):
     """A part that runs again for every target and draws it; without one, canonical Gaussians move
     by skinning alone.
     """
@@ -281,7 +283,7 @@ class Driver(Part, nn.Module):
     has_alpha = True
     """Whether its images can be put on any background; else they are on white."""
 
-    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> PyTree:
+    def __call__(self, outputs: HumanGSOutputs, target: Target, run: ForwardContext) -> PyTree:
         """The outputs corrected for a target, or its image."""
         raise NotImplementedError
 
@@ -316,8 +318,8 @@ class Driver(Part, nn.Module):
         raise NotImplementedError
 
 
-class Watched(nn.Module):
-    """What `stage` calls."""
+class Tap(nn.Module):
+    """What `tap` calls."""
 
     apart: bool = False
     """Whether each entry of the dict that the function returns is a stage by itself."""
@@ -327,10 +329,10 @@ class Watched(nn.Module):
         return function(*learned)
 
 
-def stage(name: str, function: Callable[..., T], *learned: Any, apart: bool = False) -> T:
+def tap(name: str, function: Callable[..., T], *learned: Any, apart: bool = False) -> T:
     """function(*learned), a step beside the network: Linen's interceptors see it as they see the
     network's modules.
 
     learned: the arguments that depend on parameters.
     """
-    return Watched(apart, parent=None, name=name)(function, *learned)
+    return Tap(apart, parent=None, name=name)(function, *learned)

@@ -31,8 +31,8 @@ from humangs_jax.network.maps import (
 )
 from humangs_jax.network.parts import (
     Encoding,
+    ForwardContext,
     HumanGSInputs,
-    Pass,
     Reader,
     Shells,
     VertexFeatures,
@@ -83,7 +83,9 @@ class PixelAlignedReader(Reader):
             )
 
     @nn.compact
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+    def __call__(
+        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+    ) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
         grid = run.conventions.pixel_grid
         unit = subject_unit(inputs.canonical_vertices)

@@ -7,10 +7,10 @@ from typing import Any, Literal
 import jax.numpy as jnp
 
 from humangs_jax.core.configuration import (
+    CapacityOrAuto,
     Edge,
     InputSide,
     Length,
-    Room,
     Vertices,
     configuration,
     knob,
@@ -43,7 +43,7 @@ class Runtime:
     """Patches that become tokens: "all", those that the "foreground" touches, or None: as the
     weights were trained.
     """
-    token_capacity: Room = knob(
+    token_capacity: CapacityOrAuto = knob(
         0,
         cost="tokens beyond it are dropped and counted",
         gain="time and memory",

@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.configuration import Bias, Few, Range, Spread, Width, knob, part
+from humangs_jax.core.configuration import Bias, Count, Range, Spread, Width, knob, part
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.parts import (
     Decoder,
+    ForwardContext,
     HumanGSInputs,
     HumanGSOutputs,
-    Pass,
     VertexFeatures,
     subject_unit,
 )
@@ -73,7 +73,7 @@ class VertexDecoder(Decoder):
         measured="evaluation.md",
     )
     """Gaussians per vertex without such a loss."""
-    skinning_joints: Few | None = None
+    skinning_joints: Count | None = None
     """Joints of the head that corrects skinning weights, None without it."""
     offset_scale: Spread | None = None
     """Offsets are bounded to it by tanh (normalised units; what shells add is not), None leaves
@@ -100,7 +100,7 @@ class VertexDecoder(Decoder):
 
     @nn.compact
     def __call__(
-        self, features: VertexFeatures, inputs: HumanGSInputs, run: Pass
+        self, features: VertexFeatures, inputs: HumanGSInputs, run: ForwardContext
     ) -> HumanGSOutputs:
         """Gaussians of the n vertices, vertex-major, metres.
 

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Annotated, Literal
 
 from humangs_jax.core.configuration import (
-    Few,
+    Count,
     Iterations,
     PhotoSide,
     Range,
@@ -110,7 +110,7 @@ class RefineConfig:
     many or more, any share above 0 holds one whole photo out of a trial, a third of the steps,
     which decides by its PSNR whether the iterations and how many of the steps are kept; then all
     photos are fitted. 0: nothing is held out, and the last state is returned."""
-    checks: Few = 5
+    checks: Count = 5
     """How often the PSNR is measured."""
     seed: Seed = 0
     """The seed of the order of the photos and of the blocks."""

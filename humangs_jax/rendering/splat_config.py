@@ -14,11 +14,11 @@ from typing import Annotated
 import jax
 
 from humangs_jax.core.configuration import (
+    Capacity,
     Chunk,
     Presets,
     Range,
     Share,
-    Slots,
     Spread,
     configuration,
     knob,
@@ -125,7 +125,7 @@ class SplatConfig:
     """Whether `Rendering.depth_median` is computed."""
     distortion: bool = False
     """Whether `Rendering.distortion`, the loss of 2DGS for each pixel, is computed."""
-    max_pairs: Slots | None = knob(
+    max_pairs: Capacity | None = knob(
         None,
         cost="pairs beyond it are not drawn, counted and reported",
         gain="memory, one compilation",
@@ -135,7 +135,7 @@ class SplatConfig:
     jit, grad or vmap) cannot, and takes `buffers.default_pairs(g, width, height)`; what does not
     fit is counted in `Rendering.overflow`, and `plan_buffers` measures a capacity for such calls.
     """
-    max_rows: Slots | None = knob(
+    max_rows: Capacity | None = knob(
         None, cost="as max_pairs", gain="a little time", measured=MEASURED
     )
     """Room for (splat, row of tiles) pairs. None: as many as pairs, always enough in practice."""

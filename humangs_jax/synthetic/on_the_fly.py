@@ -23,7 +23,7 @@ from jax import lax
 
 from humangs_jax.body.model import joint_transforms
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
-from humangs_jax.core.configuration import Few, Share, Side, Slots, Spread, configuration, knob
+from humangs_jax.core.configuration import Capacity, Count, Share, Side, Spread, configuration, knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -67,12 +67,12 @@ DARKEST_ALBEDO = 0.01
 class OnTheFlyConfig:
     """What an example shows."""
 
-    input_views: Few = 4
+    input_views: Count = 4
     """How many views the network reads."""
-    view_counts: tuple[Few, ...] = ()
+    view_counts: tuple[Count, ...] = ()
     """If given, how many of the `input_views` an example has, one of these at random. The last one
     is repeated after them, so that one program serves all numbers (`SubjectViews.view_count`)."""
-    target_views: Few = 3
+    target_views: Count = 3
     """How many views the rendering is compared with."""
     input_size: Side = 256
     """Side of the inputs, pixels."""
@@ -94,11 +94,11 @@ class OnTheFlyConfig:
     """
     depths: bool = False
     """Whether every view has its depths, too."""
-    views_at_once: Few = knob(
+    views_at_once: Count = knob(
         1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
     )
     """Views drawn side by side: 1 suits CPUs, all of them accelerators."""
-    pixels_per_step: Slots = knob(
+    pixels_per_step: Capacity = knob(
         1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
     )
     """Pixels of the person that are colored at a time: few for CPUs, whole images for

@@ -13,12 +13,12 @@ from humangs_jax.synthetic.bank import PeopleBank, build_bank, load_bank, save_b
 from humangs_jax.synthetic.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
 from humangs_jax.synthetic.subject import SPLITS, seeds_of
 from humangs_jax.training.config import TrainConfig
-from humangs_jax.training.sources import MakeSource
+from humangs_jax.training.sources import SourceFactory
 
 logger = logging.getLogger(__name__)
 
 
-def people_of_run(people: int, out: Path, body: BodyModel) -> MakeSource:
+def people_of_run(people: int, out: Path, body: BodyModel) -> SourceFactory:
     """People of the training seeds, rendered for every step; their bank is kept in the run's
     folder.
     """
@@ -27,7 +27,7 @@ def people_of_run(people: int, out: Path, body: BodyModel) -> MakeSource:
 
 def people_of_split(
     people: int, body: BodyModel, split: str, size: int, each_once: bool = False
-) -> MakeSource:
+) -> SourceFactory:
     """The first people of a split, rendered for every step.
 
     Arguments: size: of the images, pixels: textures are as fine as these need. each_once: see
@@ -44,7 +44,7 @@ def people_of_split(
 
 def on_the_fly_people(
     bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False
-) -> MakeSource:
+) -> SourceFactory:
     """People of a bank, rendered for every step on the device that trains; sizes and views are
     those of the run.
 

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float, Int
-from humangs_jax.geometry.mesh import vertex_crosses
+from humangs_jax.geometry.mesh import vertex_area_vectors
 from humangs_jax.rendering.mesh.atlas import Faces, Points, edges_of, unit
 
 
@@ -183,7 +183,7 @@ def rigid(vertices: Points, faces: Faces, joint: int, joints: int) -> Surface:
 
 def vertex_normals(vertices: Points, faces: Faces) -> Points:
     """(n, 3) area-weighted unit normals."""
-    return unit(vertex_crosses(vertices, faces).astype(np.float32))
+    return unit(vertex_area_vectors(vertices, faces).astype(np.float32))
 
 
 def scatter_add(

@@ -32,7 +32,7 @@ from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.training.config import TrainConfig, fitting_losses, missing_networks, read_config
 from humangs_jax.training.forward import METRICS, as_validated, compared_as
 from humangs_jax.training.loop import VALIDATED, train
-from humangs_jax.training.sources import SYNTHETIC, MakeSource, captured_people
+from humangs_jax.training.sources import SYNTHETIC, SourceFactory, captured_people
 from humangs_jax.training.state import init_state
 
 BASE = "base"
@@ -43,7 +43,7 @@ MARGIN = 0.1
 LONGEST_NAME = 100
 """Characters of a variant's name in the name of a folder; file systems allow 255 bytes."""
 UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
-People = int | Sequence[str | Path] | MakeSource
+People = int | Sequence[str | Path] | SourceFactory
 
 
 class AblationRow(NamedTuple):
@@ -286,7 +286,7 @@ def _checked_variants(
 
 
 def _check_people(
-    runs: Mapping[str, TrainConfig], people: Sequence[str | Path] | MakeSource, body: BodyModel
+    runs: Mapping[str, TrainConfig], people: Sequence[str | Path] | SourceFactory, body: BodyModel
 ) -> None:
     """Checks that each run, in all of its stages, can use the people on disk that the base can.
 
@@ -307,7 +307,7 @@ def _check_people(
             raise ArgumentError("variants", problem)
 
 
-def _unusable(make: MakeSource, config: TrainConfig) -> dict[str, str]:
+def _unusable(make: SourceFactory, config: TrainConfig) -> dict[str, str]:
     """Those people on disk that one of the stages of a run cannot use, and why."""
     problems: dict[str, str] = {}
     for first, _ in config.spans(0, config.steps):
@@ -344,7 +344,7 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
     return folders
 
 
-def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[MakeSource, int]:
+def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[SourceFactory, int]:
     """Gives the people that all runs are compared on, and how many of them are looked at."""
     found, count = _source(validation, body, base, "validation", each_once=True), VALIDATED
     if isinstance(validation, int):
@@ -397,7 +397,7 @@ def _as_budget(seconds: float) -> str:
 
 def _source(
     people: People, body: BodyModel, config: TrainConfig, split: str, each_once: bool = False
-) -> Sequence[str | Path] | MakeSource:
+) -> Sequence[str | Path] | SourceFactory:
     if not isinstance(people, int):
         return people
     drawn = imported(f"{SYNTHETIC}.sources:people_of_split")

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from humangs_jax.core.configuration import (
-    Few,
+    CapacityOrAuto,
+    Count,
     InputSide,
     Presets,
     Range,
-    Room,
     Seed,
     Share,
     Side,
@@ -33,7 +33,7 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.training.augmentation import Augmentation
 
 logger = logging.getLogger(__name__)
-Below = Annotated[float, Range(0, 0.999_999)]
+Decay = Annotated[float, Range(0, 0.999_999)]
 """A decay of a running mean; at 1 it would never forget."""
 HOST_SETTINGS = {
     "seed": 0,
@@ -59,7 +59,7 @@ class OptimizerConfig:
     """
     warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
     """Steps over which the learning rate rises from 0 to its peak."""
-    betas: tuple[Below, Below] = (0.9, 0.95)
+    betas: tuple[Decay, Decay] = (0.9, 0.95)
     """The decays of the running means of gradients and of their squares."""
     weight_decay: Spread = 0.05
     """The decay of parameters with two or more axes (products, textures, the class token)."""
@@ -70,7 +70,7 @@ class OptimizerConfig:
 
 
 @configuration
-class Stage:
+class Phase:
     """What changes at step `start` of a run and holds until the next stage; None: as the run's own
     configuration says.
     """
@@ -79,11 +79,11 @@ class Stage:
     """The step at which the stage begins."""
     image_size: InputSide | None = None
     """Side of the input photos, pixels."""
-    token_capacity: Room | None = None
+    token_capacity: CapacityOrAuto | None = None
     """Tokens that the network has room for."""
     target_size: Side | None = None
     """Side of the targets, pixels."""
-    batch_size: Few | None = None
+    batch_size: Count | None = None
     """Subjects per step."""
 
 
@@ -119,9 +119,9 @@ class TrainConfig:
     """Side of the targets, pixels."""
     steps: Steps = 20_000
     """Steps of the whole run, which the learning rate ends with."""
-    batch_size: Few = 1
+    batch_size: Count = 1
     """Subjects per step."""
-    microbatch_size: Few = knob(
+    microbatch_size: Count = knob(
         1,
         cost="memory in proportion",
         gain="fewer, larger steps on accelerators",
@@ -130,7 +130,7 @@ class TrainConfig:
     """How many subjects of a device it works on at once, gradients accumulating over the rest: 1
     needs least memory and suits CPUs. The upsampler's batch statistics are of the subjects that all
     devices work on at once."""
-    stages: tuple[Stage, ...] = ()
+    stages: tuple[Phase, ...] = ()
     """The stages in the order of their starts, for instance larger photos for the last steps.
 
     Before the first one the fields here hold.
@@ -254,7 +254,7 @@ def paper() -> TrainConfig:
         loss=dataclasses.replace(published().loss, lpips=0.0),
         target_size=256,
         steps=70_000,
-        stages=(Stage(start=60_000, image_size=512, target_size=512, batch_size=4),),
+        stages=(Phase(start=60_000, image_size=512, target_size=512, batch_size=4),),
     )
 
 

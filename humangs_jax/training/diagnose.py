@@ -1,7 +1,7 @@
 """Finds the stage of a training step in which numbers stopped being finite.
 
 Stages are the modules of the network, by their path, and the steps beside it that are a
-`parts.stage`. An interceptor of Linen keeps what they return, and adds zeros to what they take and
+`parts.tap`. An interceptor of Linen keeps what they return, and adds zeros to what they take and
 return: the gradients with respect to these zeros are those that pass back there.
 
 For one process and device. It needs the memory of a step that recomputes nothing; JAX_PLATFORMS=cpu
@@ -28,10 +28,10 @@ from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.reading import parse_json, read_text, reading
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
-from humangs_jax.network.parts import HumanGSInputs, Variables, Watched
+from humangs_jax.network.parts import HumanGSInputs, Tap, Variables
 from humangs_jax.training.checkpoint import Checkpoints, load_config
 from humangs_jax.training.config import TrainConfig
-from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
+from humangs_jax.training.sources import SourceFactory, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import seed_numbers, subject_keys, subject_loss, train_step
 
@@ -290,7 +290,7 @@ class Recorder:
         self, run: Callable, arguments: tuple, named: dict, context: nn.module.InterceptorContext
     ) -> Any:
         module, (first, *others) = context.module, arguments
-        if isinstance(module, Watched):
+        if isinstance(module, Tap):
             if not module.apart:
                 return self.watch(str(module.name), *arguments)
 
@@ -413,7 +413,7 @@ def diagnose_step(
 def diagnose_run(
     out: str | Path,
     body: BodyModel,
-    training: Sequence[str | Path] | MakeSource,
+    training: Sequence[str | Path] | SourceFactory,
     *,
     networks: LossNetworks = NO_NETWORKS,
     variables: Variables | None = None,

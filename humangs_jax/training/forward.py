@@ -31,11 +31,11 @@ from humangs_jax.losses.losses import (
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, part_variables
-from humangs_jax.network.parts import Drawn, HumanGSOutputs, Parameters, Variables, stage
+from humangs_jax.network.parts import Drawn, HumanGSOutputs, Parameters, Variables, tap
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import render
 from humangs_jax.training.config import TrainConfig, compiled_for
-from humangs_jax.training.sources import MakeSource
+from humangs_jax.training.sources import SourceFactory
 
 RASTERIZED = ("posed_vertices", "canonical_vertices", "position_maps", "depth_maps")
 """What `prepare_inputs` computes, rather than copies."""
@@ -52,9 +52,7 @@ def reconstruct_example(
     """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
     model = token_share(config, len(inputs.images))
     prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, model))
-    computed = stage(
-        "position maps", lambda: {name: getattr(prepared, name) for name in RASTERIZED}
-    )
+    computed = tap("position maps", lambda: {name: getattr(prepared, name) for name in RASTERIZED})
     return apply_humangs(variables, replace(prepared, **computed), model, train, axis_name)
 
 
@@ -91,7 +89,7 @@ def draw_targets(
     if driver is not None:
         own = part_variables(variables, "driver")
         given = body, inputs, targets, backgrounds, config
-        return stage("driver", lambda outputs: driver.draw(own, outputs, *given), outputs)
+        return tap("driver", lambda outputs: driver.draw(own, outputs, *given), outputs)
 
     def pose(outputs):
         avatar = completed_avatar(outputs, body, inputs, config.model)
@@ -99,7 +97,7 @@ def draw_targets(
             lambda pose: skin(avatar, BodyPose(*pose)), (targets.rotations, targets.translations)
         )
 
-    posed = stage("posed Gaussians", pose, outputs)
+    posed = tap("posed Gaussians", pose, outputs)
     drawn = draw_posed(posed, targets, backgrounds, config)
     return drawn._replace(
         opacities=outputs.gaussians.opacities, tight_offsets=outputs.tight_offsets
@@ -116,7 +114,7 @@ def draw_posed(
         one = lambda target: render(target[0], target[1], splat, target[2])
         return Drawn(jax.lax.map(one, (posed, targets.cameras, backgrounds)))
 
-    return stage("images", draw, posed)
+    return tap("images", draw, posed)
 
 
 def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
@@ -144,7 +142,9 @@ def predict(
 METRICS = ("psnr", "psnr_fg", "ssim", "semi_transparent", "dropped_tokens", "overflow")
 
 
-def validation_examples(make_source: MakeSource, config: TrainConfig, count: int) -> list[Example]:
+def validation_examples(
+    make_source: SourceFactory, config: TrainConfig, count: int
+) -> list[Example]:
     """This process's examples of the first `count` subjects, see `as_validated`."""
     source = make_source(as_validated(config))
     own = range(jax.process_index(), min(count, len(source)), jax.process_count())
@@ -171,7 +171,7 @@ def as_validated(config: TrainConfig) -> TrainConfig:
     )
 
 
-def compared_as(base: TrainConfig, make_source: MakeSource) -> MakeSource:
+def compared_as(base: TrainConfig, make_source: SourceFactory) -> SourceFactory:
     """The people with the photos and targets that a run is validated on, for variants of it: only
     the size of the photos, which a network is made for, is the variant's.
     """

@@ -47,7 +47,7 @@ from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import sheet, validate, validation_examples
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
-from humangs_jax.training.sources import MakeSource, bad_samples, captured_people, stage_loader
+from humangs_jax.training.sources import SourceFactory, bad_samples, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import seed_numbers, train_step, update
 
@@ -287,10 +287,10 @@ class TrainingInterrupted(KeyboardInterrupt):
 def train(
     config: TrainConfig,
     body: BodyModel,
-    training: Sequence[str | Path] | MakeSource,
+    training: Sequence[str | Path] | SourceFactory,
     out: str | Path,
     *,
-    validation: Sequence[str | Path] | MakeSource = (),
+    validation: Sequence[str | Path] | SourceFactory = (),
     validated: int = VALIDATED,
     variables: Variables | None = None,
     networks: LossNetworks = NO_NETWORKS,
@@ -448,7 +448,7 @@ def train(
 
 
 def _rehearse(
-    make_source: MakeSource,
+    make_source: SourceFactory,
     config: TrainConfig,
     step: int,
     state: TrainState,

@@ -36,12 +36,12 @@ logger = logging.getLogger(__name__)
 
 SYNTHETIC = "humangs_jax.synthetic"
 """The wing of synthetic people, which a run without them does not import."""
-MakeSource = Callable[[TrainConfig], Source]
+SourceFactory = Callable[[TrainConfig], Source]
 """Configuration of a stage -> examples of its sizes."""
 
 
 def stage_loader(
-    make_source: MakeSource, config: TrainConfig, step: int, mesh: Mesh | None = None
+    make_source: SourceFactory, config: TrainConfig, step: int, mesh: Mesh | None = None
 ) -> Loader:
     """Batches from a step on, until the end of the stage that holds there."""
     part = config.at(step)
@@ -85,14 +85,14 @@ def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list
 
 def captured_people(
     folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY
-) -> MakeSource:
+) -> SourceFactory:
     """Capture folders whose parameters belong to `body`; images that are decoded once serve all
     stages.
     """
     return cached_people(CaptureCache(folders, body, body_file=body_file))
 
 
-def cached_people(cache: PeopleCache) -> MakeSource:
+def cached_people(cache: PeopleCache) -> SourceFactory:
     """People on disk; images that are decoded once serve all stages. Their depths are unknown."""
 
     def make(config: TrainConfig) -> Source:
@@ -109,12 +109,12 @@ def cached_people(cache: PeopleCache) -> MakeSource:
     return make
 
 
-def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) -> MakeSource:
+def mixed_people(parts: Sequence[SourceFactory], weights: Sequence[float | int]) -> SourceFactory:
     """Several of these, each with its share of the examples, see `examples.Mixture`."""
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
 
 
-def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> MakeSource:
+def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> SourceFactory:
     """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md),
     whose body is `body`.
 
@@ -135,7 +135,7 @@ def training_people(
     out: Path,
     body: BodyModel,
     body_file: str | Path = DEFAULT_BODY,
-) -> MakeSource:
+) -> SourceFactory:
     """The people of `people_on_disk`, `on_the_fly` synthetic people rendered for every step, or
     both by halves.
 

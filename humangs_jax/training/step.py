@@ -19,7 +19,7 @@ from humangs_jax.core.pytree import inexact_leaves, replace
 from humangs_jax.data.loading import Example
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.losses.losses import loss_terms, psnr
-from humangs_jax.network.parts import stage
+from humangs_jax.network.parts import tap
 from humangs_jax.training import sharding
 from humangs_jax.training.augmentation import augment
 from humangs_jax.training.config import TrainConfig, compiled_for
@@ -104,7 +104,7 @@ def subject_loss(
         return loss_terms(drawn, images, targets.masks, targets.depths, config.loss, networks)
 
     # the terms of the loss, and what the log shows
-    terms = stage("loss", compare, drawn, apart=True)
+    terms = tap("loss", compare, drawn, apart=True)
     metrics = {
         **terms,
         "psnr": jnp.mean(jax.vmap(psnr)(drawn.rendering.rgb, images)),

@@ -215,18 +215,18 @@ def walk(count=24, fps=24.0):
 
 def test_an_excerpt_is_a_part_of_the_motion():
     motion = walk()
-    part = frames.excerpt(motion, 0.25, 0.75)
+    part = frames.trim_and_resample(motion, 0.25, 0.75)
     np.testing.assert_array_equal(part.translations, motion.translations[6:18])
     np.testing.assert_array_equal(part.rotations, motion.rotations[6:18])
-    assert frames.excerpt(motion).translations.shape == (24, 3)
-    faster = frames.excerpt(motion, 0.0, 0.5, fps=48.0)
+    assert frames.trim_and_resample(motion).translations.shape == (24, 3)
+    faster = frames.trim_and_resample(motion, 0.0, 0.5, fps=48.0)
     assert faster.fps == 48 and len(faster.translations) == 24
-    assert len(frames.excerpt(motion, 0.99).translations) == 1
+    assert len(frames.trim_and_resample(motion, 0.99).translations) == 1
 
 
 def test_a_loop_goes_on_where_it_was():
     motion = walk()
-    twice = frames.excerpt(motion, loop=3)
+    twice = frames.trim_and_resample(motion, loop=3)
     path = np.asarray(twice.translations)
     np.testing.assert_allclose(
         np.diff(path[:, 2]), 0.05, atol=1e-5
@@ -240,9 +240,9 @@ def test_a_loop_goes_on_where_it_was():
 )
 def test_times_outside_of_the_motion_are_named(times):
     with pytest.raises(ValueError, match=r"start .*stop .*expected 0 <= start < stop <= 1,"):
-        frames.excerpt(walk(), *times)
+        frames.trim_and_resample(walk(), *times)
     with pytest.raises(ValueError, match="loop 0"):
-        frames.excerpt(walk(), loop=0)
+        frames.trim_and_resample(walk(), loop=0)
 
 
 def test_what_is_behind_the_person():
@@ -256,7 +256,7 @@ def test_what_is_behind_the_person():
         jnp.asarray(own * alpha[..., None]), jnp.asarray(alpha), jnp.zeros((3, 4)), jnp.int32(0)
     )
     color = (0.1, 0.5, 0.9)
-    opaque, clear = frames.image_of(rendering, color), frames.image_of(rendering, None)
+    opaque, clear = frames.composite_over(rendering, color), frames.composite_over(rendering, None)
     np.testing.assert_allclose(
         opaque, own * alpha[..., None] + (1 - alpha[..., None]) * color, atol=ROUNDING
     )

@@ -28,7 +28,7 @@ from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
 from humangs_jax.apps.start import look
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export.gaussians import load_gaussians, save_gaussians
-from humangs_jax.avatar.frames import FOLLOWING, excerpt, smoothed_path
+from humangs_jax.avatar.frames import FOLLOWING, smoothed_path, trim_and_resample
 from humangs_jax.body.library import load_body, load_hands, load_smplx, save_body
 from humangs_jax.capture.calibration.importing import import_cameras
 from humangs_jax.capture.calibration.loaded import load_cameras
@@ -159,7 +159,7 @@ def continue_synthetic_set(path):
 def film(path):
     """The frames of a video of a motion, and the path of its camera."""
     with reading(path, "motion"):
-        motion = excerpt(load_motion(path), fps=30.0)
+        motion = trim_and_resample(load_motion(path), fps=30.0)
         return smoothed_path(np.asarray(motion.translations), FOLLOWING * motion.fps)
 
 

@@ -32,8 +32,8 @@ from humangs_jax.network.parts import (
     Decoder,
     Encoder,
     Encoding,
+    ForwardContext,
     HumanGSInputs,
-    Pass,
     Reader,
     VertexFeatures,
 )
@@ -48,7 +48,9 @@ class LookingReader(Reader):
     width: Width = 8
 
     @nn.compact
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+    def __call__(
+        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+    ) -> VertexFeatures:
         tokens = encoding.maps.reshape(-1, encoding.maps.shape[-1])
         dense = lambda name: nn.Dense(self.width, use_bias=False, name=name)
         queries = dense("query")(positional_encoding(inputs.canonical_vertices))

@@ -6,7 +6,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.synthetic import sources
 from humangs_jax.training import ablation
 from humangs_jax.training.ablation import Ablation, ablate
-from humangs_jax.training.config import Stage
+from humangs_jax.training.config import Phase
 from humangs_jax.training.forward import as_validated
 from humangs_jax.training.sources import captured_people
 
@@ -211,7 +211,7 @@ def test_what_cannot_be_meant_is_refused_before_the_first_run(how, said, trained
         ({"model.conventions.image_size": 1024}, "512 x 512 cannot be averaged to 1024 x 1024"),
         ({"views.target_count": 9}, "4 views, but inputs and targets need 11"),
         (
-            {"stages": (Stage(start=2, target_size=1024),)},
+            {"stages": (Phase(start=2, target_size=1024),)},
             "512 x 512 cannot be averaged to 1024 x 1024",
         ),
     ],

@@ -8,14 +8,14 @@ import pytest
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.training import config
-from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, tiny
+from humangs_jax.training.config import Phase, TrainConfig, fitting_losses, read_config, tiny
 from humangs_jax.training.sources import training_people
 
 STAGED = dataclasses.replace(
     tiny(),
     steps=10,
     batch_size=3,
-    stages=(Stage(4, image_size=64, batch_size=2), Stage(8, target_size=32)),
+    stages=(Phase(4, image_size=64, batch_size=2), Phase(8, target_size=32)),
 )
 
 
@@ -46,12 +46,12 @@ def test_examples_are_counted_over_stages():
 @pytest.mark.parametrize("starts", [(5, 3), (4, 4), (10,)])
 def test_stages_out_of_order_are_refused(starts):
     with pytest.raises(ValueError, match="stages start at"):
-        dataclasses.replace(tiny(), steps=10, stages=tuple(Stage(start) for start in starts))
+        dataclasses.replace(tiny(), steps=10, stages=tuple(Phase(start) for start in starts))
 
 
 def test_sizes_that_do_not_fit_are_refused_before_the_run():
     with pytest.raises(ValueError, match="not a multiple of patch_size"):
-        dataclasses.replace(tiny(), steps=10, stages=(Stage(4, image_size=65),))
+        dataclasses.replace(tiny(), steps=10, stages=(Phase(4, image_size=65),))
 
 
 @pytest.mark.parametrize("name", sorted(config.PRESETS))
@@ -65,7 +65,7 @@ def test_runs_survive_json(name):
     [
         (
             '{"stages": [{"start": 5, "size": 3}]}',
-            r"config\.stages\[0\]\.size: Stage has no such field",
+            r"config\.stages\[0\]\.size: Phase has no such field",
         ),
         (
             '{"optimizer": {"name": "sgd"}}',

@@ -21,7 +21,7 @@ from humangs_jax.core.pytree import inexact_leaves, replace
 from humangs_jax.data.loading import CaptureCache, Example
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network import reader, transformer, vertex_decoder
-from humangs_jax.network.parts import stage
+from humangs_jax.network.parts import tap
 from humangs_jax.training import diagnose, forward
 from humangs_jax.training.config import tiny
 from humangs_jax.training.diagnose import (
@@ -233,7 +233,7 @@ def test_gradients_are_known_where_a_stage_takes_and_gives():
         recorder = recorder or Recorder(probes)
         with nn.intercept_methods(recorder):
             y = network.apply(variables, x)
-            terms = stage(
+            terms = tap(
                 "loss", lambda y: {"a": jnp.sum(y), "b": jnp.sum(nan_gradient(y))}, y, apart=True
             )
         return terms["a"] + terms["b"], recorder.given

@@ -16,7 +16,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.network.weights import load_weights
 from humangs_jax.training import loop, step
 from humangs_jax.training.checkpoint import Checkpoints
-from humangs_jax.training.config import Stage, tiny
+from humangs_jax.training.config import Phase, tiny
 from humangs_jax.training.loop import train
 from humangs_jax.training.sources import captured_people, stage_loader
 from humangs_jax.training.state import init_state
@@ -204,7 +204,7 @@ def test_a_broken_folder_is_named_and_another_configuration_refused(
 
 def test_sizes_of_a_later_stage_are_tried_before_the_run(run, tmp_path):
     config = dataclasses.replace(
-        CONFIG, batch_size=2, microbatch_size=2, stages=(Stage(50, batch_size=3),)
+        CONFIG, batch_size=2, microbatch_size=2, stages=(Phase(50, batch_size=3),)
     )
     with pytest.raises(
         ValueError, match="3 subjects per device cannot be divided into microbatches of 2"
@@ -220,7 +220,7 @@ def test_resume_in_a_later_stage_with_changing_numbers_of_views(run, tmp_path, s
         views=dataclasses.replace(CONFIG.views, input_counts=(1, 2, 3)),
         ema_decay=0.9,
         steps=6,
-        stages=(Stage(2, image_size=16, target_size=32, batch_size=2, token_capacity=12),),
+        stages=(Phase(2, image_size=16, target_size=32, batch_size=2, token_capacity=12),),
     )
     whole = run(tmp_path / "whole", config)
     for stop in (1, 3, 4, 6):

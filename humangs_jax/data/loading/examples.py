@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int, UInt8
-from humangs_jax.core.configuration import Few, Share, Spread, configuration
+from humangs_jax.core.configuration import Count, Share, Spread, configuration
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
@@ -31,9 +31,9 @@ WINDOW_OF = 60
 class ViewSampling:
     """Which views of a subject are input and which are targets."""
 
-    input_counts: tuple[Few, ...] = (4,)
+    input_counts: tuple[Count, ...] = (4,)
     """Numbers of input views; one is drawn per step (each compiles once)."""
-    target_count: Few = 3
+    target_count: Count = 3
     """The number of target views."""
     jitter: Spread = 0.7
     """Inputs stand evenly around the subject, each off by up to half this share of the spacing."""

@@ -25,7 +25,7 @@ from humangs_jax.core.array_types import Array, Float, Int, UInt8
 from humangs_jax.data import cameras as calibration
 from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.geometry.mesh import face_areas, smallest_turns, unit, vertex_crosses
+from humangs_jax.geometry.mesh import face_areas, smallest_turns, unit, vertex_area_vectors
 from humangs_jax.io.images import to_uint8
 from humangs_jax.rendering.mesh.rasterizer import (
     interpolate_attributes,
@@ -263,7 +263,7 @@ def smooth_normals(
     """
     places, place = np.unique(vertices, axis=0, return_inverse=True)
     place = place.reshape(-1)
-    return unit(vertex_crosses(places, place[faces]))[place]
+    return unit(vertex_area_vectors(places, place[faces]))[place]
 
 
 @functools.partial(jax.jit, static_argnames="supersample")
