@@ -243,9 +243,10 @@ def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
     stands = None
     if not poses.fixed:
         stands = standing_axis(rotations[:, 0])
-    if (
-        stands in (None, usual) or len(joints := body()) != rotations.shape[1]
-    ):  # another number is refused later
+    if stands is None or stands == usual:
+        return usual, ""
+    joints = body()
+    if len(joints) != rotations.shape[1]:  # refused later
         return usual, ""
     chosen = rules.sampled_frames(len(rotations))
     points = rules.joint_places(joints, rotations[chosen], translations[chosen])

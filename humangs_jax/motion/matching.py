@@ -290,8 +290,10 @@ def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[
     chains = []
     for i in below:
         chain = [i]
-        while len(children := [j for j, p in enumerate(parents) if p == chain[-1]]) == 1:
-            chain.append(children[0])
+        children = [j for j, p in enumerate(parents) if p == i]
+        while len(children) == 1:
+            chain += children
+            children = [j for j, p in enumerate(parents) if p == chain[-1]]
         while len(chain) > 1 and plain[chain[-1]].endswith(ENDS):
             chain.pop()
         chains.append(chain)

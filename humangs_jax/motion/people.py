@@ -157,27 +157,23 @@ def _found(content: Any, name: str, depth: int) -> list[Person]:
     if depth > DEEPEST:
         return []
     # a list of people, a person, a person one level deeper, or people by name
-    if isinstance(content, list | tuple):
-        found = [
-            p for i, each in enumerate(content) for p in _found(each, _id_of(each, i), depth + 1)
-        ]
-    elif not isinstance(content, dict):
-        return []
-    elif (form := format_of(content)) is not None:
-        return _split(content, form, name)
-    elif (
-        key := next((key for key in INSIDE if isinstance(content.get(key), dict)), None)
-    ) is not None:
-        beside = {other: value for other, value in content.items() if other not in INSIDE}
-        return _found(beside | content[key], name, depth + 1)
-    elif (
-        key := next(
-            (key for key in LISTS if isinstance(objects(content.get(key)), dict | list)), None
-        )
-    ) is not None:
-        return _found(content[key], name, depth + 1)
+    if isinstance(content, dict):
+        form = format_of(content)
+        if form is not None:
+            return _split(content, form, name)
+        for key in INSIDE:
+            if isinstance(content.get(key), dict):
+                beside = {other: value for other, value in content.items() if other not in INSIDE}
+                return _found(beside | content[key], name, depth + 1)
+        for key in LISTS:
+            if isinstance(objects(content.get(key)), dict | list):
+                return _found(content[key], name, depth + 1)
+        named = [(str(key), each) for key, each in content.items()]
+    elif isinstance(content, list | tuple):
+        named = [(_id_of(each, i), each) for i, each in enumerate(content)]
     else:
-        found = [p for key, each in content.items() for p in _found(each, str(key), depth + 1)]
+        return []
+    found = [person for name, each in named for person in _found(each, name, depth + 1)]
     check_limit("people", len(found), "people")
     return found
 

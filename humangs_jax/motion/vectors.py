@@ -73,11 +73,9 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
 
 def hint_for(values: Mapping[Any, Any]) -> str:
     """Gives a hint about values that are not a motion; "" for none."""
-    return (
-        f"; these are joints in space that MDM sampled: {_RENDER}"
-        if values.keys() >= RESULTS
-        else ""
-    )
+    if values.keys() >= RESULTS:
+        return f"; these are joints in space that MDM sampled: {_RENDER}"
+    return ""
 
 
 def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[str, Any]:

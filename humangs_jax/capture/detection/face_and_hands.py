@@ -14,15 +14,20 @@ from humangs_jax.capture.detection.people import Crop, load_networks, outputs_of
 from humangs_jax.core.array_types import Float
 from humangs_jax.motion.face_tracks import ARKIT
 
-FACE, SHAPES, HAND = (
-    "face_landmarks_detector.tflite",
-    "face_blendshapes.tflite",
-    "hand_landmark_full.tflite",
-)
-"""Files of `assets/mediapipe`."""
-FACE_SIZE, HAND_SIZE = 256, 224
-"""Pixels a side of the inputs."""
-FACE_POINTS, HAND_POINTS = 478, 21
+FACE = "face_landmarks_detector.tflite"
+"""File of the landmarks of a face in `assets/mediapipe`."""
+SHAPES = "face_blendshapes.tflite"
+"""File of the expressions of a face."""
+HAND = "hand_landmark_full.tflite"
+"""File of the landmarks of a hand."""
+FACE_SIZE = 256
+"""Pixels a side of the network of faces."""
+HAND_SIZE = 224
+"""Pixels a side of the network of hands."""
+FACE_POINTS = 478
+"""Landmarks of a face."""
+HAND_POINTS = 21
+"""Landmarks of a hand."""
 LEAST_PRESENCE = 0.5
 """Probability of a face or a hand from which on it is believed."""
 LEAST_VISIBLE = 0.5
@@ -30,9 +35,10 @@ LEAST_VISIBLE = 0.5
 ENLARGED = {"face": 1.5, "hand": 2.7, "palm": 2.0}
 """Side of a region over that of the box around the landmarks, or twice the length from the wrist to
 the knuckles."""
-FACE_BOX, FACE_MIDDLE = 2.75, 0.4
-"""Height of a face over the distance from the eyes to the mouth, and where along it its middle is.
-"""
+FACE_BOX = 2.75
+"""Height of a face over the distance from the eyes to the mouth."""
+FACE_MIDDLE = 0.4
+"""Where along that distance the middle of the face is."""
 PALM = (0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18)
 """Landmarks of a hand that say where it is in the next look: fingers move, the palm less."""
 PALM_SHIFT = -0.1
@@ -104,12 +110,13 @@ class FaceAndHands:
         visibility: Float[np.ndarray, " 33"],
     ) -> tuple[Hand | None, Hand | None]:
         """The left and the right hand of somebody with these landmarks of BlazePose."""
-        left, right = (
-            self._hand_in(photo, hand_region(body, side), body[wrist])
-            if visibility[wrist] >= LEAST_VISIBLE
-            else None
-            for side, wrist in enumerate(WRISTS)
-        )
+        found: list[Hand | None] = []
+        for side, wrist in enumerate(WRISTS):
+            if visibility[wrist] < LEAST_VISIBLE:
+                found.append(None)
+            else:
+                found.append(self._hand_in(photo, hand_region(body, side), body[wrist]))
+        left, right = found
         return left, right
 
     def _hand_in(

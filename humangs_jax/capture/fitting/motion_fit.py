@@ -221,9 +221,8 @@ def _start(model: LandmarkModel, seen: Observations, fps: float) -> BodyPose:
     world = np.asarray(seen.world)[:, 0] * np.diag(FLIP)[:3]
     turns = [_turn(resting, points, weights).as_matrix() for points in world]
     # sizes of the trunks say how large the detector's person is
-    size = lambda x: np.sqrt(np.average(np.square(x - x.mean(-2, keepdims=True)).sum(-1), axis=-1))
     trunk = weights > 0.5
-    scale = size(resting[trunk]) / np.maximum(size(world[:, trunk]), 1e-3)
+    scale = _radius(resting[trunk]) / np.maximum(_radius(world[:, trunk]), 1e-3)
     hips = [model.names.index(f"{side}_hip") for side in ("left", "right")]
     offsets = (world - world[:, hips].mean(1, keepdims=True)) * scale[:, None, None]
     views = (np.asarray(x)[:, 0] for x in (seen.points, seen.confidences, seen.K))
@@ -235,15 +234,9 @@ def _start(model: LandmarkModel, seen: Observations, fps: float) -> BodyPose:
     if not len(known):
         raise ValueError("the person is seen in no frame")
     nearest = known[np.searchsorted((known[1:] + known[:-1]) / 2, frames)]
-    between = lambda x: np.stack([np.interp(frames, known, c[known]) for c in x.T], axis=-1)
-    steady = lambda x: gaussian_filter1d(
-        median_filter(x, size=(5, *[1] * (x.ndim - 1)), mode="nearest"),
-        max(SMOOTHED * fps, 0.5),
-        axis=0,
-        mode="nearest",
-    )
-    places = steady(between(places))
-    matrices = steady(np.stack(turns)[nearest])
+    between = [np.interp(frames, known, column[known]) for column in places.T]
+    places = _steady(np.stack(between, axis=-1), fps)
+    matrices = _steady(np.stack(turns)[nearest], fps)
     u, _, vt = np.linalg.svd(matrices)
     u[..., -1] *= np.linalg.det(u @ vt)[:, None]  # the nearest rotations
     roots = Rotation.from_matrix(u @ vt).as_rotvec()
@@ -254,12 +247,24 @@ def _start(model: LandmarkModel, seen: Observations, fps: float) -> BodyPose:
     )
 
 
+def _radius(points: Float[np.ndarray, "*m k 3"]) -> Float[np.ndarray, "*m"] | np.floating:
+    """Root mean square of the distances from the middle."""
+    off = points - points.mean(-2, keepdims=True)
+    return np.sqrt(np.square(off).sum(-1).mean(-1))
+
+
+def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray, "m ..."]:
+    """Values of the frames without outliers, smoothed over time."""
+    kept = median_filter(values, size=(5, *[1] * (values.ndim - 1)), mode="nearest")
+    return gaussian_filter1d(kept, max(SMOOTHED * fps, 0.5), axis=0, mode="nearest")
+
+
 def _turn(
     a: Float[np.ndarray, "k 3"], b: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
 ) -> Rotation:
     """The rotation about weighted middles that takes points a to b best."""
-    middle = lambda x: x - np.average(x, axis=0, weights=weights)
-    return Rotation.align_vectors(middle(b), middle(a), weights=weights)[0]
+    a, b = (x - np.average(x, axis=0, weights=weights) for x in (a, b))
+    return Rotation.align_vectors(b, a, weights=weights)[0]
 
 
 def _place(
@@ -338,7 +343,10 @@ def _run(
     count = len(frames)
     # windows have one length, so that one program does for all: what is added shows nothing
     padded = np.append(frames, np.full(WINDOW - count, frames[-1]))
-    filled = lambda x: np.append(x, np.zeros((WINDOW - count, *np.shape(x)[1:])), axis=0)
+
+    def filled(x):
+        return np.append(x, np.zeros((WINDOW - count, *np.shape(x)[1:])), axis=0)
+
     own = jax.tree.map(lambda x: x[padded], seen)
     own = replace(own, confidences=own.confidences * filled(np.ones(count))[:, None, None])
     window = _Window(
@@ -354,8 +362,8 @@ def _run(
         scales=jnp.asarray(scales, jnp.float32),
     )
     found, betas = _solved(model, own, window)
-    placed = lambda all_, new: all_.at[frames].set(new[:count])
-    return jax.tree.map(placed, poses, found), np.asarray(betas)
+    poses = jax.tree.map(lambda old, new: old.at[frames].set(new[:count]), poses, found)
+    return poses, np.asarray(betas)
 
 
 @functools.cache
@@ -388,7 +396,10 @@ def _solved(
 
     def smooth(state: FitState) -> FitState:
         """x = begun + S u."""
-        moved = lambda old, u: old + jnp.einsum("vw,w...->v...", window.smoother, u)
+
+        def moved(old, u):
+            return old + jnp.einsum("vw,w...->v...", window.smoother, u)
+
         return FitState(
             begun.betas + state.betas * (1 - jnp.max(window.timed)),  # in time the shape is known
             moved(begun.global_orient, state.global_orient),
@@ -418,11 +429,11 @@ def _solved(
         steps = jnp.diff(landmarks[:, feet], axis=0) * window.rate / HELD_SPEED
         found["feet"] = robust(jnp.sqrt(window.held)[..., None] * steps, ROBUST_SCALE)
         # frames that another window has solved
-        off = lambda x, y: (ANCHOR * window.anchored).reshape(-1, *[1] * (x.ndim - 1)) * (x - y)
-        found["anchor"] = [
-            off(getattr(state, name), getattr(begun, name))
-            for name in ("global_orient", "transl", "body_pose")
-        ]
+        found["anchor"] = []
+        for name in ("global_orient", "transl", "body_pose"):
+            moved = getattr(state, name) - getattr(begun, name)
+            weights = (ANCHOR * window.anchored).reshape(-1, *[1] * (moved.ndim - 1))
+            found["anchor"].append(weights * moved)
         tall = window.tall[0] + jnp.sum(window.tall[1:] * state.betas)
         found["height"] = window.height[1] * (tall - window.height[0]) / HEIGHT_STD
         return found
@@ -536,8 +547,10 @@ def betas_of_joints(
     if np.shape(rest_joints) != mean.shape:
         raise ValueError(f"expected {len(mean)} joints, got {len(rest_joints)}")
     directions = np.einsum("jn,nas->jas", body.joint_regressor, body.shape_directions)
-    bones = lambda x: (x - x[:1])[1:].reshape(3 * (len(mean) - 1), -1)
-    a, b = bones(directions), bones(np.asarray(rest_joints, np.float64) - mean)[:, 0]
+    # places from the root, which is at its origin in both
+    wanted = np.asarray(rest_joints, np.float64) - mean
+    a = (directions - directions[:1])[1:].reshape(3 * (len(mean) - 1), -1)
+    b = (wanted - wanted[:1])[1:].ravel()
     # a coefficient of 1 is usual; joints are known to a millimetre
     ridge = 1e-3 * np.eye(a.shape[1])
     right = np.append(b, np.zeros(len(ridge)))
