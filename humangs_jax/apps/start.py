@@ -152,13 +152,13 @@ def look(
     further = sorted(
         path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
     )
+    places = [folder / name for name in CAMERA_PLACES]
     return Material(
         folder=folder,
         images=images,
         photos=len(photos),
         size=image_size(photos[0]),
-        cameras=cameras
-        or next((place for name in CAMERA_PLACES if CAMERAS.found(place := folder / name)), None),
+        cameras=cameras or next((place for place in places if CAMERAS.found(place)), None),
         masks=masks or next(iter([*mask_folders, *([images] if scan.masks else [])]), None),
         alpha=is_transparent(photos[0]),
         keypoints=keypoints or next(iter([*named, *further]), None),

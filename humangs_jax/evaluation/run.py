@@ -473,10 +473,8 @@ def _score_person(
     """What there is to say of a person, as JSON has it; its images go to the gallery. first: number
     of its first row.
     """
-    predicted, name = (
-        _without_nobody(case, predict(case, rules.behind)),
-        printable(case.name),
-    )  # of a folder: now one line
+    predicted = _without_nobody(case, predict(case, rules.behind))
+    name = printable(case.name)  # of a folder: now one line
     about: dict[str, Any] = {
         "missing": [printable(file) for file in predicted.missing],
         "rows": [],

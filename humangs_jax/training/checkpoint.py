@@ -195,7 +195,8 @@ class Checkpoints:
             problem = str(error)
         # a checkpoint may be whole and still hold other numbers
         recorded = (self._manager.metrics(step) or {}).get(CHECKSUM)
-        if state is not None and recorded != (found := _checksum(state)):
+        found = None if state is None else _checksum(state)
+        if state is not None and recorded != found:
             state = None
             problem = (
                 f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}"

@@ -111,7 +111,10 @@ def draw_posed(
     splat = dataclasses.replace(config.splat, distortion=bool(config.loss.distortion))
 
     def draw(posed):
-        one = lambda target: render(target[0], target[1], splat, target[2])
+        def one(target):
+            posed, camera, background = target
+            return render(posed, camera, splat, background)
+
         return Drawn(jax.lax.map(one, (posed, targets.cameras, backgrounds)))
 
     return tap("images", draw, posed)

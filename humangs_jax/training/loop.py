@@ -509,11 +509,10 @@ def stop_requested() -> Generator[Callable[[int], bool], None, None]:
         stop.set()
         logger.warning("stopping after this step; what is done is saved")
 
-    caught = (
-        (signal.SIGINT, signal.SIGTERM)
-        if threading.current_thread() is threading.main_thread()
-        else ()
-    )  # others may not
+    # threads other than the main one may not handle signals
+    caught = ()
+    if threading.current_thread() is threading.main_thread():
+        caught = (signal.SIGINT, signal.SIGTERM)
     previous = {number: signal.signal(number, handle) for number in caught}
     try:
         yield lambda _: stop.is_set()
