@@ -208,7 +208,7 @@ def noise(seed: int, shape: tuple[int, ...]) -> np.ndarray:
 
 @change
 def turned_by(capture, degrees: float):
-    """Every camera turned about an axis of its own."""
+    """Turns every camera about another axis."""
     axes = noise(2, (capture.view_count, 3))
     axes *= np.radians(degrees) / np.linalg.norm(axes, axis=-1, keepdims=True)
     turns = iter(np.asarray(matrix_from_axis_angle(jnp.asarray(axes))))

@@ -120,7 +120,7 @@ def _of_equation(equation, devices) -> Costs:
 
 
 def _inner(given):
-    """The programs that an equation calls; of a function with a gradient of its own, the
+    """The programs that an equation calls; of a function with a custom gradient, the
     function.
     """
     for key in ("jaxpr", "call_jaxpr", "call"):

@@ -1,4 +1,4 @@
-"""How much code there is and how plainly it is said, counted from the files."""
+"""How much code there is and how plain it is, counted from the files."""
 
 import ast
 import inspect

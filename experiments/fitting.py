@@ -51,7 +51,7 @@ class FitCase:
 
 
 def make_case(seed, body, model, frames, views) -> FitCase:
-    """The person of a seed in random poses, each with cameras of its own, as of the published
+    """The person of a seed in random poses, each with other cameras, as of the published
     protocol.
     """
     subject = make_subject(seed, body)

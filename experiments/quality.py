@@ -87,8 +87,8 @@ def evaluation_views(
 def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) -> str:
     """Scores by number of photos and task, whether more photos help.
 
-    by_views: scores by number of photos and seed. chosen: the number of photos of what is said of
-    single people.
+    by_views: scores by number of photos and seed. chosen: the number of photos of which single
+    people are described.
     """
     mean = {n: means(list(rows.values())) for n, rows in by_views.items()}
     tasks = [task for task in TASKS if task in mean[chosen]]

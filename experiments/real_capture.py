@@ -80,8 +80,8 @@ class RealFrame(NamedTuple):
     what differs from the room.
     cameras: as published. keypoints: MediaPipe's 33. world: (v, 33, 3) landmarks in metres. crop:
     (v, 3, 3), pixels of the photos from pixels of the video (homogeneous). names: of the views.
-    moments: whether each view has a pose of its own, where the cameras are from the person; None:
-    they are published.
+    moments: whether each view has another pose, where the cameras are from the person; None: they
+    are published.
     """
 
     images: Float[np.ndarray, "v s s 3"]
@@ -114,7 +114,7 @@ class RealFrame(NamedTuple):
         write_description(folder, views)
 
     def truth(self) -> Float[np.ndarray, "v s s 3"]:
-        """The man alone on white, by the careful masks, the rims in colors of his own."""
+        """The man alone on white, by the careful masks, with rims in his colors."""
         return np.stack(
             [
                 on_white_background(*pair)

@@ -73,7 +73,7 @@ Cases = Iterator[tuple[str, Callable[[], Case]]]
 """(row, what makes its photos)."""
 
 
-# Whom there is
+# The people
 # --------------------------------------------------------------------------------------------------
 
 

@@ -315,8 +315,8 @@ def real_person(
 
     Needs the extra `photos` and `imageio-ffmpeg`. Everything is scored by careful masks, in squares
     of 512 pixels. Rows: calibrated, the published calibration: held out, cameras and body know all
-    four photos, the avatar three; unseen, nothing knows the fourth photo; where its camera stands
-    is told by cameras that all frames have refined together. poses: the avatar of one frame in the
+    four photos, the avatar three; unseen, nothing knows the fourth photo; its
+    camera is the one refined on all frames together. poses: the avatar of one frame in the
     poses of the others. uncalibrated: cameras from the person. moments: the same, of photos that
     each show another moment. rooms: synthetic people in photographed rooms. start: seconds of
     `humangs start` on photos of 12 megapixels.

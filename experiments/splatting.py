@@ -238,8 +238,8 @@ def short(value: Any) -> str:
 
 
 def largest_weights(scene: Scene) -> np.ndarray:
-    """(g,) the largest weight of each Gaussian on any pixel of any of the cameras around the scene,
-    and of its own.
+    """(g,) the largest weight of each Gaussian on any pixel of the bench's camera and of those
+    around the scene.
     """
     (gaussians, own), config = scene, SplatConfig(visibility=True)
     middle = jnp.median(gaussians.means, axis=0)

@@ -38,7 +38,7 @@ def versions(
 
     Every interpreter needs the package's dependencies. The demo's person at 512 px is drawn, with
     and without gradients; the demo's avatar is refined by `steps=0`; the step is that of `small` at
-    256 px. Each turn is a process of its own; programs come from the compile cache after the first.
+    256 px. Each turn is a new process; programs come from the compile cache after the first.
 
     Options:
     pythons: interpreters, by path

@@ -1,4 +1,4 @@
-"""BVH files in the conventions of their sources, written from poses of our own skeleton."""
+"""BVH files in the conventions of their sources, written from poses of our skeleton."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -7,7 +7,7 @@ from humangs_jax.avatar.layers import RGBA, ExrView
 from humangs_jax.geometry.camera import Camera
 
 STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments"}
-"""Header strings with a meaning of their own in OpenEXR."""
+"""Header strings that have a meaning in OpenEXR."""
 
 
 def read_exr(path):

@@ -1,4 +1,4 @@
-"""GLB files of a skinned skeleton in motion, written from poses of our own skeleton."""
+"""GLB files of a skinned skeleton in motion, written from poses of our skeleton."""
 
 import numpy as np
 from bvh_files import INDEX

@@ -74,7 +74,7 @@ ROUND, BATCH, MOST_ROUNDS = 300, 8, 12
 FLAT, MARGIN = 0.2, 2.0
 """dB of foreground PSNR."""
 SEEDS = 3
-"""Of the reference, and of whom claims are about."""
+"""Training seeds of the reference and of the systems that claims are about."""
 PROTOCOL = EvaluationProtocol(lpips=("alex",))
 PER_PERSON = ("animatable",)
 """Systems that are fitted to one person, and so have no place in a training on many."""

@@ -12,7 +12,7 @@ photos and of the target (57 and 54 channels): the target's pose enters through 
 alone. A residual convolutional decoder fuses its target tokens of four depths. Trained with squared
 error and 1.0 VGG.
 
-Every target is a pass of its own through the whole transformer: photos attend to the target, so
+Every target needs a pass through the whole transformer: photos attend to the target, so
 nothing of a person can be kept from one target to the next, and a frame costs as much as the first
 one. (The encoder-decoder's latents could be kept; here they are made again.)
 

@@ -3,7 +3,7 @@ two streams.
 
 Theirs (Qiu et al. 2025, https://arxiv.org/abs/2503.10625): encoded canonical points of the body
 meet the tokens of one photo in blocks of the kind of Stable Diffusion 3 (Esser et al. 2024,
-https://arxiv.org/abs/2403.03206): joint attention over both, each stream with weights of its own,
+https://arxiv.org/abs/2403.03206): joint attention over both, with separate weights for each stream,
 modulated by the pooled image features; a small MLP makes a Gaussian of every point. There is no
 camera and no pose of the photo. LHM++ (https://arxiv.org/abs/2506.13766): the same on pooled
 points, for several photos.

@@ -24,7 +24,7 @@ SIZE = 64
 
 @functools.cache
 def boxes():
-    """A torso and two arms as boxes, each moved by a joint of its own; 1 m tall, 1.2 m wide,
+    """A torso and two arms as boxes, each moved by another joint; 1 m tall, 1.2 m wide,
     unequal in front and behind.
     """
 
@@ -286,7 +286,7 @@ MADE = {
     ),
     "a world with z up": lambda m: m @ Z_UP,
 }
-"""What people do to a right cam_from_world, and what is said of it."""
+"""What people do to a right cam_from_world, and the words for it."""
 
 
 @pytest.mark.parametrize("change", CHANGES)

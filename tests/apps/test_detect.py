@@ -1,4 +1,4 @@
-"""`humangs detect`: who is chosen, what is written, and what is said where that is not clear."""
+"""`humangs detect`: who is chosen, what is written, and the warnings where that is not clear."""
 
 import dataclasses
 import shutil

@@ -1,4 +1,4 @@
-"""`humangs start`: what a folder has, what is said to be missing, and the way to the page."""
+"""`humangs start`: what a folder has, what it reports as missing, and the way to the page."""
 
 import dataclasses
 import shutil
@@ -76,8 +76,8 @@ def test_everything_is_found(mine):
 
 
 def test_other_layouts_are_found(mine):
-    """Photos beside the rest, a folder for each camera, COLMAP's workspace, OpenPose's file of a
-    name of its own.
+    """Photos beside the rest, a folder for each camera, COLMAP's workspace, OpenPose's file with
+    another name.
     """
     for path in (mine / "images").iterdir():
         (mine / path.stem).mkdir()
@@ -338,7 +338,7 @@ def write_masks(folder, masks):
 
 @pytest.mark.parametrize(("who", "area"), [(0, 2e5), (1, 1e5)])
 def test_without_cameras_keypoints_of_several_people_choose_in_each_photo(who, area, two_people):
-    """`--person` counts in the keypoint file; the person whom the detector found there has the
+    """`--person` counts in the keypoint file; the person that the detector found there has the
     cameras and masks.
     """
     files = sorted((two_people / "images").iterdir())

@@ -626,7 +626,7 @@ def test_chunks_without_bounds_are_left_out(tmp_path, caplog):
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
 def test_the_smoothing_filter_of_mip_splatting_is_in_scales_and_opacities(form, tmp_path):
-    """By the formula of its own `save_fused_ply`: the filter has twenty scales, 0 among them."""
+    """By the formula of Mip-Splatting's `save_fused_ply`: the filter has twenty scales, 0 among them."""
     kept, filters = scene(), np.arange(20)[:, None] / 40
     (tmp_path / "a.ply").write_bytes(ply(kept, form=form, extra={"filter_3D": filters[:, 0]}))
     scales, found = np.asarray(kept.scales, np.float64), hg.load_gaussians(tmp_path / "a.ply")

@@ -358,7 +358,7 @@ def test_where_hands_are_exchanged_the_body_is_right():
     assert [swap.kind for swap in examine(capture, exchanged).report.swaps] == ["hands"]
 
 
-# People of several views are told apart by how their landmarks triangulate
+# People of several views are separated by how their landmarks triangulate
 # --------------------------------------------
 
 

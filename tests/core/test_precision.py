@@ -1,5 +1,5 @@
 """Matrix products say how exact they are: accelerators round factors to 10 bits (TF32, bfloat16)
-where nothing is said.
+by default.
 """
 
 import ast

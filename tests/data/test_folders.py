@@ -1,5 +1,5 @@
-"""Folders of photos as phones, disks and other programs fill them: what is used, and what is said
-of the rest.
+"""Folders of photos as phones, disks and other programs fill them: what is used, and the line about
+the rest.
 """
 
 import json

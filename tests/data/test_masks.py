@@ -105,7 +105,7 @@ def test_parts_are_moved_by_their_own_error():
 
 
 def test_one_side_alone_stays():
-    """A side that is too large cannot be told from one whose rim has the color of the wall."""
+    """A side that is too large looks like one whose rim has the color of the wall."""
     mask = figure()
     wrong = np.where(np.arange(HEIGHT)[:, None] < 120, grown(mask, 3.0), mask)
     fitted, excess = fit_mask(photo_of(mask), wrong)
@@ -141,8 +141,8 @@ def before_a_wall(colors, masks, rim=0.0, color=WALL, where=True):
 @pytest.mark.parametrize("rim", [2.0, 4.0])
 @pytest.mark.parametrize("kind", ["rim light", "piping", "on one side"])
 def test_exact_masks_stay_where_the_rim_looks_like_the_wall(person, kind, rim):
-    """A stripe that cannot be told from the wall is told by the fingers, which a mask that is too
-    large would not have.
+    """A stripe of the color of the wall is found by the fingers, which a mask that is too large would
+    not have.
     """
     colors, masks = person
     side = np.arange(masks.shape[2]) < np.median(np.nonzero(masks > 0.5)[2])

@@ -101,8 +101,8 @@ def test_the_square_box(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_centred_window(seed):
-    """Of an image that has the size already; the corner by the published rule, said once more in
-    words of branches.
+    """Of an image that has the size already; the corner by the published rule, written with
+    branches.
     """
     image, mask = blob(seed, 100, 80)
     wanted, corner = (70, 30), []

@@ -184,7 +184,7 @@ def test_lpips_sees_its_own_crop(monkeypatch):
 
 @pytest.mark.slow
 def test_patches_are_those_that_are_more_than_half_person(networks):
-    """64 x 64, 32 apart, each scored as an image of its own."""
+    """64 x 64, 32 apart, each scored as an image."""
     predicted, truth, masks = (x[0] for x in random_views(4, 1, 200, 152))
     masks = np.clip(2 * masks, 0, 1)
     protocol = dataclasses.replace(PROTOCOLS["lvsm"], lpips=("alex",))

@@ -114,7 +114,7 @@ def read_cameras(path):
 
 
 def import_into(path):
-    """Photos beside the calibration; the capture goes into a folder of its own."""
+    """Photos beside the calibration; the capture goes into another folder."""
     return import_cameras(path, path.parent / "photos", path.parent / "imported", overwrite=True)
 
 

@@ -1,6 +1,6 @@
 """Hostile files end in one line, in bounded memory and time, and nothing else happens.
 
-Some files of each item are read here, all of them in a process of their own (`worker`), by the slow
+Some files of each item are read here, all of them in another process (`worker`), by the slow
 tests. `python tests/hostile/test_hostile.py FOLDER` reads all files and prints the figures of
 docs/security.md. That nothing is half-written is in tests/io/test_atomic.py.
 HUMANGS_HOSTILE_SEED=N makes the randomly damaged files from other seeds.

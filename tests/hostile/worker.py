@@ -59,7 +59,7 @@ class Forbidden(BaseException):
 
 
 class TooLong(BaseException):
-    """Likewise."""
+    """Raised after too many seconds; no reader catches it."""
 
 
 class Watch:

@@ -637,7 +637,7 @@ def test_arrays_that_are_no_motion_say_what_they_are(kind, tmp_path):
 
 
 def mhr(rots=True, frames=FRAMES):
-    """SAM 3D Body's joints of the shipped body, with bones that have turns of their own at rest."""
+    """SAM 3D Body's joints of the shipped body, with bones that are turned at rest."""
     places = joint_places(shipped_joints(), ROTATIONS, PLACES) * [1, -1, -1]
     world = Rotation.from_rotvec(ROTATIONS.reshape(-1, 3)).as_matrix().reshape(FRAMES, 55, 3, 3)
     points, turns = (

@@ -20,7 +20,7 @@ KINDS = {dtype: kind for kind, dtype in STORAGE_DTYPES.items() if kind != "BFloa
 @dataclasses.dataclass
 class FakeTensor:
     """What `torch.save` writes for a tensor: a storage by reference, and a view of it (contiguous
-    if not said).
+    by default).
     """
 
     storage: np.ndarray

@@ -29,5 +29,5 @@ def person(body):
 
 @pytest.fixture(scope="session")
 def four(body):
-    """An avatar, and four photos of the person, whom it shows in other colors."""
+    """An avatar, and four photos of the person, in other colors than the avatar's."""
     return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), views=4)

@@ -45,7 +45,7 @@ def toy_avatar(body, shade):
 
 
 def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
-    """Photos of an avatar, each in a pose of its own if `moving`. distance: of each camera,
+    """Photos of an avatar, each in another pose if `moving`. distance: of each camera,
     metres.
     """
     cameras = orbit(

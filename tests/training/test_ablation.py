@@ -145,7 +145,7 @@ def test_all_variants_are_compared_on_the_photos_and_targets_of_the_base(
 
     run(tmp_path, validation=make, seeds=1, variants={"larger": larger})
     base, other = validated[-2:]  # before, all of them are looked at without a photo
-    assert asked == [(32, 8), (64, 8)]  # the photos that a network reads are of its own size
+    assert asked == [(32, 8), (64, 8)]  # the photos that a network reads have its size
     assert [config.model.conventions.image_size for config in validated[-2:]] == [32, 64]
     assert other.views == base.views and other.target_size == base.target_size == 32
     assert base.views.input_counts == (2,) and base.views.target_count == 2

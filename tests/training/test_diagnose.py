@@ -41,7 +41,7 @@ from humangs_jax.training.step import train_step
 FLOAT32 = 1e-4
 """Relative: the stages are fused otherwise than in the step."""
 BFLOAT16 = 2e-2
-"""Relative, likewise."""
+"""The same in bfloat16."""
 CONFIG = tiny()
 
 

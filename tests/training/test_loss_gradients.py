@@ -30,7 +30,7 @@ WHOLE = 1e-4
 """Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha)
 within a step, and some Gaussians exchange places in the depth order."""
 NETWORKS = ("perceptual", "vgg16", "lpips")
-"""Terms that need a network of their own."""
+"""Terms that need another network."""
 SIDE, TARGETS, VERTICES = 32, 2, 800
 STEP_SIZES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
 """Of central differences, relative to the size of what is varied. Thousands of Gaussians move:
@@ -164,7 +164,7 @@ def test_terms_with_networks_of_their_own():
 
 @pytest.mark.slow
 def test_terms_of_the_whole_network(tmp_path):
-    """Without those with networks of their own: minutes of convolutions in float64."""
+    """Without those that need another network: minutes of convolutions in float64."""
     with jax.enable_x64(True):
         errors = agreement(
             *network_case(PLAIN, tmp_path), PLAIN, directions=1, steps=(1e-6, 1e-8, 1e-9)

@@ -1,4 +1,4 @@
-"""Runs of `training_worker.py` in processes of their own."""
+"""Runs of `training_worker.py` in other processes."""
 
 import contextlib
 import json

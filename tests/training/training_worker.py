@@ -1,4 +1,4 @@
-"""Trains `tiny` on made-up captures in a process of its own, alone or as one of several; prints
+"""Trains `tiny` on made-up captures in a new process, alone or as one of several; prints
 "ready" before the first step.
 
 python training_worker.py OUT CAPTURES --stop-at 4 [--devices 4] [--coordinator localhost:1234

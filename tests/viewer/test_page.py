@@ -68,7 +68,7 @@ def test_a_joint_may_have_any_name():
 
 
 def test_shape_sliders_come_with_the_shipped_body_and_vertex_major_gaussians():
-    """Also where those between the legs have weights of their own; not where refinement has added
+    """Also where those between the legs have other weights; not where refinement has added
     Gaussians.
     """
     body, each = load_body(), 3

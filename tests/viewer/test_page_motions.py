@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(NODE is None, reason="needs node (nodejs.org)")
 EXACT = 1e-5
 """Entries of rotation matrices and metres: float32, and BVH's eight decimals."""
 HOW_TO_CHANGE = ", which --motion-fps (in Python fps=) changes"
-"""Said in Python alone: the page has a field for it."""
+"""Python alone adds this: the page has a field for it."""
 PROGRAM = """
 const given = JSON.parse(require("fs").readFileSync(0, "utf8")), { scene } = given;
 scene.order = jointOrder(scene.parents);

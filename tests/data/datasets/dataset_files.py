@@ -343,7 +343,7 @@ def write_dna(folder, frames=FRAMES):
 
 
 def write_scenes(folder, arrays, scale=1.3, views=3):
-    """One scene of two frames in units of its own; returns the list and what the arrays were made
+    """One scene of two frames in unusual units; returns the list and what the arrays were made
     from.
     """
     rng = np.random.default_rng(5)

@@ -111,7 +111,7 @@ def write_thuman(out, seeds=SEEDS, kinds="AC", texture_size=1024, vertices=None)
     """out/body.npz and out/thuman with a scan for each seed, fits of these kinds; returns the data
     set.
 
-    Scans stand in a world of their own: turned, moved, and in other units for each person.
+    The world of the scans is another for each person: turned, moved, and in other units.
     """
     people, small = make_people(seeds, vertices)
     posed = [sample_pose(person, 1) for person in people]

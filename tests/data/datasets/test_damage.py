@@ -464,7 +464,7 @@ def test_honest_sets_are_read(layout, honest, body):
 
 @pytest.mark.wings
 def test_preprocessing_names_all_damage_and_makes_the_rest(honest, body, tmp_path):
-    """All of a layout's damage at once: each case is a subject of its own, beside an honest one."""
+    """All of a layout's damage at once: each case is a subject, beside an honest one."""
     shutil.copytree(honest("avatarrex"), tmp_path / "in" / "honest")
     for name, (damage, *_) in AVATARREX.items():
         shutil.copytree(honest("avatarrex"), tmp_path / "in" / name)

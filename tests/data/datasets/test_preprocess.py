@@ -211,7 +211,7 @@ def test_a_subject_that_cannot_be_read_is_skipped_with_the_reason(videos, tmp_pa
         and "smpl_params.npz: not a readable npz archive" in report.skipped["avatarrex_a"]
     )
     assert "skipped avatarrex_a" in str(report)
-    (source / "avatarrex_a" / "smpl_params.npz").write_bytes(good)  # mended: tried again
+    (source / "avatarrex_a" / "smpl_params.npz").write_bytes(good)  # repaired: tried again
     report = run(source, out, body, settings())
     assert report.scenes == 2 and not report.skipped
     shutil.rmtree(source / "avatarrex_b")
