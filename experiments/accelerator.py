@@ -1,5 +1,6 @@
 """What an accelerator does: agreement with the CPU, and times."""
 
+import dataclasses
 import functools
 import json
 import os
@@ -12,15 +13,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments import quarter_hour, train_by_clock
 from experiments.harness import Run, entry
+from experiments.reconstruction import benchmark_inputs, foreground, random_variables
 from experiments.results import markdown_table, page_of, publish, significant
 from experiments.splatting import demo_scene
 from experiments.timing import medians, timed
+from humangs_jax.avatar.frames import motion_frames
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.views import gaussian_body, prepare_inputs, to_network_views
+from humangs_jax.losses.loss_networks import load_loss_networks
+from humangs_jax.motion import load_motion
+from humangs_jax.network import presets
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.refine import refine
@@ -29,17 +37,14 @@ from humangs_jax.rendering.splatting import render
 from humangs_jax.synthetic.bank import build_bank
 from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig, on_the_fly_example
 from humangs_jax.synthetic.subject import SPLITS
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import seed_numbers
 
-SCENES = (
-    (20_000, 256),
-    (20_000, 512),
-    (52_000, 512),
-    (52_000, 1024),
-    (140_000, 1024),
-    (500_000, 1024),
-)
+SCENES = tuple((count, size) for count in (20_000, 52_000, 200_000) for size in (512, 1024))
 """Gaussians of the scenes, pixels a side."""
-Stage = Literal["check", "splatting", "people", "reconstruct"]
+Stage = Literal["check", "splatting", "people", "reconstruct", "step", "frames", "published"]
+REHEARSAL = 1800.0
+"""Seconds of a rehearsal."""
 Measurement = tuple[str, Callable[[], dict[str, Any]]]
 
 
@@ -49,6 +54,10 @@ def accelerator(
     stage: tuple[Stage, ...] = get_args(Stage),
     small: bool = False,
     earlier: tuple[Path, ...] = (),
+    trace: Path | None = None,
+    minutes: float | None = None,
+    rehearse: bool = False,
+    out: Path = Path("accelerator_out"),
 ) -> int:
     """What an accelerator does: agreement with the CPU, and times.
 
@@ -56,14 +65,29 @@ def accelerator(
 
     check: the same numbers on CPU and device: the shipped network, splatting by the schedule of
     each with gradients. splatting: forward and with gradients. people: rendered on the fly.
-    reconstruct: the demo's photos. Training: `train_by_clock`.
+    reconstruct: the demo's photos. step: of training, as `train_by_clock` makes it. frames: of an
+    animation. published: the published network on 32 people at once.
+
+    With --minutes all of it is done by a list with a clock (`quarter_hour.py`), training and the
+    paper's systems too, in OUT; the same command goes on with what is not done. --rehearse does so
+    at small sizes, with as much time as that takes on two cores of a CPU.
 
     Options:
     stage: which
     small: sizes that a CPU rehearses in minutes
     earlier: files of --json of runs on an accelerator, and run.json of `train_by_clock`: their rows
         are published together, and nothing is measured
+    trace: folder for a profile of a training step
+    minutes: of the list; default: no list
+    rehearse: the list at small sizes
+    out: folder of the list
     """
+    if minutes is not None or rehearse:
+        limit = REHEARSAL if minutes is None else 60 * minutes
+        became = quarter_hour.spend(out, limit, rehearse or small)
+        print(quarter_hour.table_of(became))
+        print("measured:", *quarter_hour.measured_files(out))
+        return int(any(each["became"] in ("failed", "no time") for each in became.values()))
     if earlier:
         records = [json.loads(path.read_text()) for path in earlier]
         rows = {name: row for record in records for name, row in record["rows"].items()}
@@ -83,7 +107,7 @@ def accelerator(
     cases = {
         f"{name}: {what}": functools.partial(_tried, measure)
         for name in stage
-        for what, measure in STAGES[name](small)
+        for what, measure in (STAGES[name](small, trace) if name == "step" else STAGES[name](small))
     }
     found = run.rows(cases, settings)
     run.show(table_of(settings["device"], found), found)
@@ -238,4 +262,83 @@ def reconstructed(small: bool) -> Iterator[Measurement]:
     yield "learned iterations", functools.partial(measure, True)
 
 
-STAGES = dict(zip(get_args(Stage), (check, splatting, people, reconstructed), strict=True))
+def training_step(small: bool, trace: Path | None) -> Iterator[Measurement]:
+    """Seconds to compile a step of training with LPIPS, milliseconds of a step and of its batch."""
+
+    def measure() -> dict[str, Any]:
+        how = train_by_clock.Clock(batch=1 if small else 8)
+        body, (variables, model) = load_body(), load_weights()
+        config, carrier = train_by_clock.configured(how), gaussian_body(body, model)
+        config = dataclasses.replace(
+            config, model=dataclasses.replace(model, runtime=config.model.runtime)
+        )
+        networks = load_loss_networks(lpips_net="alex", installed=True)
+        bank = build_bank(SPLITS["train"][:1], body, "train", displaced=carrier)
+        state, average = (init_state(config, variables) for _ in range(2))
+        examples = jax.jit(train_by_clock.examples_of(config, how))
+        batch = jax.block_until_ready(examples(bank, 0))
+        given = carrier, networks, seed_numbers(0)
+
+        began = perf_counter()
+        lowered = train_by_clock.stepper(config).lower(state, average.params, batch, *given, 1.0)
+        middle = perf_counter()
+        step = lowered.compile()
+        numbers = {"lower s": middle - began, "compile s": perf_counter() - middle}
+
+        # the state is given away at each step
+        running = [state, average.params]
+
+        def one() -> None:
+            running[:] = step(*running, batch, *given, 1.0)[:2]
+            jax.block_until_ready(running)
+
+        runs = {"step": one, "batch": lambda: jax.block_until_ready(examples(bank, 1))}
+        numbers |= {
+            name: float(wall) for name, (wall, _) in medians(runs, 1 if small else 10).items()
+        }
+        if trace is not None:
+            with jax.profiler.trace(str(trace)):
+                one()
+        return numbers
+
+    yield f"{1 if small else 8} people", measure
+
+
+def frames(small: bool) -> Iterator[Measurement]:
+    """Frames of an animation a second, drawn one after the other."""
+
+    def measure(size: int) -> dict[str, Any]:
+        avatar = reconstruct(*load_weights(), load_capture(DEMO_CAPTURE))
+        motion = load_motion()
+        draw = lambda: list(motion_frames(avatar, motion, Shot(size=size), progress=False))
+        wall = float(medians({"all": draw}, 1)["all"][0])
+        return {"frames a second": 1e3 * len(motion.translations) / wall}
+
+    for size in (64,) if small else (512, 1024):
+        yield f"{size} pixels", functools.partial(measure, size)
+
+
+def published_network(small: bool) -> Iterator[Measurement]:
+    """Milliseconds of the published network, random weights, photos to Gaussians, in a batch."""
+
+    def measure(batch: int) -> dict[str, Any]:
+        config = presets.tiny() if small else presets.published()
+        variables = random_variables(config)
+        inputs = benchmark_inputs(config, 4, config.conventions.image_size)
+        config, _, _ = foreground(inputs, config)
+        together = jax.tree.map(lambda x: jnp.stack([x] * batch), inputs)
+        each = lambda x: apply_humangs(variables, x, config)[0].gaussians
+        make = jax.jit(jax.vmap(each))
+        run = lambda: jax.block_until_ready(make(together))
+        wall = float(medians({"all": run}, 1 if small else 5)["all"][0])
+        return {"ms": wall, "people a second": 1e3 * batch / wall}
+
+    for batch in (2,) if small else (1, 32):
+        yield f"{batch} at once", functools.partial(measure, batch)
+
+
+MEASURES = (
+    *(check, splatting, people, reconstructed),
+    *(training_step, frames, published_network),
+)
+STAGES: dict[str, Any] = dict(zip(get_args(Stage), MEASURES, strict=True))

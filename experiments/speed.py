@@ -53,7 +53,7 @@ def speed(
     repeats: timed iterations in a process
     slower: factor of a ratio from which on the change is too slow
     """
-    with _checkout(before) as other:
+    with checkout(before) as other:
         places = {"before": other} if other else {}
         places["now"] = REPOSITORY
         samples = {name: [] for name in places}
@@ -116,7 +116,7 @@ def public_names(root: Path) -> list[str]:
 
 
 @contextmanager
-def _checkout(commit: str | None) -> Generator[Path | None]:
+def checkout(commit: str | None) -> Generator[Path | None]:
     """The files of a commit in a folder that is gone afterwards; None for no commit."""
     if commit is None:
         yield None

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.apps.settings import Settings
@@ -25,6 +24,7 @@ from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import contact_sheet, side_by_side, write_video
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.progress import COMPILING, stage
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
@@ -128,7 +128,7 @@ def _write_demo(
 
     def held_out(avatar: Avatar, background: float = 1.0) -> tuple[Any, list[Rendering]]:
         how = splatting_of(settings.shot(Shot()), avatar)
-        return capture_renderings(avatar, truth, jnp.full(3, background), how)
+        return capture_renderings(avatar, truth, from_host(np.full(3, background)), how)
 
     with stage("reconstructing"):
         avatar = _timed(

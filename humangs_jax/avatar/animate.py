@@ -211,12 +211,15 @@ def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
     It looks as before: by how much its low-pass was larger is now part of the scales, which a fit
     can reduce.
     """
+    return replace(avatar, gaussians=_low_pass_of(avatar, views))
+
+
+@jax.jit
+def _low_pass_of(avatar: Avatar, views: SubjectViews) -> Gaussians:
     gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
     if gaussians.low_pass is None:
-        return with_low_pass(avatar, sizes)
-    return replace(
-        avatar, gaussians=replace(gaussians, low_pass=jnp.minimum(gaussians.low_pass, sizes))
-    )
+        return with_low_pass(avatar, sizes).gaussians
+    return replace(gaussians, low_pass=jnp.minimum(gaussians.low_pass, sizes))
 
 
 @jax.jit

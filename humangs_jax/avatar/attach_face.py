@@ -8,6 +8,7 @@ from collections.abc import Callable
 from importlib import resources
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
@@ -20,6 +21,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.configuration import config_from_json
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
@@ -171,10 +173,10 @@ def _face(avatar: Avatar, body: BodyModel, of_arkit: bool) -> Face:
     beside, stretching = _stretching(avatar, vertices, row_of_vertex)
     hidden = _hidden(avatar, body, row < len(vertices)) if of_arkit else _nothing(expressions)
     return Face(
-        row=jnp.asarray(row, jnp.int32),
-        eyes=jnp.asarray(eyes),
-        beside=jnp.asarray(beside, jnp.int32),
-        stretching=jnp.asarray(stretching, jnp.float32),
+        row=from_host(row, jnp.int32),
+        eyes=from_host(eyes),
+        beside=from_host(beside, jnp.int32),
+        stretching=from_host(stretching, jnp.float32),
         expressions=expressions,
         **hidden,
     )
@@ -233,7 +235,7 @@ def _nothing(expressions: Expressions) -> dict[str, Any]:
     the mouth.
     """
     e = len(expressions.names)
-    empty = Gaussians(*(jnp.zeros((0, *shape)) for shape in ((3,), (4,), (3,), (), (3,))))
+    empty = Gaussians(*(from_host(np.zeros((0, *shape))) for shape in ((3,), (4,), (3,), (), (3,))))
     shapes = {
         "hidden_normals": (0, 3),
         "hidden_directions": (0, 3, e),
@@ -242,7 +244,7 @@ def _nothing(expressions: Expressions) -> dict[str, Any]:
         "lips": (4, 3),
         "lip_directions": (4, 3, e),
     }
-    return {"hidden": empty} | {name: jnp.zeros(shape) for name, shape in shapes.items()}
+    return {"hidden": empty} | {name: from_host(np.zeros(shape)) for name, shape in shapes.items()}
 
 
 @functools.cache
@@ -290,7 +292,7 @@ def _hidden(avatar: Avatar, body: BodyModel, follows: np.ndarray) -> dict[str, A
         "lips": lips,
         "lip_directions": parts.lip_directions,
     }
-    return {"hidden": hidden} | {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items()}
+    return {"hidden": hidden} | {name: from_host(x, jnp.float32) for name, x in arrays.items()}
 
 
 def _map_around(
@@ -343,9 +345,12 @@ def _gaussians_of(
     scales = np.concatenate([COVER * sides, THICKNESS * sides.min(axis=1, keepdims=True)], axis=1)
     axes = np.stack([unit(first), np.cross(normals, unit(first)), normals], axis=-1)
     means = corners.mean(axis=1) + np.where(in_mouth, 0, LID_LIFT)[:, None] * normals
-    number = lambda x: jnp.asarray(x, jnp.float32)
-    quats, opacities = quaternion.from_matrix(number(axes)), np.full(len(means), OPAQUE)
+    number = lambda x: from_host(x, jnp.float32)
+    quats, opacities = _from_matrices(number(axes)), np.full(len(means), OPAQUE)
     return (
         Gaussians(number(means), quats, number(scales), number(opacities), number(colors)),
         normals,
     )
+
+
+_from_matrices = jax.jit(quaternion.from_matrix)

@@ -15,6 +15,7 @@ from humangs_jax.avatar.face import Face
 from humangs_jax.body.library import expression_arrays, read_expressions
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.checks import FINITE, LARGEST, ROUNDING, SIGNED_UNIT, UNIT, require_concrete
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, shape_fault, static_field
@@ -278,12 +279,14 @@ class Avatar(Batchable):
         """The avatar with these of its Gaussians."""
         light = self.light
         if light is not None:
-            light = replace(light, normals=light.normals[index], shading=light.shading[index])
-        gaussians = jax.tree.map(lambda x: x[index], self.gaussians)
+            light = replace(
+                light, normals=taken(light.normals, index), shading=taken(light.shading, index)
+            )
+        gaussians = jax.tree.map(lambda x: taken(x, index), self.gaussians)
         return replace(
             self,
             gaussians=gaussians,
-            skinning_weights=self.skinning_weights[index],
+            skinning_weights=taken(self.skinning_weights, index),
             light=light,
             face=None if self.face is None else self.face.select(index),
         )
@@ -420,7 +423,7 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     face = _read_face(of_face, arrays)
     check_checksum(header.get("checksum"), checksum(arrays))
     arrays = {name: arrays[name] for name in wanted}
-    loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
+    loaded = {name: from_host(value) for name, value in arrays.items()}
     return cls(
         Gaussians(
             *(loaded[name] for name in _ARRAYS[:5]),
@@ -488,10 +491,10 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
     }
     for name, (shape, ends) in expected.items():
         check_array(f"face_{name}", of_face[f"face_{name}"], shape, *ends)
-    loaded = {name: jnp.asarray(of_face[f"face_{name}"], jnp.float32) for name in expected}
+    loaded = {name: from_host(of_face[f"face_{name}"], jnp.float32) for name in expected}
     # teeth, tongue and lids are Gaussians that are hidden at rest
     hidden = Gaussians(*(loaded.pop(f"hidden_{name}") for name in _ARRAYS[:5]))
-    loaded |= {name: jnp.asarray(of_face[f"face_{name}"], jnp.int32) for name in ("row", "beside")}
+    loaded |= {name: from_host(of_face[f"face_{name}"], jnp.int32) for name in ("row", "beside")}
     return Face(hidden=hidden, expressions=expressions, **loaded)
 
 

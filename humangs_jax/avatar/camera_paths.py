@@ -17,6 +17,7 @@ from humangs_jax.avatar.frames import rest_pose_of
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.motion import Motion, grounded
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.cameras import in_capture_convention, read_calibration
 from humangs_jax.geometry.camera import Camera, stack_cameras
@@ -93,7 +94,7 @@ def camera_path(cameras: Camera, frames: int) -> Camera:
     between[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centers)
     K = PchipInterpolator(places, np.asarray(cameras.K, np.float64))(times)
     dtype = cameras.K.dtype
-    return replace(cameras, K=jnp.asarray(K, dtype), cam_from_world=jnp.asarray(between, dtype))
+    return replace(cameras, K=from_host(K, dtype), cam_from_world=from_host(between, dtype))
 
 
 def standing(avatar: Avatar, pose: BodyPose | None = None) -> BodyPose:

@@ -19,6 +19,7 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody, blend_transforms, joint_transforms
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import COMPILING, bar
@@ -138,7 +139,7 @@ def composite_over(
 
 def rest_pose_of(avatar: Avatar) -> BodyPose:
     """The T-pose, at the place where the avatar's body is modelled."""
-    return BodyPose(jnp.zeros((len(avatar.parents), 3)), jnp.zeros(3))
+    return BodyPose(from_host(np.zeros((len(avatar.parents), 3))), from_host(np.zeros(3)))
 
 
 def a_pose_of(avatar: Avatar) -> BodyPose:
@@ -153,7 +154,7 @@ def a_pose_of(avatar: Avatar) -> BodyPose:
     rotations = np.zeros((len(names), 3), np.float32)
     rotations[names.index("left_shoulder"), 2] = -angle  # the left side is at +x, y is up
     rotations[names.index("right_shoulder"), 2] = angle
-    return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
+    return BodyPose(from_host(rotations), from_host(np.zeros(3)))
 
 
 # Cameras
@@ -168,7 +169,7 @@ def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"
     opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))
     count = min(TRACKED, len(opaque), max(MOST_TRACKED // len(poses.translation), 1))
     chosen = opaque[np.linspace(0, len(opaque) - 1, count).astype(int)]
-    means, weights = avatar.gaussians.means[chosen], avatar.skinning_weights[chosen]
+    means, weights = taken(avatar.gaussians.means, chosen), taken(avatar.skinning_weights, chosen)
     return np.asarray(_paths(means, weights, avatar.rest_joints, avatar.parents, poses))
 
 
@@ -213,10 +214,10 @@ def shot_cameras(
     views = np.zeros((len(turns), 4, 4), np.float32)
     views[:, :3, :3], views[:, 3, 3] = axes, 1
     views[:, :3, 3] = -np.einsum("vij,vj->vi", axes, targets + distance * back)
-    K = jnp.broadcast_to(
-        intrinsics_from_fov(np.radians(shot.fov), width, height), (len(turns), 3, 3)
-    )
-    return replace(Camera(K[0], jnp.eye(4), width, height), K=K, cam_from_world=jnp.asarray(views))
+    K = np.asarray(intrinsics_from_fov(np.radians(shot.fov), width, height))
+    each = from_host(np.broadcast_to(K, (len(turns), 3, 3)))
+    one = Camera(from_host(K), from_host(np.eye(4)), width, height)
+    return replace(one, K=each, cam_from_world=from_host(views))
 
 
 def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
@@ -311,7 +312,7 @@ def trim_and_resample(
     return replace(
         part,
         rotations=turned,
-        translations=jnp.asarray(moved, jnp.float32),
+        translations=from_host(moved, jnp.float32),
         expressions=faces,
     )
 
@@ -375,7 +376,7 @@ def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
         raise ValueError(
             f"the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}"
         )
-    poses = jax.tree.map(lambda x: x[np.asarray(capture.frames)], capture.poses)
+    poses = capture.poses[np.asarray(capture.frames)]
     return upright_world(
         poses, capture.cameras, lambda: np.asarray(avatar.rest_joints)[avatar.parents.index(-1)]
     )
@@ -400,7 +401,7 @@ def images(
 
     progress: what a progress bar says; None: no bar.
     """
-    drawn = draw(avatar, poses, cameras, jnp.zeros(3), splatting_of(shot, avatar))
+    drawn = draw(avatar, poses, cameras, from_host(np.zeros(3)), splatting_of(shot, avatar))
     shown = bar(
         drawn,
         total=len(poses),
@@ -492,7 +493,7 @@ def circle_cameras(
     # cameras stand around it in the world of the file, whose up axis may be another
     turn = world_matrix(form)
     cameras = orbit(
-        jnp.asarray(middle @ turn, jnp.float32),
+        from_host(middle @ turn, jnp.float32),
         distance if shot.distance is None else shot.distance,
         jnp.radians(shot.azimuth + 360 / views * np.arange(views)).astype(jnp.float32),
         float(np.radians(shot.elevation)),
@@ -501,7 +502,7 @@ def circle_cameras(
     )
     turned = np.asarray(cameras.cam_from_world).copy()
     turned[:, :3, :3] = turned[:, :3, :3] @ turn.T
-    each = replace(cameras, cam_from_world=jnp.asarray(turned))
+    each = replace(cameras, cam_from_world=from_host(turned))
     return {f"view_{i:03d}": camera for i, camera in enumerate(each)}
 
 

@@ -31,10 +31,13 @@ from humangs_jax.body.model import (
     spread_weights,
 )
 from humangs_jax.core.array_types import Array, Bool, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
+from humangs_jax.core.processes import compile_ahead
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.records import check_record
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import (
     PreparedCapture,
@@ -118,9 +121,15 @@ def reconstruct(
     if bucket > count:
         views = pad_views(views, bucket)
     with compiling(("reconstruct", config, views.images.shape)):
+        # two programs are compiled side by side, where masks alone say how many tokens there are
+        sized = _sized_by_masks(views, config)
+        if sized is not None:
+            shapes = jax.eval_shape(_prepare, body, views, config)
+            compile_ahead(_reconstruct, variables, sized, body, views, shapes)
         inputs = _prepare(body, views, config)
         check_values("reconstruct: capture", {POSED: (inputs.posed_vertices, FINITE)})
-        sized = fit_buffers(inputs.foreground, inputs.view_count, config)
+        if sized is None:
+            sized = fit_buffers(inputs.foreground, inputs.view_count, config)
         avatar, _ = _reconstruct(variables, sized, body, views, inputs)
     return replace(avatar, light=None) if prepared.turned else avatar
 
@@ -320,8 +329,18 @@ def network_views(prepared: PreparedCapture, config: HumanGSConfig) -> SubjectVi
     """The photos as the network wants them, and how far the body moves."""
     views = to_network_views(prepared.capture, config.image_size, config.runtime.crop)
     if prepared.displacement is not None:
-        views = replace(views, displacement=jnp.asarray(prepared.displacement))
+        views = replace(views, displacement=from_host(prepared.displacement))
     return views
+
+
+def _sized_by_masks(views: SubjectViews, config: HumanGSConfig) -> HumanGSConfig | None:
+    """What `fit_buffers` will make of the network's inputs, where the network reads the person's
+    pixels alone and every photo has a mask; None elsewhere.
+    """
+    person = np.asarray(views.masks) > MASK_THRESHOLD
+    if config.conventions.pixels != "person" or not person.any(axis=(1, 2)).all():
+        return None
+    return fit_buffers(from_host(person), views.view_count, config)
 
 
 def fit_buffers(

@@ -21,6 +21,7 @@ import numpy as np
 
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import LARGEST
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.io.arrays import check_array, check_indices, read_npz
@@ -132,9 +133,9 @@ def shipped_expressions(body_vertices: int) -> Expressions:
     for side, eye in enumerate(EYES):
         turns[JOINT_NAMES.index(eye)] = arrays["eye_turns"][:, side].T
     return Expressions(
-        vertices=jnp.asarray(moved, jnp.int32),
-        directions=jnp.asarray(dense[moved]),
-        joint_turns=jnp.asarray(turns),
+        vertices=from_host(moved, jnp.int32),
+        directions=from_host(dense[moved]),
+        joint_turns=from_host(turns),
         names=names,
     )
 

@@ -18,6 +18,7 @@ from humangs_jax.body.expressions import Expressions, shipped_expressions
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import LARGEST, checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.arrays import (
@@ -216,19 +217,19 @@ def read_body(path: str | Path) -> BodyModel:
         for name in {"collapse_order", "collapse_into"} & set(arrays):
             check_indices(name, arrays[name], (vertices,), vertices)
         expressions = read_expressions(arrays, vertices, joints)
-        index = lambda key: jnp.asarray(arrays[key], jnp.int32) if key in arrays else None
+        index = lambda key: from_host(arrays[key], jnp.int32) if key in arrays else None
         return BodyModel(
-            template=jnp.asarray(arrays["template"], jnp.float32),
-            shape_directions=jnp.asarray(directions, jnp.float32),
+            template=from_host(arrays["template"], jnp.float32),
+            shape_directions=from_host(directions, jnp.float32),
             pose_directions=None,
-            joint_regressor=jnp.asarray(
+            joint_regressor=from_host(
                 _dense_rows(arrays, "regressor", "regressor_vertices", joints, vertices)
             ),
-            skinning_weights=jnp.asarray(
+            skinning_weights=from_host(
                 _dense_rows(arrays, "weight", "weight_joints", vertices, joints)
             ),
-            faces=jnp.asarray(arrays["faces"], jnp.int32),
-            uvs=None if uvs is None else jnp.asarray(uvs, jnp.float32),
+            faces=from_host(arrays["faces"], jnp.int32),
+            uvs=None if uvs is None else from_host(uvs, jnp.float32),
             uv_faces=index("uv_faces"),
             collapse_order=index("collapse_order"),
             collapse_into=index("collapse_into"),
@@ -283,10 +284,10 @@ def read_expressions(
     check_indices(f"{EXPRESSION}vertices", found["vertices"], (moved,), vertices)
     for name in found.keys() & shapes.keys():
         check_array(f"{EXPRESSION}{name}", found[name], shapes[name], -LARGEST, LARGEST)
-    number = lambda name: jnp.asarray(found[name], jnp.float32) if name in found else None
+    number = lambda name: from_host(found[name], jnp.float32) if name in found else None
     return Expressions(
-        vertices=jnp.asarray(found["vertices"], jnp.int32),
-        directions=jnp.asarray(found["directions"], jnp.float32),
+        vertices=from_host(found["vertices"], jnp.int32),
+        directions=from_host(found["directions"], jnp.float32),
         joint_directions=number("joint_directions"),
         joint_turns=number("joint_turns"),
         names=tuple(str(name) for name in np.atleast_1d(found["names"])),
@@ -336,7 +337,7 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
         directions, names = _shape_directions(file, n, shape_count, expression_count)
         has_uvs = "vt" in file and "ft" in file
         uvs = file.numbers("vt", (None, 2)) if has_uvs else None
-        number = lambda x: jnp.asarray(x, jnp.result_type(float))
+        number = lambda x: from_host(x, jnp.result_type(float))
         # the expressions of the face, also as a change of the joints
         regressor = number(file.numbers("J_regressor", (JOINTS, n), LARGEST))
         components = number(directions[..., shape_count:])
@@ -352,9 +353,9 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
             pose_directions=number(file.numbers("posedirs", (n, 3, 9 * (JOINTS - 1)), LARGEST)),
             joint_regressor=regressor,
             skinning_weights=number(weights),
-            faces=jnp.asarray(file.indices("f", n), jnp.int32),
+            faces=from_host(file.indices("f", n), jnp.int32),
             uvs=None if uvs is None else number(uvs),
-            uv_faces=None if uvs is None else jnp.asarray(file.indices("ft", len(uvs)), jnp.int32),
+            uv_faces=None if uvs is None else from_host(file.indices("ft", len(uvs)), jnp.int32),
             expressions=expressions if expression_count else None,
             parents=_parents(file),
             joint_names=JOINT_NAMES,
@@ -409,7 +410,7 @@ def load_hands(path: str | Path) -> HandBasis:
     """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: key.startswith("hands_"))
-        number = lambda arrays: jnp.asarray(np.stack(arrays), jnp.result_type(float))
+        number = lambda arrays: from_host(np.stack(arrays), jnp.result_type(float))
         return HandBasis(
             means=number([file.numbers(f"hands_mean{side}", (45,)) for side in "lr"]),
             components=number([file.numbers(f"hands_components{side}", (45, 45)) for side in "lr"]),

@@ -318,8 +318,18 @@ def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
         raise ValueError(
             f"{used} shape coefficients, but body '{body.name}' has {available} shape directions"
         )
-    vertices = shaped(body.template, body.shape_directions, betas)
-    return RestBody(vertices, jnp.matmul(body.joint_regressor, vertices, precision=EXACT))
+    return _shaped_body(body.template, body.shape_directions, body.joint_regressor, betas)
+
+
+@jax.jit
+def _shaped_body(
+    template: Float[Array, "n 3"],
+    directions: Float[Array, "n 3 s"],
+    regressor: Float[Array, "j n"],
+    betas: Float[Array, " s_used"],
+) -> RestBody:
+    vertices = shaped(template, directions, betas)
+    return RestBody(vertices, jnp.matmul(regressor, vertices, precision=EXACT))
 
 
 def without_expression(body: BodyModel) -> BodyModel:

@@ -10,6 +10,7 @@ import numpy as np
 from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.axes import UPRIGHT, upright_matrix
@@ -40,16 +41,17 @@ class Motion:
         (`avatar.expression_names`).
         """
         faces = self.expressions_of(expression_names)
-        expression = None if faces is None else faces[frame]
-        return BodyPose(self.rotations[frame], self.translations[frame], expression)
+        expression = None if faces is None else taken(faces, frame)
+        pose = taken(self.rotations, frame), taken(self.translations, frame)
+        return BodyPose(*pose, expression)
 
     def part(self, frames: slice) -> "Motion":
         """Some of the frames, at the same rate."""
-        faces = None if self.expressions is None else self.expressions[frames]
+        faces = None if self.expressions is None else taken(self.expressions, frames)
         return replace(
             self,
-            rotations=self.rotations[frames],
-            translations=self.translations[frames],
+            rotations=taken(self.rotations, frames),
+            translations=taken(self.translations, frames),
             expressions=faces,
         )
 
@@ -82,7 +84,7 @@ class Motion:
 
     def _at(self, times: Float[np.ndarray, " n"]) -> "Motion":
         low = np.floor(times).astype(int)
-        frames = self.rotations[low], self.translations[low]
+        frames = taken(self.rotations, low), taken(self.translations, low)
         if (times > low).any():
             high = np.minimum(low + 1, len(self.translations) - 1)
             share = jnp.asarray(times - low, jnp.float32)
@@ -116,22 +118,24 @@ def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion
         rest, parents: of the body that will move. Its lowest joint is asked, and as far below it as
         in T-pose is the sole.
     """
-    joints = _joint_paths(rest.joints, parents, motion.rotations, motion.translations)
-    sole = rest.joints[:, 1].min() - rest.vertices[:, 1].min()
-    shift = jnp.stack([joints[0, 0, 0], joints[..., 1].min() - sole, joints[0, 0, 2]])
-    return replace(motion, translations=motion.translations - shift)
+    moved = _on_the_floor(rest, parents, motion.rotations, motion.translations)
+    return replace(motion, translations=moved)
 
 
 @functools.partial(jax.jit, static_argnames="parents")
-def _joint_paths(
-    rest_joints: Float[Array, "j 3"],
+def _on_the_floor(
+    rest: RestBody,
     parents: tuple[int, ...],
     rotations: Float[Array, "m j 3"],
     translations: Float[Array, "m 3"],
-) -> Float[Array, "m j 3"]:
+) -> Float[Array, "m 3"]:
+    """The translations of `grounded`."""
     transforms = jax.vmap(joint_transforms, in_axes=(None, None, 0, 0))
-    transforms = transforms(rest_joints, parents, rotations, translations)
-    return transform.apply(transforms, rest_joints)
+    transforms = transforms(rest.joints, parents, rotations, translations)
+    joints = transform.apply(transforms, rest.joints)
+    sole = rest.joints[:, 1].min() - rest.vertices[:, 1].min()
+    shift = jnp.stack([joints[0, 0, 0], joints[..., 1].min() - sole, joints[0, 0, 2]])
+    return translations - shift
 
 
 def turned_upright(
@@ -146,11 +150,16 @@ def turned_upright(
     if up == "y":
         return rotations, translations
     turn = upright_matrix(up)
-    root = quaternion.from_axis_angle(jnp.asarray(rotations[:, 0], jnp.float32))
-    root = np.asarray(quaternion.multiply(jnp.asarray(UPRIGHT[up], jnp.float32), root), np.float64)
+    root = _turned_root(from_host(UPRIGHT[up], np.float32), from_host(rotations[:, 0], np.float32))
+    root = np.asarray(root, np.float64)
     root *= np.where(root[:, :1] < 0, -1, 1)  # the shorter way round
     sine = np.linalg.norm(root[:, 1:], axis=1, keepdims=True)
     angle = 2 * np.arctan2(sine, root[:, :1])
     axis_angle = root[:, 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2)
     rotations = np.concatenate([axis_angle[:, None], rotations[:, 1:]], axis=1)
     return rotations, (translations + pelvis) @ turn.T - pelvis
+
+
+@jax.jit
+def _turned_root(turn: Float[Array, "4"], root: Float[Array, "m 3"]) -> Float[Array, "m 4"]:
+    return quaternion.multiply(turn, quaternion.from_axis_angle(root))

@@ -27,6 +27,7 @@ from scipy import sparse
 from humangs_jax.body.expressions import Expressions
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.mesh import (
@@ -108,15 +109,14 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
         vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA)
     )
     added = len(linear["template"]) - len(body.template)
-    regressor = jnp.pad(
-        body.joint_regressor, ((0, 0), (0, added))
-    )  # joints follow the original vertices
+    # joints follow the original vertices
+    regressor = from_host(np.pad(np.asarray(body.joint_regressor), ((0, 0), (0, added))))
     finer = replace(
         body,
-        **{name: jnp.asarray(x) for name, x in linear.items()},
-        faces=jnp.asarray(faces, body.faces.dtype),
+        **{name: from_host(x) for name, x in linear.items()},
+        faces=from_host(faces, body.faces.dtype),
         joint_regressor=regressor,
-        spacing=jnp.asarray(spacing, body.template.dtype),
+        spacing=from_host(spacing, body.template.dtype),
         expressions=None if moves is None else moves.expressions(),
         uvs=None,
         uv_faces=None,
@@ -158,8 +158,8 @@ class _Moves:
         vertices = np.flatnonzero(self.row < len(self.directions) - 1)
         return replace(
             self.of_body,
-            vertices=jnp.asarray(vertices, jnp.int32),
-            directions=jnp.asarray(self.directions[self.row[vertices]]),
+            vertices=from_host(vertices, jnp.int32),
+            directions=from_host(self.directions[self.row[vertices]]),
         )
 
 
@@ -173,8 +173,8 @@ def _kept_moves(
     stay = vertices >= 0
     return replace(
         expressions,
-        vertices=jnp.asarray(vertices[stay], jnp.int32),
-        directions=jnp.asarray(np.asarray(expressions.directions)[stay]),
+        vertices=from_host(vertices[stay], jnp.int32),
+        directions=from_host(np.asarray(expressions.directions)[stay]),
     )
 
 
@@ -515,7 +515,7 @@ def _carry_uvs(
         nearer = distance < best_distance
         best, best_distance = np.where(nearer, candidate, best), np.minimum(distance, best_distance)
     used, renumbered = np.unique(best, return_inverse=True)
-    return jnp.asarray(uvs[used]), jnp.asarray(renumbered.reshape(-1, 3), jnp.int32)
+    return from_host(uvs[used]), from_host(renumbered.reshape(-1, 3), jnp.int32)
 
 
 @checked_arguments
@@ -563,7 +563,7 @@ def decimate_with_kept(
     solid = (ends != np.roll(ends, 1, axis=1)).all(axis=1)
     uvs, uv_faces = (None, None) if body.uvs is None else _carry_uvs(body, faces, target, solid)
     dtype = body.template.dtype
-    rows = lambda array: jnp.asarray(
+    rows = lambda array: from_host(
         np.asarray(array)[kept]
     )  # by numpy: no compilation for each size
     coarse = replace(
@@ -571,14 +571,14 @@ def decimate_with_kept(
         template=rows(body.template),
         shape_directions=rows(body.shape_directions),
         pose_directions=None if body.pose_directions is None else rows(body.pose_directions),
-        joint_regressor=jnp.asarray(_refit_regressor(body, target, kept), dtype),
+        joint_regressor=from_host(_refit_regressor(body, target, kept), dtype),
         skinning_weights=rows(body.skinning_weights),
-        faces=jnp.asarray(renumber[ends[solid]], jnp.int32),
+        faces=from_host(renumber[ends[solid]], jnp.int32),
         expressions=_kept_moves(body.expressions, renumber),
         uvs=uvs,
         uv_faces=uv_faces,
         made_for=None,
-        collapse_order=jnp.asarray(order[kept], jnp.int32),
-        collapse_into=jnp.asarray(renumber[into[kept]], jnp.int32),
+        collapse_order=from_host(order[kept], jnp.int32),
+        collapse_into=from_host(renumber[into[kept]], jnp.int32),
     )
     return coarse, kept

@@ -27,6 +27,7 @@ import numpy as np
 from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Shaped
+from humangs_jax.core.arrays import on_host
 from humangs_jax.core.pytree import shape_fault
 
 P = ParamSpec("P")
@@ -234,8 +235,8 @@ def check_values(
 
     Arguments: owner: the function that was called, for the message. arrays: by name (for the
     message too), each with the values that it may have; None and empty arrays pass. Arrays of JAX
-    are reduced together on their device, by one program and one transfer of two numbers each;
-    numpy's are checked on the host, without a copy to a device.
+    on an accelerator are reduced together there, by one program and one transfer of two numbers
+    each; others are checked on the host, without a copy.
     Raises: ValueError that names the first array with other values, says how many they are, and
     where the first one is. Nothing is checked if one of the arrays is traced.
     """
@@ -246,11 +247,9 @@ def check_values(
     }
     if any(isinstance(array, Tracer) for array, _ in given.values()):
         return
-    on_device = {
-        name: array for name, (array, _) in given.items() if not isinstance(array, np.ndarray)
-    }
+    on_device = {name: array for name, (array, _) in given.items() if not on_host(array)}
     extremes = {
-        name: (array.min(), array.max())
+        name: _extremes_on_host(array)
         for name, (array, _) in given.items()
         if name not in on_device
     }
@@ -272,6 +271,11 @@ def require_concrete(owner: str, why: str, *trees: Any) -> None:
         raise TypeError(
             f"{owner} {why}: call it outside of jit, vmap and grad, which know shapes only"
         )
+
+
+def _extremes_on_host(array: Any) -> tuple[Any, Any]:
+    values = np.asarray(array)
+    return values.min(), values.max()
 
 
 @jax.jit

@@ -199,6 +199,12 @@ JAX's own limit needs the package `filelock`.
 """
 
 
+QUICKEST_OF_JAX = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+QUICKEST = 0.1
+"""Seconds of compilation from which a program is kept on disk. With JAX's own second most programs
+of a command are compiled again each time."""
+
+
 def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Turn on JAX's persistent compilation cache, in a folder for each version of JAX and kind of
     processor.
@@ -237,8 +243,13 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     except (OSError, RuntimeError):  # RuntimeError: no home
         return None
     os.environ[OF_JAX] = str(cache)
+    settings: dict[str, Any] = {"jax_compilation_cache_dir": str(cache)}
+    if QUICKEST_OF_JAX not in os.environ:
+        os.environ[QUICKEST_OF_JAX] = str(QUICKEST)
+        settings["jax_persistent_cache_min_compile_time_secs"] = QUICKEST
     if "jax" in sys.modules:
-        sys.modules["jax"].config.update("jax_compilation_cache_dir", str(cache))
+        for name, value in settings.items():
+            sys.modules["jax"].config.update(name, value)
     return cache
 
 
@@ -311,3 +322,23 @@ def compiler_options() -> dict[str, Any] | None:
     if jax.default_backend() == "cpu":
         return CPU_COMPILER_OPTIONS
     return None
+
+
+def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
+    """Compiles a jitted function in a thread, beside other work, and returns the thread.
+
+    A call with such arguments waits until that is done, and compiles nothing itself. What cannot
+    be compiled fails where it is called.
+
+    Args:
+        program: what `jax.jit` returned.
+        *arguments: as of the call; arrays may be `jax.ShapeDtypeStruct`.
+    """
+
+    def compile_it() -> None:
+        with contextlib.suppress(Exception):
+            program.lower(*arguments).compile()
+
+    thread = threading.Thread(target=compile_it)
+    thread.start()
+    return thread

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from humangs_jax.core.arrays import taken
+
 T = TypeVar("T")
 B = TypeVar("B", bound="Batchable")
 _PYTREES: set[type] = set()
@@ -203,7 +205,7 @@ class Batchable:
                 raise IndexError(
                     f"{type(self).__name__}: index {index} is out of range for a batch of {size}"
                 )
-        return jax.tree.map(lambda leaf: leaf[index], self)
+        return jax.tree.map(lambda leaf: taken(leaf, index), self)
 
     def __iter__(self: B) -> Iterator[B]:
         """The examples of a batch, one by one. Raises: TypeError for one example."""

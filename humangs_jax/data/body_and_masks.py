@@ -156,12 +156,13 @@ def skinned(
     joints: of the rest pose. corrected: with the body's pose correctives, if it has some; weights
     are those of all vertices.
     """
-    turns = Rotation.from_rotvec(np.asarray(poses.rotations[frame], float)).as_matrix()
+    turns = Rotation.from_rotvec(np.asarray(poses.rotations)[frame].astype(float)).as_matrix()
     world, places = posed_tree(turns, bones_of(joints, body.parents), body.parents)
     offsets = places - np.einsum("jab,jb->ja", world, joints)
     moves = np.concatenate([world, offsets[..., None]], axis=-1)
     blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
-    linear, offset = blended[..., :3], blended[..., 3] + np.asarray(poses.translation[frame], float)
+    linear = blended[..., :3]
+    offset = blended[..., 3] + np.asarray(poses.translation)[frame].astype(float)
     if corrected and body.pose_directions is not None:
         correction = np.asarray(body.pose_directions) @ (turns[1:] - np.eye(3)).ravel()
         offset = offset + np.einsum("nab,nb->na", linear, correction)
@@ -376,8 +377,8 @@ def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[Masked
         if frame not in posed:
             posed[frame] = skinned(body, joints, capture.poses, frame, weights, corrected=True)
         K, matrix = (
-            np.asarray(capture.cameras.K[i], float),
-            np.asarray(capture.cameras.cam_from_world[i], float),
+            np.asarray(capture.cameras.K, float)[i],
+            np.asarray(capture.cameras.cam_from_world, float)[i],
         )
         if all(
             np.isfinite(x).all() for x in (rest, *posed[frame])

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import UNIT, checked_arguments
 from humangs_jax.core.pytree import short_repr
 from humangs_jax.core.records import Batch
@@ -131,7 +131,7 @@ class Capture:
             images=self.images[views],
             masks=None if self.masks is None else self.masks[views],
             unknown=None if self.unknown is None else self.unknown[views],
-            cameras=jax.tree.map(lambda leaf: leaf[views], self.cameras),
+            cameras=self.cameras[views],
             frames=self.frames[views],
             names=tuple(self.names[i] for i in views),
             gains=None if self.gains is None else self.gains[views],
@@ -384,7 +384,7 @@ def _assemble(
         **vars(photos),
         body=body,
         betas=betas,
-        poses=jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations)),
+        poses=jax.vmap(BodyPose)(from_host(rotations), from_host(translations)),
         body_file=str(body_file),
         displacement=displacement,
     )
@@ -498,8 +498,8 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
             (folder / "unknown").mkdir(exist_ok=True)
             write_png(folder / view["unknown"], capture.unknown[i].astype(np.float32))
         view["frame"] = int(capture.frames[i])
-        view["K"] = np.asarray(capture.cameras.K[i], float).tolist()
-        view["cam_from_world"] = np.asarray(capture.cameras.cam_from_world[i], float).tolist()
+        view["K"] = np.asarray(capture.cameras.K, float)[i].tolist()
+        view["cam_from_world"] = np.asarray(capture.cameras.cam_from_world, float)[i].tolist()
         views.append(view)
     background = "photo" if capture.masks is None else "white"
     write_npz(folder / "body.npz", capture_parameters(target, capture), compressed=False)

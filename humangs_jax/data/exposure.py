@@ -29,6 +29,7 @@ from scipy.sparse.csgraph import connected_components
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import taken
 from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import to_network_views
@@ -122,10 +123,8 @@ def points_of(
         (views.images, views.masks, views.cameras),
     )
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
-    each = [
-        seen_colors(capture.body, rest, *jax.tree.map(lambda x, i=i: x[i], (poses, *per_view)))
-        for i in range(capture.view_count)
-    ]
+    photo = lambda i: jax.tree.map(lambda x: taken(x, i), (poses, *per_view))
+    each = [seen_colors(capture.body, rest, *photo(i)) for i in range(capture.view_count)]
     colors, seen = (np.stack(x) for x in zip(*each, strict=True))
     return colors, seen
 

@@ -9,11 +9,11 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import short_repr
 from humangs_jax.data.body_and_masks import fit_vertex_offsets, views_without_person, without_views
@@ -141,7 +141,7 @@ def _prepared_photos(given: Capture, views: int | str | None) -> PreparedCapture
     # the world with y up, if person and cameras stand along another axis
     up = world_up(np.asarray(capture.poses.rotations)[capture.frames, 0], capture.cameras)
     if up != "y":
-        pelvis = np.asarray(shape_body(capture.body, jnp.asarray(capture.betas)).joints[0])
+        pelvis = np.asarray(shape_body(capture.body, from_host(capture.betas)).joints[0])
         poses, cameras = turned_world(capture.poses, capture.cameras, up, pelvis)
         capture = dataclasses.replace(capture, poses=poses, cameras=cameras)
     left_out = {given.names[view]: reason for view, reason in reasons.items()}

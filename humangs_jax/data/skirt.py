@@ -13,12 +13,12 @@ host, by numpy and scipy.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import sparse
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import (
     MASK_THRESHOLD,
@@ -93,9 +93,7 @@ def add_skirt(
     sides = np.sqrt(vertex_areas(rest + moved, faces))
     own = np.ones(count) if body.spacing is None else np.asarray(body.spacing)
     spacing = np.concatenate([own, sides[count:] / np.median(sides[:count] / own)])
-    return replace(worn, spacing=jnp.asarray(spacing, body.template.dtype)), moved.astype(
-        np.float32
-    )
+    return replace(worn, spacing=from_host(spacing, body.template.dtype)), moved.astype(np.float32)
 
 
 def find_hem(body: BodyModel, capture: Capture) -> float | None:
@@ -172,16 +170,19 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     following, lower = np.roll(upper, -1, axis=1), loop
     corners = [(upper, following, upper + lower), (following, following + lower, upper + lower)]
     tube = np.concatenate([np.stack(each, axis=-1).reshape(-1, 3) for each in corners])
+    # joints stay where they are
+    regressor = np.pad(np.asarray(body.joint_regressor), ((0, 0), (0, added)))
+    spacing = None
+    if body.spacing is not None:
+        spacing = from_host(np.pad(np.asarray(body.spacing), (0, added), constant_values=1))
     return replace(
         body,
-        **{name: jnp.asarray(x) for name, x in linear.items()},
-        faces=jnp.asarray(
+        **{name: from_host(x) for name, x in linear.items()},
+        faces=from_host(
             np.concatenate([np.asarray(body.faces), len(body.template) + tube]), body.faces.dtype
         ),
-        joint_regressor=jnp.pad(body.joint_regressor, ((0, 0), (0, added))),  # joints stay
-        spacing=None
-        if body.spacing is None
-        else jnp.pad(body.spacing, (0, added), constant_values=1),
+        joint_regressor=from_host(regressor),
+        spacing=spacing,
         uvs=None,
         uv_faces=None,
         collapse_order=None,

@@ -15,6 +15,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, sha
 from humangs_jax.body.motion import turned_upright
 from humangs_jax.body.resolution import decimate_with_kept, split_with_weights
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
@@ -80,8 +81,10 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
         raise ValueError(f"{own} views cannot be padded to {count}")
     repeated = np.minimum(np.arange(count), own - 1)
     per_view = ("images", "masks", "cameras", "rotations", "translations")
-    padded = {name: jax.tree.map(lambda x: x[repeated], getattr(views, name)) for name in per_view}
-    return replace(views, **padded, view_count=jnp.asarray(own, jnp.int32))
+    padded = {
+        name: jax.tree.map(lambda x: taken(x, repeated), getattr(views, name)) for name in per_view
+    }
+    return replace(views, **padded, view_count=from_host(own, jnp.int32))
 
 
 @checked_arguments
@@ -170,7 +173,7 @@ def _remeshed(
             coarse, split = split_with_weights(coarse, longer)
             of_coarse = split @ of_coarse
         wider = np.sqrt(len(body.template) / len(coarse.template))
-        spacing = jnp.full(len(coarse.template), wider, body.template.dtype)
+        spacing = from_host(np.full(len(coarse.template), wider), body.template.dtype)
         body, weights = replace(coarse, spacing=spacing), of_coarse
     if longest is not None:
         body, split = split_with_weights(body, longest)
@@ -186,9 +189,9 @@ def on_gaussian_body(
     by the mean of the ends.
     """
     if has_mesh_of(body, config):
-        return jnp.asarray(displacement)
+        return from_host(displacement)
     weights = _remeshed(_ByContent(body), *remesh_key(config))[1]
-    return jnp.asarray(weights @ np.asarray(displacement, np.float64), body.template.dtype)
+    return from_host(weights @ np.asarray(displacement, np.float64), body.template.dtype)
 
 
 def subject_rest(
@@ -313,7 +316,8 @@ def _squares(
     shift = np.zeros((len(boxes), 3, 3), np.float32)
     shift[:, 0, 2], shift[:, 1, 2] = left, top
     scale = np.stack([size / sides, size / sides, np.ones_like(sides)], axis=-1)
-    cameras = replace(cameras, K=(cameras.K - shift) * scale[:, :, None], width=size, height=size)
+    K = from_host((np.asarray(cameras.K) - shift) * scale[:, :, None])
+    cameras = replace(cameras, K=K, width=size, height=size)
     return cut(images, 1.0), None if masks is None else cut(masks, 0.0), cameras
 
 
@@ -382,9 +386,9 @@ def turned_world(
     rotations, translations = turned_upright(rotations, translations, up, pelvis)
     back = np.eye(4)
     back[:3, :3] = upright_matrix(up).T
-    matrices = jnp.asarray(cameras.cam_from_world @ back, jnp.float32)
+    matrices = from_host(np.asarray(cameras.cam_from_world) @ back, jnp.float32)
     turned = jax.vmap(BodyPose)(
-        jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32)
+        from_host(rotations, jnp.float32), from_host(translations, jnp.float32)
     )
     return turned, replace(cameras, cam_from_world=matrices)
 
@@ -405,10 +409,10 @@ def to_network_views(capture: Capture, size: int, crop: bool = False) -> Subject
     masks = np.zeros(images.shape[:3], np.float32) if masks is None else masks
     frames = np.asarray(capture.frames)
     return SubjectViews(
-        images=jnp.asarray(images, jnp.float32),
-        masks=jnp.asarray(masks, jnp.float32),
+        images=from_host(images, jnp.float32),
+        masks=from_host(masks, jnp.float32),
         cameras=cameras,
-        rotations=jnp.asarray(capture.poses.rotations)[frames],
-        translations=jnp.asarray(capture.poses.translation)[frames],
-        betas=jnp.asarray(capture.betas),
+        rotations=from_host(np.asarray(capture.poses.rotations)[frames]),
+        translations=from_host(np.asarray(capture.poses.translation)[frames]),
+        betas=from_host(capture.betas),
     )

@@ -17,7 +17,8 @@ from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host, joined
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading.captures import find_captures
@@ -477,32 +478,46 @@ def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
     where none does.
     """
     body = inputs.body
-    rest = shape_body(body, jnp.asarray(inputs.betas))
-    size = (inputs.cameras.width, inputs.cameras.height)
+    rest = shape_body(body, from_host(inputs.betas))
+    seen = [
+        _seen(body, rest, inputs.pose(int(frame)), inputs.cameras[i])
+        for i, frame in enumerate(inputs.frames)
+    ]
+    pixels, visible = (joined(x) for x in zip(*seen, strict=True))
+    return _photo_colors(from_host(inputs.images), pixels, visible)
 
-    def view(frame, camera):
-        vertices = _posed(body, rest, inputs.pose(frame))
-        pixels, depths = project_vertices(camera, vertices)
-        depth_map = rasterize_mesh(vertices, body.faces, camera).depth
-        return pixels, visible_vertices(pixels, depths, depth_map, size, "half_pixel")
 
-    seen = [view(int(frame), inputs.cameras[i]) for i, frame in enumerate(inputs.frames)]
-    pixels, visible = (jnp.stack(x) for x in zip(*seen, strict=True))
-    return photo_colors(jnp.asarray(inputs.images), pixels, visible, "half_pixel")
+_photo_colors = jax.jit(functools.partial(photo_colors, grid="half_pixel"))
+
+
+@jax.jit
+def _seen(
+    body: BodyModel, rest: RestBody, pose: BodyPose, camera: Camera
+) -> tuple[Float[Array, "n 2"], Bool[Array, " n"]]:
+    """Where a camera shows the vertices of a posed body, pixels, and which of them it sees."""
+    vertices = pose_body(body, rest, pose).vertices
+    pixels, depths = project_vertices(camera, vertices)
+    depth_map = rasterize_mesh(vertices, body.faces, camera).depth
+    size = (camera.width, camera.height)
+    return pixels, visible_vertices(pixels, depths, depth_map, size, "half_pixel")
 
 
 def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:
     """The vertex-color baseline on white, in the poses and from the cameras of a capture."""
     body = views.body
-    rest = shape_body(body, jnp.asarray(views.betas))
+    rest = shape_body(body, from_host(views.betas))
 
-    def draw(frame: int, camera: Camera):
-        fragments = rasterize_mesh(_posed(body, rest, views.pose(frame)), body.faces, camera)
-        return np.asarray(interpolate_attributes(fragments, body.faces, colors, jnp.ones(3)))
-
-    return np.stack([draw(int(frame), views.cameras[i]) for i, frame in enumerate(views.frames)])
+    images = [
+        _painted(body, rest, views.pose(int(frame)), views.cameras[i], colors)
+        for i, frame in enumerate(views.frames)
+    ]
+    return np.stack(images)
 
 
 @jax.jit
-def _posed(body: BodyModel, rest: RestBody, pose: BodyPose) -> Float[Array, "n 3"]:
-    return pose_body(body, rest, pose).vertices
+def _painted(
+    body: BodyModel, rest: RestBody, pose: BodyPose, camera: Camera, colors: Float[Array, "n 3"]
+) -> Float[Array, "h w 3"]:
+    vertices = pose_body(body, rest, pose).vertices
+    fragments = rasterize_mesh(vertices, body.faces, camera)
+    return interpolate_attributes(fragments, body.faces, colors, jnp.ones(3))

@@ -23,6 +23,7 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.core.configuration import Presets
 from humangs_jax.data.capture import Capture
@@ -447,7 +448,7 @@ def score_image(
             image if mask is None else crop.cut(image, mask, protocol.behind)
             for image in (predicted, truth)
         ]
-        size, least = jnp.asarray(pair[0].shape[:2]), min(pair[0].shape[:2])
+        size, least = np.asarray(pair[0].shape[:2], np.int32), min(pair[0].shape[:2])
         pair = [_padded(image) for image in pair]
         if crop is protocol.crops[0] and least >= window.size:
             row |= pair_scores(*pair, size, window)
@@ -462,8 +463,8 @@ def score_image(
     # the person alone, and patches of the person
     if not empty:
         frame = [_padded(x) for x in (predicted, truth, mask, boundary_band(mask))]
-        scores, kept = person_scores(*frame, jnp.asarray(mask.shape), window)
-        kept = np.argwhere(kept)
+        scores, kept = person_scores(*frame, np.asarray(mask.shape, np.int32), window)
+        kept = np.argwhere(np.asarray(kept))
         row |= scores | {"patches": len(kept)}
         if not len(kept):
             row |= {"patch_psnr": None, "patch_ssim": None}
@@ -478,7 +479,7 @@ def score_image(
 def _padded(image: np.ndarray) -> Array:
     """With zeros below and right, up to a size that many images share; on the device."""
     missing = [(0, round_up(side) - side) for side in image.shape[:2]]
-    return jnp.asarray(np.pad(image, missing + [(0, 0)] * (image.ndim - 2)), jnp.float32)
+    return from_host(np.pad(image, missing + [(0, 0)] * (image.ndim - 2)), jnp.float32)
 
 
 def _patch_lpips(

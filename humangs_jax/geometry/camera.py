@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
+from humangs_jax.core.arrays import from_host, joined, on_host
 from humangs_jax.core.checks import POSITIVE, checked_arguments
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
@@ -132,7 +133,7 @@ class Camera(Batchable):
             raise ValueError(
                 f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}"
             )
-        arrays = jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept)
+        arrays = from_host(K, kept), from_host(cam_from_world, kept)
         return cls(*arrays, width, height, coefficients, lens)
 
     @property
@@ -156,8 +157,9 @@ class Camera(Batchable):
         Raises: ValueError for sides that are no whole numbers.
         """
         width, height = _pixels(width, height)
-        scale = jnp.asarray([width / self.width, height / self.height, 1.0], self.K.dtype)
-        return replace(self, K=self.K * scale[:, None], width=width, height=height)
+        scale = np.asarray([width / self.width, height / self.height, 1.0], self.K.dtype)
+        K = np.asarray(self.K) if on_host(self.K) else self.K
+        return replace(self, K=from_host(K * scale[:, None]), width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
         """The same camera for a world whose lengths are divided by `unit`."""
@@ -221,7 +223,7 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
         raise ValueError(f"image sizes differ: {sorted({(c.width, c.height) for c in cameras})}")
     if len({(c.lens, None if c.distortion is None else c.distortion.shape) for c in cameras}) > 1:
         raise ValueError("lenses differ: expected one lens with one number of coefficients")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    return jax.tree.map(lambda *leaves: joined(leaves), *cameras)
 
 
 def project(
@@ -263,7 +265,8 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
         )
     tan = jnp.tan if isinstance(vertical_fov, Tracer) else np.tan
     focal = 0.5 * height / tan(0.5 * vertical_fov)
-    return jnp.asarray([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+    K = [[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]]
+    return jnp.asarray(K) if isinstance(focal, jax.Array) else from_host(K)
 
 
 @checked_arguments

@@ -13,11 +13,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.motion import Motion, turned_upright
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.registry import alternatives
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
@@ -179,10 +179,10 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
         raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
     names, faces = ((), None) if found.face is None else checked_track(found.face, len(rotations))
     motion = Motion(
-        jnp.asarray(rotations),
-        jnp.asarray(translations),
+        from_host(rotations),
+        from_host(translations),
         rate,
-        None if faces is None else jnp.asarray(faces),
+        None if faces is None else from_host(faces),
         names,
     )
     if isinstance(found, Poses) and found.frames is not None:

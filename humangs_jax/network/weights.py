@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import PyTree
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.io.arrays import check_checksum, checksum, file_checksum
@@ -34,7 +34,7 @@ SHIPPED = "assets/weights.safetensors"
 
 def expected_variables(config: HumanGSConfig) -> Variables:
     """Shapes and dtypes of the variables of a configuration, without computing anything."""
-    return jax.eval_shape(lambda key: init_humangs(key, config), jax.random.key(0))
+    return jax.eval_shape(lambda: init_humangs(jax.random.key(0), config))
 
 
 def flatten_variables(variables: PyTree) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def variables_from_tensors(
     expected = expected_variables(config)
     arrays = _check(tensors, expected, where)
     return jax.tree.unflatten(
-        jax.tree.structure(expected), [jnp.asarray(x, jnp.float32) for x in arrays.values()]
+        jax.tree.structure(expected), [from_host(x, np.float32) for x in arrays.values()]
     )
 
 

@@ -18,6 +18,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
+from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import PreparedCapture
@@ -30,11 +31,10 @@ from humangs_jax.refinement.objective import (
     compiled,
     drawn_photo,
     image_loss,
-    parameters_of,
     pulled,
 )
 from humangs_jax.refinement.photos import MARGIN, Photo, crop_to_person, photos_of, windows
-from humangs_jax.refinement.search import BUFFERS, HOST_SETTINGS, Clock, planned
+from humangs_jax.refinement.search import BUFFERS, HOST_SETTINGS, Clock, planned, unconstrained
 from humangs_jax.refinement.steps import RefineState, started, update
 from humangs_jax.rendering.splat_config import SplatConfig
 
@@ -98,11 +98,14 @@ def sharpened(
     with clock.compiling():
         photos, drawn = photos_of(crops.views), avatar.select(crops.drawn)
         drawn = with_low_pass_of(drawn, crops.views) if crops.finer else drawn
-        parameters = parameters_of(drawn.gaussians)
-        share = jnp.asarray(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
+        parameters = unconstrained(drawn.gaussians)
+        share = from_host(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
         state = started(parameters, share, settings, crops.splat)
         state = replace(
-            state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(count), share=jnp.ones(())
+            state,
+            done=from_host(0, np.int32),
+            total=from_host(count, np.int32),
+            share=from_host(1, np.float32),
         )
         state = _advanced(state, 0, photos, drawn, settings, clock)
     for part in range(1, PARTS + 1):
@@ -114,7 +117,7 @@ def sharpened(
     def put(before: Array, after: Array) -> Array:
         merged = np.array(before)
         merged[crops.drawn[rows]] = np.asarray(after)[rows]
-        return jnp.asarray(merged)
+        return from_host(merged)
 
     return replace(avatar, gaussians=jax.tree.map(put, own, new))
 
@@ -130,8 +133,8 @@ def _advanced(
     """The state at step `stop`, with buffers in which all fits."""
 
     def advanced(splat: SplatConfig) -> tuple[RefineState, Array]:
-        begin = replace(state, splat=splat, overflow=jnp.zeros((), jnp.int32))
-        new = _steps(begin, photos, avatar, jnp.asarray(stop), settings)
+        begin = replace(state, splat=splat, overflow=from_host(0, np.int32))
+        new = _steps(begin, photos, avatar, from_host(stop, np.int32), settings)
         return new, new.overflow
 
     return clock.with_room(advanced, state.splat)
@@ -189,7 +192,9 @@ def head_crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) ->
     # squares of one size around the head, in the photos that show it
     half = -(-(side + 2 * MARGIN) // SIDES) * SIDES // 2 - MARGIN
     boxes = [[(int(at) - half, int(at) + half) for at in middles[i]] for i in seen]
-    views = replace(views, rotations=views.rotations[seen], translations=views.translations[seen])
+    views = replace(
+        views, rotations=taken(views.rotations, seen), translations=taken(views.translations, seen)
+    )
     images, masks, cameras = windows(
         np.asarray(views.images)[seen], np.asarray(views.masks)[seen], views.cameras[seen], boxes
     )

@@ -27,6 +27,7 @@ from scipy.spatial import KDTree
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.tensors import read_safetensors
@@ -109,9 +110,9 @@ def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
     distances, nearest = KDTree(centers).query(means, NEAREST_CLUSTERS)
     weights = 1 / (distances + CLUSTER_BLUR)
     weights /= weights.sum(axis=1, keepdims=True)
-    indices = jnp.asarray(members, jnp.int32), jnp.asarray(nearest, jnp.int32)
+    indices = from_host(members, jnp.int32), from_host(nearest, jnp.int32)
     return Graph(
-        neighbors_of(means), neighbors_of(centers), *indices, jnp.asarray(weights, jnp.float32)
+        neighbors_of(means), neighbors_of(centers), *indices, from_host(weights, jnp.float32)
     )
 
 
@@ -146,7 +147,7 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
     )
     share = mutual / np.maximum(mutual.sum(axis=1, keepdims=True), 1)
     return Neighbors(
-        jnp.asarray(np.where(mutual, nearest, own), jnp.int32), jnp.asarray(share, jnp.float32)
+        from_host(np.where(mutual, nearest, own), jnp.int32), from_host(share, jnp.float32)
     )
 
 
@@ -317,18 +318,43 @@ def learned_update(
     """The parameters after some iterations on at most `MOST_PHOTOS` of the photos, evenly spaced;
     and the overflow.
     """
-    start = values = stacked(parameters)
-    hidden, overflow = jnp.zeros((len(values), Refiner.width)), jnp.zeros((), jnp.int32)
+    start = values = side_by_side(parameters)
+    hidden = from_host(np.zeros((len(values), Refiner.width), values.dtype))
+    overflow = from_host(0, jnp.int32)
     used = min(len(photos), MOST_PHOTOS)
     chosen = [photos[i * len(photos) // used] for i in range(used)]
     for _ in range(iterations):
         each = [photo_signals(parameters, avatar, photo, splat) for photo in chosen]
-        signals, missing = jax.tree.map(lambda *x: jnp.stack(x), *each)
-        values, hidden = refiner_iteration(
-            load_refiner(), values, start, hidden, signals, graph, avatar
+        parameters, values, hidden, overflow = iteration_by(
+            load_refiner(), parameters, values, start, hidden, overflow, each, graph, avatar
         )
-        parameters, overflow = unstacked(values, parameters), overflow + jnp.sum(missing)
     return parameters, overflow
+
+
+@compiled
+def side_by_side(parameters: UnconstrainedGaussians) -> Float[Array, "g 14"]:
+    """`stacked`, as a program."""
+    return stacked(parameters)
+
+
+@compiled
+def iteration_by(
+    variables: PyTree,
+    parameters: UnconstrainedGaussians,
+    values: Float[Array, "g 14"],
+    start: Float[Array, "g 14"],
+    hidden: Float[Array, "g w"],
+    overflow: Int[Array, ""],
+    each: Sequence[tuple[Signals, Int[Array, ""]]],
+    graph: Graph,
+    avatar: Avatar,
+) -> tuple[UnconstrainedGaussians, Float[Array, "g 14"], Float[Array, "g w"], Int[Array, ""]]:
+    """`refiner_iteration` by the `photo_signals` of each photo: the parameters, values and hidden
+    features after it, and the overflow so far.
+    """
+    signals, missing = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    values, hidden = refiner_iteration(variables, values, start, hidden, signals, graph, avatar)
+    return unstacked(values, parameters), values, hidden, overflow + jnp.sum(missing)
 
 
 def photo_signals(
@@ -420,7 +446,7 @@ def read_refiner(path: str | os.PathLike[str]) -> PyTree:
     variables: dict[str, Any] = {}
     for key, tensor in read_safetensors(path)[0].items():
         layer, name = key.split("/")
-        variables.setdefault(layer, {})[name] = jnp.asarray(tensor, jnp.float32)
+        variables.setdefault(layer, {})[name] = from_host(tensor, jnp.float32)
     return {"params": variables}
 
 

@@ -10,10 +10,11 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 
 from humangs_jax.avatar.animate import skin
@@ -103,6 +104,7 @@ def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
     return unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
 
 
+@compiled
 def gaussians_of(
     parameters: UnconstrainedGaussians, low_pass: Float[Array, " g"] | None
 ) -> Gaussians:
@@ -171,28 +173,34 @@ def loss_gradient(image: Image, photo: Photo, config: RefineConfig) -> Image:
 class Comparison:
     """Comparison of an avatar with a photo (or with each of some, leading axis v)."""
 
-    loss: Float[Array, "*v"]
+    loss: Float[Array | np.ndarray, "*v"]
     """The loss, see `image_loss`."""
-    squared: Float[Array, "*v"]
+    squared: Float[Array | np.ndarray, "*v"]
     """The sum of the squared errors over the pixels that count."""
-    pixels: Float[Array, "*v"]
+    pixels: Float[Array | np.ndarray, "*v"]
     """The number of these pixels."""
-    visibility: Float[Array, "*v g"]
+    visibility: Float[Array | np.ndarray, "*v g"]
     """The largest weight of each Gaussian on any pixel, (g,)."""
-    overflow: Int[Array, "*v"]
+    overflow: Int[Array | np.ndarray, "*v"]
     """The (splat, tile) pairs that the buffers had no room for."""
 
     def together(self) -> "Comparison":
         """With all photos: the mean loss, sums of the errors, the largest visibility."""
-        sums = (jnp.sum(x) for x in (self.squared, self.pixels))
-        return Comparison(
-            jnp.mean(self.loss), *sums, jnp.max(self.visibility, axis=0), jnp.sum(self.overflow)
-        )
+        xp: Any = np if isinstance(self.loss, np.ndarray) else jnp
+        sums = [xp.sum(x) for x in (self.squared, self.pixels)]
+        most = xp.max(self.visibility, axis=0)
+        numbers = (xp.mean(self.loss), *sums, most, xp.sum(self.overflow))
+        return Comparison(*map(xp.asarray, numbers))
 
     @property
     def psnr(self) -> Float[Array, "*v"]:
         """Over the pixels that count, dB."""
-        return decibels(safe_divide(self.squared, self.pixels))
+        return _psnr(self.squared, self.pixels)
+
+
+@jax.jit
+def _psnr(squared: Float[Array, "*v"], pixels: Float[Array, "*v"]) -> Float[Array, "*v"]:
+    return decibels(safe_divide(squared, pixels))
 
 
 def compare(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.prepared import PreparedCapture
@@ -49,7 +50,7 @@ def photos_of(views: SubjectViews) -> Photo:
     """The views of a person as a batch of photos, whose pixels count unless somebody may hide
     the person there.
     """
-    counted = jnp.ones(views.masks.shape, bool)
+    counted = from_host(np.ones(views.masks.shape, bool))
     if views.unknown is not None:
         counted = ~views.unknown
     leaves = views.images, views.masks, counted, views.cameras, views.rotations, views.translations
@@ -80,9 +81,9 @@ def crop_to_person(photos: PreparedCapture, image_size: int | None = None) -> Su
         images=images,
         masks=masks,
         cameras=cameras,
-        rotations=jnp.asarray(capture.poses.rotations)[frames],
-        translations=jnp.asarray(capture.poses.translation)[frames],
-        betas=jnp.asarray(capture.betas),
+        rotations=from_host(np.asarray(capture.poses.rotations)[frames]),
+        translations=from_host(np.asarray(capture.poses.translation)[frames]),
+        betas=from_host(capture.betas),
         unknown=unknown,
     )
 
@@ -109,14 +110,14 @@ def windows(
             x[top : top + rows, left : left + columns]
             for x, (top, left) in zip(arrays, corners, strict=True)
         ]
-        return jnp.asarray(np.stack(cut), jnp.float32)
+        return from_host(np.stack(cut), jnp.float32)
 
     shift = np.zeros((len(images), 3, 3), np.float32)
     shift[:, 1, 2], shift[:, 0, 2] = np.transpose(corners)
     return (
         crop(images),
         crop(masks),
-        replace(cameras, K=cameras.K - shift, width=columns, height=rows),
+        replace(cameras, K=from_host(np.asarray(cameras.K) - shift), width=columns, height=rows),
     )
 
 

@@ -15,10 +15,9 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from typing import NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.animate import with_low_pass, with_low_pass_of, without_low_pass
@@ -26,6 +25,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
@@ -51,7 +51,7 @@ from humangs_jax.refinement.objective import (
 from humangs_jax.refinement.photos import Photo, held_out_blocks, photo_order, photos_of
 from humangs_jax.refinement.steps import RefineState, init_state, step
 from humangs_jax.rendering.buffers import plan_buffers
-from humangs_jax.rendering.gaussians import UnconstrainedGaussians
+from humangs_jax.rendering.gaussians import Gaussians, UnconstrainedGaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 
 T = TypeVar("T")
@@ -134,9 +134,7 @@ class Clock:
         finally:
             self.compile_seconds = before + time.perf_counter() - began
 
-    def with_room(
-        self, function: Callable[[SplatConfig], tuple[T, Array]], splat: SplatConfig
-    ) -> T:
+    def with_room(self, function: Callable[[SplatConfig], tuple[T, Any]], splat: SplatConfig) -> T:
         """The result of a function of buffers, which also returns what did not fit: they are
         doubled until all does.
         """
@@ -235,20 +233,27 @@ def prepare(
 ) -> tuple[Task, Found, Comparison]:
     """The task, the start and its comparison with each photo."""
     start = with_low_pass_of(avatar, views)
-    fresh = with_low_pass(without_low_pass(avatar), cast(Array, start.gaussians.low_pass))
+    fresh = replace(avatar, gaussians=_fresh(avatar, start.gaussians.low_pass))
     photos, held = list(photos_of(views)), np.zeros(views.masks.shape, bool)
     if len(photos) < HELD_OUT_PHOTOS:
         held = held_out_blocks(views.masks.shape, config.held_out, config.seed)
     seen = [
-        replace(photo, counted=photo.counted & ~h) for photo, h in zip(photos, held, strict=True)
+        replace(photo, counted=from_host(np.asarray(photo.counted) & ~h))
+        for photo, h in zip(photos, held, strict=True)
     ]
     graph = graph_of(np.asarray(start.gaussians.means)) if config.iterations else None
     settings = dataclasses.replace(config, **HOST_SETTINGS)
     task = Task(start, fresh, photos, seen, graph, config, settings, clock)
-    parameters, splat = _parameters_of(start.gaussians), planned(start, views)
+    parameters, splat = unconstrained(start.gaussians), planned(start, views)
     each = comparison(task, parameters, photos, splat)
     state = init_state(parameters, each.together(), settings, splat)
     return task, Found(state, 0, np.arange(len(photos))), each
+
+
+@jax.jit
+def _fresh(avatar: Avatar, low_pass: Float[Array, " g"] | None) -> Gaussians:
+    """See `Task.fresh`."""
+    return with_low_pass(without_low_pass(avatar), cast(Array, low_pass)).gaussians
 
 
 def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
@@ -286,7 +291,7 @@ def align(task: Task, start: Found, each: Comparison) -> tuple[Task, Comparison]
         images_of(task, start, task.photos), photos, task.photos, task.seen, strict=True
     ):
         there = moved_photo(photo, smooth_moves(image, photo))
-        colors, mask = jnp.asarray(there[..., :3]), jnp.asarray(there[..., 3])
+        colors, mask = from_host(there[..., :3]), from_host(there[..., 3])
         moved.append(replace(all, image=colors, mask=mask))
         seen.append(replace(own, image=colors, mask=mask))
     each = comparison(task, start.state.parameters, moved, start.state.splat)
@@ -320,11 +325,11 @@ def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) 
     first.
     """
     hidden = [
-        replace(all, counted=all.counted & ~seen.counted)
+        replace(all, counted=from_host(np.asarray(all.counted) & ~np.asarray(seen.counted)))
         for all, seen in zip(task.photos, task.seen, strict=True)
     ]
     # a small crop may have no block to hold out
-    any_hidden = any(photo.counted.any() for photo in hidden)
+    any_hidden = any(np.asarray(photo.counted).any() for photo in hidden)
     best, highest = start, psnr_of(task, start, hidden)
     if task.config.iterations:
         found, loss = iterated(task, start, start.used)
@@ -465,7 +470,7 @@ def updated(
     task: Task, start: Found, used: Int[np.ndarray, " n"], iterations: int
 ) -> UnconstrainedGaussians:
     """The parameters after iterations of the learned update on some photos."""
-    fresh, photos = _parameters_of(task.fresh.gaussians), [task.seen[i] for i in used]
+    fresh, photos = unconstrained(task.fresh.gaussians), [task.seen[i] for i in used]
 
     def updated(splat: SplatConfig) -> tuple[UnconstrainedGaussians, Array]:
         assert task.graph is not None
@@ -479,10 +484,10 @@ def comparison(
 ) -> Comparison:
     """Comparison with each of the photos (leading axis v)."""
 
-    def compared(splat: SplatConfig) -> tuple[Comparison, Array]:
+    def compared(splat: SplatConfig) -> tuple[Comparison, int]:
         each = [compare(parameters, task.avatar, photo, task.settings, splat) for photo in photos]
-        each = jax.tree.map(lambda *x: jnp.stack(x), *each)
-        return each, jnp.sum(each.overflow)
+        each = jax.tree.map(lambda *x: np.stack(x), *each)  # numbers for decisions on the host
+        return each, int(np.sum(each.overflow))
 
     return task.clock.with_room(compared, splat)
 
@@ -491,7 +496,7 @@ def avatar_comparison(
     task: Task, avatar: Avatar, photos: Sequence[Photo], splat: SplatConfig
 ) -> Comparison:
     """`comparison` of an avatar with each of the photos, drawn with the low-pass that it has."""
-    parameters = _parameters_of(avatar.gaussians)
+    parameters = unconstrained(avatar.gaussians)
     return comparison(task._replace(avatar=avatar), parameters, photos, splat)
 
 
@@ -502,7 +507,7 @@ def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:
             image, _side_by_side(photo.image, photo.mask), counted=np.asarray(photo.counted)
         )
         for image, photo in zip(images_of(task, found, photos), photos, strict=True)
-        if photo.counted.any()
+        if np.asarray(photo.counted).any()
     ]
     return float(np.mean(scores)) if scores else LARGEST_PSNR
 
@@ -513,10 +518,10 @@ def images_of(
     """Colors and alpha as some photos show what was found."""
     parameters = found.state.parameters
 
-    def drawn(splat: SplatConfig) -> tuple[list[Image], Array]:
+    def drawn(splat: SplatConfig) -> tuple[list[Image], int]:
         splat = dataclasses.replace(splat, visibility=True)  # the program that comparisons have
         each = [drawn_photo(parameters, task.avatar, photo, splat) for photo in photos]
-        overflow = jnp.sum(jnp.stack([rendering.overflow for _, _, rendering in each]))
+        overflow = sum(int(rendering.overflow) for _, _, rendering in each)
         return [image for image, _, _ in each], overflow
 
     return [_side_by_side(*image) for image in task.clock.with_room(drawn, found.state.splat)]
@@ -528,4 +533,5 @@ def _side_by_side(
     return np.concatenate([np.asarray(colors), np.asarray(alpha)[..., None]], axis=-1)
 
 
-_parameters_of = jax.jit(parameters_of)
+unconstrained = jax.jit(parameters_of)
+"""What refinement moves, by a program."""

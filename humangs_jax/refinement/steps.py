@@ -14,6 +14,7 @@ import optax
 from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.refinement.config import RefineConfig
@@ -76,7 +77,7 @@ def init_state(
     """The state before the first step. found: comparison of the parameters with the photos;
     Gaussians that no photo shows get no trust.
     """
-    return started(parameters, _trust(found.visibility, config), config, splat)
+    return started(parameters, _trust(from_host(found.visibility), config), config, splat)
 
 
 def started(
@@ -86,8 +87,13 @@ def started(
     splat: SplatConfig,
 ) -> RefineState:
     """`init_state`, with a trust that is known."""
-    moments = OPTIMIZERS[config.optimizer]().init(cast(Any, parameters))
-    return RefineState(parameters, parameters, trust, moments, jnp.zeros((), jnp.int32), splat)
+    none = from_host(0, jnp.int32)
+    return RefineState(parameters, parameters, trust, _moments(parameters, config), none, splat)
+
+
+@compiled
+def _moments(parameters: UnconstrainedGaussians, config: RefineConfig) -> PyTree:
+    return OPTIMIZERS[config.optimizer]().init(cast(Any, parameters))
 
 
 @compiled

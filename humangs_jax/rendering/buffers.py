@@ -6,16 +6,15 @@ Measured on a scene, or guessed for traced calls; what does not fit.
 import dataclasses
 import functools
 import logging
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from humangs_jax.core.array_types import Array, Int
 from humangs_jax.core.checks import checked_arguments, require_concrete
 from humangs_jax.core.numerics import at_least_float32
+from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import project_gaussians
@@ -108,7 +107,7 @@ def raise_on_overflow(
     overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig
 ) -> None:
     """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
-    if missing := int(jnp.max(overflow, initial=0)):
+    if missing := int(np.max(np.asarray(overflow), initial=0)):
         rows, pairs = _needed(gaussians, cameras, config)
         raise BufferOverflowError(
             f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs}"
@@ -143,17 +142,23 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
     config = dataclasses.replace(
         config, max_pairs=None, max_rows=None
     )  # not read here: one program for all
-    return [int(most) for most in _count(gaussians, cameras, config)]
+    # one program for images of every size, and for every number of cameras
+    size = np.asarray([cameras.width, cameras.height], np.int32)
+    sizeless = replace(cameras, width=1, height=1)
+    each = [
+        _count(gaussians, camera, size, config)
+        for camera in (sizeless if sizeless.batch_shape else [sizeless])
+    ]
+    rows, pairs = np.asarray(each, int).reshape(-1, 2).max(axis=0, initial=0)
+    return [int(rows), int(pairs)]
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Sequence[Array]:
-    def one(camera):
-        projected = project_gaussians(gaussians, camera, config)
-        footprints = footprints_by(projected, projected.dimmed(gaussians.opacities), config)
-        grid = TileGrid(camera.width, camera.height, config.tile_size)
-        return count_pairs(footprints, grid)
-
-    if not cameras.batch_shape:
-        return one(cameras)
-    return [jnp.max(most, initial=0) for most in lax.map(one, cameras)]
+@functools.partial(jax.jit, static_argnums=3)
+def _count(
+    gaussians: Gaussians, camera: Camera, size: Int[Array, "2"], config: SplatConfig
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Rows and pairs of a camera whose image has `size` (width, height) in place of its own."""
+    camera = replace(camera, width=size[0], height=size[1])
+    projected = project_gaussians(gaussians, camera, config)
+    footprints = footprints_by(projected, projected.dimmed(gaussians.opacities), config)
+    return count_pairs(footprints, TileGrid(camera.width, camera.height, config.tile_size))

@@ -34,7 +34,7 @@ as 0.
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -326,7 +326,7 @@ def _planes_bwd(_: None, planes: Planes) -> tuple[Array]:
 _planes.defvjp(lambda columns: (_planes(columns), None), _planes_bwd)
 
 
-def _clamp_to_view(slope: Array, focal: Array, center: Array, size: int, margin: float) -> Array:
+def _clamp_to_view(slope: Array, focal: Array, center: Array, size: Any, margin: float) -> Array:
     extra = margin * 0.5 * size / focal
     return jnp.clip(slope, -center / focal - extra, (size - center) / focal + extra)
 

@@ -24,6 +24,7 @@ from jax import lax
 from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.processes import compiler_options
@@ -331,9 +332,9 @@ def _shifts_of(shifts: Float[Array, "g 2"], gaussians: Gaussians) -> Float[Array
 
 def _color(background: object, dtype: np.dtype) -> Array:
     if background is None:
-        return jnp.ones(3, dtype)
+        return from_host(np.ones(3), dtype)
     if isinstance(background, str):
-        return jnp.asarray(named_color(background), dtype)
+        return from_host(named_color(background), dtype)
     if hasattr(background, "shape"):
         color, fits = background, background.shape == (3,) and not _of_bytes(background)
     else:

@@ -27,7 +27,7 @@ row, and farthest left at the opposite point.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -46,29 +46,35 @@ _ROW = 64
 """Width of the triangular products in `cumsum`: 64 numbers below 2^18 add up exactly in float32."""
 
 
+Size = Any
+"""An integer, or where only counts are asked for an array of JAX without axes."""
+
+
 @dataclasses.dataclass(frozen=True)
 class TileGrid:
-    """An image cut into squares of `tile_size` pixels, numbered row by row. Static (hashable)."""
+    """An image cut into squares of `tile_size` pixels, numbered row by row. Static (hashable),
+    except for `count_pairs`, which takes traced sizes, too: one program counts for all of them.
+    """
 
-    width: int
+    width: Size
     """Width of the image, pixels."""
-    height: int
+    height: Size
     """Height of the image, pixels."""
     tile_size: int
     """Side of a tile, pixels."""
 
     @property
-    def columns(self) -> int:
+    def columns(self) -> Size:
         """Tiles per row of tiles."""
         return -(-self.width // self.tile_size)
 
     @property
-    def rows(self) -> int:
+    def rows(self) -> Size:
         """Rows of tiles."""
         return -(-self.height // self.tile_size)
 
     @property
-    def tiles(self) -> int:
+    def tiles(self) -> Size:
         """Number of tiles; also the tile number of "no tile"."""
         return self.columns * self.rows
 
@@ -397,7 +403,7 @@ class Squares(NamedTuple):
         """First and last tile of each square, the same in all its rows."""
         return self._range(self.x, grid.tile_size, grid.columns)
 
-    def _range(self, center: Array, size: int, tiles: int) -> tuple[Array, Array]:
+    def _range(self, center: Array, size: int, tiles: Size) -> tuple[Array, Array]:
         low, high = center - 0.5 - self.radius, center - 0.5 + self.radius + size - 1
         first = jnp.clip(jnp.floor(low / size), 0, tiles)
         return first.astype(jnp.int32), (jnp.clip(jnp.floor(high / size), 0, tiles) - 1).astype(
@@ -541,14 +547,14 @@ def emit_pairs(
     return Pairs(tiles, table[:, 1], needed, needed - jnp.minimum(pairs.needed, max_pairs))
 
 
-def _first(v: Array, tile_size: int, tiles: int) -> Array:
+def _first(v: Array, tile_size: int, tiles: Size) -> Array:
     """First of `tiles` whose last pixel centre is not left of v."""
     return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(
         jnp.int32
     )
 
 
-def _last(v: Array, tile_size: int, tiles: int) -> Array:
+def _last(v: Array, tile_size: int, tiles: Size) -> Array:
     """Last of `tiles` whose first pixel centre is not right of v."""
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 

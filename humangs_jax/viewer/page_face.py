@@ -4,6 +4,7 @@ each expression.
 
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -80,7 +81,7 @@ def pack_face(
         scale = max(float(np.abs(values).max()), 1.0) / 32767
         arrays["motion_faces"] = np.rint(values / scale).astype("<i2")
         header["motion"]["face_step"] = scale
-    return with_hidden_among(avatar, face.hidden)
+    return jax.jit(with_hidden_among)(avatar, face.hidden)
 
 
 def _eye_turns(avatar: Avatar, face: Face) -> np.ndarray:

@@ -5,10 +5,20 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from experiments.programs import watched
 from humangs_jax.core import processes
-from humangs_jax.core.processes import OF_JAX, VARIABLE, enable_compile_cache
+from humangs_jax.core.processes import (
+    OF_JAX,
+    QUICKEST,
+    QUICKEST_OF_JAX,
+    VARIABLE,
+    compile_ahead,
+    enable_compile_cache,
+)
 
 USE = """
 import sys
@@ -25,12 +35,14 @@ def no_cache(monkeypatch, tmp_path):
     """As in a program that has not heard of a cache; the tests' own comes back."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
-    for name in (VARIABLE, OF_JAX):
+    quickest = jax.config.jax_persistent_cache_min_compile_time_secs
+    for name in (VARIABLE, OF_JAX, QUICKEST_OF_JAX):
         monkeypatch.setenv(name, "")  # so that it is put back even if it was not there
         monkeypatch.delenv(name)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     yield
     jax.config.update("jax_compilation_cache_dir", before)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", quickest)
 
 
 def test_it_lies_in_the_users_cache_folder_by_version(tmp_path):
@@ -42,6 +54,18 @@ def test_it_lies_in_the_users_cache_folder_by_version(tmp_path):
     )
     assert jax.__version__ in folder.name and jax.config.jax_compilation_cache_dir == str(folder)
     assert not list(folder.iterdir())
+
+
+def test_quick_programs_are_kept_too_unless_the_user_says_from_when_on(tmp_path, monkeypatch):
+    enable_compile_cache(tmp_path)
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == QUICKEST < 1
+    assert os.environ[QUICKEST_OF_JAX] == str(QUICKEST)  # for programs that this one starts
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 5.0)
+    jax.config.update("jax_compilation_cache_dir", None)
+    monkeypatch.delenv(OF_JAX)
+    monkeypatch.setenv(QUICKEST_OF_JAX, "5")
+    enable_compile_cache(tmp_path)
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == 5.0
 
 
 def test_the_environment_turns_it_off_or_moves_it(tmp_path, monkeypatch):
@@ -102,3 +126,21 @@ def test_a_second_program_finds_what_the_first_one_compiled(tmp_path):
         and done.stderr == ""
     )
     assert len(seen[0]) > 0 and seen[0] == seen[1]
+
+
+def test_what_is_compiled_ahead_is_not_compiled_again():
+    program = jax.jit(lambda x: jnp.sort(jnp.sin(x) @ x))
+    shape = jax.ShapeDtypeStruct((9, 9), np.float32)
+    with watched() as watch:
+        compile_ahead(program, shape)
+        found = program(np.eye(9, dtype=np.float32))  # waits for the thread
+    assert len(watch.programs) == 1
+    assert np.allclose(found, np.sort(np.sin(np.eye(9))))
+
+
+def test_a_function_that_cannot_be_compiled_fails_where_it_is_called(capfd):
+    program = jax.jit(lambda x: x @ jnp.ones(3))
+    compile_ahead(program, jax.ShapeDtypeStruct((4,), np.float32)).join()
+    assert capfd.readouterr().err == ""
+    with pytest.raises(TypeError, match="dot"):
+        program(np.zeros(4, np.float32))

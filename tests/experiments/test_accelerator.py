@@ -13,4 +13,4 @@ def test_every_stage_runs(tmp_path):
     assert call(accelerator, ["--small", "--json", str(tmp_path / "day.json")]) == 0
     found = json.loads((tmp_path / "day.json").read_text())["rows"]
     assert not [name for name, numbers in found.items() if "failed" in numbers], found
-    assert len({name.split(":")[0] for name in found}) == 4
+    assert len({name.split(":")[0] for name in found}) == 7

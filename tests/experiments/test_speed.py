@@ -30,7 +30,7 @@ def test_a_change_that_is_too_slow_fails_and_the_report_has_code_by_room(monkeyp
         return times(1.0, gradient=30.0 if place == REPOSITORY else 20.0)
 
     monkeypatch.setattr(speed, "_measured", measured)
-    monkeypatch.setattr(speed, "_checkout", speed.contextmanager(lambda commit: iter([commit])))
+    monkeypatch.setattr(speed, "checkout", speed.contextmanager(lambda commit: iter([commit])))
     monkeypatch.setattr(speed, "code_by_room", lambda place: {"core/": 5, "public names": 2})
     assert call(speed.speed, ["--turns", "2"]) == 0 and len(asked) == 2
     assert call(speed.speed, ["--turns", "2", "--before", "v1"]) == 1

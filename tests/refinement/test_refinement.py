@@ -450,7 +450,7 @@ def test_photos_that_are_off_by_pixels_are_moved_to_where_the_avatar_is(body, pi
     monkeypatch.setattr(search, "iterated", lambda task, start, used: (start, 0.0))
     config = dataclasses.replace(STEPS, iterations=4)
     task, start, each = search.prepare(
-        avatar, crop_to_person(capture), config, search.Clock(config)
+        avatar, crop_to_person(prepare_capture(capture)), config, search.Clock(config)
     )
     aligned, after = search.align(task, start, each)
     assert aligned.moved is (pixels > 0)

@@ -16,12 +16,16 @@ from hypothesis import strategies as st
 from rounding import bound
 from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians, with_harmonics
 
+from experiments.programs import watched
 from humangs_jax.avatar.frames import render_in_bands
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.rendering.buffers import default_pairs, plan_buffers
+from humangs_jax.rendering.buffers import default_pairs, plan_buffers, round_up
+from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.reference import render_reference
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG
 from humangs_jax.rendering.splatting import SplatConfig, render, render_views
+from humangs_jax.rendering.tiling import TileGrid, count_pairs, footprints_by
 
 FLOAT64 = 1e-9
 """Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the
@@ -352,3 +356,24 @@ def test_lowers_for_every_platform():
         gaussians, view
     )
     assert "callback" not in exported.mlir_module()
+
+
+@functools.partial(jax.jit, static_argnames=("camera_size",))
+def pairs_in(gaussians, view, camera_size):
+    """How many pairs there are, by a program for one size of image."""
+    projected = project_gaussians(gaussians, view)
+    footprints = footprints_by(projected, gaussians.opacities, DEFAULT_CONFIG)
+    return count_pairs(footprints, TileGrid(*camera_size, DEFAULT_CONFIG.tile_size))[1]
+
+
+def test_buffers_are_planned_by_one_program_whatever_the_size_and_number_of_images():
+    gaussians = random_gaussians(COUNT, dtype=np.float32)
+    view = camera(np.float32)
+    each = [view.resized(40, 24), view.resized(72, 56)]
+    with watched() as watch:
+        found = [plan_buffers(gaussians, one, margin=1.0).max_pairs for one in each]
+        both = plan_buffers(gaussians, stack_cameras([each[1]] * 3), margin=1.0).max_pairs
+    assert len(watch.programs) <= 1  # none if an earlier test had such Gaussians
+    needed = [int(pairs_in(gaussians, one, (one.width, one.height))) for one in each]
+    assert found == [round_up(pairs) for pairs in needed] and both == found[1]
+    assert 64 < found[0] < found[1]

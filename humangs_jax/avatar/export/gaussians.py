@@ -8,6 +8,7 @@ up and back, half a turn about y from ours. So converters make the same of all o
 turns avatars so; `load_gaussians` and `save_gaussians` do with `y_up`.
 """
 
+import functools
 import logging
 import os
 import re
@@ -18,6 +19,7 @@ from typing import get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
@@ -25,6 +27,7 @@ from humangs_jax.avatar.export import EXPORTS, OTHERS, READ_ONLY, ExportFormat, 
 from humangs_jax.body.model import RestBody
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import (
     BOUNDED,
     LARGEST,
@@ -95,6 +98,11 @@ def turned(gaussians: Gaussians, up: Up) -> Gaussians:
 
 def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Gaussians:
     """Gaussians turned about the origin by a quaternion (wxyz) of quarters of a turn."""
+    return _rotated(gaussians, turn)
+
+
+@functools.partial(jax.jit, static_argnames="turn")
+def _rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Gaussians:
     gaussians, matrix = factored(gaussians), jnp.asarray(_matrix(turn), gaussians.means.dtype)
     means = jnp.matmul(gaussians.means, matrix.T, precision=EXACT)
     quats = quaternion.multiply(jnp.asarray(turn, gaussians.quats.dtype), gaussians.quats)
@@ -106,8 +114,8 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
 
 def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]:
     """The rotation as a matrix of 0 and +-1."""
-    with jax.ensure_compile_time_eval():  # the turn is known inside of transformations, too
-        return np.asarray(quaternion.to_matrix(jnp.asarray(turn)), np.float32).round()
+    w, x, y, z = turn
+    return Rotation.from_quat([x, y, z, w]).as_matrix().astype(np.float32).round()
 
 
 def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
@@ -118,7 +126,7 @@ def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
     seen = opacities >= min(SEEN, opacities.max(initial=0.0))
     lowest = means[seen, 1].min(initial=np.inf)
     shift = np.asarray([0.0, lowest if np.isfinite(lowest) else 0.0, 0.0], means.dtype)
-    return replace(gaussians, means=gaussians.means - shift)
+    return replace(gaussians, means=from_host(means - shift))
 
 
 def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
@@ -137,13 +145,18 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
     check_values(
         "export", {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names}
     )
-    g = factored(
-        replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None)
-    )
+    g = _plain(gaussians)
     harmonics = np.zeros((len(g.means), 0, 3)) if g.harmonics is None else g.harmonics
     arrays = (g.means, g.quats, g.scales, g.opacities, g.colors, harmonics)
     means, quats, scales, opacities, colors, harmonics = (np.asarray(x, np.float64) for x in arrays)
     return means, unit_quats(quats), scales, opacities, colors, harmonics
+
+
+@jax.jit
+def _plain(gaussians: Gaussians) -> Gaussians:
+    """Without deformations and without low-pass."""
+    scales = widened(gaussians.scales, gaussians.low_pass, -1)
+    return factored(replace(gaussians, scales=scales, low_pass=None))
 
 
 def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
@@ -299,7 +312,7 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) ->
         check_array(name, array, (count, *shape), *ranges.get(field, (-LARGEST, LARGEST)))
     values = dict(zip(fields, arrays.values(), strict=False))
     values["quats"] = unit_quats(values["quats"])
-    return Gaussians(**{name: jnp.asarray(array, jnp.float32) for name, array in values.items()})
+    return Gaussians(**{name: from_host(array, jnp.float32) for name, array in values.items()})
 
 
 def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, np.ndarray]:

@@ -1,0 +1,159 @@
+"""What a user waits for the first time, and every time after: the time line of commands, each in a
+process of its own, with an empty cache of compiled programs and with a full one.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from experiments.harness import Run, entry
+from experiments.results import REPOSITORY, markdown_table
+from experiments.speed import checkout
+
+Command = Literal["demo", "start", "animate"]
+PROGRAMS = REPOSITORY / "experiments" / "programs.py"
+TIMES = {"empty": "the first time", "full": "every time after"}
+"""State of the cache -> how the table calls it."""
+
+
+@entry
+def first_run(
+    run: Run,
+    command: tuple[Command, ...] = get_args(Command),
+    before: str | None = None,
+    small: bool = False,
+) -> None:
+    """What `humangs demo`, `start` on four photos and `animate` wait for: seconds by stage,
+    programs, and seconds of compiling, the first time and every time after.
+
+    CPU seconds are those of all threads; other work beside changes them least. Compiling is part
+    of the stages' seconds, and counts reading from the cache on disk.
+
+    Options:
+    command: which
+    before: commit, branch or tag to compare with, measured in turns
+    small: no refinement and small frames, for a rehearsal
+    """
+    with checkout(before) as other:
+        places = {"before": other} if other else {}
+        places["now"] = REPOSITORY
+        cases = {
+            f"{where}: {name}, {state}": (place, name, state)
+            for name in command
+            for where, place in places.items()
+            for state in TIMES
+        }
+        with tempfile.TemporaryDirectory() as folder:
+            root = Path(folder)
+            measure = lambda case: lambda: measured(root / case[0].name, *case, small)
+            rows = run.rows({name: measure(case) for name, case in cases.items()}, {"small": small})
+    run.show(table_of(rows), rows)
+
+
+def measured(folder: Path, place: Path, command: Command, state: str, small: bool) -> dict:
+    """Numbers of a command of the package at a place, in a process of its own.
+
+    folder: holds the cache, and what earlier commands made, which `animate` shows.
+
+    Raises: OSError with the end of the command's errors.
+    """
+    folder.mkdir(exist_ok=True)
+    cache = folder / f"cache_{command}"
+    words = words_of(command, folder, small)
+    environment = os.environ | {"PYTHONPATH": str(place), "HUMANGS_COMPILE_CACHE": str(cache)}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    ran = subprocess.run(
+        [sys.executable, "-P", str(PROGRAMS), *words],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    if ran.returncode:
+        raise OSError(f"humangs {' '.join(words)}: {ran.stderr[-1000:]}")
+    return summary(json.loads(ran.stdout.splitlines()[-1]))
+
+
+def words_of(command: Command, folder: Path, small: bool) -> list[str]:
+    """The command line. `animate` shows what `demo` made, `start` gets the demo's photos alone."""
+    frames = ["--size", "64"] if small else []
+    if command == "demo":
+        return ["demo", "--out", str(folder / "demo"), *frames, *(["--refine", "0"] * small)]
+    if command == "animate":
+        avatar = next(iter(folder.glob("*/avatar.npz")))
+        return ["animate", str(avatar), "--out", str(folder / "walk.mp4"), *frames]
+    photos = folder / "photos"
+    if not photos.exists():
+        write_photos(photos, 256 if small else 1024)
+    out = folder / f"started_{len(list(folder.iterdir()))}"
+    return ["start", str(photos), "--out", str(out), "--no-browser", *(["--refine", "0"] * small)]
+
+
+def write_photos(folder: Path, size: int) -> None:
+    """The demo's four photos, enlarged to `size` pixels, without anything beside them."""
+    from PIL import Image
+
+    folder.mkdir()
+    for path in sorted((REPOSITORY / "humangs_jax/assets/demo_capture/images").glob("*.png")):
+        image = Image.open(path).convert("RGB").resize((size, size), Image.Resampling.LANCZOS)
+        image.save(folder / f"{path.stem}.jpg", quality=95)
+
+
+def summary(ran: dict[str, Any]) -> dict[str, Any]:
+    """What is published of a run of `experiments.programs`."""
+    programs = ran["programs"]
+    largest = sorted(programs, key=lambda each: -each["seconds"])[:8]
+    stages = {
+        name: {
+            "seconds": round(seconds, 2),
+            "programs": sum(each["stage"] == name for each in programs),
+            "compile": round(sum(x["seconds"] for x in programs if x["stage"] == name), 2),
+        }
+        for name, seconds in ran["stages"].items()
+    }
+    return {
+        "wall": round(ran["wall"], 2),
+        "cpu": round(ran["cpu"], 2),
+        "programs": len(programs),
+        "from disk": ran["hits"],
+        **{part: round(seconds, 2) for part, seconds in ran["seconds"].items()},
+        "stages": stages,
+        "largest": {each["name"]: round(each["seconds"], 2) for each in largest},
+    }
+
+
+def table_of(rows: dict[str, dict[str, Any]]) -> str:
+    """A line for each run, then the stages of the runs with a full cache and an empty one."""
+    header = ["", "CPU s", "wall s", "programs", "from disk", "compile s"]
+    lines = [
+        [
+            name,
+            *(f"{row[key]:.1f}" for key in ("cpu", "wall")),
+            *(str(row[key]) for key in ("programs", "from disk")),
+            f"{row['compile']:.1f}",
+        ]
+        for name, row in shown(rows).items()
+    ]
+    stages = [
+        [name, stage, f"{own['seconds']:.1f}", str(own["programs"]), f"{own['compile']:.1f}"]
+        for name, row in shown(rows).items()
+        for stage, own in row["stages"].items()
+    ]
+    return (
+        markdown_table(header, lines)
+        + "\n\n"
+        + markdown_table(["", "stage", "wall s", "programs", "compile s"], stages, "llrrr")
+    )
+
+
+def shown(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Rows by how the table calls them."""
+    names = {}
+    for name in rows:
+        head, _, state = name.rpartition(", ")
+        names[name] = f"{head}, {TIMES[state]}"
+    return {names[name]: row for name, row in rows.items()}

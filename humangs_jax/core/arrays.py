@@ -1,0 +1,55 @@
+"""Small work on arrays by numpy. Each operation of `jnp` outside of `jit` is a program of its own,
+for each shape: some ten milliseconds to make, for nothing to compute.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+SMALL = 1 << 16
+"""Numbers that cost less to bring from an accelerator and back than a program costs to make."""
+
+
+def from_host(array: Any, dtype: Any = None) -> Any:
+    """The numbers of a list or of an array of numpy as an array of JAX; one of JAX stays.
+
+    `jnp.asarray` makes the same, by a program for each shape.
+    """
+    if isinstance(array, jax.Array):
+        return array if dtype is None or array.dtype == dtype else array.astype(dtype)
+    return jax.device_put(np.asarray(array, dtype))
+
+
+def on_host(array: Any) -> bool:
+    """Whether numpy can read an array at once: it is numpy's, or JAX's on a CPU of this process."""
+    if isinstance(array, np.ndarray):
+        return True
+    return _plain(array) and all(device.platform == "cpu" for device in array.devices())
+
+
+def taken(array: Any, index: Any) -> Any:
+    """`array[index]`, by numpy where it can read the array, or the array is small."""
+    small = _plain(array) and array.size <= SMALL
+    if isinstance(index, Tracer) or isinstance(array, np.ndarray) or not (small or on_host(array)):
+        return array[index]
+    index = np.asarray(index) if isinstance(index, jax.Array) else index
+    return from_host(np.asarray(array)[index])
+
+
+def joined(arrays: Sequence[Any]) -> Any:
+    """`jnp.stack`, by numpy where it can read the arrays."""
+    if all(on_host(array) for array in arrays):
+        return from_host(np.stack(arrays))
+    return jnp.stack(arrays)
+
+
+def _plain(array: Any) -> bool:
+    """Whether it is an array of JAX, with numbers, whose values this process has."""
+    if isinstance(array, Tracer) or not isinstance(array, jax.Array):
+        return False
+    numbers = jnp.issubdtype(array.dtype, jnp.number) or array.dtype == bool
+    return numbers and array.is_fully_addressable
