@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 
-from experiments.programs import watched
 from humangs_jax.core.arrays import from_host, joined, on_host, taken
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
@@ -15,11 +15,11 @@ def numbers(*shape):
 
 
 def test_arrays_of_the_host_become_arrays_of_jax_without_a_program():
-    with watched() as watch:
+    with compiled_programs() as programs:
         one = from_host(numbers(3, 17).astype(np.float64), jnp.float32)
         whole = from_host([[1, 2, 3]], jnp.int32)
         bools = from_host(np.ones(19, bool))
-    assert watch.programs == []
+    assert programs == []
     assert isinstance(one, jax.Array) and one.dtype == jnp.float32
     assert np.array_equal(one, numbers(3, 17)) and whole.dtype == jnp.int32
     assert bools.dtype == bool
@@ -34,9 +34,9 @@ def test_an_array_of_jax_stays_and_a_traced_one_may_have_another_type():
 @pytest.mark.parametrize("index", [1, slice(1, None), np.array([2, 0, 2]), np.arange(3) > 0])
 def test_examples_of_a_batch_are_taken_without_a_program(index):
     batch = jax.device_put(numbers(3, 4, 13))
-    with watched() as watch:
+    with compiled_programs() as programs:
         found = taken(batch, index)
-    assert watch.programs == []
+    assert programs == []
     assert isinstance(found, jax.Array) and np.array_equal(found, np.asarray(batch)[index])
 
 
@@ -54,16 +54,16 @@ def test_keys_are_no_numbers_and_stay_with_jax():
 
 def test_stacking_compiles_nothing():
     arrays = [jax.device_put(numbers(2, 23)) for _ in range(3)]
-    with watched() as watch:
+    with compiled_programs() as programs:
         found = joined(arrays)
-    assert watch.programs == [] and np.array_equal(found, np.stack(arrays))
+    assert programs == [] and np.array_equal(found, np.stack(arrays))
 
 
 def test_cameras_are_made_indexed_resized_and_stacked_without_a_program():
     K = [[90.0, 0, 31], [0, 91, 30], [0, 0, 1]]
-    with watched() as watch:
+    with compiled_programs() as programs:
         one = Camera.from_opencv(K, np.eye(4), 64, 61)
         cameras = stack_cameras([one, one.resized(32, 61).resized(64, 61), one])
         assert len([camera.K for camera in cameras]) == 3
-    assert watch.names() == {}
+    assert programs == []
     assert np.allclose(cameras[1].K, K, rtol=1e-6)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 
-from experiments.programs import watched
 from humangs_jax.core import processes
 from humangs_jax.core.processes import (
     OF_JAX,
@@ -131,10 +131,10 @@ def test_a_second_program_finds_what_the_first_one_compiled(tmp_path):
 def test_what_is_compiled_ahead_is_not_compiled_again():
     program = jax.jit(lambda x: jnp.sort(jnp.sin(x) @ x))
     shape = jax.ShapeDtypeStruct((9, 9), np.float32)
-    with watched() as watch:
+    with compiled_programs() as programs:
         compile_ahead(program, shape)
         found = program(np.eye(9, dtype=np.float32))  # waits for the thread
-    assert len(watch.programs) == 1
+    assert len(programs) == 1
     assert np.allclose(found, np.sort(np.sin(np.eye(9))))
 
 

@@ -11,12 +11,12 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rounding import bound
 from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians, with_harmonics
 
-from experiments.programs import watched
 from humangs_jax.avatar.frames import render_in_bands
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
@@ -370,10 +370,10 @@ def test_buffers_are_planned_by_one_program_whatever_the_size_and_number_of_imag
     gaussians = random_gaussians(COUNT, dtype=np.float32)
     view = camera(np.float32)
     each = [view.resized(40, 24), view.resized(72, 56)]
-    with watched() as watch:
+    with compiled_programs() as programs:
         found = [plan_buffers(gaussians, one, margin=1.0).max_pairs for one in each]
         both = plan_buffers(gaussians, stack_cameras([each[1]] * 3), margin=1.0).max_pairs
-    assert len(watch.programs) <= 1  # none if an earlier test had such Gaussians
+    assert len(programs) <= 1  # none if an earlier test had such Gaussians
     needed = [int(pairs_in(gaussians, one, (one.width, one.height))) for one in each]
     assert found == [round_up(pairs) for pairs in needed] and both == found[1]
     assert 64 < found[0] < found[1]

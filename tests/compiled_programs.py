@@ -1,0 +1,26 @@
+"""The programs that a block of a test compiles."""
+
+import contextlib
+
+import jax
+
+EVENT = "/jax/core/compile/backend_compile_duration"
+
+
+@contextlib.contextmanager
+def compiled_programs():
+    """Gives a list, in which the name of each program that is compiled in the block comes to be.
+
+    Programs that an earlier test has compiled for such arguments are not among them.
+    """
+    names = []
+
+    def note(event, duration_secs, **about):
+        if event == EVENT:
+            names.append(about.get("fun_name", "?"))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        yield names
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
