@@ -52,7 +52,6 @@ FILES = ("report.json", *PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
 """What the demonstration writes; the first tells that a folder is of it."""
 REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
 """Keys of the first."""
-VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
 
 
 def run_demo(
@@ -144,16 +143,15 @@ def _write_demo(
         labels=[f"photo {i}" for i in range(inputs.view_count)],
     )
     side_by_side(truth.images, ours, folder / "novel_views.png")
+    packages = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
+    versions = {name: metadata.version(name) for name in packages}
     report = _scores(ours, truth) | {
         "baseline_psnr": round(baseline.psnr, 4),
         "baseline_psnr_fg": round(baseline.psnr_fg, 4),
         "gaussians": len(avatar.gaussians.means),
         "views": {"input": inputs.view_count, "held_out": truth.view_count},
         "image_size": [inputs.cameras.width, inputs.cameras.height],
-        "versions": (
-            {name: metadata.version(name) for name in VERSIONS}
-            | {"python": platform.python_version()}
-        ),
+        "versions": versions | {"python": platform.python_version()},
         "device": f"{jax.devices()[0].platform}: {jax.devices()[0].device_kind}",
         "timings": timings,
     }

@@ -71,7 +71,6 @@ GLANCE = (0.03, 0.25)
 glancing angle.
 """
 HEAD_JOINTS = ("head", "jaw", "eye")
-HAND_JOINTS = ("wrist", "index", "middle", "pinky", "ring", "thumb")
 BLOCK = 256
 """Vertices whose sources are weighed at a time: bounds the memory."""
 TINY = 1e-6
@@ -132,7 +131,7 @@ def body_regions(body: BodyModel, rest: Float[Array, "n 3"]) -> Regions:
     """The regions of a body whose vertices in the T-pose are `rest`, metres."""
     weights = body.skinning_weights
     head = _share_of(body, HEAD_JOINTS) > 0.5
-    hands = _share_of(body, HAND_JOINTS) > 0.5
+    hands = _share_of(body, ("wrist", "index", "middle", "pinky", "ring", "thumb")) > 0.5
 
     # Shares of the head's box: 0 at the chin and at the back of the head, 1 at the crown and at the
     # nose.

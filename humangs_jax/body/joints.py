@@ -34,12 +34,11 @@ BODY_NAMES = (
     ),
     *("right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
 )
-FACE_NAMES = ("jaw", "left_eye", "right_eye")
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 
 JOINT_NAMES = (
     *BODY_NAMES,
-    *FACE_NAMES,
+    *("jaw", "left_eye", "right_eye"),
     *(
         f"{side}_{finger}{knuckle}"
         for side in ("left", "right")
@@ -49,15 +48,18 @@ JOINT_NAMES = (
 )
 """22 of the body, jaw and eyes, then 15 per hand from the palm outwards."""
 
-_BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
-
 
 def _hand_parents(wrist: int, first: int) -> list[int]:
     """Parents of the 15 joints of a hand: five fingers of three joints each, from the wrist on."""
     return [parent for j in range(first, first + 15, 3) for parent in (wrist, j, j + 1)]
 
 
-PARENTS = (*_BODY_PARENTS, 15, 15, 15, *_hand_parents(20, 25), *_hand_parents(21, 40))
+PARENTS = (
+    *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19),
+    *(15, 15, 15),
+    *_hand_parents(20, 25),
+    *_hand_parents(21, 40),
+)
 """Parent of each joint, -1 for the pelvis; every finger starts at its wrist."""
 
 

@@ -75,7 +75,6 @@ GROUPS = {
 }
 """Commands by purpose: module and class of each, imported when it is asked for."""
 COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items()}
-ABOUT = "Animatable 3D Gaussian humans from a few photos with body poses."
 EVERYWHERE = """Options of every command:
   --help       its options, with examples
   --quiet      results and errors only
@@ -209,7 +208,8 @@ def summary(command: type[Any]) -> str:
 
 def overview() -> str:
     """What `humangs --help` prints: all commands by purpose, a line for each."""
-    lines = ["usage: humangs COMMAND [OPTIONS]", "", ABOUT]
+    lines = ["usage: humangs COMMAND [OPTIONS]", ""]
+    lines.append("Animatable 3D Gaussian humans from a few photos with body poses.")
     for group, commands in GROUPS.items():
         lines += ["", f"{group}:"]
         lines += [f"  {name:<12} {summary(_command(name))}" for name in commands]

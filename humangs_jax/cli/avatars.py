@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from humangs_jax.data.prepared import PreparedCapture
 
 
-DEMO_REFINE = "15s"
-
 _USUAL_UP = (
     f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers"
     " expect, else y."
@@ -73,7 +71,7 @@ class Demo:
     """
 
     def run(self) -> None:
-        limits = first_refinement(DEMO_REFINE if self.refine is None else self.refine)
+        limits = first_refinement("15s" if self.refine is None else self.refine)
         with stage("starting"):
             from humangs_jax.apps.demo import run_demo, summary
             from humangs_jax.refinement.config import RefineConfig

@@ -59,7 +59,6 @@ DEFAULT_BODY = "makehuman"
 file.
 """
 BODY_KEYS = {"body", "betas", "rotations", "translations"}
-OPTIONAL_BODY_KEYS = {"shape_names", "displacement"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -423,7 +422,7 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
     if pickled:
         raise CaptureError(file, pickled[0], "expected numbers, got a pickled object")
     # what the file must hold whatever its body is
-    check_keys(values, BODY_KEYS | OPTIONAL_BODY_KEYS, BODY_KEYS, file)
+    check_keys(values, BODY_KEYS | {"shape_names", "displacement"}, BODY_KEYS, file)
     name = values["body"]
     if name.shape != () or name.dtype.kind not in "US" or not str(name.item()):
         problem = f"expected the string {DEFAULT_BODY!r} or the path of a model file, got {name!r}"

@@ -60,7 +60,6 @@ class Reason:
 
 CLIP = Reason("video", "beside photos")
 STILL = Reason("photo", "beside the videos whose frames were asked for")
-OTHER_FORMAT = Reason("file", "in a format that is not read")
 OWN = Reason("picture", "that humangs drew")
 ELSEWHERE = Reason("photo", "outside of the folder of photos")
 SAME_NAME = Reason("photo", "with the name of another one")
@@ -133,7 +132,7 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
         if suffix in VIDEO_SUFFIXES and photos:
             unused.append(Unused(file, CLIP))
         elif suffix in OTHER_PICTURES + RAW_PICTURES + OTHER_VIDEOS:
-            unused.append(Unused(file, OTHER_FORMAT))
+            unused.append(Unused(file, Reason("file", "in a format that is not read")))
     return FolderScan(
         folder,
         tuple(photos),

@@ -35,7 +35,6 @@ ENVIRONMENT = "HUMANGS_LIMITS"
 OUTSIDE = f"{ENVIRONMENT}=photos_outside=1 allows it"
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 """No path in a file needs these."""
-NO_PERMISSION = "no permission to read it"
 LONGEST_LINE = 1000
 """Most characters of an error, in which values of files are quoted."""
 LONGEST_REASON = 300
@@ -243,7 +242,7 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
     except Refused as error:
         raise raises(path, "", error) from error
     except PermissionError as error:
-        raise raises(error.filename or path, "", NO_PERMISSION) from error
+        raise raises(error.filename or path, "", "no permission to read it") from error
     except Exception as error:  # readers of damaged files raise some twenty types
         named = str(path) and str(error).startswith(f"{path}: ")
         raise raises(

@@ -52,7 +52,6 @@ from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import seed_numbers, train_step, update
 
 logger = logging.getLogger("humangs_jax.training")
-FLUSH_SECONDS = 10
 MANY_SKIPPED = 20
 """Number of consecutive steps that is reported if all were skipped, or all had a gradient of 0."""
 ALL_SKIPPED = "were skipped: `humangs train --diagnose` names the first stage that fails"
@@ -249,7 +248,7 @@ def _tensorboard(folder: Path, step: int) -> Any:
         from tensorboardX import SummaryWriter
     except ImportError:  # optional: the log has the same numbers
         return None
-    return SummaryWriter(str(folder), purge_step=step + 1, flush_secs=FLUSH_SECONDS)
+    return SummaryWriter(str(folder), purge_step=step + 1, flush_secs=10)
 
 
 # Records

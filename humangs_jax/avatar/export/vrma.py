@@ -31,8 +31,6 @@ BONES = {
     "right_elbow": "rightLowerArm", "right_wrist": "rightHand",
 }  # fmt: skip
 """VRM's names of our joints; jaw and eyes have none in animations."""
-SEGMENTS = ("Proximal", "Intermediate", "Distal")
-THUMB_SEGMENTS = ("Metacarpal", "Proximal", "Distal")
 VRM_FINGERS = {"pinky": "Little"}
 """Fingers that VRM calls otherwise."""
 
@@ -42,7 +40,9 @@ def bone_names() -> dict[str, str]:
     names = dict(BONES)
     for side in ("left", "right"):
         for finger in FINGERS:
-            segments = THUMB_SEGMENTS if finger == "thumb" else SEGMENTS
+            segments = ("Proximal", "Intermediate", "Distal")
+            if finger == "thumb":
+                segments = ("Metacarpal", "Proximal", "Distal")
             for i, segment in enumerate(segments, start=1):
                 called = VRM_FINGERS.get(finger, finger.capitalize())
                 names[f"{side}_{finger}{i}"] = f"{side}{called}{segment}"
