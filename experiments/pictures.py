@@ -13,7 +13,6 @@ from PIL import Image
 from skimage.transform import resize
 
 from experiments.harness import Run, entry
-from experiments.subjects import HeldOut, make_evaluation_subject, task_views
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.attach_face import with_face
 from humangs_jax.avatar.avatar import Avatar
@@ -24,19 +23,14 @@ from humangs_jax.avatar.frames import (
     rest_pose_of,
     turntable_views,
 )
-from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile, write_video
-from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.geometry.camera import look_at, project
 from humangs_jax.io.images import to_uint8
 from humangs_jax.motion import load_motion
-from humangs_jax.network.weights import load_weights
-from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.refine import refine
 from humangs_jax.rendering.splatting import render
 
 CROP = 0.75
@@ -224,43 +218,6 @@ def expression_sheet(
     sheet = tile(np.stack(faces), labels=list(EXPRESSIONS), columns=4)
     Image.fromarray(to_uint8(sheet)).save(out, quality=82)
     run.show(f"{out}: {sheet.shape[1]} x {sheet.shape[0]}")
-
-
-LOOSE_CLOTHES = (1000000, 1000029)
-"""Validation seeds of people in a coat and in a long skirt."""
-
-
-@entry
-def failure_picture(
-    run: Run,
-    seeds: tuple[int, ...] = LOOSE_CLOTHES,
-    out: Path = Path("docs/images/failures.jpg"),
-    size: int = 512,
-) -> None:
-    """People in loose clothes, whose avatars fray in a pose that no photo shows: truth and avatar.
-
-    Options:
-    seeds: of the people
-    out: the picture
-    size: side of the photos and of what is drawn, pixels
-    """
-    variables, config = load_weights()
-    pairs = []
-    for seed in seeds:
-        person = make_evaluation_subject(
-            seed, load_body(), (4,), size, HeldOut(views=1, poses=1, pose_views=4)
-        )
-        photos, held_out = person.inputs(4), person.held_out
-        avatar = reconstruct(variables, config, photos)
-        avatar = refine(avatar, photos, RefineConfig(head_steps=0), steps=0)
-        (_, views) = task_views(held_out).values()
-        view = frontal_view(photos, held_out, views.tolist())
-        pose = held_out.pose(int(np.asarray(held_out.frames)[view]))
-        drawn = np.asarray(render(animate(avatar, pose), held_out.cameras[view]).rgb)
-        pairs += [np.asarray(held_out.images[view]), np.clip(drawn, 0, 1)]
-    strip = np.concatenate([_framed(each, size) for each in pairs], axis=1)
-    Image.fromarray(to_uint8(strip)).save(out, quality=85)
-    run.show(f"{out}: {strip.shape[1]} x {strip.shape[0]}")
 
 
 def _framed(image: np.ndarray, size: int) -> np.ndarray:
