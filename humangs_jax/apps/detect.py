@@ -133,20 +133,57 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
     Raises: see `found_in_photos`.
     """
     photos = load_photos(folder)  # checked; these are on white where there are masks
+    unknown = unknown_in_capture(folder)
     if photos.masks is None:
-        pictures = without_others(photos.images, unknown_in_capture(folder))
+        pictures = without_others(photos.images, unknown)
     else:
         views = read_description(folder / "capture.json")["views"]
         pictures = (read_image(folder / view["image"])[0] for view in views)
     found = detect_photos([f"{name}.png" for name in photos.names], pictures)
     if photos.masks is not None:
         found = with_masked(found, list(photos.masks), list(photos.images))
+    found = without_hidden_landmarks(found, unknown)
     return same_people(found, photos.cameras, photos.frames.tolist())
 
 
+Hidden = Sequence[Bool[np.ndarray, "h w"] | None] | Bool[np.ndarray, "v h w"] | None
+"""Where each photo does not show the person; None: everything is shown."""
+
+
+def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[PhotoPeople]:
+    """The photos with no landmark seen where the photo does not show the person: the detector
+    guesses it.
+    """
+    if hidden is None:
+        return photos
+
+    def uncovered(points: Float[np.ndarray, "k c"], cover: Bool[np.ndarray, "h w"]) -> np.ndarray:
+        """Points (x, y, confidence, ...) with no confidence under the cover."""
+        column, row = np.floor(points[:, :2]).astype(int).T
+        inside = np.flatnonzero(inside_photo(column, row, *cover.shape[::-1]))
+        points = points.copy()
+        points[inside[cover[row[inside], column[inside]]], 2] = 0
+        return points
+
+    def seen(found: Found | None, cover: Bool[np.ndarray, "h w"]) -> Found | None:
+        """Somebody with no landmark seen under the cover."""
+        if found is None:
+            return None
+        person = found.person
+        hands = None if person.hands is None else uncovered(person.hands, cover)
+        points = uncovered(person.points, cover)
+        return found._replace(person=dataclasses.replace(person, points=points, hands=hands))
+
+    return [
+        photo
+        if cover is None or not cover.any()
+        else dataclasses.replace(photo, people=tuple(seen(each, cover) for each in photo.people))
+        for photo, cover in zip(photos, hidden, strict=True)
+    ]
+
+
 def without_others(
-    pictures: Iterable[Float[np.ndarray, "h w 3"]],
-    others: Sequence[Bool[np.ndarray, "h w"] | None] | Bool[np.ndarray, "v h w"] | None,
+    pictures: Iterable[Float[np.ndarray, "h w 3"]], others: Hidden
 ) -> Iterator[Float[np.ndarray, "h w 3"]]:
     """The photos with the colors around in place of other people and of things in front, so that
     the detector finds the person alone.
@@ -362,7 +399,8 @@ def _found(
 ) -> Found:
     """The person with a mask whose edges are the photo's, and with hands if `parts` looks for them.
 
-    Nothing of the size of the photo is made.
+    Nothing of the size of the photo is made. Landmarks beyond the photo are guesses of the
+    detector, and are not seen.
     """
     pixel = person.crop.side / LANDMARK_SIZE
     window = mask_window(person, photo.shape[1], photo.shape[0], filter_margin(pixel))
@@ -371,10 +409,14 @@ def _found(
     cut = to_uint8(mask[top:bottom, left:right])
     corner = (window[0].start + top, window[1].start + left)
     # the first pixel's centre is at 0 for the network, and at one half here
-    points = np.column_stack([person.pixels + 0.5, person.visibility]).astype(np.float64)
+    places = person.pixels + 0.5
+    column, row = np.floor(places).astype(int).T
+    height, width = photo.shape[:2]
+    seen = inside_photo(column, row, width, height)
+    points = np.column_stack([places, np.where(seen, person.visibility, 0.0)]).astype(np.float64)
     both = (None, None)
     if parts is not None:
-        both = parts.hands(photo, person.pixels, person.visibility)
+        both = parts.hands(photo, person.pixels, points[:, 2])
     hands = hand_columns(both, person.world)
     if hands is not None:
         hands[hands[:, 2] > 0, :2] += 0.5

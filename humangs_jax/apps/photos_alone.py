@@ -156,16 +156,16 @@ class _Choice(NamedTuple):
 
 def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:
     names = [file.relative_to(images).as_posix() for file in looked_at]
-    pictures = map(detect.upright, looked_at)
-    if choice.others is not None:
-        pictures = detect.without_others(pictures, others_as_shown(choice.others, images, files))
-    photos = detect.detect_photos(names, pictures)
+    others = others_as_shown(choice.others, images, files)
+    shown = detect.without_others(map(detect.upright, looked_at), others)
+    photos = detect.detect_photos(names, shown)
     # where nobody found fits a given mask, the detector looks at the photo cut to it
     if choice.masks is not None:
         masks = [upright_mask(choice.masks, images, file) for file in files]
         pictures = [detect.upright(file) for file in looked_at]
         cut = [on_white_background(*pair) for pair in zip(pictures, masks, strict=True)]
         photos = detect.with_masked(photos, masks, cut)
+    photos = detect.without_hidden_landmarks(photos, others)
     photos = same_people(photos)
     photos, number = _chosen(photos, images, files, choice)
     # cameras are found from photos with the person only

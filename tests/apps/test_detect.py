@@ -433,6 +433,25 @@ def test_a_mask_is_made_where_the_person_is_and_is_the_one_of_the_whole_photo(ce
     assert whole.sum() == seen.mask.sum() > 0
 
 
+def test_landmarks_beyond_the_photo_or_under_what_hides_it_are_not_seen():
+    person = looked_at((150, 195), 120.0)
+    picture = np.full((200, 300, 3), 0.5, np.float32)
+    seen = detect._found(person, picture)
+    below = person.pixels[:, 1] + 0.5 >= 200
+    assert below.any() and not below.all()
+    np.testing.assert_array_equal(seen.person.points[:, 2] == 0, below)
+    hidden = np.zeros((200, 300), bool)
+    hidden[:, :150] = True
+    whole = PhotoPeople("a", (300, 200), np.ones((2, 3, 3)), (None, seen))
+    (covered,) = detect.without_hidden_landmarks([whole], [hidden])
+    points = covered.people[1].person.points
+    np.testing.assert_array_equal(points[:, 2] == 0, below | (points[:, 0] < 150))
+    np.testing.assert_array_equal(points[:, :2], seen.person.points[:, :2])
+    assert covered.people[0] is None
+    assert detect.without_hidden_landmarks([whole], [None])[0] is whole
+    assert detect.without_hidden_landmarks([whole], None)[0] is whole
+
+
 def test_masks_of_many_people_take_no_more_than_the_people_do(monkeypatch):
     people = [looked_at((500 + 600 * i, 1500), 400.0) for i in range(5)]
     monkeypatch.setattr(detect, "Networks", lambda: None)

@@ -29,6 +29,7 @@ from humangs_jax.capture.fitting.person_moments import (
     explain,
     known_landmarks,
     middle_of,
+    only_known,
     under_bar,
 )
 from humangs_jax.core.array_types import Bool, Float
@@ -46,6 +47,12 @@ STATURE_STD = 0.001
 """Metres by which the stature may differ from that of a scaled person."""
 STATURE = 1.52
 """Stature over trunk, thigh and shin together, of the shipped body's mean person."""
+SHARES = {("shoulder", "hip"): 0.36, ("hip", "knee"): 0.315, ("knee", "ankle"): 0.325}
+"""Shares of trunk, thigh and shin in their sum, of the same person: what of it a photo does not
+show."""
+LEAST_TRUNK = 2
+"""Landmarks of shoulders and hips, of the four, without which a photo says nothing of a pose."""
+TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,6 +90,15 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
     is found.
     """
     _check(seen, height)
+    # photos that show too little are left out where others show more
+    little = _little_shown(seen)
+    if little and len(little) < len(seen.photos):
+        kept = [view for view in range(len(seen.photos)) if view not in little]
+        found = cameras_from_person(seen.select(kept), height=height)
+        left_out = tuple(f"{seen.photos[view]}: left out: {why}" for view, why in little.items())
+        views = tuple(kept[view] for view in found.views)
+        return dataclasses.replace(found, views=views, warnings=(*found.warnings, *left_out))
+    _check_views(seen)
     seen = cleaned(seen)
     explained = explain(seen)
     if explained.trial is not None:
@@ -148,13 +164,29 @@ def _check(seen: PersonViews, height: float | None) -> None:
         )
     if height is not None and not 0.3 < height < 3:
         raise ValueError(f"height {height:g}: expected metres between 0.3 and 3")
+
+
+def _little_shown(seen: PersonViews) -> dict[int, str]:
+    """The views that show too little of the person for a pose, and why."""
+    trunk = [seen.names.index(name) for name in TRUNK if name in seen.names]
+    found = {}
+    for view, known in enumerate(known_landmarks(seen)):
+        if known.sum() < FEWEST:
+            found[view] = _few_landmarks(int(known.sum()))
+        elif len(trunk) == len(TRUNK) and known[trunk].sum() < LEAST_TRUNK:
+            found[view] = "neither shoulders nor hips are seen in it"
+    return found
+
+
+def _few_landmarks(count: int) -> str:
+    return f"{count} landmarks of the person are seen, expected {FEWEST} or more"
+
+
+def _check_views(seen: PersonViews) -> None:
     # enough of the person in every photo: landmarks, pixels and depth
     for photo, points, visible in zip(seen.photos, seen.points, known_landmarks(seen), strict=True):
         if visible.sum() < FEWEST:
-            raise ValueError(
-                f"{photo}: {visible.sum()} landmarks of the person are seen, expected {FEWEST} or"
-                " more"
-            )
+            raise ValueError(f"{photo}: {_few_landmarks(int(visible.sum()))}")
         if np.ptp(points[visible], axis=0).max() < SMALLEST:
             raise ValueError(
                 f"{photo}: all landmarks of the person lie within {SMALLEST:.0f} pixels"
@@ -177,35 +209,44 @@ def _in_world(
     seen: PersonViews, rig: Rig, height: float | None
 ) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
     """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this
-    height.
+    height. What no photo shows of the person is as long as usual.
     """
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
-    names = seen.names
-    hips, shoulders, ankles = (
-        middle_of(points, names, part) for part in ("hip", "shoulder", "ankle")
-    )
-    body = (shoulders - ankles) / np.linalg.norm(shoulders - ankles)
+    known, names = only_known(points, seen.names, np.any(known_landmarks(seen), axis=0))
+    middles = {part: middle_of(known, names, part) for part in ("shoulder", "hip", "knee", "ankle")}
+    shown = {part: place for part, place in middles.items() if np.isfinite(place).all()}
+    # the body, from the lowest to the highest part that is seen; else it is as cameras are held
+    body = -rotations[:, 1].mean(axis=0)
+    if len(shown) > 1:
+        highest, *_, lowest = shown.values()
+        body = highest - lowest
+    body = body / np.linalg.norm(body)
     # y up: across the images' x axes, and along the body; least squares of both
     level = rotations[:, 0]  # images' x axes: horizontal if the cameras are level
     precision = level.T @ level / LEVEL**2 + np.eye(3) / UPRIGHT**2
     up = np.linalg.solve(precision, body)
     up /= np.linalg.norm(up)
     # x to the person's left, horizontal; z is then to the front
-    left = across(points, names)
-    left -= (left @ up) * up
+    left = across(known, names)
+    if not left.any():  # as of a person who looks at the cameras
+        left = level.mean(axis=0)
+    left = left - (left @ up) * up
     left /= np.linalg.norm(left)
     world_from_rig = np.stack([left, up, np.cross(left, up)])
     # metres: the stature is estimated from the lengths of trunk and legs
-    scale = 1.0
-    if height is not None:
-        thigh = _bone_length(points, names, "hip", "knee")
-        shin = _bone_length(points, names, "knee", "ankle")
-        trunk = float(np.linalg.norm(shoulders - hips))
-        scale = height / (STATURE * (trunk + thigh + shin))
-    # the origin under the hips, on the lowest landmark
+    lengths = _lengths(known, names)
+    shares = sum(SHARES[part] for part in lengths)
+    total = sum(lengths.values()) / shares if lengths else 0.0
+    scale = 1.0 if height is None or not lengths else height / (STATURE * total)
+    # the origin under the hips, on the lowest landmark, or below the lowest joint that is seen by
+    # the length of the parts that are not
     turned = scale * points @ world_from_rig.T
-    middle = scale * world_from_rig @ hips
-    origin = np.asarray([middle[0], turned[:, 1].min(), middle[2]])
+    middle = scale * world_from_rig @ shown.get("hip", known.mean(axis=0))
+    unseen = sum(share for (_, end), share in SHARES.items() if end not in shown)
+    heights = scale * known @ up
+    joints = [scale * place @ up for place in shown.values()]
+    ground = min(heights.min(), min(joints, default=np.inf) - scale * total * unseen)
+    origin = np.asarray([middle[0], ground, middle[2]])
     cameras = []
     for (width, tall), rotation, place, f in zip(seen.sizes, rotations, places, focal, strict=True):
         matrix = np.eye(4)
@@ -219,13 +260,27 @@ def _in_world(
     return tuple(cameras), turned - origin
 
 
-def _bone_length(points: Float[np.ndarray, "k 3"], names: Sequence[str], a: str, b: str) -> float:
-    """The mean distance of two parts on the left and on the right."""
-    lengths = [
-        np.linalg.norm(points[names.index(f"{side}_{a}")] - points[names.index(f"{side}_{b}")])
-        for side in ("left", "right")
-    ]
-    return float(np.mean(lengths))
+def _lengths(
+    points: Float[np.ndarray, "k 3"], names: Sequence[str]
+) -> dict[tuple[str, str], float]:
+    """The lengths of those of trunk, thigh and shin whose ends are among the names."""
+    found = {}
+    for first, last in SHARES:
+        if first == "shoulder":
+            length = np.linalg.norm(
+                middle_of(points, names, first) - middle_of(points, names, last)
+            )
+        else:
+            pairs = [(f"{side}_{first}", f"{side}_{last}") for side in ("left", "right")]
+            sides = [
+                np.linalg.norm(points[names.index(a)] - points[names.index(b)])
+                for a, b in pairs
+                if a in names and b in names
+            ]
+            length = np.mean(sides) if sides else np.nan
+        if np.isfinite(length):
+            found[first, last] = float(length)
+    return found
 
 
 def _warnings(

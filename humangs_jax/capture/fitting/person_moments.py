@@ -287,7 +287,8 @@ def best_trial(seen: PersonViews) -> Trial:
         if found.error > DOUBTFUL:
             other = _least(seen, _try(seen, np.ones(views, bool)))
             found = min(found, other, key=lambda each: each.cost)
-        if handedness(found.rig.landmarks, seen.names) < 0:
+        shown = np.any(known_landmarks(seen), axis=0)
+        if handedness(*only_known(found.rig.landmarks, seen.names, shown)) < 0:
             found = _try(seen, ~found.mirrored)
     return _polished(found)
 
@@ -379,9 +380,9 @@ def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Ev
 
     points, weights = pick(seen.points - np.asarray(seen.sizes)[:, None] / 2), pick(seen.visibility)
     world = pick(seen.world)
-    for own, flipped in zip(world, mirrored, strict=True):
+    for own, shown, flipped in zip(world, weights > SEEN, mirrored, strict=True):
         # the detector saw the body turned round as well
-        if flipped and handedness(own, seen.names) < 0:
+        if flipped and handedness(*only_known(own, seen.names, shown)) < 0:
             own[:, 2] *= -1
     # 3D landmarks in the axes of their camera, centred, and of one size in all views
     K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
@@ -424,8 +425,18 @@ def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
 def middle_of(
     points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str
 ) -> Float[np.ndarray, "3"]:
-    """The middle of the left and the right of a part."""
-    return np.mean([points[names.index(f"{side}_{part}")] for side in ("left", "right")], axis=0)
+    """The middle of the left and the right of a part; NaN where neither is among the names."""
+    sides = [f"{side}_{part}" for side in ("left", "right") if f"{side}_{part}" in names]
+    found = [points[names.index(name)] for name in sides]
+    return np.mean(found, axis=0) if found else np.full(3, np.nan)
+
+
+def only_known(
+    points: Float[np.ndarray, "k 3"], names: Sequence[str], known: Bool[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
+    """Those landmarks that are known, and their names: places of the others mean nothing."""
+    kept = np.flatnonzero(known)
+    return points[kept], tuple(names[i] for i in kept)
 
 
 def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
@@ -446,15 +457,20 @@ def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.n
 
 
 def across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    """From the right side of the trunk to the left one."""
-    to_left = [
-        points[names.index(f"left_{part}")] - points[names.index(f"right_{part}")]
-        for part in ("shoulder", "hip")
-    ]
-    return to_left[0] + to_left[1]
+    """From the right side of the trunk to the left one, by the pairs that are among the names."""
+    total = np.zeros(3)
+    for part in ("shoulder", "hip"):
+        left, right = f"left_{part}", f"right_{part}"
+        if left in names and right in names:
+            total += points[names.index(left)] - points[names.index(right)]
+    return total
 
 
 def handedness(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> float:
-    """Positive if the left side is to the left of somebody who looks to the front."""
+    """Positive if the left side is to the left of somebody who looks to the front; 0 if the names
+    do not tell.
+    """
     up = middle_of(points, names, "shoulder") - middle_of(points, names, "hip")
+    if np.isnan(up).any():
+        return 0.0
     return float(np.linalg.det(np.stack([across(points, names), up, _front(points, names)])))
