@@ -87,7 +87,9 @@ class Step:
         """The text, after the name of the file or the word "warning"."""
         if self.warning:
             return f"warning: {self.text}"
-        return self.text if self.file is None else f"{self.file}: {self.text}"
+        if self.file is None:
+            return self.text
+        return f"{self.file}: {self.text}"
 
 
 def avatar_from_photos(
@@ -139,7 +141,10 @@ def avatar_from_photos(
         ...     print(step)
         >>> hg.show(step.avatar)
     """
-    as_path = lambda value: None if value is None else Path(value)
+
+    def as_path(value):
+        return None if value is None else Path(value)
+
     run = FromPhotos(
         photos=Path(photos),
         out=Path(out),
@@ -257,7 +262,9 @@ class FromPhotos:
 
     def _check_same_options(self, mark: Any) -> None:
         """Raises: ArgumentError if the body of the earlier run was made with other options."""
-        earlier = mark.get("options") if isinstance(mark, dict) else None
+        earlier = None
+        if isinstance(mark, dict):
+            earlier = mark.get("options")
         if not isinstance(earlier, dict):  # of a version that did not record them
             return
         for name, value in self._decisive().items():
@@ -306,7 +313,9 @@ class FromPhotos:
             if not (masked and each.name == "masks")
         ]
         # what the detector finds is not asked for
-        findable = ("masks", "keypoints") if detection.available() else ()
+        findable = ()
+        if detection.available():
+            findable = "masks", "keypoints"
         detected = [each.name for each in needed if each.name in findable]
         needed = [each for each in needed if each.name not in detected]
         if needed:
@@ -372,7 +381,10 @@ class FromPhotos:
         video = video_of(self.photos)
         if video is None:
             return self.photos
-        out = self.out if self.out.name not in ("", "..") else self.out.resolve()
+        if self.out.name not in ("", ".."):
+            out = self.out
+        else:
+            out = self.out.resolve()
         folder = out.with_name(f"{out.name}_photos")
         with stage("choosing frames of the video"):
             told = photos_of_video(video, folder)
@@ -441,7 +453,9 @@ class FromPhotos:
             person = None if found_here else self.person
             keypoints = _keypoints(photos, material.keypoints, person)
             assert keypoints is not None
-            against = find_contradiction(photos, keypoints) if photos.calibrated else None
+            against = None
+            if photos.calibrated:
+                against = find_contradiction(photos, keypoints)
             if against:
                 raise ValueError(
                     f"{material.cameras}: {against}: correct it, or go on without it by"
@@ -548,7 +562,10 @@ def _bodies_to_masks(fitted: FittedCapture) -> list[RefinedCapture]:
     """The fitted body, refined by the masks: as of someone in loose clothes, and in tight ones."""
     capture = fitted.capture
     # calibrated cameras move where the keypoints have shown that they are off
-    fixed = not fitted.camera_errors if capture.calibrated else cameras_are_unseen(capture)
+    if capture.calibrated:
+        fixed = not fitted.camera_errors
+    else:
+        fixed = cameras_are_unseen(capture)
     found = []
     for tight in (False, True):
         config = usual_config(

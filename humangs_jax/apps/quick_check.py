@@ -163,7 +163,9 @@ def _coarse_views(capture: Capture) -> list[_View]:
     matrices = np.asarray(capture.cameras.cam_from_world, float)
     views = []
     for i, frame in enumerate(capture.frames.tolist()):
-        mask = None if capture.masks is None else capture.masks[i]
+        mask = None
+        if capture.masks is not None:
+            mask = capture.masks[i]
         cells = None if mask is None else _mask_cells(mask)
         view = _View(
             capture.names[i],

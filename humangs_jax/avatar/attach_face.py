@@ -171,7 +171,10 @@ def _face(avatar: Avatar, body: BodyModel, of_arkit: bool) -> Face:
         eyes = np.zeros((len(row), 2), np.float32)
     row[eyes.sum(axis=1) > 0.5] = len(vertices)  # what shows the eye does not go with the lids
     beside, stretching = _stretching(avatar, vertices, row_of_vertex)
-    hidden = _hidden(avatar, body, row < len(vertices)) if of_arkit else _nothing(expressions)
+    if of_arkit:
+        hidden = _hidden(avatar, body, row < len(vertices))
+    else:
+        hidden = _nothing(expressions)
     return Face(
         row=from_host(row, jnp.int32),
         eyes=from_host(eyes),
@@ -345,7 +348,10 @@ def _gaussians_of(
     scales = np.concatenate([COVER * sides, THICKNESS * sides.min(axis=1, keepdims=True)], axis=1)
     axes = np.stack([unit(first), np.cross(normals, unit(first)), normals], axis=-1)
     means = corners.mean(axis=1) + np.where(in_mouth, 0, LID_LIFT)[:, None] * normals
-    number = lambda x: from_host(x, jnp.float32)
+
+    def number(x):
+        return from_host(x, jnp.float32)
+
     quats, opacities = _from_matrices(number(axes)), np.full(len(means), OPAQUE)
     return (
         Gaussians(number(means), quats, number(scales), number(opacities), number(colors)),

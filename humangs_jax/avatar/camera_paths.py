@@ -99,7 +99,8 @@ def camera_path(cameras: Camera, frames: int) -> Camera:
 
 def standing(avatar: Avatar, pose: BodyPose | None = None) -> BodyPose:
     """A pose (default: the T-pose) moved so that the person stands on the floor, at x = z = 0."""
-    pose = rest_pose_of(avatar) if pose is None else pose
+    if pose is None:
+        pose = rest_pose_of(avatar)
     moment = Motion(pose.rotations[None], pose.translation[None], 1.0)
     return grounded(
         moment, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents

@@ -308,7 +308,9 @@ def trim_and_resample(
     travelled = period * (path[-1] - path[0]) * [1, 0, 1]
     moved = np.concatenate([path + i * travelled for i in range(loop)])
     turned = jnp.tile(part.rotations, (loop, 1, 1))
-    faces = None if part.expressions is None else jnp.tile(part.expressions, (loop, 1))
+    faces = None
+    if part.expressions is not None:
+        faces = jnp.tile(part.expressions, (loop, 1))
     return replace(
         part,
         rotations=turned,

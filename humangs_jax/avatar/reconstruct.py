@@ -131,7 +131,9 @@ def reconstruct(
         if sized is None:
             sized = fit_buffers(inputs.foreground, inputs.view_count, config)
         avatar, _ = _reconstruct(variables, sized, body, views, inputs)
-    return replace(avatar, light=None) if prepared.turned else avatar
+    if prepared.turned:
+        return replace(avatar, light=None)
+    return avatar
 
 
 @checked_arguments

@@ -217,7 +217,12 @@ def read_body(path: str | Path) -> BodyModel:
         for name in {"collapse_order", "collapse_into"} & set(arrays):
             check_indices(name, arrays[name], (vertices,), vertices)
         expressions = read_expressions(arrays, vertices, joints)
-        index = lambda key: from_host(arrays[key], jnp.int32) if key in arrays else None
+
+        def index(key):
+            if key in arrays:
+                return from_host(arrays[key], jnp.int32)
+            return None
+
         return BodyModel(
             template=from_host(arrays["template"], jnp.float32),
             shape_directions=from_host(directions, jnp.float32),
@@ -284,7 +289,12 @@ def read_expressions(
     check_indices(f"{EXPRESSION}vertices", found["vertices"], (moved,), vertices)
     for name in found.keys() & shapes.keys():
         check_array(f"{EXPRESSION}{name}", found[name], shapes[name], -LARGEST, LARGEST)
-    number = lambda name: from_host(found[name], jnp.float32) if name in found else None
+
+    def number(name):
+        if name in found:
+            return from_host(found[name], jnp.float32)
+        return None
+
     return Expressions(
         vertices=from_host(found["vertices"], jnp.int32),
         directions=from_host(found["directions"], jnp.float32),
@@ -336,8 +346,13 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
         check_row_sums("weights", weights)
         directions, names = _shape_directions(file, n, shape_count, expression_count)
         has_uvs = "vt" in file and "ft" in file
-        uvs = file.numbers("vt", (None, 2)) if has_uvs else None
-        number = lambda x: from_host(x, jnp.result_type(float))
+        uvs = None
+        if has_uvs:
+            uvs = file.numbers("vt", (None, 2))
+
+        def number(x):
+            return from_host(x, jnp.result_type(float))
+
         # the expressions of the face, also as a change of the joints
         regressor = number(file.numbers("J_regressor", (JOINTS, n), LARGEST))
         components = number(directions[..., shape_count:])
@@ -410,7 +425,10 @@ def load_hands(path: str | Path) -> HandBasis:
     """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: key.startswith("hands_"))
-        number = lambda arrays: from_host(np.stack(arrays), jnp.result_type(float))
+
+        def number(arrays):
+            return from_host(np.stack(arrays), jnp.result_type(float))
+
         return HandBasis(
             means=number([file.numbers(f"hands_mean{side}", (45,)) for side in "lr"]),
             components=number([file.numbers(f"hands_components{side}", (45, 45)) for side in "lr"]),

@@ -41,13 +41,17 @@ class Motion:
         (`avatar.expression_names`).
         """
         faces = self.expressions_of(expression_names)
-        expression = None if faces is None else taken(faces, frame)
+        expression = None
+        if faces is not None:
+            expression = taken(faces, frame)
         pose = taken(self.rotations, frame), taken(self.translations, frame)
         return BodyPose(*pose, expression)
 
     def part(self, frames: slice) -> "Motion":
         """Some of the frames, at the same rate."""
-        faces = None if self.expressions is None else taken(self.expressions, frames)
+        faces = None
+        if self.expressions is not None:
+            faces = taken(self.expressions, frames)
         return replace(
             self,
             rotations=taken(self.rotations, frames),

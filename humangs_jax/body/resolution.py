@@ -561,7 +561,10 @@ def decimate_with_kept(
     faces = np.asarray(body.faces)
     ends = target[faces]
     solid = (ends != np.roll(ends, 1, axis=1)).all(axis=1)
-    uvs, uv_faces = (None, None) if body.uvs is None else _carry_uvs(body, faces, target, solid)
+    if body.uvs is None:
+        uvs, uv_faces = None, None
+    else:
+        uvs, uv_faces = _carry_uvs(body, faces, target, solid)
     dtype = body.template.dtype
     rows = lambda array: from_host(
         np.asarray(array)[kept]

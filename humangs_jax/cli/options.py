@@ -87,7 +87,9 @@ class PartOfMotion:
                     said.append(f"{option_of(name)}={text}")
                 else:
                     said += [option_of(name), text]
-        return () if path is None else ("--motion", path, *said)
+        if path is None:
+            return ()
+        return "--motion", path, *said
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
         """The motion of a file; None: the shipped walk. Raises: MotionError."""

@@ -96,7 +96,9 @@ class Start:
 
         own = ("photos", "out", "refine", "browser")
         options = {name: value for name, value in vars(self).items() if name not in own}
-        refinement = None if limits is None else RefineConfig(**limits)
+        refinement = None
+        if limits is not None:
+            refinement = RefineConfig(**limits)
         try:
             for step in avatar_from_photos(self.photos, self.out, refinement=refinement, **options):
                 self._show(step)

@@ -20,7 +20,9 @@ def from_host(array: Any, dtype: Any = None) -> Any:
     `jnp.asarray` makes the same, by a program for each shape.
     """
     if isinstance(array, jax.Array):
-        return array if dtype is None or array.dtype == dtype else array.astype(dtype)
+        if dtype is None or array.dtype == dtype:
+            return array
+        return array.astype(dtype)
     return jax.device_put(np.asarray(array, dtype))
 
 
@@ -36,7 +38,8 @@ def taken(array: Any, index: Any) -> Any:
     small = _plain(array) and array.size <= SMALL
     if isinstance(index, Tracer) or isinstance(array, np.ndarray) or not (small or on_host(array)):
         return array[index]
-    index = np.asarray(index) if isinstance(index, jax.Array) else index
+    if isinstance(index, jax.Array):
+        index = np.asarray(index)
     return from_host(np.asarray(array)[index])
 
 

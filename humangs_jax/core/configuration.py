@@ -117,7 +117,9 @@ class ArgumentError(ValueError):
 
     def line(self, name: str) -> str:
         """The message, with this name of the argument."""
-        return f"{name}{self.problem}" if self.problem.startswith(":") else f"{name} {self.problem}"
+        if self.problem.startswith(":"):
+            return f"{name}{self.problem}"
+        return f"{name} {self.problem}"
 
 
 class UnknownPresetError(KeyError):

@@ -376,14 +376,14 @@ def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[Masked
             continue
         if frame not in posed:
             posed[frame] = skinned(body, joints, capture.poses, frame, weights, corrected=True)
-        K, matrix = (
-            np.asarray(capture.cameras.K, float)[i],
-            np.asarray(capture.cameras.cam_from_world, float)[i],
-        )
+        K = np.asarray(capture.cameras.K, float)[i]
+        matrix = np.asarray(capture.cameras.cam_from_world, float)[i]
         if all(
             np.isfinite(x).all() for x in (rest, *posed[frame])
         ):  # whoever poses the body names what is not
-            hidden = None if capture.unknown is None else capture.unknown[i]
+            hidden = None
+            if capture.unknown is not None:
+                hidden = capture.unknown[i]
             views.append(_window(mask, hidden, K @ matrix[:3], *posed[frame]))
     return views
 

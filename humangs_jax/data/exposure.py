@@ -118,12 +118,13 @@ def points_of(
     capture: photos on white, with masks, all of which show the person.
     """
     views = to_network_views(capture, EXPOSURE_SIZE, crop=True)
-    rest, per_view = (
-        shape_body(capture.body, views.betas),
-        (views.images, views.masks, views.cameras),
-    )
+    rest = shape_body(capture.body, views.betas)
+    per_view = views.images, views.masks, views.cameras
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
-    photo = lambda i: jax.tree.map(lambda x: taken(x, i), (poses, *per_view))
+
+    def photo(i):
+        return jax.tree.map(lambda x: taken(x, i), (poses, *per_view))
+
     each = [seen_colors(capture.body, rest, *photo(i)) for i in range(capture.view_count)]
     colors, seen = (np.stack(x) for x in zip(*each, strict=True))
     return colors, seen

@@ -91,7 +91,10 @@ def add_skirt(
         count:
     ]
     sides = np.sqrt(vertex_areas(rest + moved, faces))
-    own = np.ones(count) if body.spacing is None else np.asarray(body.spacing)
+    if body.spacing is None:
+        own = np.ones(count)
+    else:
+        own = np.asarray(body.spacing)
     spacing = np.concatenate([own, sides[count:] / np.median(sides[:count] / own)])
     return replace(worn, spacing=from_host(spacing, body.template.dtype)), moved.astype(np.float32)
 

@@ -178,7 +178,8 @@ def _remeshed(
     if longest is not None:
         body, split = split_with_weights(body, longest)
         weights = split @ weights
-    body = body if wanted is None else replace(body, texels=wanted.texels(body))
+    if wanted is not None:
+        body = replace(body, texels=wanted.texels(body))
     return replace(body, made_for=(vertices, edge, fewer, longest, wanted)), weights
 
 
@@ -406,7 +407,8 @@ def to_network_views(capture: Capture, size: int, crop: bool = False) -> Subject
     side = max(height, width)
     boxes = [(-((side - width) // 2), -((side - height) // 2), side)] * capture.view_count
     images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
-    masks = np.zeros(images.shape[:3], np.float32) if masks is None else masks
+    if masks is None:
+        masks = np.zeros(images.shape[:3], np.float32)
     frames = np.asarray(capture.frames)
     return SubjectViews(
         images=from_host(images, jnp.float32),

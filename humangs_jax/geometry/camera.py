@@ -97,7 +97,9 @@ class Camera(Batchable):
         if cam_from_world.shape != (4, 4):
             raise ValueError(f"cam_from_world: expected shape (4, 4), got {cam_from_world.shape}")
         width, height = _pixels(width, height)
-        coefficients = None if distortion is None else jnp.asarray(distortion, kept)
+        coefficients = None
+        if distortion is not None:
+            coefficients = jnp.asarray(distortion, kept)
         check_lens(lens, None if coefficients is None else coefficients.size)
         if coefficients is not None and coefficients.ndim != 1:
             raise ValueError(f"distortion: expected shape (n,), got {coefficients.shape}")
@@ -266,7 +268,9 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
     tan = jnp.tan if isinstance(vertical_fov, Tracer) else np.tan
     focal = 0.5 * height / tan(0.5 * vertical_fov)
     K = [[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]]
-    return jnp.asarray(K) if isinstance(focal, jax.Array) else from_host(K)
+    if isinstance(focal, jax.Array):
+        return jnp.asarray(K)
+    return from_host(K)
 
 
 @checked_arguments

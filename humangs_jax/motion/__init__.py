@@ -152,7 +152,10 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
             rotations, translations, said = skeleton.retargeted(found, body(), up)
         else:
             rate = found.fps
-            axis, said = _up_of(found, body) if up == "auto" else (up, "")
+            if up == "auto":
+                axis, said = _up_of(found, body)
+            else:
+                axis, said = up, ""
             rotations, translations = turned_upright(found.rotations, found.translations, axis)
     if rest_joints is not None and rotations.shape[1] != len(rest_joints):
         raise MotionError(
@@ -177,7 +180,10 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
     check_limit("rate", rate, "frames per second")
     if rate < SLOWEST:
         raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
-    names, faces = ((), None) if found.face is None else checked_track(found.face, len(rotations))
+    if found.face is None:
+        names, faces = (), None
+    else:
+        names, faces = checked_track(found.face, len(rotations))
     motion = Motion(
         from_host(rotations),
         from_host(translations),
@@ -277,4 +283,6 @@ def made_from_of(path: Path) -> str | None:
         arrays, _ = read_npz(path)
     except (ValueError, OSError):
         return None
-    return str(arrays[MADE_FROM]) if MADE_FROM in arrays else None
+    if MADE_FROM in arrays:
+        return str(arrays[MADE_FROM])
+    return None

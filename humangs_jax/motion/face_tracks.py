@@ -96,7 +96,10 @@ def of_preset(name: str) -> dict[str, float] | None:
         return None
     found = {}
     for shape, weight in shapes.items():
-        sides = [shape] if shape in ARKIT else [f"{shape}Left", f"{shape}Right"]
+        if shape in ARKIT:
+            sides = [shape]
+        else:
+            sides = [f"{shape}Left", f"{shape}Right"]
         found |= dict.fromkeys(sides, weight)
     return found
 

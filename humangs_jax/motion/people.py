@@ -180,7 +180,9 @@ def _found(content: Any, name: str, depth: int) -> list[Person]:
 
 def _id_of(content: Any, number: int) -> str:
     key = next((key for key in IDS if isinstance(content, dict) and key in content), None)
-    return str(number) if key is None else _word(content[key])
+    if key is None:
+        return str(number)
+    return _word(content[key])
 
 
 def _word(value: Any) -> str:
@@ -217,7 +219,9 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     rest = {key: value for key, value in values.items() if key not in arrays}
 
     def of(array, i):
-        return array[i] if place == "root" else array[i : i + 1]
+        if place == "root":
+            return array[i]
+        return array[i : i + 1]
 
     def own(i):
         return {key: of(array, i) for key, array in arrays.items() if len(array) == len(ids)}

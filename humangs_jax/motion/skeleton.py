@@ -122,7 +122,9 @@ def retargeted(
     rotations = np.stack([_rotation(turn) for turn in relative], axis=1)
     # the pelvis follows the file's, and the soles stand as high as the file's do
     moves = scale * places[:, source["pelvis"]]
-    soles = _soles(clip, source, joints) if standing else None
+    soles = None
+    if standing:
+        soles = _soles(clip, source, joints)
     moves[:, 1] += _steps(scale * places[..., 1], source, soles) - _steps_of_body(
         world, joints, moves, source
     )

@@ -97,7 +97,8 @@ def sharpened(
     count, settings = config.head_steps, dataclasses.replace(config, **HOST_SETTINGS)
     with clock.compiling():
         photos, drawn = photos_of(crops.views), avatar.select(crops.drawn)
-        drawn = with_low_pass_of(drawn, crops.views) if crops.finer else drawn
+        if crops.finer:
+            drawn = with_low_pass_of(drawn, crops.views)
         parameters = unconstrained(drawn.gaussians)
         share = from_host(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
         state = started(parameters, share, settings, crops.splat)

@@ -140,11 +140,10 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
     nearest = KDTree(means).query(means, min(count + 1, total))[1].reshape(total, -1)[:, 1:]
     pairs = np.sort((own * total + nearest).ravel())
     reverse = nearest * total + own
-    mutual = (
-        pairs[np.minimum(np.searchsorted(pairs, reverse), len(pairs) - 1)] == reverse
-        if pairs.size
-        else reverse > 0
-    )
+    if pairs.size:
+        mutual = pairs[np.minimum(np.searchsorted(pairs, reverse), len(pairs) - 1)] == reverse
+    else:
+        mutual = reverse > 0
     share = mutual / np.maximum(mutual.sum(axis=1, keepdims=True), 1)
     return Neighbors(
         from_host(np.where(mutual, nearest, own), jnp.int32), from_host(share, jnp.float32)

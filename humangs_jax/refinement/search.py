@@ -241,7 +241,9 @@ def prepare(
         replace(photo, counted=from_host(np.asarray(photo.counted) & ~h))
         for photo, h in zip(photos, held, strict=True)
     ]
-    graph = graph_of(np.asarray(start.gaussians.means)) if config.iterations else None
+    graph = None
+    if config.iterations:
+        graph = graph_of(np.asarray(start.gaussians.means))
     settings = dataclasses.replace(config, **HOST_SETTINGS)
     task = Task(start, fresh, photos, seen, graph, config, settings, clock)
     parameters, splat = unconstrained(start.gaussians), planned(start, views)
@@ -334,7 +336,10 @@ def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) 
     if task.config.iterations:
         found, loss = iterated(task, start, start.used)
         psnr = psnr_of(task, found, hidden)
-        better = psnr > highest if any_hidden else loss < np.mean(losses)
+        if any_hidden:
+            better = psnr > highest
+        else:
+            better = loss < np.mean(losses)
         if better:
             best, highest = found, psnr
         yield best
@@ -509,7 +514,9 @@ def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:
         for image, photo in zip(images_of(task, found, photos), photos, strict=True)
         if np.asarray(photo.counted).any()
     ]
-    return float(np.mean(scores)) if scores else LARGEST_PSNR
+    if scores:
+        return float(np.mean(scores))
+    return LARGEST_PSNR
 
 
 def images_of(

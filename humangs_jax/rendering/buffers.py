@@ -107,7 +107,8 @@ def raise_on_overflow(
     overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig
 ) -> None:
     """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
-    if missing := int(np.max(np.asarray(overflow), initial=0)):
+    missing = int(np.max(np.asarray(overflow), initial=0))
+    if missing:
         rows, pairs = _needed(gaussians, cameras, config)
         raise BufferOverflowError(
             f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs}"

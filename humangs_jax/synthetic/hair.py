@@ -110,7 +110,10 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
     if headwear:
         thickness = min(thickness, 0.010)
     # bottom and waves matter to long hair only
-    bottom = rng.uniform(0.15, 0.2) if cut == "bob" else rng.uniform(-0.17, 0.1)
+    if cut == "bob":
+        bottom = rng.uniform(0.15, 0.2)
+    else:
+        bottom = rng.uniform(-0.17, 0.1)
     wave = rng.choice([rng.uniform(0.002, 0.004), rng.uniform(0.006, 0.014)], p=[0.55, 0.45])
     if male:
         receding = rng.uniform(-0.004, 0.012 + 0.012 * (years > 45))

@@ -310,7 +310,8 @@ def _views(
     rotations = scene.rotations[poses]
     translations = scene.translations[poses]
     betas = bank.betas[scene.person]
-    depths = depths if config.depths else None
+    if not config.depths:
+        depths = None
     return SubjectViews(images, masks, found, rotations, translations, betas, depths=depths)
 
 

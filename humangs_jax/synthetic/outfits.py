@@ -392,7 +392,10 @@ def _top(
         bottom = rng.uniform(-0.385, -0.30)
     # only plain tops may be tight
     wide = kind not in ("tank", "tee", "longsleeve", "turtleneck")
-    loose = rng.uniform(0.25, 1.0) if wide else rng.uniform(0.0, 1.0) ** 1.3
+    if wide:
+        loose = rng.uniform(0.25, 1.0)
+    else:
+        loose = rng.uniform(0.0, 1.0) ** 1.3
     if kind == "hoodie":
         loose = 0.5 + 0.5 * loose
     elif style == "street":
@@ -406,8 +409,11 @@ def _top(
         details.add("tucked")
     # what is worn under or in something else is close to the body
     sleeve = float(min(sleeve, WRIST - 0.01) if outer else sleeve)
-    loose = min(loose, 0.2) if outer or tucked else loose
-    plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
+    if outer or tucked:
+        loose = min(loose, 0.2)
+    plainness = 0.55
+    if style != "formal":
+        plainness = PLAIN_TOPS.get(kind, 0.35)
     depth = rng.uniform(0.04, 0.095)
     return _made(
         rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth
@@ -449,9 +455,15 @@ def _trousers(
 
 def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
     kind = drawn(rng, {"short_skirt": 3, "pleated_skirt": 1.5, "long_skirt": 2})
-    end = rng.uniform(-1.1, -0.84) if kind == "long_skirt" else rng.uniform(-0.76, -0.57)
+    if kind == "long_skirt":
+        end = rng.uniform(-1.1, -0.84)
+    else:
+        end = rng.uniform(-0.76, -0.57)
     narrow = rng.random() < 0.35 and kind != "pleated_skirt"
-    flare = rng.uniform(0.0, 0.05) if narrow else rng.uniform(0.05, 0.16)
+    if narrow:
+        flare = rng.uniform(0.0, 0.05)
+    else:
+        flare = rng.uniform(0.05, 0.16)
     sizes = {
         "top": waist,
         "end": end,

@@ -115,7 +115,8 @@ class Gait:
 
 def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
     step, curved = rng.uniform(0.3, LONG_STEP) * build.leg, rng.random() < 0.6
-    cadence, bend = rng.uniform(0.75, 1.05), rng.normal(0, 0.16) if curved else 0.0
+    cadence = rng.uniform(0.75, 1.05)
+    bend = rng.normal(0, 0.16) if curved else 0.0
     width = build.hip_width * rng.uniform(0.5, 0.9)
     lift = rng.uniform(0.04, 0.09)
     turn_out = rng.uniform(0.0, 0.18)
@@ -206,7 +207,9 @@ def _foot_at(
     down = number - 0.5 * side
     here, there = (_footprint(build, gait, heading, track, side, down + k) for k in (0, 1))
     long = np.clip(gait.step / (LONG_STEP * build.leg), 0.15, 1.0)
-    strike = HEEL_STRIKE * long if gait.step > 0.2 * build.leg else 0.0
+    strike = 0.0
+    if gait.step > 0.2 * build.leg:
+        strike = HEEL_STRIKE * long
     off = TOE_OFF * (0.35 + 0.65 * long)
     if share < STANCE_SHARE:
         u = share / STANCE_SHARE

@@ -195,7 +195,10 @@ def sample_shape(
     betas[at["muscle"]] = np.clip(rng.normal(0.1 - 0.4 * (years > 60), 0.6), -1.0, 1.5)
     mean, std = HEIGHTS[male]
     youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
-    tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
+    if rng.random() < 0.85:
+        tall = rng.standard_t(5)
+    else:
+        tall = rng.uniform(-2.6, 3.4)
     tallest = HEIGHT_RANGE[1] if male else TALLEST_WOMAN
     wanted = np.clip(mean - youth + std * tall, HEIGHT_RANGE[0], tallest)
     *_, stature, gains = _host_arrays(body)

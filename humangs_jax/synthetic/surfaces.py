@@ -349,7 +349,10 @@ def sweep(
     closed: the path's end joins its start; otherwise the ends are open (let the widths run out to
     close them).
     """
-    along = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
+    if closed:
+        along = np.roll(path, -1, 0) - np.roll(path, 1, 0)
+    else:
+        along = np.gradient(path, axis=0)
     tangent = unit(along)
     first = unit(across - np.sum(across * tangent, -1, keepdims=True) * tangent)
     second, widths = np.cross(tangent, first), np.broadcast_to(widths, (len(path), 2))

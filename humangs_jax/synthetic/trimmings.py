@@ -69,7 +69,9 @@ def random_text(rng: np.random.Generator) -> str:
     if kind < 0.4:
         return str(rng.choice(WORDS))
     if kind < 0.6:
-        return str(rng.integers(1, 100)) if rng.random() < 0.5 else str(rng.integers(1950, 2030))
+        if rng.random() < 0.5:
+            return str(rng.integers(1, 100))
+        return str(rng.integers(1950, 2030))
     word = ""
     for _ in range(rng.integers(2, 4)):
         word += str(rng.choice(list("BDFGKLMNPRSTVZ"))) + str(rng.choice(list("AEIOU")))
@@ -383,7 +385,9 @@ def leather(s: Spots, garment: Garment) -> Points:
     trim = dark
     if sneakers:
         trim = color(0.1, 0.05, 0.82 if white else 0.1)
-    second = accent(rng, base) if rng.random() < 0.5 else trim
+    second = trim
+    if rng.random() < 0.5:
+        second = accent(rng, base)
     laced = sneakers or (kind in ("flats", "ankle_boots") and rng.random() < 0.6)
     swoosh, toe = rng.uniform(0.2, 0.8), sneakers and rng.random() < 0.5
     if kind == "ankle_boots" and rng.random() < 0.3:
@@ -412,7 +416,10 @@ def buckled(s: Spots, garment: Garment) -> Points:
     x = s.template[:, 0]
     y = s.template[:, 1] - (garment.sizes["top"] - 0.5 * width)
     front = s.cloth[:, 2] > 0
-    metal = color(0.12, 0.3, 0.62) if width > 0.035 else color(0.6, 0.05, 0.6)
+    if width > 0.035:
+        metal = color(0.12, 0.3, 0.62)
+    else:
+        metal = color(0.6, 0.05, 0.6)
     result = _darker(
         garment.fabric.colors(s), 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012)
     )

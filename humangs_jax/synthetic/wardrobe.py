@@ -78,7 +78,9 @@ class Outfit:
 
     def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
         """Put one more piece on. layered: whether later layers can hide parts of it."""
-        shown = np.zeros(len(surface.vertices), bool) if layered else None
+        shown = None
+        if layered:
+            shown = np.zeros(len(surface.vertices), bool)
         self.pieces.append(Piece(surface, material, shown))
 
     def hide(self, cover: Cover, margin: float, cloth: bool = True) -> None:
@@ -172,7 +174,9 @@ def _top(outfit: Outfit, garment: Garment) -> None:
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
     # looser tops stand off further, hang more, and have higher folds; short sleeves stand off too
     least = 0.008 if "tucked" in details else 0.012
-    hang = outfit.rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0
+    hang = 2.0
+    if loose > 0.3:
+        hang = outfit.rng.choice([0.05, 0.2, 0.5])
     wide = 0.035 if sleeve < 0.45 else 0.016
     fit = Fit(
         ease=max(least + 0.016 * loose, outfit.trunk + LAYER),
@@ -233,7 +237,9 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
     material = Material(
         stitches, 0.15 if blazer else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05
     )
-    opening = [(tailoring.front_opening, gap, spread)] if gap > 0 else []
+    opening = []
+    if gap > 0:
+        opening = [(tailoring.front_opening, gap, spread)]
     neck = "vee" if "lapels" in details else "crew"
     low = WAIST - 0.045 if long else bottom
     _bodice(outfit, neck, (0.09, sizes["sleeve"], low), fit, material, 0.03, opening)

@@ -319,7 +319,9 @@ def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ..
             return folders
         read_manifest(root, SYNTHETIC)
         for folder in folders:
-            other = split_of(int(folder.name)) if folder.name.isdigit() else split
+            other = split
+            if folder.name.isdigit():
+                other = split_of(int(folder.name))
             if other != split:
                 raise ValueError(
                     f"{folder}: a subject of the split '{other}', where '{split}' was expected"

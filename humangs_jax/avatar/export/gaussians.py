@@ -146,7 +146,10 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
         "export", {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names}
     )
     g = _plain(gaussians)
-    harmonics = np.zeros((len(g.means), 0, 3)) if g.harmonics is None else g.harmonics
+    if g.harmonics is None:
+        harmonics = np.zeros((len(g.means), 0, 3))
+    else:
+        harmonics = g.harmonics
     arrays = (g.means, g.quats, g.scales, g.opacities, g.colors, harmonics)
     means, quats, scales, opacities, colors, harmonics = (np.asarray(x, np.float64) for x in arrays)
     return means, unit_quats(quats), scales, opacities, colors, harmonics
