@@ -147,6 +147,7 @@ def fit_video(
         raise ArgumentError("focal_mm", f"{focal_mm:g}: expected millimetres, 5 to 2000")
     if person is not None and person < 0:
         raise ArgumentError("person", f"{person}: expected a number from 0")
+    # what the camera saw, with the lens as it is given or usual
     rate, count = rate_and_count(video)
     body = load_body()
     betas = None

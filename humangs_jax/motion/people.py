@@ -203,6 +203,7 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     if not isinstance(values[key], list):
         shape = np.shape(as_array(values[key]))
     turns = shape[1:] == (3, 3) and _off_rotations(as_array(values[key])) < NEARLY_ORTHONORMAL
+    # vectors (people, 3), and not one person's matrix, or a whole body each
     several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not turns
     several = several or (form.pivot == "head" and len(shape) == 3)
     if not several:

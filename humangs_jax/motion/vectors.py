@@ -44,6 +44,7 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
     """The values by key that an array stands for. Raises: Refused, saying what the array is."""
     shape = array.shape
     columns = shape[-1] if shape else 0
+    # rotations, in one of the layouts that are read
     if array.ndim == 2 and columns == COLUMNS_OF_MOTION_X:
         parts = {key: array[:, first:end] for key, (first, end) in _PARTS.items()}
         return {MOTION_X: array, **parts}
@@ -51,6 +52,7 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
         return {POSES: array}
     if array.ndim == 4 and shape[2:] == (3, 3):
         return {POSES: array}
+    # arrays of other programs that are known, and are no rotations
     if array.ndim == 2 and columns in FEATURES:
         raise Refused(
             f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints"

@@ -182,6 +182,7 @@ def style(
     skin.
     """
     kind, parts = haircut.cut, []
+    # long hair falls as a tube, short hair is a shell of the scalp
     if kind in LONG_CUTS:
         opening, wave = fringe(rng, haircut), haircut.wave
         parts.append(

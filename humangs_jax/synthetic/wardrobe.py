@@ -429,6 +429,7 @@ def _bag(outfit: Outfit, garment: Garment) -> None:
         straps = tailoring.sash(outfit.template, -side * 0.105, side * 0.165, 0.014)
     surface = accessories.bag(outfit.anatomy, garment, ease)
     outfit.add(surface, material, layered=False)
+    # the straps lie on the folds of what is below them
     raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
     flat = {
         "ease": raised,

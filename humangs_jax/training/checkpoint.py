@@ -155,6 +155,7 @@ class Checkpoints:
         if not steps:
             wanted = "" if step is None else f" of step {step}"
             raise FileNotFoundError(f"{folder}: no checkpoint{wanted}")
+        # the newest that is whole; newer ones, which are damaged, are then set aside
         damaged: list[Path] = []
         for candidate in steps:
             state, problem = self._restore(candidate, like)

@@ -293,19 +293,23 @@ def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         checked_path(images, name, images)
-    of_frame = {
+    # CAMERA/FRAME.jpg
+    by_camera = [photos_in(images / name) for name in names]
+    if any(by_camera):
+        return by_camera
+    # FRAME/CAMERA.jpg
+    frames = {
         folder.name: photos_in(folder) for folder in images.iterdir() if _may_be_frame(folder)
     }
+    by_frame = [
+        {frame: photos[name] for frame, photos in frames.items() if name in photos}
+        for name in names
+    ]
+    if any(by_frame):
+        return by_frame
+    # CAMERA.jpg
     alone = photos_in(images)
-    layouts: tuple[list[dict[str, Path]], ...] = (
-        [photos_in(images / name) for name in names],
-        [
-            {frame: photos[name] for frame, photos in of_frame.items() if name in photos}
-            for name in names
-        ],
-        [{"": alone[name]} if name in alone else {} for name in names],
-    )
-    return next((layout for layout in layouts if any(layout)), layouts[-1])
+    return [{"": alone[name]} if name in alone else {} for name in names]
 
 
 def _may_be_frame(folder: Path) -> bool:

@@ -352,11 +352,10 @@ def _frame_camera(
     if whole is not None:
         K = floats(values[whole], file, f"{prefix}{whole}", (3, 3))
     elif focal:
-        center = [
-            number(key) if key in values else 0.5 * (side or 0)
-            for key, side in (("cx", width), ("cy", height))
-        ]
-        K = intrinsics(*(focal.get(axis, next(iter(focal.values()))) for axis in "xy"), *center)
+        cx = number("cx") if "cx" in values else 0.5 * (width or 0)
+        cy = number("cy") if "cy" in values else 0.5 * (height or 0)
+        either = next(iter(focal.values()))
+        K = intrinsics(focal.get("x", either), focal.get("y", either), cx, cy)
     else:
         raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
     # the lens; one that cannot be undistorted carries the error, for those who ask for photos
@@ -458,7 +457,9 @@ def _values(
     """
     key = next((key for key in keys if any(key in frame for frame in frames)), "")
     values = []
-    for i, frame in enumerate(frames if key else ()):
+    if not key:
+        return key, values
+    for i, frame in enumerate(frames):
         if key not in frame:
             raise CaptureError(
                 file,

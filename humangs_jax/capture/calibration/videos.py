@@ -146,9 +146,8 @@ def photos_of_videos(
         if moments is not None:
             notes += moments.notes
             warnings = moments.warnings
-        found = VideoPhotos(
-            own, None if masks is None else mattes, tuple(dict.fromkeys(notes)), warnings
-        )
+        written = None if masks is None else mattes
+        found = VideoPhotos(own, written, tuple(dict.fromkeys(notes)), warnings)
         with named_after(own, images), named_after(mattes, masks or images):
             yield found
 

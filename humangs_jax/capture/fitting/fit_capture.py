@@ -234,9 +234,12 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         f"{error}, as the keypoints show: `humangs fit` turns it back"
         for error in find_camera_errors(capture, keypoints)
     ]
+    median = {}
+    if compared.any():
+        median["keypoint_error_px"] = Change(_quantile(lengths, 0.5))
     report = FitReport(
         fitted="keypoints",
-        errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},
+        errors=median,
         views=rows,
         violations=violations,
         swaps=swaps,
@@ -365,11 +368,12 @@ def fit_photos(
     )
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
     record = FitRecord(keypoints, photos.names, *known)
-    turned = (f"{error}: turned back" for error in errors)
-    notes = (*_places(model, fit), *turned, *([] if line is None else [line]))
+    notes = [*_places(model, fit), *(f"{error}: turned back" for error in errors)]
+    if line is not None:
+        notes.append(line)
     motion = _motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), smoothness)
     warnings = (*_blind_frames(seen, smoothness > 0 and len(seen) > 2), *motion)
-    return FittedCapture(shown, record, fit, notes, warnings, errors)
+    return FittedCapture(shown, record, fit, tuple(notes), warnings, errors)
 
 
 def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:

@@ -146,7 +146,8 @@ def columns_of(person: SeenPerson | None, hands: bool) -> Float[np.ndarray, "k 6
     with hands of `MEDIAPIPE_69`.
     """
     if person is None:
-        return np.zeros((len((MEDIAPIPE_69 if hands else MEDIAPIPE_33).names), 6))
+        kind = MEDIAPIPE_69 if hands else MEDIAPIPE_33
+        return np.zeros((len(kind.names), 6))
     body = np.column_stack([person.points, person.world])
     if not hands:
         return body
