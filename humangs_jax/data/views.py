@@ -284,6 +284,8 @@ def cropped(capture: Capture, size: int) -> Capture:
         return capture
     images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
     unknown = capture.unknown
+    if unknown is None and _reaches_border(capture.masks):
+        unknown = np.zeros(capture.masks.shape, bool)
     if unknown is not None:
         shares = unknown.astype(np.float32)
         # nobody knows what is beyond the edge of a photo
@@ -292,6 +294,13 @@ def cropped(capture: Capture, size: int) -> Capture:
     return dataclasses.replace(
         capture, images=images, masks=masks, cameras=cameras, unknown=unknown
     )
+
+
+def _reaches_border(masks: Float[np.ndarray, "v h w"]) -> bool:
+    """Whether a photo's border may cut the person off."""
+    person = masks > MASK_THRESHOLD
+    ends = (person[:, 0], person[:, -1], person[:, :, 0], person[:, :, -1])
+    return any(end.any() for end in ends)
 
 
 def _squares(

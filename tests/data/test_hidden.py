@@ -106,6 +106,22 @@ def test_an_image_of_what_is_unknown_is_grey(hidden, tmp_path):
     np.testing.assert_array_equal(read_grey(file) > 0.5, hidden.unknown[0])
 
 
+def test_a_crop_knows_nothing_beyond_the_border_that_cuts_the_person_off(demo):
+    first = demo.select([0])
+    rows = np.flatnonzero((first.masks[0] > 0.5).any(1))
+    height = rows[0] + int(0.7 * np.ptp(rows))
+    cut = dataclasses.replace(
+        first,
+        images=first.images[:, :height],
+        masks=first.masks[:, :height],
+        cameras=replace(first.cameras, height=height),
+    )
+    part, whole = cropped(cut, 64), cropped(first, 64)
+    assert whole.unknown is None
+    assert part.unknown is not None and part.unknown[0, -1].all()
+    assert not part.unknown[part.masks > 0.5].any() and not part.unknown[0, 20:40, 20:40].any()
+
+
 # What is in front, by the body
 # --------------------------------------------------------------------------------------------------
 
