@@ -106,14 +106,14 @@ def face_picture(subject, rng):
     return render_view(posed, look_at(*place, K, FACE_SIDE, FACE_SIDE))[0].astype(np.float32)
 
 
-FULL_SIDE, FULL_METRES = 1024, 2.1
+FULL_SIDE, FULL_METRES = 768, 2.1
 """Pixels of a picture of a whole person, and metres that it shows."""
 HAND_VIEWS = (0.0, 50.0, -60.0, 120.0)
 """Degrees around a person from which cameras see it."""
 
 
 @entry
-def motion_fingers(run: Run, people: int = 2, poses: int = 4) -> None:
+def motion_fingers(run: Run, people: int = 1, poses: int = 2) -> None:
     """Joints of the fingers of synthetic people, fitted to photos of four known cameras: without
     landmarks of hands, where the prior of poses alone says how fingers bend, and with them.
 
