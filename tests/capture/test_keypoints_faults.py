@@ -355,7 +355,7 @@ OWN = {
             {"set": np.array("halpe27")},
             (
                 r"set: expected one of coco17, halpe26, .*, openpose67, openpose_b67, mediapipe33,"
-                r" got 'halpe27'"
+                r" mediapipe69, got 'halpe27'"
             ),
         ),
         (
