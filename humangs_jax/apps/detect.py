@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.apps.same_people import (
-    Found,
+    PersonInPhoto,
     PhotoPeople,
     inside_photo,
     is_unclear,
@@ -232,7 +232,7 @@ def with_masked(
     return result
 
 
-def _overlap(found: Found | None, mask: Float[np.ndarray, "h w"]) -> float:
+def _overlap(found: PersonInPhoto | None, mask: Float[np.ndarray, "h w"]) -> float:
     """Intersection over union of somebody's mask and a mask of the photo."""
     if found is None:
         return 0.0
@@ -243,7 +243,7 @@ def _overlap(found: Found | None, mask: Float[np.ndarray, "h w"]) -> float:
     return shared / max(either, 1)
 
 
-def _mostly(found: Found | None, other: Found, size: tuple[int, int]) -> bool:
+def _mostly(found: PersonInPhoto | None, other: PersonInPhoto, size: tuple[int, int]) -> bool:
     """Tells whether most of somebody's mask is on that of another person."""
     if found is None:
         return True
@@ -337,7 +337,7 @@ def _has_any(given: Keypoints | Masks, view: int) -> bool:
     return bool(np.any(given[view]))
 
 
-def _agreement(found: Found | None, given: Keypoints | Masks, view: int) -> float:
+def _agreement(found: PersonInPhoto | None, given: Keypoints | Masks, view: int) -> float:
     """How much of the keypoints or the mask of a view is on the mask of somebody who was found
     there.
     """
@@ -396,7 +396,7 @@ def detect_photos(
 
 def _found(
     person: Landmarks, photo: Float[np.ndarray, "h w 3"], parts: FaceAndHands | None = None
-) -> Found:
+) -> PersonInPhoto:
     """The person with a mask whose edges are the photo's, and with hands if `parts` looks for them.
 
     Nothing of the size of the photo is made. Landmarks beyond the photo are guesses of the
@@ -423,7 +423,7 @@ def _found(
     area = float((cut > 255 * SEEN).sum())
     if person.covered:
         area = max(area, AREA_OF_CROP * person.crop.side**2)
-    return Found(
+    return PersonInPhoto(
         SeenPerson(points, person.world, person.presence, hands),
         cut,
         corner,

@@ -10,7 +10,7 @@ from typing import Any
 from humangs_jax.apps import detect, photos_alone
 from humangs_jax.apps import start as material_of
 from humangs_jax.apps.check import check_capture
-from humangs_jax.apps.start import HeldOut, Material, held_out_psnr, missing, photos_to_read
+from humangs_jax.apps.start import HeldOut, PhotoFolder, held_out_psnr, missing, photos_to_read
 from humangs_jax.apps.video_photos import photos_of_video, seconds_of_photos, video_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
@@ -204,7 +204,7 @@ class FromPhotos:
         self.resumes()  # what is wrong with the folder is reported before the work
         folder = yield from self._folder()
         ignored = self.cameras == Path(IGNORE)
-        material = material_of.look(
+        material = material_of.inspect_folder(
             folder,
             cameras=None if ignored else self.cameras,
             masks=self.masks,
@@ -220,7 +220,7 @@ class FromPhotos:
         with only_writer(self.out, replaced=True), decoded_once():
             yield from self._go_on(material)
 
-    def _check_lengths(self, material: Material) -> None:
+    def _check_lengths(self, material: PhotoFolder) -> None:
         """Raises: ArgumentError for a scale or a direction that something else sets."""
         if material.cameras is not None and self.height is not None:
             raise ArgumentError(
@@ -273,7 +273,7 @@ class FromPhotos:
                 problem = f": the body in {self.out} was made {how}: --overwrite begins anew"
                 raise ArgumentError(name, problem)
 
-    def _go_on(self, material: Material) -> Iterator[Step]:
+    def _go_on(self, material: PhotoFolder) -> Iterator[Step]:
         """From where an earlier run came to an end, if there was one."""
         # a body that is there is used again
         if self.resumes():
@@ -296,7 +296,7 @@ class FromPhotos:
         capture, estimate = yield from self._fit(material)
         yield from self._finish(capture, estimate)
 
-    def _with_cameras(self, material: Material) -> Generator[Step, None, Material]:
+    def _with_cameras(self, material: PhotoFolder) -> Generator[Step, None, PhotoFolder]:
         """Import photos and cameras, find keypoints and masks that are missing, and name what else
         is to be made.
 
@@ -331,7 +331,7 @@ class FromPhotos:
             material = yield from self._detect(material, detected)
         return material
 
-    def _photos_alone(self, material: Material) -> Generator[Step, None, Material]:
+    def _photos_alone(self, material: PhotoFolder) -> Generator[Step, None, PhotoFolder]:
         """Find the person and the cameras in the photos."""
         with stage("finding the person and the cameras"):
             given = (material.keypoints, material.masks, material.alpha, material.others)
@@ -354,7 +354,9 @@ class FromPhotos:
         yield Step("who was found in the photos", file=self.out / detect.SHEET_FILE)
         return self._with_found(material, own_masks)
 
-    def _detect(self, material: Material, wanted: list[str]) -> Generator[Step, None, Material]:
+    def _detect(
+        self, material: PhotoFolder, wanted: list[str]
+    ) -> Generator[Step, None, PhotoFolder]:
         """Find keypoints or masks in the photos of the capture."""
         with stage("finding the person"):
             photos = load_photos(self.out)
@@ -368,7 +370,7 @@ class FromPhotos:
         yield Step(f"{' and '.join(wanted)} found in the photos: {sheet} shows them")
         return self._with_found(material, "masks" in wanted)
 
-    def _with_found(self, material: Material, masks: bool) -> Material:
+    def _with_found(self, material: PhotoFolder, masks: bool) -> PhotoFolder:
         """The material with what was found in the photos: keypoints where there are none, and
         perhaps masks.
         """
@@ -413,7 +415,7 @@ class FromPhotos:
             raise ArgumentError("out", str(error)) from error
         return fitted
 
-    def _import(self, material: Material) -> Generator[Step, None, ImportReport]:
+    def _import(self, material: PhotoFolder) -> Generator[Step, None, ImportReport]:
         """Import photos and cameras into the capture."""
         with stage("importing photos and cameras"):
             assert material.cameras is not None
@@ -442,7 +444,7 @@ class FromPhotos:
             yield Step(f"photos were turned upright: {should}", warning=True)
         return report
 
-    def _fit(self, material: Material) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
+    def _fit(self, material: PhotoFolder) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
         """Fit the body to keypoints and masks, and write it into the capture."""
         with stage("fitting the body"):
             assert material.keypoints is not None

@@ -28,7 +28,7 @@ RIVAL = 0.35
 """Somebody with this share of the pixels of the largest person could be the intended person too."""
 
 
-class Found(NamedTuple):
+class PersonInPhoto(NamedTuple):
     """A person who was found in a photo."""
 
     person: SeenPerson
@@ -61,7 +61,7 @@ class PhotoPeople:
     """Width and height of the photo, pixels."""
     thumbnail: Float[np.ndarray, "h w 3"]
     """The photo reduced for the sheet, (h, w, 3), 0 to 1."""
-    people: tuple[Found | None, ...]
+    people: tuple[PersonInPhoto | None, ...]
     """The people by number, the same in all photos; None for those who are not in it."""
     known: bool = True
     """Whether the numbers tell who is who. False if several people are large and nothing tells who
@@ -112,7 +112,7 @@ def same_people(
     ]
 
 
-def _large(people: Sequence[Found | None]) -> list[int]:
+def _large(people: Sequence[PersonInPhoto | None]) -> list[int]:
     """Gives the people of a photo who could be the intended person as well as its largest."""
     areas = [0.0 if each is None else each.area for each in people]
     return [
@@ -125,7 +125,7 @@ def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
     return [sum((found.area for found in person if found is not None), 0.0) for person in people]
 
 
-Row = list[Found | None]
+Row = list[PersonInPhoto | None]
 """The people of a photo, each at the number of the person."""
 
 
@@ -184,7 +184,7 @@ def _with_those_apart(
     rows: list[Row], person: int, source: Int[np.ndarray, " v"], frames: Int[np.ndarray, " v"]
 ) -> list[Row]:
     """The same where photos of the person that do not meet the others of their moment are marked,
-    see `Found.apart`.
+    see `PersonInPhoto.apart`.
 
     Arguments: source: the number that each photo had by its match.
     """
@@ -206,7 +206,7 @@ def _with_those_apart(
     return rows
 
 
-def exchanged(found: Found) -> Found:
+def exchanged(found: PersonInPhoto) -> PersonInPhoto:
     """The person with left and right exchanged."""
     order = np.asarray(MEDIAPIPE_33.mirror)
     person = dataclasses.replace(

@@ -56,7 +56,7 @@ OWN_DETECTOR = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Material:
+class PhotoFolder:
     """What a folder has."""
 
     folder: Path
@@ -118,14 +118,14 @@ class Missing:
         return "\n".join([f"{self.name}: {self.why}", *(f"    {line}" for line in self.how)])
 
 
-def look(
+def inspect_folder(
     folder: Path,
     *,
     cameras: Path | None = None,
     masks: Path | None = None,
     keypoints: Path | None = None,
     others: Path | None = None,
-) -> Material:
+) -> PhotoFolder:
     """What a folder has; what the arguments name is taken from there.
 
     Raises: CaptureError, one line, if there is no photo, the folder is a capture already, or a
@@ -153,7 +153,7 @@ def look(
         path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
     )
     places = [folder / name for name in CAMERA_PLACES]
-    return Material(
+    return PhotoFolder(
         folder=folder,
         images=images,
         photos=len(photos),
@@ -213,7 +213,7 @@ def _expect_folder(folder: Path) -> None:
         )
 
 
-def missing(material: Material, images: Path | None = None) -> tuple[Missing, ...]:
+def missing(material: PhotoFolder, images: Path | None = None) -> tuple[Missing, ...]:
     """What is still to be made, with the commands that make it.
 
     Arguments: images: where photos without lens distortion are, if they were imported: keypoints

@@ -209,13 +209,13 @@ class Task(NamedTuple):
     """The configuration that programs are compiled for, the same for runs of 5 s and of 15 s."""
     clock: Clock
     """The time and the number of steps of the run."""
-    first: tuple["Found", float] | None = None
+    first: tuple["Candidate", float] | None = None
     """What iterations on all photos find, and the loss on them; None where it is not known."""
     moved: bool = False
     """Whether the photos were moved, see `align`."""
 
 
-class Found(NamedTuple):
+class Candidate(NamedTuple):
     """What a run has found."""
 
     state: RefineState
@@ -230,7 +230,7 @@ class Found(NamedTuple):
 
 def prepare(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, clock: Clock
-) -> tuple[Task, Found, Comparison]:
+) -> tuple[Task, Candidate, Comparison]:
     """The task, the start and its comparison with each photo."""
     start = with_low_pass_of(avatar, views)
     fresh = replace(avatar, gaussians=_fresh(avatar, start.gaussians.low_pass))
@@ -249,7 +249,7 @@ def prepare(
     parameters, splat = unconstrained(start.gaussians), planned(start, views)
     each = comparison(task, parameters, photos, splat)
     state = init_state(parameters, each.together(), settings, splat)
-    return task, Found(state, 0, np.arange(len(photos))), each
+    return task, Candidate(state, 0, np.arange(len(photos))), each
 
 
 @jax.jit
@@ -273,7 +273,7 @@ def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
 # --------------------------------------------------------------------------------------------------
 
 
-def align(task: Task, start: Found, each: Comparison) -> tuple[Task, Comparison]:
+def align(task: Task, start: Candidate, each: Comparison) -> tuple[Task, Comparison]:
     """The task whose photos show the person where the start does, and the comparison of the start
     with each of them; the same ones where the photos agree.
 
@@ -300,7 +300,7 @@ def align(task: Task, start: Found, each: Comparison) -> tuple[Task, Comparison]
     return task._replace(photos=moved, seen=seen, moved=True), each
 
 
-def compile_parts(task: Task, start: Found) -> Found:
+def compile_parts(task: Task, start: Candidate) -> Candidate:
     """Makes a step and an iteration, so that their programs are compiled; the start, with buffers
     in which the step fits.
     """
@@ -312,7 +312,7 @@ def compile_parts(task: Task, start: Found) -> Found:
     return start._replace(state=replace(start.state, splat=state.splat))
 
 
-def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
+def search(task: Task, start: Candidate, each: Comparison) -> Iterator[Candidate]:
     """What a run finds, one after the other: the last that is kept is its result. each: comparison
     of the start with photos.
     """
@@ -321,7 +321,9 @@ def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
     yield from method(task, start, np.asarray(each.loss))
 
 
-def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
+def search_by_blocks(
+    task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
+) -> Iterator[Candidate]:
     """The held-out pixels choose the best state. Where there are none, the loss on all pixels
     decides on the iterations, and the last state of the steps is kept. losses: of the photos, at
     first.
@@ -352,7 +354,9 @@ def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) 
         yield found._replace(kept=kept)
 
 
-def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
+def search_by_photo(
+    task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
+) -> Iterator[Candidate]:
     """A trial without one photo, then a fit of all photos as the trial says. losses: of the
     photos, at first.
     """
@@ -402,10 +406,10 @@ def search_by_photo(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -
 
 def _trial_gains(
     task: Task,
-    start: Found,
+    start: Candidate,
     used: Int[np.ndarray, " n"],
     asked: Sequence[int],
-    tried: dict[int, Found],
+    tried: dict[int, Candidate],
 ) -> Iterator[float]:
     """Decibels that iterations without a photo gain on it, for one photo after the other; what they
     have found goes to `tried`.
@@ -419,12 +423,12 @@ def _trial_gains(
 
 def steps(
     task: Task,
-    begin: Found,
+    begin: Candidate,
     photos: Int[np.ndarray, " n"],
     total: int,
     end: int,
     shown: tuple[float, float],
-) -> Iterator[Found]:
+) -> Iterator[Candidate]:
     """The first `end` of `total` steps on some photos: the state at each check and at the end.
     shown: from where to where the bar goes.
     """
@@ -460,7 +464,7 @@ def stepped(task: Task, state: RefineState, view: int | np.integer) -> RefineSta
     return task.clock.with_room(stepped, state.splat)
 
 
-def iterated(task: Task, start: Found, used: Int[np.ndarray, " n"]) -> tuple[Found, float]:
+def iterated(task: Task, start: Candidate, used: Int[np.ndarray, " n"]) -> tuple[Candidate, float]:
     """The state after the learned update on some photos, and the loss on them."""
     if task.first is not None and len(used) == len(task.photos):
         return task.first
@@ -468,11 +472,11 @@ def iterated(task: Task, start: Found, used: Int[np.ndarray, " n"]) -> tuple[Fou
     splat = start.state.splat
     found = comparison(task, parameters, [task.photos[i] for i in used], splat).together()
     state = init_state(parameters, found, task.settings, splat)
-    return Found(state, task.config.iterations, used), float(found.loss)
+    return Candidate(state, task.config.iterations, used), float(found.loss)
 
 
 def updated(
-    task: Task, start: Found, used: Int[np.ndarray, " n"], iterations: int
+    task: Task, start: Candidate, used: Int[np.ndarray, " n"], iterations: int
 ) -> UnconstrainedGaussians:
     """The parameters after iterations of the learned update on some photos."""
     fresh, photos = unconstrained(task.fresh.gaussians), [task.seen[i] for i in used]
@@ -505,7 +509,7 @@ def avatar_comparison(
     return comparison(task._replace(avatar=avatar), parameters, photos, splat)
 
 
-def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:
+def psnr_of(task: Task, found: Candidate, photos: Sequence[Photo]) -> float:
     """`aligned_psnr` of what no step sees, dB: mean over the photos some pixels of which count."""
     scores = [
         aligned_psnr(
@@ -520,7 +524,7 @@ def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:
 
 
 def images_of(
-    task: Task, found: Found, photos: Sequence[Photo]
+    task: Task, found: Candidate, photos: Sequence[Photo]
 ) -> list[Float[np.ndarray, "h w 4"]]:
     """Colors and alpha as some photos show what was found."""
     parameters = found.state.parameters

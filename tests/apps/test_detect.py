@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax import cli
 from humangs_jax.apps import detect
 from humangs_jax.apps.detect import (
-    Found,
+    PersonInPhoto,
     PhotoPeople,
     choose,
     person_mask,
@@ -42,7 +42,7 @@ DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 def found(mark, area, corner=(5, 10)):
     """A person whose pixels are all `mark`."""
     points = np.concatenate([np.full((33, 2), float(mark)), np.ones((33, 1))], axis=1)
-    return Found(
+    return PersonInPhoto(
         SeenPerson(points, np.zeros((33, 3)), 1.0), np.full((8, 4), 255, np.uint8), corner, area
     )
 

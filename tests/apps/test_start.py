@@ -14,9 +14,9 @@ from PIL import Image
 from experiments.your_photos import landmarks_in, write_material
 from humangs_jax import cli
 from humangs_jax.apps import detect, photos_alone, start
-from humangs_jax.apps.detect import Found, PhotoPeople, detect_photos
+from humangs_jax.apps.detect import PersonInPhoto, PhotoPeople, detect_photos
 from humangs_jax.apps.from_photos import FromPhotos, avatar_from_photos
-from humangs_jax.apps.start import better_body, held_out_psnr, look, missing
+from humangs_jax.apps.start import better_body, held_out_psnr, inspect_folder, missing
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.video import write_video
 from humangs_jax.body.library import load_body
@@ -65,7 +65,7 @@ def mine(photos, tmp_path, monkeypatch):
 
 
 def test_everything_is_found(mine):
-    found = look(mine)
+    found = inspect_folder(mine)
     assert (found.images, found.photos, found.size) == (mine / "images", 4, (512, 512))
     assert (found.cameras, found.masks, found.keypoints) == (
         mine,
@@ -89,29 +89,29 @@ def test_other_layouts_are_found(mine):
     (mine / "keypoints").rename(mine / "my_keypoints")
     (mine / "masks").rename(mine / "matte")
     shutil.copytree(mine / "matte", mine / "colmap" / "dense" / "images")
-    found = look(mine)
+    found = inspect_folder(mine)
     assert (found.images, found.photos, found.masks) == (mine, 4, mine / "matte")
     assert (found.cameras, found.keypoints) == (mine / "colmap", mine / "my_keypoints")
 
 
 @pytest.mark.parametrize("name", ["others", "occluders", "unknown"])
 def test_masks_of_others_are_found_by_the_name_of_their_folder(name, mine):
-    assert look(mine).others is None and "in front" not in str(look(mine))
+    assert inspect_folder(mine).others is None and "in front" not in str(inspect_folder(mine))
     (mine / name).mkdir()
     write_png(mine / name / "a.png", np.ones((8, 8), np.float32))
-    found = look(mine)
+    found = inspect_folder(mine)
     assert found.others == mine / name and f"in front:  {mine / name}" in str(found)
-    assert found.photos == look(mine, others=mine / name).photos
+    assert found.photos == inspect_folder(mine, others=mine / name).photos
     assert not any(each.path.is_relative_to(mine / name) for each in found.unused)
     with pytest.raises(CaptureError, match="nowhere: no such file or folder"):
-        look(mine, others=mine / "nowhere")
+        inspect_folder(mine, others=mine / "nowhere")
 
 
 def test_alpha_is_a_mask(mine):
     shutil.rmtree(mine / "masks")
     for path in (mine / "images").iterdir():
         write_png(path, np.concatenate([np.ones((512, 512, 3)), np.zeros((512, 512, 1))], axis=-1))
-    found = look(mine)
+    found = inspect_folder(mine)
     assert found.alpha and missing(found) == () and "in the photos' alpha channel" in str(found)
 
 
@@ -124,7 +124,7 @@ def test_opaque_alpha_is_no_mask(distortion, mine, capsys):
     without(mine, "masks", "keypoints")
     for path in (mine / "images").iterdir():
         write_png(path, np.ones((512, 512, 4)))
-    found = look(mine)
+    found = inspect_folder(mine)
     assert not found.alpha and [each.name for each in missing(found)] == ["masks", "keypoints"]
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert (
@@ -158,7 +158,7 @@ def without(folder, *names):
 def test_what_is_missing_comes_with_its_tools(names, mine, capsys):
     without(mine, *names)
     if set(names) - {"cameras"}:
-        assert "pip install 'humangs_jax[photos]'" in missing(look(mine))[-1].how[0]
+        assert "pip install 'humangs_jax[photos]'" in missing(inspect_folder(mine))[-1].how[0]
     code = cli.execute(["start", str(mine), "--out", "me"])
     out, err = capsys.readouterr()
     told = " and ".join(", ".join(names).rsplit(", ", 1))
@@ -199,7 +199,7 @@ def detected(mine, monkeypatch):
             np.concatenate([points[v], np.ones((33, 1))], axis=1), np.zeros((33, 3)), 1.0
         )
         mask = to_uint8(capture.masks[v])
-        bystander = Found(
+        bystander = PersonInPhoto(
             person, mask[:60, :20], (0, 0), 2e5
         )  # larger, but nobody's masks or keypoints are there
         shown.append(
@@ -207,7 +207,7 @@ def detected(mine, monkeypatch):
                 f"{name}.png",
                 (512, 512),
                 np.ones((48, 48, 3)),
-                (bystander, Found(person, mask, (0, 0), 1e5)),
+                (bystander, PersonInPhoto(person, mask, (0, 0), 1e5)),
             )
         )
 
@@ -619,13 +619,13 @@ def test_folders_without_photos_and_captures_are_refused(mine):
         (mine / "calibration.json", "is a file: expected a folder of photos"),
     ):
         with pytest.raises(CaptureError, match=problem):
-            look(folder)
+            inspect_folder(folder)
     (mine / "capture.json").write_text("{}")
     with pytest.raises(CaptureError, match="is a capture already"):
-        look(mine)
+        inspect_folder(mine)
     (mine / "capture.json").unlink()
     with pytest.raises(CaptureError, match=r"none\.json: no such file or folder"):
-        look(mine, keypoints=Path("none.json"))
+        inspect_folder(mine, keypoints=Path("none.json"))
 
 
 @pytest.mark.parametrize(

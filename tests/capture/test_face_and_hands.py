@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from humangs_jax.apps.same_people import Found, exchanged
+from humangs_jax.apps.same_people import PersonInPhoto, exchanged
 from humangs_jax.capture.detection.face_and_hands import (
     PALM,
     SHAPE_NAMES,
@@ -123,7 +123,7 @@ def test_hands_are_written_with_the_people_of_photos_and_read_again(tmp_path):
 
 def test_hands_change_sides_where_left_and_right_were_exchanged():
     person = seen_person((hand(3.0), None))
-    found = exchanged(Found(person, np.zeros((1, 1), np.uint8), (0, 0), 1.0))
+    found = exchanged(PersonInPhoto(person, np.zeros((1, 1), np.uint8), (0, 0), 1.0))
     np.testing.assert_allclose(found.person.hands[21:, :2], hand(3.0).pixels)
     assert not found.person.hands[:21].any()
 

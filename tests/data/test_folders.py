@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 import humangs_jax as hg
-from humangs_jax.apps.start import look, photo_files
+from humangs_jax.apps.start import inspect_folder, photo_files
 from humangs_jax.apps.video_photos import video_of
 from humangs_jax.avatar.video import contact_sheet, write_video
 from humangs_jax.capture.calibration.importing import import_cameras
@@ -52,7 +52,7 @@ def test_photos_win_over_the_clips_beside_them(suffix, rig):
         f"not used: 4 videos beside photos (a{suffix.upper()}, b{suffix.upper()}, c{suffix.upper()}"
         " and 1 more)" in str(report)
     )
-    assert "not used: 4 videos" in str(look(rig[1]))
+    assert "not used: 4 videos" in str(inspect_folder(rig[1]))
     assert (
         imported(rig, frames=2, overwrite=True).frames == 2
     )  # frames are asked for: of the videos
@@ -138,11 +138,14 @@ def test_masks_may_say_that_they_are_masks(pattern, rig, tmp_path):
     assert imported(rig, masks=tmp_path / "masks").masks
     for name in names:  # beside the photos
         (tmp_path / "masks" / name).rename(rig[1] / name)
-    found = look(rig[1])
+    found = inspect_folder(rig[1])
     assert (found.photos, found.masks) == (4, rig[1])
     assert imported(rig, masks=rig[1], overwrite=True).masks
     (rig[1] / names[0]).unlink()
-    assert "3 masks beside photos" in str(look(rig[1])) and look(rig[1]).masks is None
+    assert (
+        "3 masks beside photos" in str(inspect_folder(rig[1]))
+        and inspect_folder(rig[1]).masks is None
+    )
 
 
 def test_names_that_only_look_like_those_of_masks_are_photos():
@@ -153,11 +156,13 @@ def test_names_that_only_look_like_those_of_masks_are_photos():
 def test_pictures_of_other_formats_are_named(rig):
     for name in ("x.TIF", "y.dng", "notes.txt"):
         (rig[1] / name).write_bytes(b"II*\0")
-    assert "not used: 2 files in a format that is not read (x.TIF, y.dng)" in str(look(rig[1]))
+    assert "not used: 2 files in a format that is not read (x.TIF, y.dng)" in str(
+        inspect_folder(rig[1])
+    )
     for file in FILES:
         (rig[1] / file).unlink()
     with pytest.raises(CaptureError, match=r"no photo: expected .*\(not used: 2 files .*x\.TIF"):
-        look(rig[1])
+        inspect_folder(rig[1])
 
 
 def test_of_two_photos_of_one_name_one_is_taken_and_the_other_named(rig):
@@ -170,7 +175,7 @@ def test_of_two_photos_of_one_name_one_is_taken_and_the_other_named(rig):
 def test_photos_beside_a_folder_of_photos_are_named(tmp_path):
     written.write_photos(tmp_path / "images", FILES)
     written.write_photos(tmp_path, ["late.png"])
-    assert "1 photo outside of the folder of photos (late.png)" in str(look(tmp_path))
+    assert "1 photo outside of the folder of photos (late.png)" in str(inspect_folder(tmp_path))
 
 
 def test_pictures_that_show_results_are_no_photos(rig):
@@ -178,7 +183,7 @@ def test_pictures_that_show_results_are_no_photos(rig):
     write_png(rig[1] / "cut.png", np.zeros((8, 8, 3)), mark=DRAWN)
     assert is_own_picture(rig[1] / "cut.png") and not is_own_picture(rig[1] / "a.png")
     assert [photo.name for photo in photo_files(rig[1])[1]] == list(FILES)
-    assert "2 pictures that humangs drew (cut.png, people.png)" in str(look(rig[1]))
+    assert "2 pictures that humangs drew (cut.png, people.png)" in str(inspect_folder(rig[1]))
     assert "2 pictures that humangs drew" in str(imported(rig))
 
 

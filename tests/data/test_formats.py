@@ -12,7 +12,7 @@ import pytest
 
 from experiments.render_tables import format_table
 from humangs_jax import cli
-from humangs_jax.apps.start import look
+from humangs_jax.apps.start import inspect_folder
 from humangs_jax.capture.calibration.importing import import_cameras
 from humangs_jax.capture.keypoints.keypoints import DetectedImage, detections_of
 from humangs_jax.capture.keypoints.reading import read_keypoints
@@ -64,7 +64,7 @@ def test_a_format_of_cameras_is_one_row(tmp_path, made_up, capsys):
     )
     written.write_photos(tmp_path, [f"c{i}.png" for i in range(len(cameras))])
     (tmp_path / "studio.rig").write_text("RIG")
-    assert look(tmp_path).cameras == tmp_path
+    assert inspect_folder(tmp_path).cameras == tmp_path
     for i, source in enumerate((tmp_path, tmp_path / "studio.rig")):
         report = import_cameras(source, tmp_path, tmp_path.with_name(f"out{i}"))
         assert (
@@ -96,7 +96,7 @@ def test_a_format_of_keypoints_is_one_row(tmp_path, made_up, capsys):
     (tmp_path / "tracks").mkdir()
     (tmp_path / "tracks" / "front.json").write_text(json.dumps({"tracks": []}))
     written.write_photos(tmp_path, ["front.png"])
-    assert look(tmp_path).keypoints == tmp_path / "tracks"
+    assert inspect_folder(tmp_path).keypoints == tmp_path / "tracks"
     found = read_keypoints(tmp_path / "tracks", ["front"], 200, 200)
     np.testing.assert_allclose(found.points[0], people[0, :, :2] + 0.5)
     for command in ("fit", "start", "check"):

@@ -25,7 +25,6 @@ from sog_files import write_sog
 from torch_writer import plain_pickle, tensors, write_checkpoint
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
-from humangs_jax.apps.start import look
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export.gaussians import load_gaussians, save_gaussians
 from humangs_jax.avatar.frames import FOLLOWING, smoothed_path, trim_and_resample
