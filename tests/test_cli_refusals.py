@@ -232,7 +232,7 @@ BAD_USAGE = {
     ),
     "fit someone": "body.npz exists: --overwrite replaces it",
     FIT: "body.npz exists: --overwrite replaces it",
-    "fit someone --bare": "--bare is for --refine, not for --keypoints",
+    "fit someone --bare": "--tight-clothes is for --refine, not for --keypoints",
     "fit someone --refine --smoothness 0.1": "--smoothness is for --keypoints, not for --refine",
     f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
 }

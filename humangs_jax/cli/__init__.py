@@ -154,6 +154,10 @@ def _prepare(verbose: bool) -> None:
     enable_compile_cache()
 
 
+RENAMED = {"fit": {"--bare": "--tight-clothes"}}
+"""Options of commands by the names that they had, which are still taken."""
+
+
 def _parsed(arguments: list[str]) -> Command:
     """The command with its options. Only its own module is imported, and only its options are
     looked at: that is faster.
@@ -170,6 +174,7 @@ def _parsed(arguments: list[str]) -> Command:
     from humangs_jax.cli.parsing import parsed
 
     name, *options = arguments
+    options = [RENAMED.get(name, {}).get(word, word) for word in options]
     if name == "--tyro-print-completion" or name == "--tyro-write-completion":
         import tyro
 

@@ -68,7 +68,7 @@ class Refinement:
 
     Else a fit to keypoints turns back those that they show to be turned, and --refine moves all.
     """
-    bare: bool = False
+    tight_clothes: bool = False
     """With --refine, fill the masks: to measure a body in no or tight clothes.
 
     Avatars are better without.
@@ -77,7 +77,7 @@ class Refinement:
 
 Way = Literal["--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
-    "--refine": {"keypoints", "person", "fixed_cameras", "bare"},
+    "--refine": {"keypoints", "person", "fixed_cameras", "tight_clothes"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
 """The two ways to fit, by the option that chooses each, and their other options."""
@@ -225,7 +225,7 @@ class Fit:
         config = usual_config(
             record is not None,
             fixed_cameras=fixed,
-            bare=self.refinement.bare,
+            bare=self.refinement.tight_clothes,
             calibrated=start.calibrated,
         )
         with stage("refining cameras and body"):

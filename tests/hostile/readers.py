@@ -346,7 +346,7 @@ ROWS = {
         written("log.jsonl", '{"step": 1, "loss": 2.0}\n{"step": 2, "event": "skipped"}\n'),
     ),
     "filmed": (film, npz("m.npz", honest.motion_arrays)),
-    "start": (look, honest.write_import_folder, "photos/000.png"),
+    "start": (inspect_folder, honest.write_import_folder, "photos/000.png"),
     "avatarrex": (read_data_set, avatarrex, "calibration_full.json"),
     "video poses": (read_data_set, avatarrex, "smpl_params.npz"),
     "missing photos": (
