@@ -165,7 +165,7 @@ def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[
         points[inside[cover[row[inside], column[inside]]], 2] = 0
         return points
 
-    def seen(found: Found | None, cover: Bool[np.ndarray, "h w"]) -> Found | None:
+    def seen(found: PersonInPhoto | None, cover: Bool[np.ndarray, "h w"]) -> PersonInPhoto | None:
         """Somebody with no landmark seen under the cover."""
         if found is None:
             return None
