@@ -15,7 +15,13 @@ from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.configuration import Range, Share, Weight, configuration
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.perceptual import lpips, perceptual_loss, vgg16_loss
+from humangs_jax.losses.perceptual import (
+    Lpips,
+    lpips_features,
+    lpips_to,
+    perceptual_loss,
+    vgg16_loss,
+)
 from humangs_jax.network.parts import Drawn
 
 T = TypeVar("T")
@@ -117,7 +123,7 @@ def loss_terms(
             vgg16_loss, _needed(networks.vgg16, "vgg16", "LPIPS vgg"), rgb, images
         )
     if config.lpips:
-        losses["lpips"] = _each(lpips, _needed(networks.lpips, "lpips", "LPIPS"), rgb, images)
+        losses["lpips"] = _each_lpips(_needed(networks.lpips, "lpips", "LPIPS"), rgb, images)
     return {name: jnp.mean(loss) for name, loss in losses.items()}
 
 
@@ -134,6 +140,26 @@ def _each(
     step.
     """
     return jax.lax.map(jax.checkpoint(lambda pair: compare(network, *pair)), (predicted, targets))
+
+
+def _each_lpips(
+    network: Lpips, predicted: Float[Array, "v h w 3"], targets: Float[Array, "v h w 3"]
+) -> Float[Array, " v"]:
+    """LPIPS of each view; the features of the truth are computed once, gradients or not.
+
+    The maps of VGG would be the largest arrays of a step: those of its images are computed again
+    for gradients, one view after the other.
+    """
+
+    def one(pair: tuple[Array, Array]) -> Scalar:
+        image, target = pair
+        truth = jax.lax.stop_gradient(lpips_features(network, target))
+        compare = lambda image: lpips_to(network, image, truth)
+        return jax.checkpoint(compare)(image) if network.net == "vgg" else compare(image)
+
+    if network.net == "vgg":
+        return jax.lax.map(one, (predicted, targets))
+    return jax.vmap(lambda *pair: one(pair))(predicted, targets)
 
 
 def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:

@@ -310,13 +310,33 @@ def lpips_distances(
 
     See `lpips`.
     """
-    images = at_least_float32((predicted, target))
-    slices = BACKBONES[weights.net]
-    maps = [feature_maps(weights.backbone, slices, _scaled(image), size) for image in images]
+    maps = [lpips_features(weights, image, size) for image in (predicted, target)]
+    return _distances(weights, *maps)
+
+
+LpipsMaps = list[tuple[Float[Array, "_y _x _c"], Int[Array, "2"] | None]]
+"""Unit-length features of an image at each depth, and how large their maps are, see
+`feature_maps`."""
+
+
+def lpips_features(
+    weights: Lpips, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+) -> LpipsMaps:
+    """What `lpips` compares of an image."""
+    image = at_least_float32(image)
+    maps = feature_maps(weights.backbone, BACKBONES[weights.net], _scaled(image), size)
+    return [(_unit(at_least_float32(x)), own) for x, own in maps]
+
+
+def lpips_to(weights: Lpips, predicted: Float[Array, "h w 3"], target: LpipsMaps) -> Scalar:
+    """`lpips` to an image whose features are known."""
+    return jnp.sum(_distances(weights, lpips_features(weights, predicted), target))
+
+
+def _distances(weights: Lpips, predicted: LpipsMaps, target: LpipsMaps) -> Float[Array, " _"]:
     distances = []
-    for head, (x, own), (y, _) in zip(weights.heads, *maps, strict=True):
-        x, y = at_least_float32((x, y))
-        different = jnp.sum(head * jnp.square(_unit(x) - _unit(y)), axis=-1)
+    for head, (x, own), (y, _) in zip(weights.heads, predicted, target, strict=True):
+        different = jnp.sum(head * jnp.square(x - y), axis=-1)
         distances.append(
             jnp.mean(different) if own is None else jnp.sum(different) / (own[0] * own[1])
         )

@@ -15,6 +15,7 @@ from rounding import bound
 
 from experiments.training import random_weights
 from humangs_jax.losses import perceptual
+from humangs_jax.losses.losses import _each_lpips
 from humangs_jax.losses.perceptual import (
     BACKBONES,
     DIVISORS,
@@ -24,6 +25,7 @@ from humangs_jax.losses.perceptual import (
     Lpips,
     Pool,
     Vgg19,
+    convolutions,
     feature_maps,
     lpips,
     lpips_distances,
@@ -256,3 +258,23 @@ def test_weights_in_bfloat16(name):
     )
     assert value.dtype == jnp.float32 and np.isfinite(gradient).all()
     np.testing.assert_allclose(value, with_gradient(weights, *images)[0][0], rtol=BFLOAT16)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["alex", "vgg"])
+def test_lpips_of_views_is_that_of_each_and_reads_the_truth_once(name):
+    """The value and the gradient of `lpips`, by one pass for the truth, and for the image one
+    forwards and one backwards.
+    """
+    weights = made_up(name)
+    pairs = [image_pair(*SIZES[name], seed) for seed in (0, 1)]
+    shown, truth = (jnp.stack([pair[i] for pair in pairs]) for i in (0, 1))
+    of_views = lambda shown: jnp.sum(_each_lpips(weights, shown, truth))
+    one_by_one = lambda shown: sum(lpips(weights, *each) for each in zip(shown, truth, strict=True))
+    found, expected = (jax.jit(jax.value_and_grad(each))(shown) for each in (of_views, one_by_one))
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-5)
+    scale = np.abs(expected[1]).max()
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-4 * scale)
+    text = jax.jit(jax.grad(of_views)).lower(shown).as_text()
+    layers = sum(1 for _ in convolutions(BACKBONES[name]))
+    assert text.count("stablehlo.convolution") == 3 * layers
