@@ -33,6 +33,7 @@ def products_that_say_nothing(file):
             yield f"{file.relative_to(PACKAGE)}:{node.lineno}"
 
 
+@pytest.mark.wings
 def test_every_product_of_jax_says_how_exact_it_is():
     assert [
         place for file in sorted(PACKAGE.rglob("*.py")) for place in products_that_say_nothing(file)

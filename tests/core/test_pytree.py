@@ -234,6 +234,7 @@ def test_a_structure_comes_back_with_its_static_fields():
     assert back == jax.tree.structure(((body,), {}))
 
 
+@pytest.mark.wings
 def test_every_public_pytree_has_a_name_in_files_of_jax_export():
     public = [
         value

@@ -23,6 +23,7 @@ sys.path[:0] = [
     *(str(HERE.parent / name) for name in ("network", "capture", "data/datasets", "")),
 ]
 
+from attacks_pickles import PICKLES, body_pickle  # noqa: E402
 from hostile_cases import all_cases  # noqa: E402
 from readers import FORMATS  # noqa: E402
 
@@ -139,6 +140,21 @@ def test_some_files_of_each_item(item, tmp_path):
             result |= {"outcome": "refused", "message": str(error)}
         faults.append(fault(case, result))
     assert faults and not any(faults), "\n".join(filter(None, faults))
+
+
+def test_every_pickle_of_an_attack_is_refused(tmp_path, monkeypatch):
+    """Or its values are no arrays; in both cases nothing of it runs."""
+    monkeypatch.chdir(tmp_path)
+    for kind, instructions in PICKLES.items():
+        for reader in ("pickle", "pickled tensors"):
+            (tmp_path / "a.pkl").write_bytes(body_pickle(instructions))
+            try:
+                FORMATS[reader].read(tmp_path / "a.pkl")
+            except ValueError as error:
+                assert str(error).startswith(str(tmp_path)), kind
+            else:
+                assert reader == "pickled tensors", kind
+    assert os.listdir(tmp_path) == ["a.pkl"]
 
 
 @pytest.mark.parametrize("name", [name for name, each in FORMATS.items() if each.make is not None])

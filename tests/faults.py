@@ -1,0 +1,122 @@
+"""Puts faults into the package, one at a time, and says which of them no test finds.
+
+python tests/faults.py [PART OF A MODULE'S NAME]
+
+A fault is a text of a module and what stands in its place while the module is imported; no file
+changes. Each is looked for by the tests beside its module's name.
+"""
+
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+ATOMIC, PICKLE, TENSORS = "io.atomic", "io.restricted_pickle", "io.tensors"
+TESTS = {
+    ATOMIC: ["tests/io/test_atomic.py"],
+    PICKLE: [
+        "tests/hostile/test_hostile.py::test_every_pickle_of_an_attack_is_refused",
+        "tests/network/test_torch_file.py",
+    ],
+    TENSORS: ["tests/network/test_torch_file.py"],
+    "body.joints": ["tests/body/test_joints.py"],
+    "motion.clips": ["tests/motion/test_motion_skeletons.py"],
+}
+"""Where a fault of a module is looked for."""
+FAULTS = [
+    # what is there is lost, or half of it is written
+    (ATOMIC, "aside.rename(folder)\n            raise", "raise"),
+    (ATOMIC, "temporary.rename(folder)\n            return", "folder.mkdir()\n            return"),
+    (ATOMIC, "_being_written.discard(temporary.absolute())\n        _remove(temporary)", "pass"),
+    (ATOMIC, "            else:\n                _remove(entry)", ""),
+    (ATOMIC, "entry.rename(original)", "_remove(entry)"),
+    (ATOMIC, "age > ABANDONED_SECONDS or", ""),
+    (ATOMIC, "(machine == MACHINE and not _runs(pid))", "not _runs(pid)"),
+    (ATOMIC, "new.sort(key=lambda file: file == Path(last))", "pass"),
+    (ATOMIC, "{Path(file) for file in without}.difference(new)", "{Path(f) for f in without}"),
+    (ATOMIC, "folder.is_symlink()", "False"),
+    (ATOMIC, "Path.cwd().is_relative_to(place)", "False"),
+    (ATOMIC, "os.path.ismount(folder)", "False"),
+    (ATOMIC, "if mark not in entries:", "if False:"),
+    (ATOMIC, "if not overwrite:", "if False:"),
+    (ATOMIC, "fcntl.LOCK_EX | (0 if wait", "fcntl.LOCK_SH | (0 if wait"),
+    (ATOMIC, "raise OSError(error.errno, error.strerror, str(path)) from error", "raise"),
+    (ATOMIC, "tempfile.TemporaryFile(dir=place).close()", "pass"),
+    (ATOMIC, "for each in new:  # the innermost first", "for each in ():"),
+    # a pickle runs, or takes more than it holds
+    (PICKLE, "if key not in self.names:", "if key[0] not in ('os', *[k[0] for k in self.names]):"),
+    (PICKLE, "if opcode.name in REFUSED:", "if opcode.name in REFUSED - {'DUP'}:"),
+    (PICKLE, "if opcode.name in REFUSED:", "if opcode.name == 'DUP':"),
+    (PICKLE, "abs(argument) >= LARGEST_INTEGER", "abs(argument) < 0"),
+    (PICKLE, "if not 0 <= index <= self.count or not stack:", "if not stack:"),
+    (PICKLE, "key is None or key > LARGEST_KEY", "key is None"),
+    (PICKLE, "self.memo[index] = stack[-1] or 0", "self.memo[index] = 0"),
+    (PICKLE, "if within and (end > self.frame_end", "if within and (False"),
+    (PICKLE, "made = 1 + sum(part or 0 for part in taken)", "made = 1"),
+    (PICKLE, "if self.file.tell() != self.seen:", "if self.file.tell() == self.seen:"),
+    (PICKLE, "!= len(data):", "> len(data):"),
+    (PICKLE, 'encoding not in ("latin1", "latin-1")', "False"),
+    (PICKLE, "depth > 8 or left < 0", "left < 0"),
+    (PICKLE, "if not dtype.itemsize:", "if dtype.itemsize > 4:"),
+    # a file of tensors gives others, or more
+    (TENSORS, "if count > len(data) or (count and last >= len(data)):", "if count > len(data):"),
+    (TENSORS, "if len(shape) != len(strides) or len(shape) > MOST_AXES:", "if False:"),
+    (TENSORS, "self.kinds.setdefault(pid[2], pid[1].name) != pid[1].name", "False"),
+    (TENSORS, "if left < 0:", "if left is None:"),
+    (TENSORS, "(array.astype(np.uint32) << 16)", "(array.astype(np.uint32) << 15)"),
+    (TENSORS, "(data)[len(data) - size :]", "(data)[len(data) - size - 1 : -1]"),
+    # people stand elsewhere
+    ("body.joints", "above @ turns[..., joint, :, :]", "turns[..., joint, :, :] @ above"),
+    ("motion.clips", "turns[:, joint], moves[:, joint] = turn, move", "turns[:, joint] = turn"),
+]
+"""(module, text, what stands in its place)."""
+
+
+class Faulty(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader):
+    """Finds one module, and loads it with a fault in it."""
+
+    def __init__(self, module, text, other):
+        path = ROOT / "humangs_jax" / (module.replace(".", "/") + ".py")
+        super().__init__(f"humangs_jax.{module}", str(path))
+        source = path.read_text()
+        assert text in source, f"{module} has no {text!r}"
+        self.source = source.replace(text, other).encode()
+
+    def find_spec(self, name, path=None, target=None):
+        """The module, if it is this one."""
+        return importlib.util.spec_from_loader(name, self) if name == self.name else None
+
+    def get_code(self, name):
+        """Its code, never from a cache."""
+        return compile(self.source, self.path, "exec")
+
+
+if "HUMANGS_FAULT" in os.environ:  # as a plugin of pytest
+    sys.meta_path.insert(0, Faulty(*FAULTS[int(os.environ["HUMANGS_FAULT"])]))
+
+
+def main():
+    """Runs the tests of each fault; 1 if one is not found."""
+    wanted, missed = sys.argv[1] if len(sys.argv) > 1 else "", 0
+    for number, (module, text, other) in enumerate(FAULTS):
+        if wanted not in module:
+            continue
+        command = [sys.executable, "-m", "pytest", "-p", "faults", "-x", "-q", *TESTS[module]]
+        environment = os.environ | {
+            "HUMANGS_FAULT": str(number),
+            "PYTHONPATH": f"{ROOT}:{ROOT}/tests",
+        }
+        code = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True).returncode
+        missed += code != 1
+        found = {0: "NOT FOUND", 1: "found"}.get(code, f"pytest ended with {code}")
+        print(f"{found:10} {module}: {text[:60]!r} -> {other[:40]!r}", flush=True)
+    print(f"{missed} not found")
+    sys.exit(missed > 0)
+
+
+if __name__ == "__main__":
+    main()
