@@ -96,7 +96,14 @@ class Faulty(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader)
 
 
 if "HUMANGS_FAULT" in os.environ:  # as a plugin of pytest
-    sys.meta_path.insert(0, Faulty(*FAULTS[int(os.environ["HUMANGS_FAULT"])]))
+    finder = Faulty(*FAULTS[int(os.environ["HUMANGS_FAULT"])])
+    sys.meta_path.insert(0, finder)
+
+
+def pytest_sessionstart():
+    """Puts the fault before the finder of jaxtyping, which came later."""
+    sys.meta_path.remove(finder)
+    sys.meta_path.insert(0, finder)
 
 
 def main():

@@ -9,9 +9,7 @@ import dataclasses
 import functools
 import importlib
 import json
-import math
 import re
-import time
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,11 +36,8 @@ from humangs_jax.training.state import init_state
 BASE = "base"
 CONFIDENCE = 0.95
 DEFAULT_METRIC = "psnr_fg"
-MARGIN = 0.1
-"""Share of the time of runs that a budget is proposed with beyond it."""
 LONGEST_NAME = 100
 """Characters of a variant's name in the name of a folder; file systems allow 255 bytes."""
-UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 People = int | Sequence[str | Path] | SourceFactory
 
 
@@ -76,12 +71,6 @@ class Ablation:
     """The name of the score."""
     scores: dict[str, dict[int, float]]
     """The score of each variant by seed."""
-    missing: int = 0
-    """How many runs the budget had no room for."""
-    longest: float = 0.0
-    """What the longest run took, seconds. The first run of the base and of each variant compiles a
-    program.
-    """
 
     @property
     def rows(self) -> list[AblationRow]:
@@ -100,20 +89,7 @@ class Ablation:
             else:
                 difference = _shown(row)
             cells.append([row.name, str(row.seeds), f"{row.mean:.2f}", *difference])
-        return "\n".join([*text_table([head, *cells]), *self._missing_told()])
-
-    def _missing_told(self) -> list[str]:
-        """What is missing, and the budget with which the same call would make it."""
-        if not self.missing:
-            return []
-        told = [f"{self.missing} runs are missing: the budget was used up"]
-        if self.longest:
-            enough = _as_budget(self.missing * self.longest * (1 + MARGIN))
-            took = f"a run took up to {_as_budget(self.longest)}"
-            told.insert(
-                0, f'{took}: the same call goes on, budget="{enough}" would do for the rest'
-            )
-        return told
+        return "\n".join(text_table([head, *cells]))
 
     def plot(self) -> Any:
         """Differences to the base with their intervals; gray where the interval contains 0. Without
@@ -125,9 +101,7 @@ class Ablation:
         make = importlib.import_module("matplotlib.figure").Figure
         if not rows:
             figure = make(figsize=(6.4, 1.0), dpi=150)
-            words = "\n".join(
-                ["no variant finished: there is nothing to compare", *self._missing_told()]
-            )
+            words = "no variant finished: there is nothing to compare"
             figure.text(0.5, 0.5, words, ha="center", va="center", fontsize="small")
             return figure
         figure = make(figsize=(6.4, 1.0 + 0.35 * len(rows)), dpi=150, layout="constrained")
@@ -150,7 +124,6 @@ def ablate(
     variants: Mapping[str, Mapping[str, Any]],
     *,
     seeds: int = 3,
-    budget: str | None = None,
     people: People = 16,
     validation: People = 4,
     out: str | Path = "ablation",
@@ -161,16 +134,12 @@ def ablate(
 ) -> Ablation:
     """Train a base and its variants with several seeds each, and compare them on other people.
 
-    Runs are made seed by seed, so that differences are paired however far the budget reaches. Each
-    run is a folder `out/VARIANT/SEED` that `train` goes on with: the same call resumes.
+    Each run is a folder `out/VARIANT/SEED` that `train` goes on with: the same call resumes.
 
     Args:
         base: a run, or the name of a preset of training ("tiny", "small", "paper", "published").
         variants: fields that change, by their paths (`vary`), of each variant by its name.
         seeds: runs of each variant.
-        budget: wall-clock time, such as "90s", "5min" or "2h": no run begins that would probably
-            end after it. The first one, which compiles, may exceed it. The result says which budget
-            would do for what is missing. None: all runs.
         people: to train on: a number of synthetic people, who are rendered during training; capture
             folders; or a source.
         validation: other people to compare on, in the same forms. Of a number and of folders each
@@ -189,7 +158,7 @@ def ablate(
     Raises:
         ValueError: before the first run, for a variant that cannot be trained: named "base", with a
             path that is no field, another seed, or a loss whose network is missing; for a
-            metric, budget or number of seeds that cannot be meant. Later, for a folder with runs of
+            metric or number of seeds that cannot be meant. Later, for a folder with runs of
             other settings.
         TrainingInterrupted: after Ctrl-C; what is trained is kept.
 
@@ -200,7 +169,6 @@ def ablate(
     """
     if seeds < 1:
         raise ArgumentError("seeds", f"{seeds}: expected at least 1")
-    seconds = _seconds(budget)
     _check_metric(metric, networks)
     base = fitting_losses(read_config(base) if isinstance(base, str) else base, networks)
     # what is compared is the end of a run
@@ -217,19 +185,11 @@ def ablate(
     if validation and not isinstance(validation, int):
         shown = {name: as_validated(config.at(config.steps - 1)) for name, config in runs.items()}
         _check_people(shown, compared, body)
-    # seed after seed, so that a budget that ends leaves pairs to compare
+    # seed after seed, so that a call that is interrupted leaves pairs to compare
     scores: dict[str, dict[int, float]] = {name: {} for name in runs}
-    began, longest = time.monotonic(), 0.0
     order = [(name, seed) for seed in range(seeds) for name in runs]
     for name, seed in bar(order, desc="ablate", unit="run", shown=progress):
         folder, config = folders[name] / str(seed), dataclasses.replace(runs[name], seed=seed)
-        start = time.monotonic()
-        if (
-            seconds is not None
-            and not _validated(folder, config.steps)
-            and start - began + longest > seconds
-        ):
-            continue
         others = functools.partial(train, validation=compared, validated=count, networks=networks)
         others(config, body, learned, folder, progress=progress)
         found = _validated(folder, config.steps)
@@ -238,8 +198,7 @@ def ablate(
                 "validation", f"{validation!r}: nobody was looked at: expected people to compare on"
             )
         scores[name][seed] = found[metric]
-        longest = max(longest, time.monotonic() - start)
-    result = Ablation(metric, scores, sum(seeds - len(own) for own in scores.values()), longest)
+    result = Ablation(metric, scores)
     if progress:
         say(str(result))
     return result
@@ -373,26 +332,6 @@ def _shown(row: AblationRow) -> tuple[str, str]:
     if row.interval is None:
         return f"{row.difference:+.2f}", "one seed"
     return f"{row.difference:+.2f}", f"+-{row.interval:.2f}{'' if row.clear else ', unclear'}"
-
-
-def _seconds(budget: str | None) -> float | None:
-    if budget is None:
-        return None
-    match = re.fullmatch(r"(\d+(?:\.\d*)?) ?(s|min|h)", budget)
-    if match is None:
-        raise ArgumentError("budget", f'{budget!r}: expected a time such as "90s", "5min" or "2h"')
-    return float(match[1]) * UNITS[match[2]]
-
-
-def _as_budget(seconds: float) -> str:
-    """A time, rounded up, as a budget is written."""
-    if seconds < 90:
-        unit = "s"
-    elif seconds < 5400:
-        unit = "min"
-    else:
-        unit = "h"
-    return f"{math.ceil(seconds / UNITS[unit])}{unit}"
 
 
 def _source(
