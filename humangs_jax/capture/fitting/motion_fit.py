@@ -161,9 +161,11 @@ def fit_motion(
     model = landmark_model(body, kind.names, kind.places, kind.certainty)
     seen = _observations(keypoints, K)
     m = len(seen.noise)
-    poses = _start(model, seen, fps)
     shape = np.zeros(body.shape_directions.shape[-1]) if betas is None else np.asarray(betas)
     tall = _tallness(body)
+    if betas is None:
+        shape = _of_height(shape, tall, height)
+    poses = _start(model, seen, fps, shape)
     # one stage for the shape, then all levels and the feet of each window
     windows = _windows(m)
     stages = iter(watch(range(1 + len(windows) * (len(LEVELS) + 1)), len(windows)))
@@ -180,6 +182,7 @@ def fit_motion(
         found = poses
         for scales in LEVELS[1:]:
             found, shape = run(spread, found, scales, timed=False)
+        shape = _of_height(shape, tall, height)
     # the motion; then once more, with the feet held that stand still
     for scales in LEVELS:
         poses = _joined(windows, poses, functools.partial(run, scales=scales))
@@ -210,10 +213,13 @@ def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observat
 # --------------------------------------------------------------------------------------------------
 
 
-def _start(model: LandmarkModel, seen: Observations, fps: float) -> BodyPose:
+def _start(
+    model: LandmarkModel, seen: Observations, fps: float, betas: Float[np.ndarray, " s"]
+) -> BodyPose:
     """Usual poses, turned and placed as the detector's 3D landmarks are, smoothed over time."""
     problem = keypoint_problem(model)
-    resting, joints = problem.landmarks_and_joints(zero_state(problem.origin))
+    still = replace(zero_state(problem.origin), betas=jnp.asarray(betas, jnp.float32))
+    resting, joints = problem.landmarks_and_joints(still)
     resting, pelvis = np.asarray(resting), np.asarray(joints[0])
     usual = np.asarray(problem.origin.pose.rotations)
     # trunks turn onto the detector's landmarks, whose axes are the camera's
@@ -295,6 +301,16 @@ def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
     top, bottom = template[:, 1].argmax(), template[:, 1].argmin()
     directions = np.asarray(body.shape_directions)[:, 1]
     return np.append(np.ptp(template[:, 1]), directions[top] - directions[bottom])
+
+
+def _of_height(
+    betas: Float[np.ndarray, " s"], tall: Float[np.ndarray, " s1"], height: float | int | None
+) -> Float[np.ndarray, " s"]:
+    """The nearest shape of that height, metres; None: the shape itself."""
+    if height is None:
+        return betas
+    missing = height - tall[0] - tall[1:] @ betas
+    return betas + tall[1:] * missing / np.sum(np.square(tall[1:]))
 
 
 # Windows
