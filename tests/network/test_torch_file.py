@@ -171,6 +171,10 @@ BOMB = (1 << 40, 2)
             "1 axes and 2 strides",
         ),
         (
+            {"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(2,), strides=(4,))}},
+            "w: shape .* does not fit",
+        ),
+        (
             {"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=BOMB, strides=(0, 1))}},
             "does not fit",
         ),
