@@ -25,6 +25,7 @@ from sog_files import write_sog
 from torch_writer import plain_pickle, tensors, write_checkpoint
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
+from humangs_jax.apps.start import inspect_folder
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export.gaussians import load_gaussians, save_gaussians
 from humangs_jax.avatar.frames import FOLLOWING, smoothed_path, trim_and_resample
