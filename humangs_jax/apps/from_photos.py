@@ -137,9 +137,8 @@ def avatar_from_photos(
         ValueError: one line that names the file or argument and what is missing or wrong.
 
     Examples:
-        >>> for step in hg.avatar_from_photos("photos", "me", height=1.78):
-        ...     print(step)
-        >>> hg.show(step.avatar)
+        >>> *steps, last = hg.avatar_from_photos("photos", "me", height=1.78)
+        >>> hg.show(last.avatar)
     """
 
     def as_path(value):
@@ -224,12 +223,12 @@ class FromPhotos:
         """Raises: ArgumentError for a scale or a direction that something else sets."""
         if material.cameras is not None and self.height is not None:
             raise ArgumentError(
-                "height", ": is for photos without cameras: the calibration has a scale (--scale)"
+                "height", ": is for photos without cameras: the calibration has a scale"
             )
         if material.cameras is None:
             for argument, value in (("scale", self.scale), ("up", self.up)):
                 if value is not None:
-                    problem = ": is for a calibration, and there is none (--height sets the scale)"
+                    problem = ": is for a calibration, and there is none (a height sets the scale)"
                     raise ArgumentError(argument, problem)
 
     def mark(self, **more: Any) -> dict[str, dict[str, Any]]:
@@ -459,9 +458,9 @@ class FromPhotos:
             if photos.calibrated:
                 against = find_contradiction(photos, keypoints)
             if against:
-                raise ValueError(
-                    f"{material.cameras}: {against}: correct it, or go on without it by"
-                    " --cameras ignore"
+                raise ArgumentError(
+                    "cameras",
+                    f"{material.cameras}: {against}: correct it, or go on without it by {IGNORE!r}",
                 )
             fitted = fit_photos(photos, keypoints, load_body())
         with stage("examining the fit"):

@@ -1,10 +1,4 @@
-"""Names and parents of SMPL-X's 55 joints, which the shipped body shares, and joints in a pose."""
-
-from collections.abc import Sequence
-
-import numpy as np
-
-from humangs_jax.core.array_types import Float
+"""Names and parents of SMPL-X's 55 joints, which the shipped body shares."""
 
 DEFAULT_FPS = 30.0
 """Frames per second of a motion whose file says none."""
@@ -61,29 +55,3 @@ PARENTS = (
     *_hand_parents(21, 40),
 )
 """Parent of each joint, -1 for the pelvis; every finger starts at its wrist."""
-
-
-def posed_tree(
-    turns: Float[np.ndarray, "*m j 3 3"],
-    bones: Float[np.ndarray, "*m j 3"],
-    parents: Sequence[int],
-) -> tuple[Float[np.ndarray, "*m j 3 3"], Float[np.ndarray, "*m j 3"]]:
-    """Rotations and places of joints in space, in numpy; `body.model.joint_transforms` in JAX.
-
-    turns: rotations of joints relative to their parents. bones: from a parent to each joint in the
-    rest pose, and the place of the root. parents: -1 for roots; each comes before its children.
-    """
-    world, places = np.array(turns, float), np.array(bones, float)
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            above = world[..., parent, :, :]
-            world[..., joint, :, :] = above @ turns[..., joint, :, :]
-            moved = (above @ bones[..., joint, :, None])[..., 0]
-            places[..., joint, :] = places[..., parent, :] + moved
-    return world, places
-
-
-def bones_of(joints: Float[np.ndarray, "j 3"], parents: Sequence[int]) -> Float[np.ndarray, "j 3"]:
-    """From its parent to each joint of a rest pose; of a root its place."""
-    above = np.asarray(parents)
-    return np.where(above[:, None] < 0, joints, joints - joints[above])

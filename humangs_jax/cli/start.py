@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import Positional, arg
 
-from humangs_jax.cli.options import UsageError, first_refinement, off
+from humangs_jax.cli.options import UsageError, first_refinement, off, require_replaceable
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import Range, at_least
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
@@ -90,6 +90,8 @@ class Start:
             raise UsageError("--refine needs masks: leave out --without-masks")
         if self.masks is not None and self.without_masks:
             raise UsageError(f"--masks {self.masks}: does not go with --without-masks")
+        # the rest of what may be wrong with --out is known after the imports
+        require_replaceable(self.out, True, "capture.json")
         with stage("starting"):
             from humangs_jax.apps.from_photos import MissingError, avatar_from_photos
             from humangs_jax.refinement.config import RefineConfig

@@ -28,7 +28,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import bones_of, posed_tree
+from humangs_jax.body.kinematics import bones_of, posed_tree
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.capture import Capture

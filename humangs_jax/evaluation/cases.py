@@ -239,8 +239,8 @@ def choose_views(
         return chosen, targets
     if inputs is None and not reconstructs:
         return [], list(range(count))
-    count = DEFAULT_INPUTS if inputs is None else inputs
-    chosen = spread_views(name, frames, cam_from_world, count)
+    wanted = DEFAULT_INPUTS if inputs is None else inputs
+    chosen = spread_views(name, frames, cam_from_world, wanted)
     targets = [i for i in range(count) if i not in chosen]
     if not targets:
         raise ValueError(f"{name}: {count} views, all of them inputs: none is left to compare with")

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import DEFAULT_FPS, posed_tree
+from humangs_jax.body.joints import DEFAULT_FPS
+from humangs_jax.body.kinematics import posed_tree
 from humangs_jax.core.array_types import Float
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.io.nodes import (

@@ -13,7 +13,7 @@ import functools
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import bones_of, posed_tree
+from humangs_jax.body.kinematics import bones_of, posed_tree
 from humangs_jax.core.array_types import Float
 from humangs_jax.synthetic.surfaces import (
     Boundaries,

@@ -90,9 +90,8 @@ def test_crops_show_the_head(four):
     assert set(np.flatnonzero(crops.moved)) <= set(crops.drawn.tolist())
     assert len(crops.views.images) == 4 and crops.views.cameras.height < HEIGHT
     assert float(crops.views.masks.mean()) > 0.2
-    larger = head_crops(
-        avatar, capture, RefineConfig(image_size=HEIGHT // 2)
-    )  # of the photos as they are
+    # of the photos as they are
+    larger = head_crops(avatar, prepare_capture(capture), RefineConfig(image_size=HEIGHT // 2))
     assert larger.finer and not crops.finer
     np.testing.assert_allclose(
         larger.views.cameras.K[:, 0, 0], crops.views.cameras.K[:, 0, 0], rtol=1e-6

@@ -52,6 +52,7 @@ from humangs_jax.capture.fitting.state import (
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.geometry.transform import EXACT
 
 WINDOW, OVERLAP = 120, 24
 """Frames of a window, and those that it shares with the next."""
@@ -414,7 +415,7 @@ def _solved(
         """x = begun + S u."""
 
         def moved(old, u):
-            return old + jnp.einsum("vw,w...->v...", window.smoother, u)
+            return old + jnp.einsum("vw,w...->v...", window.smoother, u, precision=EXACT)
 
         return FitState(
             begun.betas + state.betas * (1 - jnp.max(window.timed)),  # in time the shape is known

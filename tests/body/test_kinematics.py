@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import PARENTS, bones_of, posed_tree
+from humangs_jax.body.joints import PARENTS
+from humangs_jax.body.kinematics import bones_of, posed_tree
 from humangs_jax.body.model import joint_transforms
 
 
