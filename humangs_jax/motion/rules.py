@@ -18,9 +18,8 @@ from humangs_jax.body.joints import (
     FINGERS,
     JOINT_NAMES,
     PARENTS,
-    bones_of,
-    posed_tree,
 )
+from humangs_jax.body.kinematics import bones_of, posed_tree
 from humangs_jax.body.motion import PELVIS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE
