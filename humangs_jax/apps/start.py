@@ -406,13 +406,17 @@ def better_body(
     """
     reports: list[tuple[HeldOut, HeldOut]] = []
     photos = _photos_to_hold_out(first)
-    others = _photos_to_hold_out(second)
 
     def gains() -> Iterator[float]:
+        others: PreparedCapture | None = None
         for number in range(ASKED):
             one = held_out_psnr(variables, config, photos, refinement, number)
-            two = one and held_out_psnr(variables, config, others, refinement, number)
-            if one is None or two is None:
+            if one is None:
+                return
+            if others is None:
+                others = _photos_to_hold_out(second)
+            two = held_out_psnr(variables, config, others, refinement, number)
+            if two is None:
                 return
             reports.append((one, two))
             yield two.aligned - one.aligned
