@@ -399,34 +399,34 @@ def better_body(
     refinement: RefineConfig | None,
 ) -> tuple[Capture, HeldOut | None]:
     """The capture whose body makes the better avatar, judged by photos that are held out of it, and
-    what the first of them says.
+    what the first of them says of the avatar after refinement.
 
     More of the masks is covered by a body that fills clothes; the avatar is not better for it.
-    Several photos are asked, see `photos_agree`. Without enough photos the first.
+    Several photos are asked, see `photos_agree`, about avatars that are not refined: which body is
+    better shows before, and refinement takes most of the time. Without enough photos the first.
     """
-    reports: list[tuple[HeldOut, HeldOut]] = []
     photos = _photos_to_hold_out(first)
+    begun = held_out_psnr(variables, config, photos, None)
+    if begun is None:
+        return first, None
+    others = _photos_to_hold_out(second)
 
     def gains() -> Iterator[float]:
-        others: PreparedCapture | None = None
         for number in range(ASKED):
-            one = held_out_psnr(variables, config, photos, refinement, number)
-            if one is None:
+            one = begun
+            if number:
+                one = held_out_psnr(variables, config, photos, None, number)
+            two = held_out_psnr(variables, config, others, None, number)
+            if one is None or two is None:
                 return
-            if others is None:
-                others = _photos_to_hold_out(second)
-            two = held_out_psnr(variables, config, others, refinement, number)
-            if two is None:
-                return
-            reports.append((one, two))
             yield two.aligned - one.aligned
 
-    better = photos_agree(gains(), CLEARLY)
-    if not reports:
-        return first, None
-    if better:
-        return second, reports[0][1]
-    return first, reports[0][0]
+    chosen, shown = first, photos
+    if photos_agree(gains(), CLEARLY):
+        chosen, shown = second, others
+    if refinement is None and chosen is first:
+        return first, begun
+    return chosen, held_out_psnr(variables, config, shown, refinement)
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:

@@ -786,7 +786,7 @@ def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
 def test_no_photo_alone_rejects_a_body(gains, asked, better, toy, monkeypatch):
     other, numbers = dataclasses.replace(toy, body_file="other"), []
 
-    def scored(variables, config, photos, refinement, number):
+    def scored(variables, config, photos, refinement, number=0):
         numbers.append(number)
         of_other = photos.given is other
         return start.HeldOut(photos.given.names[number], 20.0, 30.0 + of_other * gains[number])
