@@ -7,9 +7,7 @@ the background, the median over frames of what he does not cover. No photo is wr
 folder that the user names.
 """
 
-import dataclasses
-import functools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -17,8 +15,6 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy import ndimage
 
-from experiments.subjects import Scores, score_tasks
-from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.capture.detection.people import (
     LANDMARK_SIZE,
     DetectedPerson,
@@ -27,21 +23,15 @@ from humangs_jax.capture.detection.people import (
     detect_people,
 )
 from humangs_jax.capture.detection.sharpening import sharpened
-from humangs_jax.capture.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.data.cameras import distort
-from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import apply_gain, camera_gains
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.photos import on_white_background, write_description
-from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import resized, to_uint8, write_png
-from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
-from humangs_jax.losses.perceptual import Lpips
 
 PACKAGE, VERSION = "pose2sim", "0.10.49"
 FRAMES = (0, 12, 33, 66, 90)
@@ -344,57 +334,3 @@ def _without_small(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     parts, _ = ndimage.label(inside)
     areas = np.bincount(parts.ravel())
     return (areas >= SPECK)[parts] & inside
-
-
-# Scores
-# --------------------------------------------------------------------------------------------------
-
-
-def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]) -> list[Scores]:
-    """Of each view the PSNRs (dB) and LPIPS of the avatar of the others, against the man on white
-    as he was photographed.
-
-    Renderings are brought to the exposure of the view's camera, which is found from all photos.
-
-    Arguments: body: what the package makes of the photos, with masks, cameras, shape and pose.
-    make: an avatar from a part of it.
-    """
-    found, views, gains = [], range(body.view_count), camera_gains(body)
-    for view in views:
-        others = [other for other in views if other != view]
-        avatar, shown = make(body.select(others)), body.select([view])
-        # of the others alone the gains are the same but for one factor
-        factor = np.exp(np.mean(np.log(gains[others] / camera_gains(body.select(others))), axis=0))
-        drawn = draw_views(avatar, shown)
-        images = apply_gain(drawn.images, np.asarray(drawn.alpha), (factor / gains[view])[None])
-        truth = dataclasses.replace(
-            shown, images=photos.truth()[[view]], masks=photos.careful[[view]]
-        )
-        found.append(_scores(images, truth))
-    return found
-
-
-def drawn_psnrs(avatar: Avatar, truth: Capture) -> Scores:
-    """psnr and psnr_fg (dB), and LPIPS, of an avatar against the photos of these views, means over
-    them.
-    """
-    return _scores(draw_views(avatar, truth).images, truth)
-
-
-def _scores(images, truth):
-    scores = score_tasks(images, truth, _alex())["novel"]
-    return {
-        key: scores[name]
-        for key, name in (("psnr", "psnr"), ("psnr_fg", "psnr_fg"), ("alex", "lpips"))
-    }
-
-
-@functools.cache
-def _alex() -> Lpips | None:
-    return load_lpips("alex") if "alex" in installed_lpips() else None
-
-
-def body_ious(body: Capture, careful: Float[np.ndarray, "v s s"]) -> list[float]:
-    """How well the naked body fills the masks, of each view."""
-    truth = dataclasses.replace(body, masks=careful)
-    return [float(iou) for iou in Scene(truth, None, CaptureRefineConfig()).score(truth).ious]

@@ -22,13 +22,16 @@ from experiments.real_capture import FRAMES, RealFrame, prepare
 from experiments.results import cells, markdown_table
 from experiments.subjects import shipped_digest
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import images, motion_views, turntable_views
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.video import write_video
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.video import tile, write_video
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.io.images import to_uint8, write_png
 from humangs_jax.io.reading import write_json
+from humangs_jax.motion import load_motion
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.refine import refine
@@ -53,6 +56,8 @@ RATE = 10
 """Frames a second of his video: 53 of them are a turn, which takes a person some five seconds."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenCV's axes of a camera to those of transforms.json."""
+SIDES = 6
+"""Pictures in a row of the sheet."""
 WOMAN, ANGLES = "20_1", (0, 90, 180, 270)
 """Of the scans: the woman's number, and the views that there are of her."""
 
@@ -217,10 +222,27 @@ def avatar_of(capture: Capture) -> Avatar:
     return refine(reconstruct(*load_weights(), capture), capture, config)
 
 
+def draw_sheet(capture: Capture, path: Path) -> None:
+    """The avatar from six sides in the pose of its photos, and walking; no photo."""
+    avatar, shot = avatar_of(capture), Shot(width=200, height=300)
+    around = images(avatar, *turntable_views(avatar, capture.pose(0), SIDES, shot), shot)
+    motion = load_motion(rest_joints=avatar.rest_joints)
+    chosen = np.linspace(0, len(motion.translations) - 1, SIDES).astype(int)
+    poses, cameras = motion_views(avatar, motion, dataclasses.replace(shot, azimuth=40))
+    walking = images(avatar, poses[chosen], cameras[chosen], shot)
+    sheet = to_uint8(tile(np.stack([*around, *walking]), columns=SIDES))
+    Image.fromarray(sheet).save(path, quality=90)
+
+
 def section(rows: dict[str, dict[str, Any]]) -> str:
     """The table of the page."""
     lines = [[row, *cells(numbers, COLUMNS)] for row, numbers in rows.items()]
     return markdown_table(["row", *(heading for heading, _ in COLUMNS.values())], lines)
+
+
+def _place_of(work: Path, row: str) -> Path:
+    """Where the capture of a row is kept."""
+    return work / f"start_{row.replace(', ', '_')}"
 
 
 @entry
@@ -232,6 +254,7 @@ def real_people(
     scan: Path | None = None,
     views: int = 0,
     rows: tuple[str, ...] = (),
+    pictures: Path | None = None,
 ) -> None:
     """Real people: what `humangs start` makes of them, and how like them the avatar is where no
     photo was.
@@ -249,6 +272,7 @@ def real_people(
     scan: dataset/multihuman of github.com/DSaurus/DeepMultiCap
     views: photos that are held out, evenly spread; 0: all
     rows: how their names begin, as "turning man, video"; all if none is given
+    pictures: a sheet of the avatar of the first row
     """
     people = {known_man: known, turning_man: turning, woman: scan}
     given = {person: source for person, source in people.items() if source is not None}
@@ -260,7 +284,7 @@ def real_people(
     enable_compile_cache()
     work.mkdir(parents=True, exist_ok=True)
     cases = {
-        row: functools.partial(measure, make, work / f"start_{row.replace(', ', '_')}", views)
+        row: functools.partial(measure, make, _place_of(work, row), views)
         for person, source in given.items()
         for row, make in person(source, work)
         if not rows or row.startswith(rows)
@@ -268,3 +292,5 @@ def real_people(
     settings = {"views": views, "iterations": ITERATIONS, "weights": shipped_digest(SHIPPED)}
     found = run.rows(cases, settings)
     run.show(section(found), found)
+    if pictures is not None:
+        draw_sheet(load_capture(_place_of(work, next(iter(cases)))), pictures)

@@ -3,16 +3,10 @@ careful masks.
 """
 
 import numpy as np
-import pytest
 
 from experiments.real_capture import VideoCamera, background, careful_mask, read_cameras
-from experiments.real_person import section
-from experiments.real_rooms import camera_errors, seen_from, to_reference
-from humangs_jax.capture.fitting.triangulation import Similarity
-from humangs_jax.geometry.camera import Camera, stack_cameras
 
 PIXEL = 1e-6
-FLOAT32 = 1e-4
 CALIBRATION = """<calibration><cameras><camera serial="cam07">
 <fov_video bottom="1919" left="8" right="1087" top="0"/>
 <transform r11="1" r12="0" r13="0" r21="0" r22="0" r23="1" r31="0" r32="-1" r33="0" x="0" y="-3000" z="1500"/>
@@ -65,38 +59,3 @@ def test_the_careful_mask_is_what_moved():
 def rotation(rng):
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     return turn * np.sign(np.linalg.det(turn))
-
-
-def test_cameras_are_compared_after_one_similarity():
-    rng = np.random.default_rng(0)
-    move, own, there = Similarity(1.1, rotation(rng), rng.normal(size=3)), [], []
-    for _ in range(4):
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = rotation(rng), [0, 0, 3]
-        moved = matrix @ move.matrix()  # from the other world, 1.1 times as large
-        moved[:3] /= move.scale
-        K = [[500, 0, 256], [0, 500, 256], [0, 0, 1]]
-        there.append(Camera.from_opencv(K, matrix, 512, 512))
-        own.append(Camera.from_opencv(K, moved, 512, 512))
-    own, there = stack_cameras(own), stack_cameras(there)
-    degrees, centimetres = camera_errors(own, there)
-    assert degrees.max() < 0.05  # arccos of 1 in float32
-    assert centimetres.max() < 100 * FLOAT32
-    assert to_reference(own, there).scale == pytest.approx(1.1, rel=FLOAT32)
-    # the fourth camera, found by the other three
-    found = seen_from(own[np.asarray([0, 1, 2])], (0, 1, 2), there, 3)
-    np.testing.assert_allclose(found.cam_from_world[0], own.cam_from_world[3], atol=FLOAT32)
-
-
-def test_rows_are_means_over_their_cases_in_the_table_of_their_kind():
-    cases = {
-        "33": {"iou": 0.7, "psnr": 19.5, "each_iou": [0.7, 0.8]},
-        "66": {"iou": 0.8, "psnr": 20.5, "each_iou": [0.9]},
-    }
-    text = section(
-        {"calibrated, fit, detected": cases, "start": {"0": {"first": 125.0, "load": 2.0}}}
-    )
-    assert (
-        "| calibrated, fit, detected | 2 | 0.750 | - | 20.0 | - |" in text
-        and "| start | 1 | 125 | - | - | - | 2 |" in text
-    )
