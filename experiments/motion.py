@@ -176,7 +176,7 @@ def motion_fingers(run: Run, people: int = 1, poses: int = 2) -> None:
 
 
 def full_camera(posed, azimuth):
-    """A camera that sees a whole person from the front, or from so many degrees beside it."""
+    """A camera that sees a whole person. azimuth: degrees from the front."""
     target = (posed.vertices.min(0) + posed.vertices.max(0)) / 2
     angle, distance = np.radians(azimuth), 3.0
     eye = target + distance * np.asarray([np.sin(angle), 0.1, np.cos(angle)])

@@ -157,6 +157,7 @@ def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[
     if hidden is None:
         return photos
 
+    # points of one person under the cover of one photo
     def uncovered(points: Float[np.ndarray, "k c"], cover: Bool[np.ndarray, "h w"]) -> np.ndarray:
         """Points (x, y, confidence, ...) with no confidence under the cover."""
         column, row = np.floor(points[:, :2]).astype(int).T
@@ -174,12 +175,14 @@ def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[
         points = uncovered(person.points, cover)
         return found._replace(person=dataclasses.replace(person, points=points, hands=hands))
 
-    return [
-        photo
-        if cover is None or not cover.any()
-        else dataclasses.replace(photo, people=tuple(seen(each, cover) for each in photo.people))
-        for photo, cover in zip(photos, hidden, strict=True)
-    ]
+    shown = []
+    for photo, cover in zip(photos, hidden, strict=True):
+        # photos that hide nothing stay the same objects
+        if cover is not None and cover.any():
+            people = tuple(seen(each, cover) for each in photo.people)
+            photo = dataclasses.replace(photo, people=people)
+        shown.append(photo)
+    return shown
 
 
 def without_others(

@@ -54,14 +54,17 @@ LONGER_SIDE = 1920
 """Pixels of the longer side of the frames that are looked at, at most."""
 SHOWN = 720
 """Pixels of the longer side of a check video."""
-PATIENCE, RARELY = 8, 8
-"""Frames in a row without the person after which only every so many is searched, which takes ten
-times as long as to follow somebody."""
-FARTHEST, LARGEST_CHANGE = 0.6, 1.6
-"""Between two frames the hips of the same person move less than this share of the crop's side, and
-that side changes by less than this factor."""
+PATIENCE = 8
+"""Frames without the person, in a row, that are all searched. A search takes ten times as long as
+following the person from the frame before."""
+RARELY = 8
+"""After these frames, one of this many is searched."""
+FARTHEST = 0.6
+"""Between two frames the hips of a person move by less than this share of the crop's side."""
+LARGEST_CHANGE = 1.6
+"""Between two frames the crop's side changes by less than this factor."""
 ALIKE = 0.6
-"""Somebody whose crop is at least this share of the largest may be meant as well."""
+"""If a second person's crop has at least this share of the largest side, the user has to choose."""
 SAVED = 15.0
 """Seconds of work after which what was seen is kept."""
 KEYPOINTS = len(MEDIAPIPE_69.names)
@@ -100,7 +103,7 @@ def motion_from_video(
     Args:
         video: its file.
         person: the number of the person, from 0, the largest first where several are seen in the
-            first frame that shows so many. None: the largest.
+            first frame with that many people. None: the largest.
         height: of the person, metres, which gives the motion its scale. None: as tall as people
             usually are.
         avatar: whose body is moved as the person moves, in place of a body with the person's own

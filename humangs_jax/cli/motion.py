@@ -53,6 +53,7 @@ class MotionOfVideo:
             from humangs_jax.io.reading import open_file
             from humangs_jax.motion import made_from_of, save_motion
 
+            # what is wrong with the files is reported before the work
             open_file(self.video).close()
             if self.out.exists() and made_from_of(self.out) is None:
                 raise UsageError(
@@ -61,6 +62,7 @@ class MotionOfVideo:
             joints = None
             if self.avatar is not None:
                 joints = np.asarray(Avatar.load(self.avatar).rest_joints)
+        # what was seen is kept beside the result, so that an interrupted run goes on
         kept = self.out.with_name(f"{self.out.stem}.seen.npz")
         with stage("finding the motion"):
             found = fit_video(

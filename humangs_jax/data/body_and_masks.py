@@ -205,7 +205,7 @@ HELD = 20.0
 """The same, for hands and head."""
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
 NEAR = 2.5
-"""A vertex may be on the body's silhouette if it is within so many pixels of the edge."""
+"""Pixels. A vertex may be on the body's silhouette if it is no farther from the edge."""
 PROBE = 0.012
 """Metres by which such a vertex is moved along its normal, to see whether it leaves the
 silhouette.

@@ -282,6 +282,7 @@ class Profile(NamedTuple):
 
 def read_profile(data: bytes) -> Profile:
     """What an ICC profile says. Raises: Refused for one that is damaged, or of no photo."""
+    # the header: size, signature, kind of device and of colors
     if len(data) > PROFILE_BYTES:
         raise Refused(f"it has {len(data):,} bytes, expected at most {PROFILE_BYTES:,}")
     if len(data) < 132 or data[36:40] != b"acsp" or int.from_bytes(data[:4], "big") > len(data):
@@ -289,6 +290,7 @@ def read_profile(data: bytes) -> Profile:
     if data[12:16] not in CLASSES or data[16:20] not in SPACES:
         kind = f"{data[12:16]!r} of {data[16:20]!r}"
         raise Refused(f"it is of the kind {kind}, expected one of a photo in RGB, grey or CMYK")
+    # its curves, if colors are not given by tables alone
     space = SPACES[data[16:20]]
     try:
         tags = _tags(data)

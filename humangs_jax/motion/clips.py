@@ -57,6 +57,7 @@ def read_bvh(path: Path, options: object = None) -> Clip:
     text = read_text(path)
     if text.split(maxsplit=1)[:1] != ["HIERARCHY"]:
         raise Refused("not a BVH file: expected HIERARCHY first")
+    # the tree of joints, before the line that the motion begins with
     found = _MOTION.search(text)
     end = found.start() if found else len(text)
     names, parents, offsets, channels = _tree(text[:end])
@@ -69,6 +70,7 @@ def read_bvh(path: Path, options: object = None) -> Clip:
         raise Refused(
             f"expected at least one frame and a positive Frame Time, got {found[1]} and {found[2]}"
         )
+    # a row of numbers for each frame
     width = sum(len(each) for each in channels)
     numbers = _numbers(text[found.end() :])
     if width == 0 or len(numbers) != count * width:

@@ -95,6 +95,7 @@ def sharpened(
     avatar: with the low-pass of the photos. trust: see `RefineState`.
     """
     count, settings = config.head_steps, dataclasses.replace(config, **HOST_SETTINGS)
+    # the Gaussians that the crops show; no step is made yet, all programs are compiled
     with clock.compiling():
         photos, drawn = photos_of(crops.views), avatar.select(crops.drawn)
         if crops.finer:
@@ -109,9 +110,11 @@ def sharpened(
             share=from_host(1, np.float32),
         )
         state = _advanced(state, 0, photos, drawn, settings, clock)
+    # the steps, in parts, so that the bar moves
     for part in range(1, PARTS + 1):
         state = _advanced(state, part * count // PARTS, photos, drawn, settings, clock)
         clock.show(part / PARTS)
+    # what has moved goes back to its rows of the whole avatar
     own, new = avatar.gaussians, avatar_of(state.parameters, drawn).gaussians
     rows = np.flatnonzero(crops.moved[crops.drawn])
 

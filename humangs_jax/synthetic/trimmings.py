@@ -379,6 +379,7 @@ def sewn(
 
 def leather(s: Spots, garment: Garment) -> Points:
     """Shoes: upper, a sole of another color, laces on the instep, and what marks the kind."""
+    # colors of sole and laces; the order of the draws is part of the seed
     rng, kind, base = garment.fabric.rng(2), garment.kind, garment.fabric.base
     white, sneakers = rng.random() < 0.75, kind == "sneakers"
     dark = base * rng.uniform(0.35, 0.6)
@@ -392,6 +393,7 @@ def leather(s: Spots, garment: Garment) -> Points:
     swoosh, toe = rng.uniform(0.2, 0.8), sneakers and rng.random() < 0.5
     if kind == "ankle_boots" and rng.random() < 0.3:
         base, trim = color(0.095, 0.6, 0.6), color(0.08, 0.6, 0.25)
+    # painted from the upper outwards: stripe at the side, toe cap, laces and tongue, sole
     y, x, z = s.cloth[:, 1], np.abs(s.cloth[:, 0]), s.cloth[:, 2]
     result = np.broadcast_to(base, (len(y), 3)).astype(np.float32)
     if sneakers:

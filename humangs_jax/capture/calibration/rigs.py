@@ -345,9 +345,8 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
 # -------------------------------------------
 
 RELATIVE = "_to_"
-"""What stands between the names of two cameras: the key is the pose of the first, in the axes of
-the second, as X_first = R X_second + T.
-"""
+"""Separates the names of two cameras in a key: "a_to_b" has the pose of a relative to b, with
+X_a = R X_b + T."""
 
 
 def recognizes_multical(source: Source) -> bool:

@@ -1,5 +1,5 @@
-"""The face and the hands of somebody whom BlazePose has found: scores of ARKit's shapes, and 21
-landmarks a hand, by mediapipe's networks in LiteRT.
+"""Face and hands of a person that BlazePose has found: scores of ARKit's shapes, and 21 landmarks a
+hand, by mediapipe's networks in LiteRT.
 
 Each is looked at twice: in the region that BlazePose's landmarks say, and in the one that the first
 look says, as mediapipe does from one frame of a video to the next. Regions follow its graphs of
@@ -44,7 +44,7 @@ PALM = (0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18)
 PALM_SHIFT = -0.1
 """How far the region is moved from the palm to the fingers, a share of its side."""
 SMALLEST = 24.0
-"""Pixels of a region below which nothing can be told of a face or a hand."""
+"""Pixels. In a smaller region faces and hands are not looked for."""
 SHAPE_NAMES = ARKIT[:-1]
 """Of the scores: all of ARKit's but the tongue's."""
 SHAPE_POINTS = (
@@ -57,7 +57,7 @@ SHAPE_POINTS = (
     380, 381, 382, 384, 385, 386, 387, 388, 389, 390, 397, 398, 400, 402, 405, 409, 415, 454,
     466, 468, 469, 470, 471, 472, 473, 474, 475, 476, 477,
 )  # fmt: skip
-"""The points of the face that its shapes are told from."""
+"""Indices of the face's landmarks that the network of the scores reads."""
 EYES, MOUTH, WRISTS = (2, 5), (9, 10), (15, 16)
 """Landmarks of BlazePose: eyes, the corners of the mouth, and the wrists, the left one first."""
 KNUCKLES = ((17, 19), (18, 20))

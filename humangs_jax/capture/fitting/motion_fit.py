@@ -154,7 +154,7 @@ def fit_motion(
         K: of the camera, pixels.
         betas: the person's shape, if it is known; None: it is fitted.
         height: of the person, metres; None: as the keypoints and the prior have it.
-        watch: shows the progress of an iterable of so many stages.
+        watch: called with the stages and the number of windows; returns the stages, for a bar.
     Raises: ValueError if no frame shows the person.
     """
     body = without_expression(body)
@@ -281,7 +281,7 @@ def _place(
     offsets: Float[np.ndarray, "k 3"],
 ) -> Float[np.ndarray, "3"]:
     """The point from which points at these offsets are seen at their keypoints: with (x, y) a
-    keypoint over the focal length, x (z + t_z) = X + t_x, linear in t, and likewise y.
+    keypoint over the focal length, x (z + t_z) = X + t_x, linear in t; the same for y.
     """
     xy = (points - K[:2, 2]) / np.diagonal(K)[:2]
     off = offsets * np.diag(FLIP)[:3]

@@ -286,7 +286,7 @@ class Match(NamedTuple):
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
     """Matches the people of some views of one moment.
 
-    Those whom most views show come first, and those of a single view last.
+    People that most views show come first, those of a single view last.
 
     Arguments: mirror: for each landmark the index of its mirror image.
     """

@@ -385,6 +385,7 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
 
     Raises: ValueError naming file and key.
     """
+    # the scan is turned and moved to the body that was fitted to it
     scan_file, fit_file = scan_files(source, name)
     fit = read_fit(fit_file, body)
     fitted = next(posed_people(body.model, fit.parameters, fit.scale))
@@ -394,6 +395,7 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
     transform = scan_alignment(scan.vertices, fitted.joints[PELVIS], fitted.joints[NECK])
     vertices = moved(transform, scan.vertices)
     radius = float(np.linalg.norm(vertices, axis=1).max())
+    # cameras depend on the scan's number alone, or on its name
     if name.isdecimal():
         number = int(name)
     else:
