@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from experiments.harness import Run, entry
+from experiments.harness import Run, entry, figure
 from experiments.results import REPOSITORY, markdown_table
 from experiments.speed import checkout
 
@@ -18,6 +18,10 @@ Command = Literal["demo", "start", "animate"]
 PROGRAMS = REPOSITORY / "experiments" / "programs.py"
 TIMES = {"empty": "the first time", "full": "every time after"}
 """State of the cache -> how the table calls it."""
+LABELLED = 0.12
+"""Share of a run's time from which on the figure names a stage."""
+LABEL = 24
+"""Letters that a stage's name has in the figure."""
 
 
 @entry
@@ -52,6 +56,8 @@ def first_run(
             measure = lambda case: lambda: measured(root / case[0].name, *case, small)
             rows = run.rows({name: measure(case) for name, case in cases.items()}, {"small": small})
     run.show(table_of(rows), rows)
+    if run.publish:
+        draw_time_lines(REPOSITORY / "docs" / "images" / "first_run.png", rows)
 
 
 def measured(folder: Path, place: Path, command: Command, state: str, small: bool) -> dict:
@@ -157,3 +163,28 @@ def shown(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         head, _, state = name.rpartition(", ")
         names[name] = f"{head}, {TIMES[state]}"
     return {names[name]: row for name, row in rows.items()}
+
+
+def draw_time_lines(path: Path, rows: dict[str, dict[str, Any]]) -> None:
+    """Draws a bar for each run: its stages one after the other, the compiling of each darker.
+
+    What is not in a stage, starting Python and importing, comes first, in grey. Programs that a
+    second thread compiled meanwhile do not prolong a stage: a stage is dark for as long as it took
+    at most.
+    """
+    with figure(path, 1, (11, 0.42 * len(rows) + 1.2)) as axis:
+        for line, row in enumerate(reversed(shown(rows).values())):
+            stages = row["stages"].items()
+            begin = max(row["wall"] - sum(own["seconds"] for _, own in stages), 0.0)
+            axis.barh(line, begin, color="0.8")
+            for number, (stage, own) in enumerate(stages):
+                color = f"C{number % 10}"
+                compiling = min(own["compile"], own["seconds"])
+                axis.barh(line, own["seconds"], left=begin, color=color, alpha=0.35)
+                axis.barh(line, compiling, left=begin, color=color)
+                if own["seconds"] > LABELLED * row["wall"]:
+                    words = stage if len(stage) <= LABEL else f"{stage[:LABEL]}…"
+                    axis.text(begin + 0.2, line, words, va="center", fontsize=6, clip_on=True)
+                begin += own["seconds"]
+        axis.set_yticks(range(len(rows)), list(reversed(shown(rows))), fontsize=7)
+        axis.set_xlabel("seconds; dark: compiling")
