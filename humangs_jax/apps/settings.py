@@ -35,7 +35,7 @@ from humangs_jax.core.processes import peak_memory
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import PreparedCapture, prepare_capture
-from humangs_jax.io.reading import Refused, parse_json, read_text, reading, write_json
+from humangs_jax.io.reading import InvalidFileError, parse_json, read_text, reading, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.runtime import Runtime
@@ -200,11 +200,11 @@ def load_settings(path: str | os.PathLike[str]) -> Settings:
     with reading(path, "settings file"):
         content = parse_json(read_text(path))
         if not isinstance(content, dict) or content.get("kind") != KIND:
-            raise Refused(f'no settings of `humangs tune`: expected "kind": "{KIND}"')
+            raise InvalidFileError(f'no settings of `humangs tune`: expected "kind": "{KIND}"')
         try:
             return config_from_json(Settings, json.dumps(content.get("settings")))
         except ValueError as error:
-            raise Refused(str(error)) from error
+            raise InvalidFileError(str(error)) from error
 
 
 # Settings for a budget

@@ -46,7 +46,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum, read_npz, write_npz
 from humangs_jax.io.images import DIAGONAL_35MM
-from humangs_jax.io.reading import Refused, check_limit, reading
+from humangs_jax.io.reading import InvalidFileError, check_limit, reading
 from humangs_jax.motion import made_from_of, save_motion
 
 logger = logging.getLogger(__name__)
@@ -206,7 +206,7 @@ def rate_and_count(video: Path) -> tuple[float, int]:
     with reading(video, "video", CaptureError):
         check_limit("frames", count, "frames")
         if count < 2:
-            raise Refused("one frame: expected a video in which somebody moves")
+            raise InvalidFileError("one frame: expected a video in which somebody moves")
     seconds = times[-1] - times[0]
     if np.isfinite(seconds) and seconds > 0:
         rate = (count - 1) / seconds
@@ -367,7 +367,7 @@ def _earlier(kept: Path | None, about: str) -> list[dict[str, np.ndarray]]:
     with reading(kept, "landmarks of a video"):
         arrays, _ = read_npz(kept)
         if not {"about", "points", "again"} <= set(arrays):
-            raise Refused("exists, and is not ours: expected no file of that name")
+            raise InvalidFileError("exists, and is not ours: expected no file of that name")
     if str(arrays.pop("about")) != about:
         return []
     return [{key: each[i] for key, each in arrays.items()} for i in range(len(arrays["points"]))]

@@ -31,7 +31,7 @@ from humangs_jax.io.arrays import (
     read_npz,
     write_npz,
 )
-from humangs_jax.io.reading import FileError, Refused, is_unread, parse_json, reading
+from humangs_jax.io.reading import FileError, InvalidFileError, is_unread, parse_json, reading
 from humangs_jax.rendering.gaussians import Gaussians, check_count
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
@@ -388,7 +388,7 @@ def _read(
         or header.get("version") != VERSION
     ):
         found = header if isinstance(header, dict) else {}
-        raise Refused(
+        raise InvalidFileError(
             f"expected {FORMAT} version {VERSION}, got {found.get('format')} version"
             f" {found.get('version')}"
         )
@@ -403,14 +403,14 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     wanted += tuple(name for name in _OPTIONAL if name in arrays)
     missing = [name for name in wanted if name not in arrays]
     if missing:
-        raise Refused(f"missing keys {missing}")
+        raise InvalidFileError(f"missing keys {missing}")
     check_joints(header["parents"], header["joint_names"])
     skinning, rendering = (
         header["skinning"],
         header.get("rendering", "exact"),
     )  # the first files do not say
     if skinning not in ("affine", "rotation") or rendering not in ("exact", "inria"):
-        raise Refused(
+        raise InvalidFileError(
             f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation',"
             " 'exact' or 'inria'"
         )
@@ -456,7 +456,10 @@ def _face_arrays(face: Face) -> dict[str, np.ndarray]:
 
 
 def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> Face | None:
-    """The face in a file of an avatar; None if it has none. Raises: Refused, naming the key."""
+    """The face in a file of an avatar; None if it has none.
+
+    Raises: InvalidFileError, naming the key.
+    """
     expressions = read_expressions(
         of_face, len(arrays["rest_vertices"]), len(arrays["rest_joints"])
     )
@@ -466,7 +469,7 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
     keys = [f"face_{name}" for name in _FACE] + [f"face_hidden_{name}" for name in _ARRAYS[:5]]
     missing = [key for key in keys if key not in of_face]
     if missing:
-        raise Refused(f"missing keys {missing}")
+        raise InvalidFileError(f"missing keys {missing}")
     # sizes: g Gaussians, q hidden ones, m vertices that expressions move
     g, e = len(arrays["means"]), len(expressions.names)
     q, m = len(np.atleast_1d(of_face["face_hidden_means"])), len(expressions.vertices)
@@ -503,10 +506,13 @@ _RANGES = {"skinning_weights": UNIT, "light_normals": SIGNED_UNIT}
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
-    """Check the arrays of an avatar of j joints, as its file holds them. Raises: Refused."""
+    """Check the arrays of an avatar of j joints, as its file holds them.
+
+    Raises: InvalidFileError.
+    """
     g, n = (len(arrays[name]) for name in ("means", "rest_vertices"))
     if not g or not n:
-        raise Refused(
+        raise InvalidFileError(
             f"{'rest_vertices' if g else 'means'}: expected at least one"
             f" {'vertex' if g else 'Gaussian'}"
         )

@@ -25,7 +25,7 @@ from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import LARGEST
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.io.arrays import check_array, check_indices, read_npz
-from humangs_jax.io.reading import Refused, check_limit, reading
+from humangs_jax.io.reading import InvalidFileError, check_limit, reading
 
 FORMAT = "humangs-face-1"
 STEP = 1e-5
@@ -90,10 +90,10 @@ def read_face(path: str | Path) -> dict[str, np.ndarray]:
     with reading(path, "face file"):
         arrays, _ = read_npz(path)
         if str(arrays.get("format")) != FORMAT:
-            raise Refused(f"expected a file of the format {FORMAT}")
+            raise InvalidFileError(f"expected a file of the format {FORMAT}")
         missing = sorted(set(KEYS) - set(arrays))
         if missing:
-            raise Refused(f"key '{missing[0]}' is missing")
+            raise InvalidFileError(f"key '{missing[0]}' is missing")
         names, count = arrays["names"], len(arrays["vertices"])
         check_indices("counts", arrays["counts"], (len(names),), count + 1)
         check_array("offsets", arrays["offsets"], (3, count), -LARGEST, LARGEST)
@@ -101,7 +101,7 @@ def read_face(path: str | Path) -> dict[str, np.ndarray]:
         check_array("inside_vertices", arrays["inside_vertices"], (None, 3), -LARGEST, LARGEST)
         ends = np.cumsum(arrays["counts"].astype(np.int64))
         if not len(names) or ends[-1] != count:
-            raise Refused(f"counts: expected a sum of {count}, the number of offsets")
+            raise InvalidFileError(f"counts: expected a sum of {count}, the number of offsets")
         steps = arrays["vertices"].astype(np.int64)
         sums = np.cumsum(steps)
         before = np.concatenate([[0], sums[ends[:-1] - 1]])

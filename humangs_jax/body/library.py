@@ -30,7 +30,7 @@ from humangs_jax.io.arrays import (
     read_npz,
     write_npz,
 )
-from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, reading
+from humangs_jax.io.reading import FileError, InvalidFileError, check_limit, open_file, reading
 
 FORMAT = "humangs-body-1"
 DIRECTION_STEP = 1e-5
@@ -129,7 +129,7 @@ def _dense_rows(
     )
     sums = matrix.sum(1, keepdims=True)
     if not (sums > 0).all():
-        raise Refused(f"{rows}_values: expected rows with a sum above 0")
+        raise InvalidFileError(f"{rows}_values: expected rows with a sum above 0")
     return (matrix / sums).astype(np.float32)
 
 
@@ -192,7 +192,7 @@ def read_body(path: str | Path) -> BodyModel:
             raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
         missing = sorted(KEYS - set(arrays))
         if missing:
-            raise Refused(f"key '{missing[0]}' is missing")
+            raise InvalidFileError(f"key '{missing[0]}' is missing")
         # the parts that every body has
         parents = arrays["parents"].tolist()
         joint_names = [str(name) for name in arrays["joint_names"]]
@@ -267,7 +267,7 @@ def read_expressions(
     """The expressions of a body or an avatar with so many vertices and joints; None if its file has
     none.
 
-    Raises: Refused, naming the key.
+    Raises: InvalidFileError, naming the key.
     """
     found = {
         name: arrays[f"{EXPRESSION}{name}"]
@@ -278,7 +278,7 @@ def read_expressions(
         return None
     missing = [name for name in ("vertices", "directions", "names") if name not in found]
     if missing:
-        raise Refused(f"key '{EXPRESSION}{missing[0]}' is missing")
+        raise InvalidFileError(f"key '{EXPRESSION}{missing[0]}' is missing")
     # sizes of everything follow from the vertices and the names
     count, moved = len(np.atleast_1d(found["names"])), len(np.atleast_1d(found["vertices"]))
     shapes = {

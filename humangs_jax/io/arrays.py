@@ -1,8 +1,8 @@
 """Arrays of files: whether they are what they should be, their checksums, and npz archives, read
 without pickle.
 
-Raises: Refused, see `io.reading`; `ArrayFile` knows its file, and every fault is one line with file
-and key.
+Raises: InvalidFileError, see `io.reading`; `ArrayFile` knows its file, and every fault is one line
+with file and key.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from humangs_jax.core.progress import printable
 from humangs_jax.io.atomic import replace_file
 from humangs_jax.io.reading import (
     FileError,
-    Refused,
+    InvalidFileError,
     check_limit,
     check_unpacked,
     open_file,
@@ -115,9 +115,9 @@ def check_array(
     are any size.
     """
     if not _fits(array, shape):
-        raise Refused(f"{name}: expected shape {_in_words(shape)}, got {array.shape}")
+        raise InvalidFileError(f"{name}: expected shape {_in_words(shape)}, got {array.shape}")
     if array.dtype.kind not in "fiu":
-        raise Refused(f"{name}: expected real numbers, got {array.dtype}")
+        raise InvalidFileError(f"{name}: expected real numbers, got {array.dtype}")
     if not array.size:
         return
     least, most = float(array.min()), float(array.max())  # NaN if any entry is
@@ -128,7 +128,7 @@ def check_array(
         words = "finite numbers"
         if math.inf not in (-low, high) or low == 0:
             words = f"numbers in [{low:g}, {high:g}]"
-        raise Refused(f"{name}: expected {words}, got {least:.9g} to {most:.9g}")
+        raise InvalidFileError(f"{name}: expected {words}, got {least:.9g} to {most:.9g}")
 
 
 SUM_TOLERANCE = 1e-2
@@ -142,7 +142,7 @@ def check_row_sums(name: str, weights: np.ndarray) -> None:
         return
     worst = float(sums[np.abs(sums - 1).argmax()])
     if abs(worst - 1) > SUM_TOLERANCE:
-        raise Refused(f"{name}: expected rows with the sum 1, got {worst:.6g}")
+        raise InvalidFileError(f"{name}: expected rows with the sum 1, got {worst:.6g}")
 
 
 def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], bound: int) -> None:
@@ -151,7 +151,7 @@ def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], b
     if array.dtype.kind not in "iu" or (
         array.size and not 0 <= int(array.min()) <= int(array.max()) < bound
     ):
-        raise Refused(f"{name}: expected integers in [0, {bound})")
+        raise InvalidFileError(f"{name}: expected integers in [0, {bound})")
 
 
 def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
@@ -162,18 +162,18 @@ def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
         not all(type(parent) is int and -1 <= parent < count for parent in parents)
         or list(parents).count(-1) != 1
     ):
-        raise Refused(
+        raise InvalidFileError(
             "parents: expected the number of the parent of each joint, -1 for one of them"
         )
     up = np.asarray([*(count if parent == -1 else parent for parent in parents), count])
     for _ in range(count.bit_length()):
         up = up[up]  # twice as far up each time
     if (up != count).any():
-        raise Refused("parents: expected joints that all descend from the root")
+        raise InvalidFileError("parents: expected joints that all descend from the root")
     if len(names) != len(parents) or not all(
         isinstance(name, str) and name == printable(name) for name in names
     ):
-        raise Refused(f"joint_names: expected {len(parents)} printable names")
+        raise InvalidFileError(f"joint_names: expected {len(parents)} printable names")
 
 
 def checksum(arrays: Mapping[str, Any], *texts: str) -> str:
@@ -198,7 +198,7 @@ def file_checksum(file: Path) -> str:
 def check_checksum(recorded: Any, found: str) -> None:
     """Whether a file records this checksum. None: a file of a version that wrote none."""
     if recorded not in (None, found):
-        raise Refused(
+        raise InvalidFileError(
             f"damaged: its contents have the checksum {found[:12]}, recorded is"
             f" {str(recorded)[:12]}"
         )
@@ -317,8 +317,8 @@ def read_npz(
                 with archive.open(info) as member:
                     try:
                         array = _read_array(member, info.file_size)
-                    except Refused as error:
-                        raise Refused(f"{name}: {error}") from error
+                    except InvalidFileError as error:
+                        raise InvalidFileError(f"{name}: {error}") from error
                 if array is None:
                     pickled.append(name)
                 else:
@@ -335,7 +335,7 @@ def read_npy(path: str | Path) -> np.ndarray | None:
 def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
     """A zip archive whose members together stay within the limits.
 
-    Raises: Refused; what zipfile raises for damaged archives.
+    Raises: InvalidFileError; what zipfile raises for damaged archives.
     """
     # the list of members is not read yet
     ending = zipfile._EndRecData(file)  # ty: ignore[missing-attribute]
@@ -345,14 +345,14 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
     archive = zipfile.ZipFile(file)
     members = archive.infolist()
     if len({member.filename for member in members}) < len(members):
-        raise Refused("two members of one name")
+        raise InvalidFileError("two members of one name")
     strange = [
         m.filename
         for m in members
         if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
     ]
     if strange:
-        raise Refused(f"{strange[0]}: compressed by a method that is not read")
+        raise InvalidFileError(f"{strange[0]}: compressed by a method that is not read")
     check_unpacked(size, sum(member.file_size for member in members))
     return archive
 
@@ -360,11 +360,11 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, order (columns first?) and type of an npy array, whose bytes follow in the file.
 
-    Raises: Refused.
+    Raises: InvalidFileError.
     """
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
-        raise Refused(f"version {version} of the npy format is not read")
+        raise InvalidFileError(f"version {version} of the npy format is not read")
     with _ONE_AT_A_TIME:
         return _HEADERS[version](file, max_header_size=LONGEST_HEADER)
 
@@ -378,10 +378,10 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
     if dtype.hasobject:
         return None
     if dtype.kind not in PLAIN_KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):
-        raise Refused(f"expected numbers or strings, got {dtype}")
+        raise InvalidFileError(f"expected numbers or strings, got {dtype}")
     left = size - member.tell()
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != left:
-        raise Refused(f"shape {shape} of {dtype} does not fit its {left:,} bytes")
+        raise InvalidFileError(f"shape {shape} of {dtype} does not fit its {left:,} bytes")
     data = np.empty(left, np.uint8)
     at = 0
     while at < left:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 
 Curve = Callable[[Float[np.ndarray, "*shape"]], Float[np.ndarray, "*shape"]]
 """Levels in [0, 1] -> light, of which 1 is white."""
@@ -281,15 +281,20 @@ class Profile(NamedTuple):
 
 
 def read_profile(data: bytes) -> Profile:
-    """What an ICC profile says. Raises: Refused for one that is damaged, or of no photo."""
+    """What an ICC profile says.
+
+    Raises: InvalidFileError for one that is damaged, or of no photo.
+    """
     # the header: size, signature, kind of device and of colors
     if len(data) > PROFILE_BYTES:
-        raise Refused(f"it has {len(data):,} bytes, expected at most {PROFILE_BYTES:,}")
+        raise InvalidFileError(f"it has {len(data):,} bytes, expected at most {PROFILE_BYTES:,}")
     if len(data) < 132 or data[36:40] != b"acsp" or int.from_bytes(data[:4], "big") > len(data):
-        raise Refused("it is damaged or cut off")
+        raise InvalidFileError("it is damaged or cut off")
     if data[12:16] not in CLASSES or data[16:20] not in SPACES:
         kind = f"{data[12:16]!r} of {data[16:20]!r}"
-        raise Refused(f"it is of the kind {kind}, expected one of a photo in RGB, grey or CMYK")
+        raise InvalidFileError(
+            f"it is of the kind {kind}, expected one of a photo in RGB, grey or CMYK"
+        )
     # its curves, if colors are not given by tables alone
     space = SPACES[data[16:20]]
     try:
@@ -303,12 +308,12 @@ def read_profile(data: bytes) -> Profile:
                 encoding = _of_colors(tags)
             steps = np.linspace(0, 1, 256)
             if not all(np.isfinite(curve(steps)).all() for curve in encoding.curves):
-                raise Refused("its curves are no numbers")
+                raise InvalidFileError("its curves are no numbers")
     except (LookupError, struct.error, OverflowError, ValueError) as error:
         why = "it is damaged"
-        if isinstance(error, Refused):
+        if isinstance(error, InvalidFileError):
             why = str(error)
-        raise Refused(why) from error
+        raise InvalidFileError(why) from error
     return Profile(space, encoding._replace(curves=tuple(map(_within_white, encoding.curves))))
 
 
@@ -327,7 +332,7 @@ def _within_white(curve: Curve) -> Curve:
 def _tags(data: bytes) -> dict[bytes, bytes]:
     count = int.from_bytes(data[128:132], "big")
     if count > MOST_TAGS:
-        raise Refused(f"it has {count:,} parts, expected at most {MOST_TAGS}")
+        raise InvalidFileError(f"it has {count:,} parts, expected at most {MOST_TAGS}")
     entries = [struct.unpack_from(">4sII", data, 132 + 12 * i) for i in range(count)]
     return {name: data[at : at + size] for name, at, size in entries}
 
@@ -340,7 +345,7 @@ def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
     columns = [struct.unpack_from(">3i", tags[name + b"XYZ"], 8) for name in (b"r", b"g", b"b")]
     to_xyz = np.asarray(columns, float).T / 65536
     if np.abs(to_xyz.sum(axis=1) - _xyz(D50)).max() > WHITE_SLACK:
-        raise Refused("its primaries do not make white")
+        raise InvalidFileError("its primaries do not make white")
     return Encoding(
         tuple(_curve(tags[name + b"TRC"]) for name in (b"r", b"g", b"b")), FROM_XYZ @ to_xyz
     )
@@ -355,12 +360,12 @@ def _curve(tag: bytes) -> Curve:
         count = int.from_bytes(tag[8:12], "big")
         table = np.frombuffer(tag[12 : 12 + 2 * count], ">u2")
         if len(table) != count:
-            raise Refused("it has a curve that is cut off")
+            raise InvalidFileError("it has a curve that is cut off")
         if count < 2:
             return _power(float(table[0]) / 256 if count else 1.0)
         return lambda levels: np.interp(levels, np.linspace(0, 1, count), table / 65535)
     if tag[:4] != b"para":
-        raise Refused("it has a curve of an unknown kind")
+        raise InvalidFileError("it has a curve of an unknown kind")
     # "para": later kinds have more of the numbers; those that a kind lacks are neutral
     kind = int.from_bytes(tag[8:10], "big")
     g, *rest = (each / 65536 for each in struct.unpack_from(f">{(1, 3, 4, 5, 7)[kind]}i", tag, 12))
@@ -384,7 +389,7 @@ def _curve(tag: bytes) -> Curve:
 def by_tables(image: Any, profile: bytes) -> Any:
     """A PIL.Image in sRGB, of one whose profile is tables.
 
-    Raises: Refused for one that cannot be used.
+    Raises: InvalidFileError for one that cannot be used.
     """
     from PIL import ImageCms
 
@@ -398,4 +403,4 @@ def by_tables(image: Any, profile: bytes) -> Any:
             image, source, target, intent, outputMode="RGB", flags=flags
         )
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
-        raise Refused("it is damaged, or not for this photo") from error
+        raise InvalidFileError("it is damaged, or not for this photo") from error

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 
 HEIC_BRANDS = frozenset((b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"))
 """Of the box `ftyp` that such a file begins with (ISO/IEC 23008-12)."""
@@ -73,7 +73,7 @@ def is_webp(data: bytes) -> bool:
 
 def webp_size(data: bytes) -> tuple[int, int]:
     """Width and height of the canvas of a WebP, for which Pillow takes memory as soon as it opens
-    one. Raises: Refused.
+    one. Raises: InvalidFileError.
     """
     kind, body = data[12:16], data[20:30]
     if len(body) == 10 and kind == b"VP8X":
@@ -85,7 +85,7 @@ def webp_size(data: bytes) -> tuple[int, int]:
         return int.from_bytes(body[6:8], "little") & 0x3FFF, int.from_bytes(
             body[8:10], "little"
         ) & 0x3FFF
-    raise Refused("not a readable image: a WebP without a picture")
+    raise InvalidFileError("not a readable image: a WebP without a picture")
 
 
 def iso_kind(data: bytes) -> str | None:
@@ -144,9 +144,13 @@ def check_png_chunks(data: bytes) -> None:
         at += 12 + length
     missing = {b"IDAT", b"IEND"} - names
     if missing:
-        raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
+        raise InvalidFileError(
+            f"not a readable image: cut off, without the chunk {min(missing).decode()}"
+        )
     if data[25] == PALETTE and b"PLTE" not in names:
-        raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")
+        raise InvalidFileError(
+            "not a readable image: its pixels are numbers of a palette, and it has none"
+        )
 
 
 def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:

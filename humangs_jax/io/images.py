@@ -45,7 +45,7 @@ from humangs_jax.io.image_headers import (
     png_chunks,
     webp_size,
 )
-from humangs_jax.io.reading import Refused, check_limit, open_file, read_bytes, reading
+from humangs_jax.io.reading import InvalidFileError, check_limit, open_file, read_bytes, reading
 
 logger = logging.getLogger(__name__)
 
@@ -154,7 +154,7 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
         count = np.count_nonzero(np.unique(codes))
         if count != 1 or codes.all():
             black = " without black" if codes.all() else ""
-            raise Refused(
+            raise InvalidFileError(
                 f"{count} colors{black}: which is the person? expected one on black, or {GREY_MASK}"
             )
         return (codes > 0).astype(np.float32)
@@ -186,7 +186,7 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
     which = "0 is not black: which is the background"
     if background is not None:
         which = "which is the person"
-    raise Refused(
+    raise InvalidFileError(
         f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or"
         f" {GREY_MASK}"
     )
@@ -197,7 +197,7 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     flat = not len(shown) or np.ptp(shown, axis=0).max() <= GREY_SLACK
     if flat or not _is_grey(shown) or np.abs(shown[:, 0] - alpha[alpha > 0]).max() <= GREY_SLACK:
         return alpha
-    raise Refused(
+    raise InvalidFileError(
         "the image has an alpha channel besides its greys: which is the mask? expected one of them"
     )
 
@@ -436,21 +436,21 @@ def is_heic(path: str | Path) -> bool:
 def _formats(data: bytes) -> tuple[str, ...]:
     """The formats of Pillow, which knows them from now on, that a file with these bytes may have.
 
-    Raises: Refused.
+    Raises: InvalidFileError.
     """
     kind = iso_kind(data)
     if kind == "HEIF":
         try:
             importlib.import_module("pi_heif").register_heif_opener()
         except ImportError:
-            raise Refused(
+            raise InvalidFileError(
                 'a HEIC photo: expected PNG or JPEG, or pip install "humangs_jax[heic]"'
             ) from None
     elif kind == "AVIF":
         from PIL import features
 
         if not features.check("avif"):
-            raise Refused(
+            raise InvalidFileError(
                 "an AVIF photo, which this Pillow cannot read: expected PNG or JPEG, or pip install"
                 " -U Pillow"
             )
@@ -463,7 +463,7 @@ def _formats(data: bytes) -> tuple[str, ...]:
 def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
     """As `open_image`, of bytes in one of these formats of Pillow.
 
-    Raises: Refused; what Pillow raises for damaged images, which is of many types.
+    Raises: InvalidFileError; what Pillow raises for damaged images, which is of many types.
     """
     from PIL import Image
 
@@ -550,7 +550,7 @@ def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
     the lower ones, too.
     """
     if data[26:28] != b"\0\0" or data[28] > 1:
-        raise Refused("not a readable image: a PNG header with unknown methods")
+        raise InvalidFileError("not a readable image: a PNG header with unknown methods")
     if data[25] == GREY_AND_ALPHA:
         both = _decoded(data, "RGBA")  # the four bytes of a pixel
         return both[..., 0::2] << 8 | both[..., 1::2]
@@ -580,11 +580,11 @@ def _colors_in_srgb(
         if encoding is None and profile:
             found = read_profile(profile)
             if found.space not in PROFILE_OF_MODE.get(image.mode, ("colors", "greys")):
-                raise Refused(f"it is one of {found.space}, and the photo is none")
+                raise InvalidFileError(f"it is one of {found.space}, and the photo is none")
             if found.encoding is None:
                 return _by_tables(image, profile, own, most)
             encoding = found.encoding
-    except Refused as error:
+    except InvalidFileError as error:
         _tell(f"{path}: its color profile is not used: {error}")
         return None
     if encoding is None or is_srgb(encoding):
@@ -631,7 +631,7 @@ def _by_tables(
     from PIL import Image
 
     if levels.shape[-1] == 1:
-        raise Refused("it is tables, and the photo is grey")
+        raise InvalidFileError("it is tables, and the photo is grey")
     stored = levels
     if most > 255:
         stored = (levels >> 8).astype(np.uint8)

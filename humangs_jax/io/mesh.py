@@ -22,7 +22,7 @@ from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import (
     FileError,
-    Refused,
+    InvalidFileError,
     check_limit,
     check_unpacked,
     inside,
@@ -53,12 +53,12 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
     """The JSON of a GLB file and the bytes that it describes.
 
     Arguments: limit: of the JSON. By default that of files that nobody needs to be long.
-    Raises: Refused, KeyError, TypeError, ... for sizes that do not fit the file or are more than
-    the limits allow.
+    Raises: InvalidFileError, KeyError, TypeError, ... for sizes that do not fit the file or are
+    more than the limits allow.
     """
     start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
     if start != GLB_START or kind != JSON_CHUNK:
-        raise Refused("not a mesh or skeleton that can be read: no GLB file")
+        raise InvalidFileError("not a mesh or skeleton that can be read: no GLB file")
     check_limit(limit, length, "bytes of JSON in a GLB")
     content = parse_json(data[20 : 20 + length].decode())
     binary = b""
@@ -66,29 +66,31 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
         size, kind = struct.unpack_from("<II", data, 20 + length)
         binary = data[28 + length : 28 + length + size]
         if kind != BINARY_CHUNK or len(data) - (28 + length + size) not in range(8):
-            raise Refused("a GLB file with other chunks than JSON and one of numbers")
+            raise InvalidFileError("a GLB file with other chunks than JSON and one of numbers")
     if any("uri" in buffer for buffer in content.get("buffers", [])):
-        raise Refused("numbers in another file: expected a GLB file that holds all of its numbers")
+        raise InvalidFileError(
+            "numbers in another file: expected a GLB file that holds all of its numbers"
+        )
     accessors = content.get("accessors", [])
     check_unpacked(len(data), sum(count_of(accessor) * _width(accessor) for accessor in accessors))
     return content, binary
 
 
 def view_of(view: dict[str, Any], binary: bytes) -> bytes:
-    """The bytes that a view of the buffer names. Raises: Refused."""
+    """The bytes that a view of the buffer names. Raises: InvalidFileError."""
     start, size, step = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 1)
     if not all(type(n) is int and n >= 0 for n in (start, size)) or start + size > len(binary):
-        raise Refused(f"{size} bytes from {start}, but there are {len(binary)}")
+        raise InvalidFileError(f"{size} bytes from {start}, but there are {len(binary)}")
     if view["buffer"] != 0 or type(step) is not int or step < 1:
-        raise Refused("a view of numbers that are not in this file, or without a step")
+        raise InvalidFileError("a view of numbers that are not in this file, or without a step")
     return binary[start : start + size]
 
 
 def count_of(accessor: dict[str, Any]) -> int:
-    """How many elements an accessor says that it has. Raises: Refused."""
+    """How many elements an accessor says that it has. Raises: InvalidFileError."""
     count, start = accessor["count"], accessor.get("byteOffset", 0)
     if not all(type(n) is int and n >= 0 for n in (count, start)):
-        raise Refused(f"{shown(count)} numbers from {shown(start)}")
+        raise InvalidFileError(f"{shown(count)} numbers from {shown(start)}")
     return count
 
 
@@ -96,18 +98,18 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
     """The array (count, columns) of an accessor; integers that stand for numbers up to 1 are
     converted.
 
-    Raises: Refused, KeyError, TypeError, ... for what does not fit the file.
+    Raises: InvalidFileError, KeyError, TypeError, ... for what does not fit the file.
     """
     accessor = content["accessors"][_index(index)]
     if "sparse" in accessor or "bufferView" not in accessor:
-        raise Refused("numbers that are mostly zeros (sparse): expected all of them")
+        raise InvalidFileError("numbers that are mostly zeros (sparse): expected all of them")
     view = content["bufferViews"][_index(accessor["bufferView"])]
     data, columns = view_of(view, binary), COLUMNS[accessor["type"]]
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
     count, start, width = count_of(accessor), accessor.get("byteOffset", 0), _width(accessor)
     step = view.get("byteStride", width)
     if step < width or (count and start + (count - 1) * step + width > len(data)):
-        raise Refused(
+        raise InvalidFileError(
             f"{count} elements of {width} bytes from {start}, but there are {len(data)} bytes"
         )
     array = np.ndarray((count, columns), dtype, data, start, (step, dtype.itemsize)).astype(
@@ -121,7 +123,7 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
 def _index(value: Any) -> int:
     """An index as JSON should have it: Python would count negative ones from the end."""
     if type(value) is not int or value < 0:
-        raise Refused(f"{shown(value)} is no index")
+        raise InvalidFileError(f"{shown(value)} is no index")
     return value
 
 
@@ -228,7 +230,9 @@ def read_obj(path: str | Path) -> list[Any]:
     path = Path(path)
     with reading(path, "mesh"):
         if path.suffix.lower() != ".obj":
-            raise Refused(f"not a mesh that can be read: expected .obj, got {path.suffix!r}")
+            raise InvalidFileError(
+                f"not a mesh that can be read: expected .obj, got {path.suffix!r}"
+            )
         data, resolver = read_bytes(path, "mesh_bytes"), _Folder(path.parent)
         # text of other encodings would be guessed at for a long time
         stream = io.StringIO(_grouped(data.decode("utf-8", "replace")))
@@ -252,16 +256,16 @@ def read_obj(path: str | Path) -> list[Any]:
             part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)
         ]
         if not parts:
-            raise Refused("no triangles: expected the surface of a scan")
+            raise InvalidFileError("no triangles: expected the surface of a scan")
         for part in parts:
             if part.vertices.shape[1:] != (3,) or part.faces.shape[1:] != (3,):
-                raise Refused(
+                raise InvalidFileError(
                     f"vertices {part.vertices.shape}, faces {part.faces.shape}: expected three"
                     " numbers for each"
                 )
             low, high = int(part.faces.min()), int(part.faces.max())
             if low < 0 or high >= len(part.vertices):
-                raise Refused(
+                raise InvalidFileError(
                     f"a face has the corner {low if low < 0 else high}, but there are"
                     f" {len(part.vertices)}"
                 )
@@ -331,7 +335,7 @@ class _Folder:
 
     def _content(self, key: str) -> bytes:
         if not key:
-            raise Refused("has no name")
+            raise InvalidFileError("has no name")
         file = inside(self.folder, key)
         with reading(file, "texture"):
             if file.suffix.lower() == ".mtl":

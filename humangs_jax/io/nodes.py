@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.io.reading import Refused, shown
+from humangs_jax.io.reading import InvalidFileError, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 """What a track of an animation moves, and how many numbers a key has."""
@@ -24,12 +24,12 @@ Tracks = dict[tuple[int, str], Track]
 
 
 def node_parents(nodes: Nodes) -> list[int]:
-    """Parent of each node, -1 for roots. Raises: Refused for a node with two parents."""
+    """Parent of each node, -1 for roots. Raises: InvalidFileError for a node with two parents."""
     parents = [-1] * len(nodes)
     for i, node in enumerate(nodes):
         for child in node.get("children", []):
             if type(child) is not int or not 0 <= child < len(nodes) or parents[child] != -1:
-                raise Refused(f"nodes: {shown(child)} is no node, or has two parents")
+                raise InvalidFileError(f"nodes: {shown(child)} is no node, or has two parents")
             parents[child] = i
     return parents
 
@@ -37,7 +37,7 @@ def node_parents(nodes: Nodes) -> list[int]:
 def with_ancestors(joints: Iterable[int], parents: Sequence[int]) -> list[int]:
     """Joints and the nodes above them, parents first.
 
-    Raises: Refused for nodes that are above themselves.
+    Raises: InvalidFileError for nodes that are above themselves.
     """
     order: list[int] = []
     placed: set[int] = set()
@@ -45,7 +45,7 @@ def with_ancestors(joints: Iterable[int], parents: Sequence[int]) -> list[int]:
         path: list[int] = []
         while joint != -1 and joint not in placed:
             if len(path) > len(parents):
-                raise Refused("nodes: one lies below itself")
+                raise InvalidFileError("nodes: one lies below itself")
             path.append(joint)
             joint = parents[joint]
         order += reversed(path)
@@ -75,7 +75,7 @@ def world_matrices(
 def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
     """Where the nodes of a GLB file lie when nothing moves.
 
-    Raises: Refused; what damaged numbers raise.
+    Raises: InvalidFileError; what damaged numbers raise.
     """
     parents = node_parents(nodes)
     world = world_matrices(
@@ -123,4 +123,4 @@ def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[n
 
 def check_finite(values: Float[np.ndarray, "..."], what: str) -> None:
     if not np.isfinite(values).all():
-        raise Refused(f"{what}: expected finite numbers")
+        raise InvalidFileError(f"{what}: expected finite numbers")

@@ -7,8 +7,8 @@ Readers open files through `open_file` or `read_bytes` and work inside `reading`
         ...
 
 Whatever is raised in there becomes one `FileError` line that names the file: `me.npz: not a
-readable npz archive: ...`. A helper that does not know the file raises `Refused`, whose text
-follows the name of the file as it is.
+readable npz archive: ...`. A helper that does not know the file raises `InvalidFileError`, whose
+text follows the name of the file as it is.
 """
 
 import contextlib
@@ -214,7 +214,7 @@ def is_unread(error: BaseException) -> bool:
     return isinstance(error.__cause__, PermissionError)
 
 
-class Refused(ValueError):
+class InvalidFileError(ValueError):
     """Says what is wrong with the file that is being read; raised by functions that do not know its
     name.
     """
@@ -239,7 +239,7 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
         raise (
             FileNotFoundError(missing) if raises is FileError else raises("", "", missing)
         ) from error
-    except Refused as error:
+    except InvalidFileError as error:
         raise raises(path, "", error) from error
     except PermissionError as error:
         raise raises(error.filename or path, "", "no permission to read it") from error
@@ -269,7 +269,7 @@ def _why(kind: str, error: Exception) -> str:
 
 
 def check_limit(name: str, amount: float | int, unit: str) -> None:
-    """Raises: Refused, naming the limit and how it is raised, if that much is more than it
+    """Raises: InvalidFileError, naming the limit and how it is raised, if that much is more than it
     allows.
     """
     most = getattr(limits(), name)
@@ -278,7 +278,9 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
         if amount <= LARGEST_AMOUNT:
             raised = f"{ENVIRONMENT}={name}={math.ceil(amount)} raises it; "
             found = f"{math.ceil(amount):,}"
-        raise Refused(f"{found} {unit}: the limit {name} is {most:,} ({raised}docs/security.md)")
+        raise InvalidFileError(
+            f"{found} {unit}: the limit {name} is {most:,} ({raised}docs/security.md)"
+        )
 
 
 # Opening
@@ -288,13 +290,13 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
 def open_file(path: str | os.PathLike[str], limit: str = "file_bytes") -> BinaryIO:
     """Open a file whose size is within a limit. No devices and no pipes: these have no end.
 
-    Raises: OSError; Refused.
+    Raises: OSError; InvalidFileError.
     """
     status = os.stat(path)
     if stat.S_ISDIR(status.st_mode):
-        raise Refused("is a folder: expected a file")
+        raise InvalidFileError("is a folder: expected a file")
     if not stat.S_ISREG(status.st_mode):
-        raise Refused("is no regular file")
+        raise InvalidFileError("is no regular file")
     check_limit(limit, status.st_size, "bytes")
     return open(path, "rb")
 
@@ -313,7 +315,7 @@ def walk(
 
     Each folder is looked at once, however many links lead to it. Links that lead out are not
     followed, unless the limit `photos_outside` allows it; the first of them is logged. Raises:
-    Refused beyond the limit `entries`; OSError.
+    InvalidFileError beyond the limit `entries`; OSError.
     """
     # what links lead to comes last: a folder is found at its proper place
     seen: set[tuple[int, int]] = set()
@@ -353,11 +355,11 @@ def visible(paths: Iterable[Path]) -> list[Path]:
 
 
 def check_unpacked(size: int, unpacked: int) -> None:
-    """Raises: Refused if a file of `size` bytes must not become that much in memory."""
+    """Raises: InvalidFileError if a file of `size` bytes must not become that much in memory."""
     most = limits()
     check_limit("array_bytes", unpacked, "bytes unpacked")
     if unpacked > max(most.plain_bytes, most.ratio * size):
-        raise Refused(
+        raise InvalidFileError(
             f"{size:,} bytes unpack to {unpacked:,}: the limits plain_bytes {most.plain_bytes:,}"
             f" and ratio {most.ratio} (docs/security.md)"
         )
@@ -369,11 +371,11 @@ def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Pa
 
     Arguments: photo: it is one of a photo or mask, which the limit `photos_outside` lets lie
     elsewhere.
-    Raises: Refused.
+    Raises: InvalidFileError.
     """
     path = Path(folder) / name
     if CONTROL.search(str(name)):  # it would be several lines, or none, in a report
-        raise Refused(f"{name!r} is no path: expected one without control characters")
+        raise InvalidFileError(f"{name!r} is no path: expected one without control characters")
     if photo and limits().photos_outside:
         return path
     try:
@@ -383,10 +385,12 @@ def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Pa
         ValueError,
         RuntimeError,
     ) as error:  # too long, a null character, a loop of links
-        raise Refused(f"{name!r} is no path: {error}") from error
+        raise InvalidFileError(f"{name!r} is no path: {error}") from error
     if not contained:
         how = f" ({OUTSIDE})" if photo else ""
-        raise Refused(f"{name!r} lies outside of {folder}: expected a path in that folder{how}")
+        raise InvalidFileError(
+            f"{name!r} lies outside of {folder}: expected a path in that folder{how}"
+        )
     return path
 
 
@@ -405,29 +409,29 @@ def read_text(path: str | os.PathLike[str], limit: str = "text_bytes") -> str:
 def parse_json(text: str) -> Any:
     """The value of a JSON text; NaN and Infinity, which Python's tools write, are accepted.
 
-    Raises: Refused (a ValueError) naming the line.
+    Raises: InvalidFileError (a ValueError) naming the line.
     """
     try:
         value = json.loads(text)
     except json.JSONDecodeError as error:
-        raise Refused(f"line {error.lineno}: not valid JSON: {error.msg}") from error
+        raise InvalidFileError(f"line {error.lineno}: not valid JSON: {error.msg}") from error
     except RecursionError as error:
-        raise Refused("not usable JSON: nested too deeply") from error
+        raise InvalidFileError("not usable JSON: nested too deeply") from error
     except ValueError as error:  # an integer of thousands of digits
-        raise Refused(f"not usable JSON: {error}") from error
+        raise InvalidFileError(f"not usable JSON: {error}") from error
     check_nesting(value)
     return value
 
 
 def check_nesting(value: Any) -> None:
-    """Raises: Refused if lists and dicts contain each other more than `nesting` times."""
+    """Raises: InvalidFileError if lists and dicts contain each other more than `nesting` times."""
     level = [[value]]
     for _ in range(limits().nesting + 1):
         contents = (each.values() if isinstance(each, dict) else each for each in level)
         level = [item for items in contents for item in items if isinstance(item, list | dict)]
         if not level:
             return
-    raise Refused(
+    raise InvalidFileError(
         f"not usable: nested too deeply, the limit nesting is {limits().nesting} (docs/security.md)"
     )
 
@@ -441,7 +445,7 @@ def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
         try:
             return config_from_json(cls, read_text(path))
         except ValueError as error:
-            raise Refused(str(error)) from error
+            raise InvalidFileError(str(error)) from error
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from humangs_jax.io.reading import Refused, check_limit, limits, read_bytes, reading
+from humangs_jax.io.reading import InvalidFileError, check_limit, limits, read_bytes, reading
 
 REFUSED = {
     *("EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEWOBJ_EX", "DUP"),
@@ -70,7 +70,7 @@ class _Looked:
     def array_bytes(self, count: int) -> bytes:
         """The bytes of an array between two instructions."""
         if self.file.tell() != self.seen:
-            raise Refused("the bytes of an array within a frame of instructions")
+            raise InvalidFileError("the bytes of an array within a frame of instructions")
         data = self.file.read(count)
         self.seen = self.file.tell()
         return data
@@ -78,7 +78,8 @@ class _Looked:
     def look(self) -> None:
         """Looks at the instructions behind those that have been seen.
 
-        Raises: Refused; ValueError, from `pickletools`, for what is no instruction or is cut off.
+        Raises: InvalidFileError; ValueError, from `pickletools`, for what is no instruction or is
+        cut off.
         """
         here = self.file.tell()
         self.file.seek(self.seen)
@@ -87,13 +88,15 @@ class _Looked:
             if self.count > self.most:
                 check_limit("opcodes", self.count, "instructions of a pickle")
             if opcode.name in REFUSED:
-                raise Refused(f"refused the instruction {opcode.name} of a pickle")
+                raise InvalidFileError(f"refused the instruction {opcode.name} of a pickle")
             if type(argument) is int and abs(argument) >= LARGEST_INTEGER:
-                raise Refused("refused an integer of more than 64 bits")
+                raise InvalidFileError("refused an integer of more than 64 bits")
             # the unpickler reads a frame at once, and what crosses its end in another way than here
             within, end = (start or 0) < self.frame_end, self.file.tell()
             if within and (end > self.frame_end or opcode.name == "FRAME"):
-                raise Refused("refused a frame of instructions that ends within one, or holds one")
+                raise InvalidFileError(
+                    "refused a frame of instructions that ends within one, or holds one"
+                )
             if opcode.name == "FRAME":
                 self.frame_end = end + argument
             self.follow(opcode, argument)
@@ -111,7 +114,7 @@ class _Looked:
                 index = len(self.memo)
             # the unpickler makes a list with a place for each index: there is none without a value
             if not 0 <= index <= self.count or not stack:
-                raise Refused("refused an index of the memo that is beyond its values")
+                raise InvalidFileError("refused an index of the memo that is beyond its values")
             self.memo[index] = stack[-1] or 0
             return
         if name in ("GET", "BINGET", "LONG_BINGET"):
@@ -136,13 +139,17 @@ class _Looked:
         count = len(before) if below is None else below
         taken = stack[len(stack) - count :] if count else []
         if len(taken) < count:
-            raise Refused("refused an instruction that takes more from the stack than there is")
+            raise InvalidFileError(
+                "refused an instruction that takes more from the stack than there is"
+            )
         if count:
             del stack[len(stack) - count :]
 
         keys = {"SETITEM": taken[1:2], "SETITEMS": items[::2], "DICT": items[::2]}.get(name, ())
         if any(key is None or key > LARGEST_KEY for key in keys):
-            raise Refused("a dict with keys other than strings, numbers and short tuples of these")
+            raise InvalidFileError(
+                "a dict with keys other than strings, numbers and short tuples of these"
+            )
         if opcode.stack_after:
             made = 1 + sum(part or 0 for part in taken) + sum(part or 0 for part in items)
             stack.append(None if name == "MARK" else min(made, COUNTED))
@@ -217,7 +224,7 @@ class RestrictedUnpickler(pickle.Unpickler):
             key = "scipy.sparse", name
         if key not in self.names:
             module = "builtins" if module == "__builtin__" else module  # its name in protocol 2
-            raise Refused(f"refused to load {module}.{name}: {self.purpose}")
+            raise InvalidFileError(f"refused to load {module}.{name}: {self.purpose}")
         found = self.names[key]
         # its state is followed by bytes of this file
         if found is _Joblib:
@@ -226,7 +233,7 @@ class RestrictedUnpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> Any:
         """Torch's storages; nothing else has any."""
-        raise Refused("refused to load a persistent object")
+        raise InvalidFileError("refused to load a persistent object")
 
 
 # Arrays
@@ -324,7 +331,7 @@ class _Joblib(_Array):
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, dict):
-            raise Refused("an array of joblib without a description")
+            raise InvalidFileError("an array of joblib without a description")
         shape, dtype = state.get("shape"), state.get("dtype")
         plain = dtype.dtype if isinstance(dtype, _Dtype) else None
         if (
@@ -332,7 +339,7 @@ class _Joblib(_Array):
             or type(shape) is not tuple
             or not all(type(n) is int and n >= 0 for n in shape)
         ):
-            raise Refused("an array of joblib that is not of numbers")
+            raise InvalidFileError("an array of joblib that is not of numbers")
         if state.get("numpy_array_alignment_bytes") is not None:
             self.looked.array_bytes(self.looked.array_bytes(1)[0])
         size = math.prod(shape) * plain.itemsize
@@ -342,7 +349,7 @@ class _Joblib(_Array):
 
 def _encode(text: Any = "", encoding: Any = "latin1", *_: Any) -> str:
     if type(text) is not str or encoding not in ("latin1", "latin-1"):
-        raise Refused("refused to encode anything but latin1")
+        raise InvalidFileError("refused to encode anything but latin1")
     return text  # stands for its bytes, and takes no further memory: `_Array` encodes it
 
 
@@ -463,7 +470,7 @@ NAMES: dict[tuple[str, str], Any] = {
 
 def _instance(cls: Any) -> StandIn:
     if not isinstance(cls, type) or not issubclass(cls, StandIn):
-        raise Refused("refused to make an object of another class")
+        raise InvalidFileError("refused to make an object of another class")
     return cls()
 
 
@@ -497,7 +504,7 @@ def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarra
         and array.size
         and np.ascontiguousarray(array).reshape(-1).view(np.uint32).max() > 0x10FFFF
     ):
-        raise Refused("strings with characters that do not exist")
+        raise InvalidFileError("strings with characters that do not exist")
     return array
 
 
@@ -555,5 +562,7 @@ def read_pickle(path: str | Path) -> dict[str, Any]:
         data = io.BytesIO(read_bytes(path, "array_bytes"))
         content = RestrictedUnpickler(data, NAMES, "it is not needed to hold arrays").load()
         if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-            raise Refused(f"expected a dict of arrays by name, got {type(content).__name__}")
+            raise InvalidFileError(
+                f"expected a dict of arrays by name, got {type(content).__name__}"
+            )
         return content

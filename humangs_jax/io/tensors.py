@@ -27,7 +27,7 @@ import numpy as np
 
 from humangs_jax.io.arrays import open_archive, read_header
 from humangs_jax.io.reading import (
-    Refused,
+    InvalidFileError,
     check_limit,
     check_unpacked,
     limits,
@@ -109,16 +109,18 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
     def to_array(self) -> np.ndarray:
-        """Its numbers, bounds checked. bfloat16 becomes float32. Raises: Refused."""
+        """Its numbers, bounds checked. bfloat16 becomes float32. Raises: InvalidFileError."""
         (kind, name, _, read), offset, shape, strides = self
         try:
             data = np.frombuffer(read(name), STORAGE_DTYPES[kind])
         except Exception as error:  # zipfile raises some eight types
-            raise Refused(f"storage {name} is missing or damaged: {error}") from error
+            raise InvalidFileError(f"storage {name} is missing or damaged: {error}") from error
         last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
         count = math.prod(shape)  # views of parameters never repeat numbers: a larger one is a bomb
         if count > len(data) or (count and last >= len(data)):
-            raise Refused(f"shape {shape} does not fit storage {name} of {len(data)} numbers")
+            raise InvalidFileError(
+                f"shape {shape} does not fit storage {name} of {len(data)} numbers"
+            )
         if not count:
             return np.zeros(shape, data.dtype)
         steps = tuple(stride * data.itemsize for stride in strides)
@@ -137,22 +139,24 @@ def _rebuild_tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any
     if not (
         isinstance(storage, _Storage) and _counts((offset,)) and _counts(shape) and _counts(strides)
     ):
-        raise Refused("a tensor without a storage, or whose offset, shape or strides are no counts")
+        raise InvalidFileError(
+            "a tensor without a storage, or whose offset, shape or strides are no counts"
+        )
     if len(shape) != len(strides) or len(shape) > MOST_AXES:
-        raise Refused(f"a tensor with {len(shape)} axes and {len(strides)} strides")
+        raise InvalidFileError(f"a tensor with {len(shape)} axes and {len(strides)} strides")
     return _Tensor(storage, offset, shape, strides)
 
 
 def _rebuild_parameter(tensor: Any, *_: Any) -> _Tensor:
     if not isinstance(tensor, _Tensor):
-        raise Refused("a parameter that is no tensor")
+        raise InvalidFileError("a parameter that is no tensor")
     return tensor
 
 
 def _ordered_dict(*arguments: Any) -> PlainDict:
     """An empty one: its items follow."""
     if arguments:
-        raise Refused("an ordered dict that is made of something")
+        raise InvalidFileError("an ordered dict that is made of something")
     return PlainDict()
 
 
@@ -163,17 +167,19 @@ def _storage_of_bytes(data: bytes) -> _Storage:
     count of its numbers, and these.
     """
     if data[2:15] != STREAM_START:
-        raise Refused("a storage that is not a stream of torch")
+        raise InvalidFileError("a storage that is not a stream of torch")
     file = io.BytesIO(data)
     file.seek(2 + len(STREAM_START))
     _, machine, storage = (_TorchUnpickler(file).load() for _ in range(3))
     if not (isinstance(machine, dict) and machine.get("little_endian") is True):
-        raise Refused("only little-endian checkpoints are supported")
+        raise InvalidFileError("only little-endian checkpoints are supported")
     if not isinstance(storage, _Storage) or not _counts((storage.count,)):
-        raise Refused("a storage of a tensor that is none")
+        raise InvalidFileError("a storage of a tensor that is none")
     size = storage.count * STORAGE_DTYPES[storage.kind].itemsize
     if size > len(data) - file.tell():
-        raise Refused(f"a storage of {storage.count} numbers does not fit its bytes: truncated?")
+        raise InvalidFileError(
+            f"a storage of {storage.count} numbers does not fit its bytes: truncated?"
+        )
     numbers = memoryview(data)[len(data) - size :]
     return storage._replace(read=lambda name: numbers)
 
@@ -205,12 +211,12 @@ class _TorchUnpickler(RestrictedUnpickler):
         """A storage."""
         known = type(pid) is tuple and len(pid) in (5, 6) and pid[0] == "storage"
         if not (known and isinstance(pid[1], _StorageType) and isinstance(pid[2], str)):
-            raise Refused("refused to load a persistent object that is no storage")
+            raise InvalidFileError("refused to load a persistent object that is no storage")
         # streams add what part of another storage this one is, which torch has not had since 0.4
         if pid[5:] not in ((), (None,)):
-            raise Refused("a storage that is a part of another one")
+            raise InvalidFileError("a storage that is a part of another one")
         if self.kinds.setdefault(pid[2], pid[1].name) != pid[1].name:
-            raise Refused(f"storage {pid[2]} is of two types")
+            raise InvalidFileError(f"storage {pid[2]} is of two types")
         return _Storage(pid[1].name, pid[2], pid[4], self.read_storage)
 
 
@@ -221,14 +227,16 @@ class _TorchUnpickler(RestrictedUnpickler):
 def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
     """What the pickle in an archive holds; its tensors are read as long as the archive is open."""
     if sum(member.file_size for member in archive.infolist()) > LARGEST_RATIO * size:
-        raise Refused(f"its members unpack to more than {LARGEST_RATIO} times the size of the file")
+        raise InvalidFileError(
+            f"its members unpack to more than {LARGEST_RATIO} times the size of the file"
+        )
     members = set(archive.namelist())
     pickles = [name for name in members if name.count("/") == 1 and name.endswith("/data.pkl")]
     if len(pickles) != 1:
-        raise Refused(f"expected one <name>/data.pkl inside, found {len(pickles)}")
+        raise InvalidFileError(f"expected one <name>/data.pkl inside, found {len(pickles)}")
     root = pickles[0].removesuffix("data.pkl")
     if f"{root}byteorder" in members and archive.read(f"{root}byteorder").strip() != b"little":
-        raise Refused("only little-endian checkpoints are supported")
+        raise InvalidFileError("only little-endian checkpoints are supported")
     check_limit("text_bytes", archive.getinfo(pickles[0]).file_size, "bytes of a pickle")
 
     def read(name):
@@ -257,19 +265,19 @@ def read_torch_file(
 
 def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
     """All tensors of a dict that lies under one of the keys, in the bytes of a file of
-    `torch.save`. Raises: Refused.
+    `torch.save`. Raises: InvalidFileError.
     """
     return _tensors_of(io.BytesIO(data), len(data), everything, keys)[0]
 
 
 def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> tuple[Tensors, int]:
-    """The wanted tensors of an open file, and how many others it has. Raises: Refused."""
+    """The wanted tensors of an open file, and how many others it has. Raises: InvalidFileError."""
     start = file.read(15)
     file.seek(0)
     if start[2:] == STREAM_START:
-        raise Refused(OLD_STREAM)
+        raise InvalidFileError(OLD_STREAM)
     if not start.startswith(ZIP_START):
-        raise Refused("no file that torch.save writes")
+        raise InvalidFileError("no file that torch.save writes")
     with open_archive(file, size) as archive:
         return _state_dict(_of_archive(archive, size, _NAMES), size, wanted, keys)
 
@@ -280,7 +288,7 @@ def _state_dict(
     """The wanted tensors of the state dict in what was unpickled, and how many others it has.
 
     The state dict is what lies under one of the keys, or else the content itself. What tensors take
-    together is bounded by the size of the file. Raises: Refused.
+    together is bounded by the size of the file. Raises: InvalidFileError.
     """
     label = next(
         (key for key in keys if isinstance(content, dict) and isinstance(content.get(key), dict)),
@@ -291,13 +299,13 @@ def _state_dict(
         label is None and not any(isinstance(x, _Tensor) for x in model.values())
     ):
         names = " or ".join(map(repr, keys))
-        raise Refused(f"expected a state dict, or a dict with one under {names}")
+        raise InvalidFileError(f"expected a state dict, or a dict with one under {names}")
     if not all(isinstance(key, str) for key in model):
-        raise Refused("the state dict has a key that is no string")
+        raise InvalidFileError("the state dict has a key that is no string")
     chosen = {key: tensor for key, tensor in model.items() if wanted(key)}
     for key, tensor in chosen.items():
         if not isinstance(tensor, _Tensor):
-            raise Refused(
+            raise InvalidFileError(
                 f"{label or 'state_dict'}[{shown(key)}] is no tensor but {type(tensor).__name__}"
             )
     arrays: Tensors = {}
@@ -312,10 +320,10 @@ def _state_dict(
         left -= math.prod(tensor.shape) * STORAGE_DTYPES[tensor.storage.kind].itemsize
         try:
             arrays[key] = tensor.to_array()
-        except Refused as error:
-            raise Refused(f"{key}: {error}") from error
+        except InvalidFileError as error:
+            raise InvalidFileError(f"{key}: {error}") from error
         if left < 0:
-            raise Refused(
+            raise InvalidFileError(
                 f"{key}: the tensors take more than {LARGEST_SHARE} times the size of the file"
             )
     return {key: arrays[key] for key in chosen}, len(model) - len(chosen)
@@ -381,7 +389,7 @@ def read_values(path: str | os.PathLike[str]) -> Any:
 
         def storage(data: Any) -> _Storage:
             if type(data) is not bytes:  # tuples within tuples would take very long to hash
-                raise Refused("a storage that is not of bytes")
+                raise InvalidFileError("a storage that is not of bytes")
             return read_once(data)
 
         more = {("torch.storage", "_load_from_bytes"): Call(storage)}
@@ -389,7 +397,7 @@ def read_values(path: str | os.PathLike[str]) -> Any:
         if data.startswith(ZIP_START):
             return _of_archive(open_archive(file, len(data)), len(data), names)
         if data[2:15] == STREAM_START:
-            raise Refused(OLD_STREAM)
+            raise InvalidFileError(OLD_STREAM)
         if data.startswith(np.lib.format.MAGIC_PREFIX) and not read_header(file)[2].hasobject:
-            raise Refused("a single array: expected a dict of arrays by name")
+            raise InvalidFileError("a single array: expected a dict of arrays by name")
         return objects(_TorchUnpickler(file, names).load())

@@ -17,7 +17,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import PLACES, ArrayKeys
 from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.arrays import ArrayFile
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 from humangs_jax.io.restricted_pickle import as_array
 from humangs_jax.io.tensors import read_values
 from humangs_jax.motion import MotionError, Poses, Reading, skeleton
@@ -109,7 +109,7 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
     track = FaceTrack(names, values)
     try:
         checked_track(track, count)
-    except Refused as error:
+    except InvalidFileError as error:
         if ours:
             raise
         file.said.append(f"{key} is left out: {error}")

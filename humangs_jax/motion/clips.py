@@ -34,7 +34,7 @@ from humangs_jax.io.nodes import (
     world_matrices,
 )
 from humangs_jax.io.reading import (
-    Refused,
+    InvalidFileError,
     check_limit,
     check_unpacked,
     read_bytes,
@@ -52,29 +52,29 @@ _MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
 def read_bvh(path: Path, options: object = None) -> Clip:
     """The skeleton of a file in motion.
 
-    Raises: OSError; Refused or FileError, which say what was expected.
+    Raises: OSError; InvalidFileError or FileError, which say what was expected.
     """
     text = read_text(path)
     if text.split(maxsplit=1)[:1] != ["HIERARCHY"]:
-        raise Refused("not a BVH file: expected HIERARCHY first")
+        raise InvalidFileError("not a BVH file: expected HIERARCHY first")
     # the tree of joints, before the line that the motion begins with
     found = _MOTION.search(text)
     end = found.start() if found else len(text)
     names, parents, offsets, channels = _tree(text[:end])
     if found is None:
-        raise Refused(
+        raise InvalidFileError(
             "cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints"
         )
     count, seconds = _number(found[1]), _number(found[2])
     if not (count >= 1 and count == int(count) and seconds > 0 and np.isfinite(1 / seconds)):
-        raise Refused(
+        raise InvalidFileError(
             f"expected at least one frame and a positive Frame Time, got {found[1]} and {found[2]}"
         )
     # a row of numbers for each frame
     width = sum(len(each) for each in channels)
     numbers = _numbers(text[found.end() :])
     if width == 0 or len(numbers) != count * width:
-        raise Refused(
+        raise InvalidFileError(
             f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers: cut"
             " short?"
         )
@@ -126,18 +126,18 @@ def _tree(
                 if amount != len(channels[here]) or any(
                     name not in CHANNELS for name in channels[here]
                 ):
-                    raise Refused(
+                    raise InvalidFileError(
                         f"joint {names[here]}: expected up to 6 channels such as Xrotation"
                     )
             else:
-                raise Refused(f"unknown word {word}")
+                raise InvalidFileError(f"unknown word {word}")
     except StopIteration:
-        raise Refused("cut short") from None
+        raise InvalidFileError("cut short") from None
     if open_joints or waiting is not None or not names:
         what = "a brace of the joints is open" if names else "no joints"
-        raise Refused(f"cut short: {what}")
+        raise InvalidFileError(f"cut short: {what}")
     if parents.count(-1) != 1:
-        raise Refused(f"expected one ROOT, got {parents.count(-1)}")
+        raise InvalidFileError(f"expected one ROOT, got {parents.count(-1)}")
     return tuple(names), tuple(parents), np.stack(offsets), channels
 
 
@@ -145,9 +145,9 @@ def _number(word: str) -> float:
     try:
         value = float(word)
     except ValueError:
-        raise Refused(f"expected a number, got {word}") from None
+        raise InvalidFileError(f"expected a number, got {word}") from None
     if not np.isfinite(value):
-        raise Refused(f"expected finite numbers, got {word}")
+        raise InvalidFileError(f"expected finite numbers, got {word}")
     return value
 
 
@@ -155,9 +155,9 @@ def _numbers(text: str) -> Float[np.ndarray, " n"]:
     try:
         values = np.fromstring(text, np.float64, sep=" ")
     except ValueError as error:
-        raise Refused(f"frames: expected numbers: {error}") from None
+        raise InvalidFileError(f"frames: expected numbers: {error}") from None
     if not np.isfinite(values).all():
-        raise Refused(
+        raise InvalidFileError(
             f"frames: expected finite numbers, got {values[np.argmin(np.isfinite(values))]}"
         )
     return values
@@ -196,13 +196,13 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     """The skeleton of a GLB file in motion, with its face; the face alone of one that turns
     nothing.
 
-    Raises: OSError; Refused and what damaged numbers raise.
+    Raises: OSError; InvalidFileError and what damaged numbers raise.
     """
     data = read_bytes(path, "mesh_bytes")
     content, binary = parse_glb(data, "text_bytes")
     nodes, animations = content.get("nodes", []), content.get("animations", [])
     if not animations:
-        raise Refused("a GLB file without an animation: expected a skeleton in motion")
+        raise InvalidFileError("a GLB file without an animation: expected a skeleton in motion")
     # the animation; one that moves a face alone has no skeleton
     animation, said = _chosen(animations, options.clip if options else None)
     alone = face_alone(content, binary, animation, said)
@@ -239,7 +239,7 @@ SHOWN = 12
 def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
     """Gives the animation of a name or number, else the first, and a note about the others.
 
-    Raises: Refused.
+    Raises: InvalidFileError.
     """
     names = [str(each.get("name", i)) for i, each in enumerate(animations)]
     listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
@@ -254,7 +254,7 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
         return animations[plain.index(clip.casefold())], ""
     if clip.isdecimal() and int(clip) < len(names):
         return animations[int(clip)], ""
-    raise Refused(f"clip {clip}: expected one of {listed}")
+    raise InvalidFileError(f"clip {clip}: expected one of {listed}")
 
 
 def _humanoid(content: dict[str, Any]) -> dict[int, str]:
@@ -292,7 +292,7 @@ def _joints(
     skin = max(skins, key=lambda each: len(each["joints"]))
     joints = skin["joints"]
     if any(type(joint) is not int or not 0 <= joint < len(nodes) for joint in joints):
-        raise Refused("skins: a joint that is no node")
+        raise InvalidFileError("skins: a joint that is no node")
     joints = list(dict.fromkeys(joints))
     if "inverseBindMatrices" not in skin or len(joints) != len(skin["joints"]):
         return joints, {}
@@ -319,7 +319,7 @@ def _tracks(
         if node not in wanted or path not in PATHS:
             continue
         if (node, path) in tracks:
-            raise Refused(f"animation: two tracks for the {path} of node {node}")
+            raise InvalidFileError(f"animation: two tracks for the {path} of node {node}")
         sampler = animation["samplers"][channel["sampler"]]
         times = read_accessor(content, binary, sampler["input"])[:, 0]
         values = read_accessor(content, binary, sampler["output"])
@@ -331,11 +331,11 @@ def _tracks(
             or values.shape != (len(times), PATHS[path])
             or not (np.diff(times) > 0).all()
         ):
-            raise Refused(f"animation: expected one {path} for each of increasing times")
+            raise InvalidFileError(f"animation: expected one {path} for each of increasing times")
         check_finite(times, "times")
         tracks[node, path] = times, values, sampler.get("interpolation") == "STEP"
     if not any(path == "rotation" for _, path in tracks):
-        raise Refused("an animation that turns no joint: expected a skeleton in motion")
+        raise InvalidFileError("an animation that turns no joint: expected a skeleton in motion")
     return tracks
 
 
@@ -350,16 +350,19 @@ def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
     fps = (len(dense) - 1) / float(dense[-1] - dense[0])
     count = round((last - first) * fps) + 1
     if count > 4 * len(dense):
-        raise Refused("animation: tracks of very different lengths")
+        raise InvalidFileError("animation: tracks of very different lengths")
     return first + np.arange(count) / fps, fps
 
 
 def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3 3"]:
-    """The rotations in matrices of rotation and scale. Raises: Refused where there is none."""
+    """The rotations in matrices of rotation and scale.
+
+    Raises: InvalidFileError where there is none.
+    """
     linear = matrices[..., :3, :3]
     lengths = np.linalg.norm(linear, axis=-2, keepdims=True)
     if not (lengths > 0).all() or not (np.linalg.det(linear) > 0).all():
-        raise Refused(
+        raise InvalidFileError(
             "a joint that is mirrored or without size: expected rotations, positions and scales"
         )
     flat = (linear / lengths).reshape(-1, 3, 3)

@@ -23,7 +23,7 @@ from humangs_jax.body.joints import DEFAULT_FPS, JOINT_NAMES
 from humangs_jax.core.array_types import Float
 from humangs_jax.io.mesh import read_accessor
 from humangs_jax.io.reading import (
-    Refused,
+    InvalidFileError,
     check_limit,
     check_unpacked,
     read_json,
@@ -62,27 +62,27 @@ DEEPEST = 5
 
 
 def read_table(path: Path, options: Reading) -> Poses:
-    """A face in a table. Raises: MotionError or Refused, naming the column or the line."""
+    """A face in a table. Raises: MotionError or InvalidFileError, naming the column or the line."""
     # the line of names tells which columns are shapes
     rows = csv.reader(io.StringIO(read_text(path)))
     try:
         lines = [row for row in rows if any(word.strip() for word in row)]
     except csv.Error as error:
-        raise Refused(f"line {rows.line_num}: {error}") from None
+        raise InvalidFileError(f"line {rows.line_num}: {error}") from None
     names = []
     if lines:
         names = [name.strip() for name in lines[0]]
     shapes = {arkit_name(name): i for i, name in reversed(list(enumerate(names)))}
     shapes.pop(None, None)
     if len(shapes) < FEWEST or len(names) > MOST_COLUMNS:
-        raise Refused(
+        raise InvalidFileError(
             "expected a line with names of ARKit's shapes such as EyeBlinkLeft, got"
             f" {', '.join(names[:4]) or 'nothing'}"
         )
     # a line for each frame; some programs repeat the names
     lines = [row for row in lines[1:] if [word.strip() for word in row] != names]
     if not lines:
-        raise Refused("expected a line of numbers for each frame, got none")
+        raise InvalidFileError("expected a line of numbers for each frame, got none")
     check_limit("frames", len(lines), "frames")
     plain = {re.sub(r"[^a-z]", "", name.lower()): i for i, name in enumerate(names)}
 
@@ -109,7 +109,9 @@ def _number(row: Sequence[str], index: int, name: str, line: int) -> float:
     try:
         return float(word)
     except ValueError:
-        raise Refused(f"line {line + 2}: {name}: expected a number, got {shown(word)}") from None
+        raise InvalidFileError(
+            f"line {line + 2}: {name}: expected a number, got {shown(word)}"
+        ) from None
 
 
 def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray | None, str]:
@@ -149,7 +151,7 @@ def _standing(
     track = FaceTrack(ARKIT, clipped(values))
     checked_track(track, len(values))
     if not np.isfinite(head).all():
-        raise Refused("head: expected finite numbers")
+        raise InvalidFileError("head: expected finite numbers")
     rotations = np.zeros((len(values), len(JOINT_NAMES), 3))
     rotations[:, JOINT_NAMES.index("left_shoulder"), 2] = -ARMS_DOWN
     rotations[:, JOINT_NAMES.index("right_shoulder"), 2] = ARMS_DOWN
@@ -174,7 +176,7 @@ def read_scores(path: Path, options: Reading) -> Poses:
         content = read_json(path)
         frames = _frames_of(content)
         if frames is None:
-            raise Refused("expected a list of frames with scores of ARKit's shapes")
+            raise InvalidFileError("expected a list of frames with scores of ARKit's shapes")
         check_limit("frames", len(frames), "frames")
         seen = [i for i, frame in enumerate(frames) if frame]
         known = np.zeros((len(seen), len(ARKIT)))
@@ -246,7 +248,7 @@ def _category(entry: Mapping[str, Any]) -> str:
 
 def _score(name: object, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise Refused(f"{name}: expected a number, got {shown(value)}")
+        raise InvalidFileError(f"{name}: expected a number, got {shown(value)}")
     return float(value)
 
 
@@ -274,7 +276,7 @@ def animated_face(
         [np.interp(times, keys, weights) for keys, weights in tracks.values()], axis=1
     )
     if not np.isfinite(values).all():
-        raise Refused("animation: expected finite weights of shapes")
+        raise InvalidFileError("animation: expected finite weights of shapes")
     track, unknown = as_arkit(FaceTrack(names, values))
     if not unknown:
         return track, ""
@@ -291,16 +293,18 @@ def _keys_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Seconds (k,) and values (k, c) of a channel.
 
-    Raises: Refused unless there is a row for each of increasing times.
+    Raises: InvalidFileError unless there is a row for each of increasing times.
     """
     sampler = animation["samplers"][channel["sampler"]]
     times = read_accessor(content, binary, sampler["input"])[:, 0]
     values = read_accessor(content, binary, sampler["output"])
     if not len(times) or not (np.diff(times) > 0).all() or values.size % len(times):
-        raise Refused("animation: expected one row of weights for each of increasing times")
+        raise InvalidFileError(
+            "animation: expected one row of weights for each of increasing times"
+        )
     if sampler.get("interpolation") == "CUBICSPLINE":
         if values.size % (3 * len(times)):
-            raise Refused("animation: expected tangents beside each row of weights")
+            raise InvalidFileError("animation: expected tangents beside each row of weights")
         values = values.reshape(len(times), 3, -1)[:, 1]  # between the tangents
     return times, values.reshape(len(times), -1)
 
@@ -320,7 +324,7 @@ def _expression_tracks(
         if isinstance(entry, dict) and type(entry.get("node")) is int
     }
     if len(nodes) > MOST_COLUMNS:
-        raise Refused(f"{len(nodes)} expressions: expected at most {MOST_COLUMNS}")
+        raise InvalidFileError(f"{len(nodes)} expressions: expected at most {MOST_COLUMNS}")
     tracks = {}
     for channel in animation["channels"]:
         name = nodes.get(channel["target"].get("node"))
@@ -339,7 +343,9 @@ def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[st
     found: list[Weights] = []
     channels = [each for each in animation["channels"] if each["target"]["path"] == "weights"]
     if len(channels) > MOST_COLUMNS:
-        raise Refused(f"{len(channels)} meshes with weights: expected at most {MOST_COLUMNS}")
+        raise InvalidFileError(
+            f"{len(channels)} meshes with weights: expected at most {MOST_COLUMNS}"
+        )
     for channel in channels:
         node = content["nodes"][channel["target"]["node"]]
         mesh = content["meshes"][node["mesh"]]

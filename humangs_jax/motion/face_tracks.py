@@ -8,7 +8,7 @@ import re
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 
 ARKIT = (
     "browDownLeft", "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight",
@@ -135,14 +135,16 @@ def checked_track(
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "m e"]]:
     """Names and float32 values of a track.
 
-    Raises: Refused unless it has a finite row of numbers for each frame.
+    Raises: InvalidFileError unless it has a finite row of numbers for each frame.
     """
     values = np.asarray(track.values, np.float64)
     if values.shape != (frames, len(track.names)):
-        raise Refused(
+        raise InvalidFileError(
             f"expressions: expected shape ({frames}, {len(track.names)}), a row for each frame, got"
             f" {values.shape}"
         )
     if not (np.isfinite(values).all() and np.abs(values).max(initial=0) <= FARTHEST):
-        raise Refused(f"expressions: expected numbers between -{FARTHEST:g} and {FARTHEST:g}")
+        raise InvalidFileError(
+            f"expressions: expected numbers between -{FARTHEST:g} and {FARTHEST:g}"
+        )
     return track.names, values.astype(np.float32)

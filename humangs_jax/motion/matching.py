@@ -12,7 +12,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.mesh import unit
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 from humangs_jax.motion.rules import (
     ENDS,
     EXPECTED_NAMES,
@@ -38,7 +38,7 @@ def matched(
     """Index of the file's joint for each of ours that it has. rest, posed: places in the rest pose
     and in the first frame.
 
-    Raises: Refused if neither names nor the tree tell where those are that are needed.
+    Raises: InvalidFileError if neither names nor the tree tell where those are that are needed.
     """
     # by names first
     plain = _plain(names)
@@ -58,7 +58,7 @@ def matched(
             if missing:
                 what = f"no joint for {', '.join(missing)}"
             found = ", ".join(names[:SHOWN])
-            raise Refused(f"{what}: {EXPECTED_NAMES}, got {found}")
+            raise InvalidFileError(f"{what}: {EXPECTED_NAMES}, got {found}")
         body = {
             f"{side}_{name}"
             for side in SIDES

@@ -14,7 +14,7 @@ import numpy as np
 
 from humangs_jax.data.formats import MOTIONS, ArrayKeys
 from humangs_jax.io.arrays import ArrayFile, read_npy
-from humangs_jax.io.reading import Refused, check_limit, open_file, read_json, visible
+from humangs_jax.io.reading import InvalidFileError, check_limit, open_file, read_json, visible
 from humangs_jax.io.restricted_pickle import as_array, objects
 from humangs_jax.io.tensors import read_values
 from humangs_jax.motion import MotionError
@@ -78,7 +78,7 @@ def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
 def read_people(path: Path) -> list[Person]:
     """The people of a file or a folder.
 
-    Raises: FileError; Refused if it has nothing of any format.
+    Raises: FileError; InvalidFileError if it has nothing of any format.
     """
     files = _files(path) if path.is_dir() else [path]
     alone = not path.is_dir() and path.suffix.lower() != ".json"
@@ -92,13 +92,13 @@ def read_people(path: Path) -> list[Person]:
             found = _people(content, pickled)
             if alone and not found:
                 values = content if isinstance(content, dict) else {}
-                raise Refused(expected(values))
+                raise InvalidFileError(expected(values))
             name = (_numbers(file) or [file.stem])[-1]
             if len(found) == 1 and not alone:
                 found = [found[0]._replace(name=name)]
             people += found
     if not people:
-        raise Refused(expected({}))
+        raise InvalidFileError(expected({}))
     return people
 
 
@@ -131,7 +131,7 @@ def _files(folder: Path) -> list[Path]:
             ]
             if files:
                 return sorted(files, key=natural)
-    raise Refused("no .json, .npz or other file of a motion in this folder")
+    raise InvalidFileError("no .json, .npz or other file of a motion in this folder")
 
 
 def _numbers(file: Path) -> list[str]:
@@ -316,7 +316,7 @@ def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
             people = [person._replace(name=number[-1]) for person in people]
         frames.setdefault(number[-2] if apart else str(file), (file.name, []))[1].extend(people)
         if not people and isinstance(content, dict) and len(files) == 1:
-            raise Refused(expected(content))
+            raise InvalidFileError(expected(content))
     return list(frames.values())
 
 
@@ -337,7 +337,7 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
         for i, values in seen:
             missing = set(keys) - set(values)
             if missing:
-                raise Refused(
+                raise InvalidFileError(
                     f"{frames[i][0]}: {min(missing)}: missing, but {frames[begin][0]} has it"
                 )
         values = {key: [objects(values[key]) for _, values in seen] for key in keys}

@@ -35,7 +35,7 @@ from humangs_jax.body.library import read_body
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.axes import CLEARLY_UP, nearest_axis, upright_matrix
 from humangs_jax.geometry.mesh import smallest_turns, unit
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 from humangs_jax.motion import rules
 from humangs_jax.motion.face_tracks import FaceTrack
 from humangs_jax.motion.matching import matched
@@ -95,11 +95,11 @@ def retargeted(
     and what to say about up.
 
     Arguments: joints: of the body in T-pose, metres. up: as in `load_motion`.
-    Raises: Refused if joints of the clip that are needed have no name we know, or the body is no
-    body of SMPL-X's joints.
+    Raises: InvalidFileError if joints of the clip that are needed have no name we know, or the body
+    is no body of SMPL-X's joints.
     """
     if joints.shape != (len(JOINT_NAMES), 3):
-        raise Refused(
+        raise InvalidFileError(
             f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has"
             f" {len(joints)}"
         )

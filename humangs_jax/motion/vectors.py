@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 from humangs_jax.io.restricted_pickle import as_array
 from humangs_jax.motion.rules import COLUMNS
 
@@ -41,7 +41,10 @@ RESULTS = {"motion", "text", "lengths"}
 
 
 def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
-    """The values by key that an array stands for. Raises: Refused, saying what the array is."""
+    """The values by key that an array stands for.
+
+    Raises: InvalidFileError, saying what the array is.
+    """
     shape = array.shape
     columns = shape[-1] if shape else 0
     # rotations, in one of the layouts that are read
@@ -54,7 +57,7 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
         return {POSES: array}
     # arrays of other programs that are known, and are no rotations
     if array.ndim == 2 and columns in FEATURES:
-        raise Refused(
+        raise InvalidFileError(
             f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints"
             f" and {_RENDER}"
         )
@@ -63,11 +66,11 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
         if shape[1] in JOINTS:
             whose = f" ({JOINTS[shape[1]]})"
         wanted = "expected a row of axis-angles a frame"
-        raise Refused(
+        raise InvalidFileError(
             f"{shape[1]} joints in space{whose}, or axis-angles in three axes: {wanted}; {_RENDER}"
         )
     known = ", ".join(map(str, (COLUMNS_OF_MOTION_X, *COLUMNS)))
-    raise Refused(
+    raise InvalidFileError(
         f"an array of shape {shape}: expected (frames, columns) with {known} columns, or a dict of"
         " arrays by name"
     )
@@ -84,14 +87,14 @@ def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[
     """Values with matrices (m, j, 3, 3) and positions (m, 3), of six numbers a joint with the
     frames last, or first.
 
-    Raises: Refused for other shapes, naming the key.
+    Raises: InvalidFileError for other shapes, naming the key.
     """
     six = np.asarray(as_array(values[rotations]))
     last = six.ndim == 3 and six.shape[1] == 6
     if not last and (six.ndim != 3 or six.shape[2] != 6):
-        raise Refused(f"{rotations}: expected shape (24, 6, frames), got {six.shape}")
+        raise InvalidFileError(f"{rotations}: expected shape (24, 6, frames), got {six.shape}")
     if six.dtype.kind not in "fiu":
-        raise Refused(f"{rotations}: expected real numbers, got {six.dtype}")
+        raise InvalidFileError(f"{rotations}: expected real numbers, got {six.dtype}")
     if last:
         six = six.transpose(2, 0, 1)
     changed: dict[str, Any] = {rotations: matrices_of(six)}

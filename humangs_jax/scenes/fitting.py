@@ -25,7 +25,7 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.arrays import checksum, read_npz, write_npz
 from humangs_jax.io.images import named_color
-from humangs_jax.io.reading import Refused, reading
+from humangs_jax.io.reading import InvalidFileError, reading
 from humangs_jax.losses.losses import decibels, structural_dissimilarity
 from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import (
@@ -358,9 +358,9 @@ def _resumed(path: str | os.PathLike[str] | None, state: SceneState, about: str)
     with reading(path, "checkpoint of a scene"):
         arrays, _ = read_npz(Path(path))
         if str(arrays.get("mark")) != MARK:
-            raise Refused("not a checkpoint of fit_scene: expected one, or no file")
+            raise InvalidFileError("not a checkpoint of fit_scene: expected one, or no file")
         if str(arrays["about"]) != about:
-            raise Refused(
+            raise InvalidFileError(
                 "of other photos, cameras, points or settings: expected those it was begun with"
             )
         leaves, tree = jax.tree.flatten(state)
@@ -368,5 +368,5 @@ def _resumed(path: str | os.PathLike[str] | None, state: SceneState, about: str)
         if any(
             a.shape != b.shape or a.dtype != b.dtype for a, b in zip(found, leaves, strict=True)
         ):
-            raise Refused("damaged: arrays of other shapes than its run has")
+            raise InvalidFileError("damaged: arrays of other shapes than its run has")
         return jax.tree.unflatten(tree, list(map(jnp.asarray, found)))

@@ -341,7 +341,10 @@ _ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STAT
 
 
 def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
-    """Sizes that fit each other, real and finite numbers, indices that exist. Raises: Refused."""
+    """Sizes that fit each other, real and finite numbers, indices that exist.
+
+    Raises: InvalidFileError.
+    """
     sizes: dict[str, int] = {}
     fields = array_fields(PeopleBank)
     for name in _ARRAYS:

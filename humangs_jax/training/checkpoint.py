@@ -30,7 +30,7 @@ import numpy as np
 
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.reading import FileError, Refused, read_json, reading
+from humangs_jax.io.reading import FileError, InvalidFileError, read_json, reading
 from humangs_jax.training.config import TrainConfig, read_config
 from humangs_jax.training.state import TrainState
 
@@ -186,7 +186,7 @@ class Checkpoints:
                     x.shape for x in jax.tree.leaves(getattr(described, "tree", described))
                 )
                 if shapes != sorted(x.shape for x in jax.tree.leaves(wanted)):
-                    raise Refused("its arrays are those of another model")
+                    raise InvalidFileError("its arrays are those of another model")
                 abstract = jax.tree.map(self._ocp.utils.to_shape_dtype_struct, wanted)
                 restored = self._manager.restore(
                     step, args=self._ocp.args.StandardRestore(abstract)

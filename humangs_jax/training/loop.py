@@ -39,7 +39,7 @@ from humangs_jax.data.loading import Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer, write_text
 from humangs_jax.io.images import DRAWN, write_png
-from humangs_jax.io.reading import Refused, parse_json, read_text, reading
+from humangs_jax.io.reading import InvalidFileError, parse_json, read_text, reading
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
@@ -230,7 +230,9 @@ def forget_after(path: Path, step: int) -> None:
                     kept.append(line)
             except (ValueError, LookupError, TypeError) as error:
                 if number < len(lines):  # of the last one a kill may have left a part
-                    raise Refused(f"line {number}: expected an object with a step") from error
+                    raise InvalidFileError(
+                        f"line {number}: expected an object with a step"
+                    ) from error
     write_text(path, "".join(f"{line}\n" for line in kept))
 
 

@@ -18,7 +18,7 @@ from humangs_jax.capture.calibration.videos import grey_frames, write_frames
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import load_photos
 from humangs_jax.io.images import read_image
-from humangs_jax.io.reading import Limits, Refused, set_limits
+from humangs_jax.io.reading import InvalidFileError, Limits, set_limits
 from tests.capture import calibration_files as written
 
 NAMES, FRAMES = ("a", "b"), 5
@@ -168,7 +168,7 @@ def test_nothing_that_only_noise_changes_is_new():
 
 def test_black_frames_are_left_out_and_of_nothing_else_refused():
     frames = [np.zeros(SIZE, np.uint8)] * 10
-    with pytest.raises(Refused, match="none of its 10 frames shows anything"):
+    with pytest.raises(InvalidFileError, match="none of its 10 frames shows anything"):
         choose_frames(*looked_at(iter(frames)), PHOTOS)
     assert choose_frames(*looked_at(iter([*frames, noisy(scene(0), 0)])), PHOTOS) == [10]
 

@@ -19,7 +19,7 @@ from humangs_jax.io.color_spaces import (
     srgb_to_light,
 )
 from humangs_jax.io.images import read_grey, read_image
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 from tests.io import profiles
 
 COLORS = np.random.default_rng(0).integers(30, 226, (6, 8, 3)).astype(np.uint8)
@@ -359,5 +359,5 @@ def test_what_is_close_to_srgb_is_taken_for_it():
         and of_code_points(6, 6) is None
         and of_code_points(2, 2) is None
     )
-    with pytest.raises(Refused, match="damaged"):
+    with pytest.raises(InvalidFileError, match="damaged"):
         read_profile(bytes(200))

@@ -25,8 +25,8 @@ from humangs_jax.io.images import read_image
 from humangs_jax.io.mesh import read_obj
 from humangs_jax.io.reading import (
     FileError,
+    InvalidFileError,
     Limits,
-    Refused,
     check_limit,
     check_unpacked,
     inside,
@@ -82,9 +82,9 @@ def test_a_limit_is_named_and_can_be_changed(tmp_path):
         read_json(tmp_path / "a.json")
     set_limits(Limits(nesting=2))
     assert parse_json("[[1], {}]") == [[1], {}]
-    with pytest.raises(Refused, match="limit nesting is 2"):
+    with pytest.raises(InvalidFileError, match="limit nesting is 2"):
         parse_json('[{"a": [1]}]')
-    with pytest.raises(Refused, match="limit joints is"):
+    with pytest.raises(InvalidFileError, match="limit joints is"):
         check_limit("joints", 2000, "joints")
 
 
@@ -93,7 +93,7 @@ def test_a_file_unpacks_to_so_many_times_its_size_or_to_what_any_file_may():
     set_limits(Limits(plain_bytes=1000, ratio=10, array_bytes=5000))
     for size, most in ((1, 1000), (100, 1000), (101, 1010), (400, 4000), (600, 5000)):
         check_unpacked(size, most)
-        with pytest.raises(Refused, match=r"plain_bytes|array_bytes"):
+        with pytest.raises(InvalidFileError, match=r"plain_bytes|array_bytes"):
             check_unpacked(size, most + 1)
 
 
@@ -128,7 +128,7 @@ ZOO += [
     ValueError("no"),
     ZeroDivisionError("division by zero"),
     StopIteration(),
-    Refused("expected something else"),
+    InvalidFileError("expected something else"),
 ]
 ZOO += [ValueError("x" * 10_000)]
 
@@ -165,11 +165,11 @@ def test_only_regular_files_of_bounded_size_are_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zero").symlink_to("/dev/zero")
     for name in ("pipe", "zero", "."):
-        with pytest.raises(Refused):
+        with pytest.raises(InvalidFileError):
             read_bytes(tmp_path / name)
     with open(tmp_path / "large", "wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(Refused, match="limit file_bytes"):
+    with pytest.raises(InvalidFileError, match="limit file_bytes"):
         read_bytes(tmp_path / "large")
 
 
@@ -192,13 +192,13 @@ def test_paths_stay_inside_of_their_folder(tmp_path):
         str(tmp_path),
     ]
     for name in out:
-        with pytest.raises(Refused, match=r"outside of|is no path"):
+        with pytest.raises(InvalidFileError, match=r"outside of|is no path"):
             inside(folder, name)
-        with pytest.raises(Refused):
+        with pytest.raises(InvalidFileError):
             inside(folder, name, photo=True)
     set_limits(Limits(photos_outside=True))
     assert inside(folder, "../secret.png", photo=True) == folder / "../secret.png"
-    with pytest.raises(Refused, match="outside of"):
+    with pytest.raises(InvalidFileError, match="outside of"):
         inside(folder, "../secret.png")  # what is no photo stays inside
 
 
@@ -256,7 +256,7 @@ def test_a_folder_is_searched_once_however_many_links_lead_to_it(tmp_path, caplo
     set_limits(Limits(photos_outside=True))
     assert len(list(walk(tmp_path / "in"))) == 3
     set_limits(Limits(entries=3))
-    with pytest.raises(Refused, match="4 files and folders: the limit entries is 3"):
+    with pytest.raises(InvalidFileError, match="4 files and folders: the limit entries is 3"):
         list(walk(tmp_path / "in"))
 
 

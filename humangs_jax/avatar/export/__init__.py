@@ -43,7 +43,7 @@ class ExportFormat(Format):
     """Suffixes of further files, of the same name, that are written with it."""
     reader: str | Callable[[bytes], Any] = ""
     """The reader of Gaussians, called with the bytes of a file and a list that takes lines about
-    it; raises `io.reading.Refused`.
+    it; raises `io.reading.InvalidFileError`.
     """
     magic: tuple[bytes, ...] = ()
     """How files of the format may begin; empty: their beginning does not say."""

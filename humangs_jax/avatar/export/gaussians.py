@@ -42,7 +42,7 @@ from humangs_jax.core.registry import Formats, alternatives, imported
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.io.arrays import check_array
-from humangs_jax.io.reading import Refused, read_bytes, reading
+from humangs_jax.io.reading import InvalidFileError, read_bytes, reading
 from humangs_jax.rendering.gaussians import (
     Gaussians,
     factored,
@@ -215,7 +215,9 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
         form = next(begun, None) or next(read_only, None) or chosen_format(suffix)
         if form is None or not form.reader:
             known = alternatives((*_written().suffixes, *READ_ONLY.suffixes))
-            raise Refused(OTHERS.get(suffix, f"not known: expected a file ending in {known}"))
+            raise InvalidFileError(
+                OTHERS.get(suffix, f"not known: expected a file ending in {known}")
+            )
         # what the file holds and is not used is said in one line
         said: list[str] = []
         gaussians = imported(form.reader)(data, said)
@@ -304,7 +306,8 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) ->
 
     Those with a number that is not finite are left out, and `said` takes how many.
 
-    Raises: Refused if there are no others, or for numbers that are not what they should be.
+    Raises: InvalidFileError if there are no others, or for numbers that are not what they should
+    be.
     """
     arrays = _finite(arrays, said)
     count = len(next(iter(arrays.values())))
@@ -335,7 +338,7 @@ def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, n
     if not bad:
         return arrays
     if not keep.any():
-        raise Refused(f"{', '.join(bad)}: none of {count:,} Gaussians has finite numbers")
+        raise InvalidFileError(f"{', '.join(bad)}: none of {count:,} Gaussians has finite numbers")
     left_out = count - int(keep.sum())
     said.append(f"{left_out:,} of {count:,} Gaussians are left out: {', '.join(bad)}: not finite")
     return {name: array[keep] for name, array in arrays.items()}

@@ -20,7 +20,7 @@ from humangs_jax.core.array_types import Float, UInt8
 from humangs_jax.io.arrays import open_archive
 from humangs_jax.io.image_headers import is_webp
 from humangs_jax.io.images import image_in
-from humangs_jax.io.reading import Refused, check_limit, parse_json, shown
+from humangs_jax.io.reading import InvalidFileError, check_limit, parse_json, shown
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians
 
 META = "meta.json"
@@ -38,7 +38,7 @@ COLUMNS = 64
 def read_sog(data: bytes, said: list[str]) -> Gaussians:
     """Gaussians of the bytes of a bundle. said: takes lines.
 
-    Raises: Refused; what damaged files raise.
+    Raises: InvalidFileError; what damaged files raise.
     """
     with open_archive(io.BytesIO(data), len(data)) as archive:
         root = _root(archive)
@@ -49,7 +49,7 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
             if isinstance(meta, dict):
                 found = shown(meta.get("version"))
             convert = "`npx @playcanvas/splat-transform scene.sog scene.ply` makes a .ply of it"
-            raise Refused(f"{META}: version {found}, expected {VERSION}: {convert}")
+            raise InvalidFileError(f"{META}: version {found}, expected {VERSION}: {convert}")
         model = meta.get("model", USUAL)
         if model != USUAL:
             said.append(f"model {shown(model)} is not applied (SplatConfig.antialiased draws such)")
@@ -74,7 +74,9 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
         "sh0": colors_of(_codebook(meta, "sh0")[colors[:, :3]]),
     }
     if (quats[:, 3] < FIRST_PLACE).any():
-        raise Refused(f"quats: expected alpha from {FIRST_PLACE} on, got {quats[:, 3].min()}")
+        raise InvalidFileError(
+            f"quats: expected alpha from {FIRST_PLACE} on, got {quats[:, 3].min()}"
+        )
     return loaded(arrays | harmonics, said)
 
 
@@ -82,26 +84,28 @@ def _root(archive: zipfile.ZipFile) -> str:
     """The folder in the archive that meta.json lies in, "" for none."""
     found = [name for name in archive.namelist() if name.rsplit("/", 1)[-1] == META]
     if len(found) != 1:
-        raise Refused(f"no bundle of SOG: expected one {META} inside, found {len(found)}")
+        raise InvalidFileError(f"no bundle of SOG: expected one {META} inside, found {len(found)}")
     return found[0].removesuffix(META)
 
 
 def _member(archive: zipfile.ZipFile, name: str, limit: str) -> bytes:
     if name not in archive.NameToInfo:
-        raise Refused(f"{shown(name)}: missing in the archive")
+        raise InvalidFileError(f"{shown(name)}: missing in the archive")
     check_limit(limit, archive.getinfo(name).file_size, f"bytes of {shown(name)}")
     return archive.read(name)
 
 
 def _whole(value: Any, name: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise Refused(f"{META}: {name}: expected a whole number above 0, got {shown(value)}")
+        raise InvalidFileError(
+            f"{META}: {name}: expected a whole number above 0, got {shown(value)}"
+        )
     return value
 
 
 def _part(meta: dict[str, Any], part: str) -> dict[str, Any]:
     if not isinstance(meta.get(part), dict):
-        raise Refused(f"{META}: {part}: missing")
+        raise InvalidFileError(f"{META}: {part}: missing")
     return meta[part]
 
 
@@ -112,14 +116,16 @@ def _files(meta: dict[str, Any], part: str, number: int) -> Sequence[str]:
         or len(files) != number
         or not all(isinstance(f, str) for f in files)
     ):
-        raise Refused(f"{META}: {part}.files: expected {number} names, got {shown(files)}")
+        raise InvalidFileError(f"{META}: {part}.files: expected {number} names, got {shown(files)}")
     return files
 
 
 def _numbers(values: Any, name: str, least: int, most: int) -> Float[np.ndarray, " n"]:
     ok = isinstance(values, list) and least <= len(values) <= most
     if not ok or not all(isinstance(x, int | float) for x in values):
-        raise Refused(f"{META}: {name}: expected {least} to {most} numbers, got {shown(values)}")
+        raise InvalidFileError(
+            f"{META}: {name}: expected {least} to {most} numbers, got {shown(values)}"
+        )
     return np.asarray(values, np.float64)
 
 
@@ -135,7 +141,7 @@ def _pixels(archive: zipfile.ZipFile, name: str) -> UInt8[np.ndarray, "h w 4"]:
     data = _member(archive, name, "image_bytes")
     with image_in(data, ("WEBP",) if is_webp(data) else ("PNG",)) as image:
         if image.mode not in ("RGB", "RGBA", "L"):
-            raise Refused(f"{shown(name)}: expected 8-bit RGB or RGBA, got {image.mode}")
+            raise InvalidFileError(f"{shown(name)}: expected 8-bit RGB or RGBA, got {image.mode}")
         return np.asarray(image.convert("RGBA"))
 
 
@@ -143,7 +149,7 @@ def _picture(archive: zipfile.ZipFile, name: str, count: int) -> UInt8[np.ndarra
     """The first pixels, row by row."""
     pixels = _pixels(archive, name).reshape(-1, 4)
     if len(pixels) < count:
-        raise Refused(f"{shown(name)}: {len(pixels):,} pixels for {count:,} Gaussians")
+        raise InvalidFileError(f"{shown(name)}: {len(pixels):,} pixels for {count:,} Gaussians")
     return pixels[:count]
 
 
@@ -165,16 +171,18 @@ def _harmonics(
         return {}
     bands = _whole(_part(meta, "shN").get("bands"), "shN.bands")
     if bands >= len(COUNTS):
-        raise Refused(f"shN: harmonics of degree {bands}: expected degree 1 to 3")
+        raise InvalidFileError(f"shN: harmonics of degree {bands}: expected degree 1 to 3")
     functions = COUNTS[bands]
     rows, labels = _files(meta, "shN", 2)
     pixels = _pixels(archive, root + rows)
     if pixels.shape[1] != COLUMNS * functions:
         expected = f"{COLUMNS * functions} for degree {bands}"
-        raise Refused(f"{shown(rows)}: {pixels.shape[1]} pixels wide, expected {expected}")
+        raise InvalidFileError(f"{shown(rows)}: {pixels.shape[1]} pixels wide, expected {expected}")
     palette = pixels[..., :3].reshape(-1, functions, 3)
     label = _picture(archive, root + labels, count).astype(np.int64)
     label = label[:, 0] + 256 * label[:, 1]
     if label.max() >= len(palette):
-        raise Refused(f"{shown(labels)}: label {label.max()} of {len(palette)} rows of harmonics")
+        raise InvalidFileError(
+            f"{shown(labels)}: label {label.max()} of {len(palette)} rows of harmonics"
+        )
     return {"shN": _codebook(meta, "shN")[palette[label]]}

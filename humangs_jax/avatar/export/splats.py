@@ -39,7 +39,7 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.io.atomic import replace_file, write_bytes
 from humangs_jax.io.mesh import VERTICES, GlbWriter, count_of, parse_glb, read_accessor
 from humangs_jax.io.nodes import node_matrices
-from humangs_jax.io.reading import Refused, check_limit, shown
+from humangs_jax.io.reading import InvalidFileError, check_limit, shown
 from humangs_jax.io.tensors import tensors_in
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_gaussians
 
@@ -112,7 +112,7 @@ def write_ply(
 def read_ply(data: bytes, said: list[str]) -> Gaussians:
     """Gaussians of the bytes of a file. said: takes lines.
 
-    Raises: Refused; what damaged numbers raise.
+    Raises: InvalidFileError; what damaged numbers raise.
     """
     elements = _elements(data)
     said += _unused(elements)
@@ -176,7 +176,7 @@ def _harmonics(
     count = sum(name.startswith("f_rest_") for name in columns)
     if count % 3 or count // 3 not in COUNTS:
         degree = " of degree 4" if count == DEGREE_4 else ""
-        raise Refused(
+        raise InvalidFileError(
             f"f_rest_*: expected 9, 24 or 45 properties, of degree 1 to 3, got {count}{degree}"
         )
     if not count:
@@ -201,7 +201,7 @@ def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> 
     # each chunk of Gaussians has a range that its numbers are shares of
     count, chunks = len(words["color"]), len(next(iter(chunk.values())))
     if chunks != -(-count // CHUNK):
-        raise Refused(
+        raise InvalidFileError(
             f"chunk: expected one for each {CHUNK} of {count:,} Gaussians, got {chunks:,}"
         )
 
@@ -246,16 +246,18 @@ def _bits(words: np.ndarray, lowest: int, width: int) -> Float[np.ndarray, " g"]
 def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64) -> np.ndarray:
     """Properties (g, names) as numbers of a type.
 
-    Raises: Refused for one that is missing, or not of the bytes it is made of.
+    Raises: InvalidFileError for one that is missing, or not of the bytes it is made of.
     """
     for name in names:
         if name not in columns:
-            raise Refused(
+            raise InvalidFileError(
                 f"{name}: missing: expected Gaussians (x, y, z, f_dc_*, opacity, scale_*, rot_* or"
                 " packed_*)"
             )
         if issubclass(dtype, np.integer) and columns[name].dtype.newbyteorder("=") != dtype:
-            raise Refused(f"{name}: expected {np.dtype(dtype).name}, got {columns[name].dtype}")
+            raise InvalidFileError(
+                f"{name}: expected {np.dtype(dtype).name}, got {columns[name].dtype}"
+            )
     with np.errstate(over="ignore"):
         return np.stack([columns[name].astype(dtype) for name in names], axis=-1)
 
@@ -267,7 +269,7 @@ def _elements(data: bytes) -> dict[str, Columns]:
     """
     end = re.compile(rb"end_header[ \t]*\r?\n").search(data, 0, LONGEST_HEADER)
     if end is None:
-        raise Refused("no PLY file: expected a header that ends in end_header")
+        raise InvalidFileError("no PLY file: expected a header that ends in end_header")
     # the header: names, numbers and types
     order, counts, types = None, {}, {}
     for line in data[: end.start()].decode("ascii", "replace").splitlines():
@@ -287,9 +289,9 @@ def _elements(data: bytes) -> dict[str, Columns]:
             ):
                 list(types.values())[-1].append((name, order + TYPES[kind]))
             case _:
-                raise Refused(f"header: {shown(line)}: not understood")
+                raise InvalidFileError(f"header: {shown(line)}: not understood")
     if order is None:
-        raise Refused("header: no format")
+        raise InvalidFileError("header: no format")
     lines = None
     if not order:
         check_limit("text_bytes", len(data), "bytes")
@@ -303,7 +305,9 @@ def _elements(data: bytes) -> dict[str, Columns]:
         dtype = np.dtype(types[name])
         least = dtype.itemsize if lines is None else 2 * len(types[name])  # a digit and a space
         if not dtype.names or count * least > len(data) - at + (lines is not None):
-            raise Refused(f"element {name}: {count:,} of them are not in {len(data) - at:,} bytes")
+            raise InvalidFileError(
+                f"element {name}: {count:,} of them are not in {len(data) - at:,} bytes"
+            )
         if lines is None:
             rows = np.ndarray((count,), dtype, data, at)
             found[name] = {each: rows[each] for each in dtype.names}
@@ -311,7 +315,7 @@ def _elements(data: bytes) -> dict[str, Columns]:
         elif count:
             rows = np.loadtxt(itertools.islice(lines, count), comments=None, ndmin=2)
             if rows.shape != (count, len(dtype.names)):
-                raise Refused(
+                raise InvalidFileError(
                     f"element {name}: expected {count} lines of {len(dtype.names)} numbers, got"
                     f" {rows.shape}"
                 )
@@ -352,10 +356,10 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def read_splat(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused."""
+    """Gaussians of the bytes of a file. said: takes lines. Raises: InvalidFileError."""
     check_limit("gaussians", len(data) // ROW_BYTES, "Gaussians")
     if not data or len(data) % ROW_BYTES:
-        raise Refused(
+        raise InvalidFileError(
             f"no .splat file: expected {ROW_BYTES} bytes for each Gaussian, got {len(data):,}"
         )
     rows = np.ndarray((len(data) // ROW_BYTES,), ROW, data)
@@ -381,12 +385,14 @@ SPLATS = "splats"
 def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
     """Gaussians of the bytes of a file. said: takes lines.
 
-    Raises: Refused; what damaged files raise.
+    Raises: InvalidFileError; what damaged files raise.
     """
     try:
         tensors = tensors_in(data, (SPLATS,))
-    except Refused as error:
-        raise Refused(f"no checkpoint of gsplat with {SPLATS!r} ({error}): {CHECKPOINTS}") from None
+    except InvalidFileError as error:
+        raise InvalidFileError(
+            f"no checkpoint of gsplat with {SPLATS!r} ({error}): {CHECKPOINTS}"
+        ) from None
 
     def tensor(name: str, *shape: int) -> np.ndarray:
         if name not in tensors:
@@ -394,12 +400,14 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
             why = "missing"
             if network:
                 why = "trained with --app_opt, whose colors a network makes"
-            raise Refused(f"{SPLATS}.{name}: {why}")
+            raise InvalidFileError(f"{SPLATS}.{name}: {why}")
         array = tensors[name]
         expected = (len(tensors.get("means", ())), *shape)
         if array.shape != expected or array.dtype.kind != "f":
             got = f"{array.dtype} {array.shape}"
-            raise Refused(f"{SPLATS}.{name}: expected floats of shape {expected}, got {got}")
+            raise InvalidFileError(
+                f"{SPLATS}.{name}: expected floats of shape {expected}, got {got}"
+            )
         return array.astype(np.float64)
 
     check_limit("gaussians", len(tensors.get("means", ())), "Gaussians")
@@ -418,7 +426,7 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
         functions = rest.shape[1]
     if functions not in COUNTS:
         degree = " of degree 4" if 3 * functions == DEGREE_4 else ""
-        raise Refused(
+        raise InvalidFileError(
             f"{SPLATS}.shN: expected 0, 3, 8 or 15 functions, of degree 0 to 3, got"
             f" {functions}{degree}"
         )
@@ -503,7 +511,7 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 def read_glb(data: bytes, said: list[str]) -> Gaussians:
     """Gaussians of the bytes of a file, those of all nodes in their places. said: takes lines.
 
-    Raises: Refused; what damaged numbers raise.
+    Raises: InvalidFileError; what damaged numbers raise.
     """
     content, binary = parse_glb(data)
     # files that cannot be read right without another extension are refused
@@ -511,7 +519,7 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
         set(content.get("extensionsRequired", [])) - {EXTENSION, "KHR_mesh_quantization"}
     )
     if needed:
-        raise Refused(
+        raise InvalidFileError(
             f"needs the extension {shown(needed[0])}: expected {EXTENSION} without compression"
         )
     # each part of a mesh is placed by its node
@@ -524,7 +532,7 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
         if EXTENSION in part.get("extensions", {})
     ]
     if not placed:
-        raise Refused(f"no Gaussians: expected parts of meshes with {EXTENSION}")
+        raise InvalidFileError(f"no Gaussians: expected parts of meshes with {EXTENSION}")
     # sizes are checked before anything is read
     check_limit("parts", len(placed), "parts of meshes")
     counts = [count_of(content["accessors"][part["attributes"]["POSITION"]]) for part, _ in placed]
@@ -539,7 +547,7 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     # all parts become one set of Gaussians, in one space
     parts = [_part(content, binary, part["attributes"], place, said) for part, place in placed]
     if len({None if part.harmonics is None else part.harmonics.shape[1] for part in parts}) > 1:
-        raise Refused("parts with harmonics of different degrees: expected one degree")
+        raise InvalidFileError("parts with harmonics of different degrees: expected one degree")
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
 
 
@@ -568,7 +576,7 @@ def _part(
 ) -> Gaussians:
     def array(name: str) -> np.ndarray:
         if name not in attributes:
-            raise Refused(f"{name}: missing")
+            raise InvalidFileError(f"{name}: missing")
         return read_accessor(content, binary, attributes[name])
 
     arrays = {name: array(name) for name in ("POSITION", *NEEDED)}

@@ -27,7 +27,7 @@ import numpy as np
 from humangs_jax.avatar.export.gaussians import colors_of, loaded, plain_arrays, sh_of, with_largest
 from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.io.atomic import write_bytes
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked
+from humangs_jax.io.reading import InvalidFileError, check_limit, check_unpacked
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians
 
 if sys.version_info >= (3, 14):
@@ -169,7 +169,7 @@ def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g
 def read_spz(data: bytes, said: list[str]) -> Gaussians:
     """Gaussians of the bytes of a file. said: takes lines.
 
-    Raises: Refused; what gzip and zstd raise for damaged files.
+    Raises: InvalidFileError; what gzip and zstd raise for damaged files.
     """
     if data.startswith(b"NGSP"):
         header, parts = _with_table(data, said)
@@ -215,16 +215,18 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
 def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
     """The header at the start of a file of that many bytes, if it may unpack to what it says.
 
-    Raises: Refused.
+    Raises: InvalidFileError.
     """
     header = _Header(*HEADER.unpack(start[: HEADER.size].ljust(HEADER.size, b"\0")))
     if header.magic != SPZ_MAGIC or header.version not in versions:
-        raise Refused(
+        raise InvalidFileError(
             f"no .spz of version 1 to 4: version {header.version} in what begins as version"
             f" {versions[-1]} does"
         )
     if header.degree >= len(COUNTS):
-        raise Refused(f"harmonics of degree {header.degree}: expected .spz of degree 0 to 3")
+        raise InvalidFileError(
+            f"harmonics of degree {header.degree}: expected .spz of degree 0 to 3"
+        )
     check_limit("gaussians", header.count, "Gaussians")
     check_unpacked(size, header.count * sum(header.widths))
     return header
@@ -244,7 +246,7 @@ def _of_gzip(data: bytes) -> tuple[_Header, list[bytes]]:
 def _check_size(size: int, header: _Header, more: bool = False) -> None:
     expected = header.count * sum(header.widths)
     if size < expected or (size > expected and not more):
-        raise Refused(
+        raise InvalidFileError(
             f"expected {header.count:,} Gaussians in {expected:,} bytes, got"
             f" {'more' if size > expected else 'less'}"
         )
@@ -257,11 +259,11 @@ def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
     header = _checked_header(data, (WITH_TABLE,), len(data))
     begin = HEADER.size + TABLE_PLACE.size
     if len(data) < begin:
-        raise Refused(f"cut short: expected a header of {begin} bytes, got {len(data)}")
+        raise InvalidFileError(f"cut short: expected a header of {begin} bytes, got {len(data)}")
     (place,) = TABLE_PLACE.unpack_from(data, HEADER.size)
     end = place + header.streams * TABLE_ROW.size
     if not begin <= place <= end <= len(data):
-        raise Refused(
+        raise InvalidFileError(
             f"table of {header.streams} streams at {place:,}: expected it within {len(data):,}"
             " bytes"
         )
@@ -275,14 +277,14 @@ def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
     if [unpacked for _, unpacked in rows] != filled:
         found = ", ".join(f"{unpacked:,}" for _, unpacked in rows[: len(sizes)]) or "none"
         wanted = ", ".join(f"{size:,}" for size in filled)
-        raise Refused(
+        raise InvalidFileError(
             f"table: {header.count:,} Gaussians: expected streams of {wanted} bytes, got {found}"
         )
     streams = []
     at = end
     for packed, unpacked in TABLE_ROW.iter_unpack(data[place:end]):
         if packed > len(data) - at:
-            raise Refused(
+            raise InvalidFileError(
                 f"cut short: a stream of {packed:,} bytes from {at:,}, but there are {len(data):,}"
             )
         if unpacked:
@@ -308,10 +310,10 @@ def _records(data: bytes) -> list[str]:
 
 
 def _unpacked(stream: bytes, size: int) -> bytes:
-    """That many bytes, of a zstd frame. Raises: Refused for another number; ZstdError."""
+    """That many bytes, of a zstd frame. Raises: InvalidFileError for another number; ZstdError."""
     content = zstd.ZstdDecompressor().decompress(stream, size + 1)
     if len(content) != size:
-        raise Refused(
+        raise InvalidFileError(
             f"a stream unpacks to {'more' if len(content) > size else 'less'} than the {size:,}"
             " bytes of the table"
         )

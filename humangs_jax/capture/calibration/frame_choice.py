@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int, UInt
-from humangs_jax.io.reading import Refused
+from humangs_jax.io.reading import InvalidFileError
 
 PHOTOS = 8
 """Photos of a video in which nobody was found: a person from all sides."""
@@ -60,11 +60,11 @@ def offered_frames(
     """Numbers of the sharpest frame of each window of time, in order, and what each is worth, in
     (0, 1]: of a window that is blurred as a whole less.
 
-    Raises: Refused if no frame shows anything.
+    Raises: InvalidFileError if no frame shows anything.
     """
     shown = np.flatnonzero(sharpness > 0)
     if not len(shown):
-        raise Refused(
+        raise InvalidFileError(
             f"none of its {len(sharpness):,} frames shows anything: expected a video of a person"
         )
     windows = np.array_split(shown, min(len(shown), WINDOWS))
@@ -78,7 +78,7 @@ def choose_frames(
     """Numbers of at most `most` frames that look different, in order: where nobody tells which way
     the person faces.
 
-    Raises: Refused if no frame shows anything.
+    Raises: InvalidFileError if no frame shows anything.
     """
     offered, worth = offered_frames(sharpness)
     chosen, new = [int(np.argmax(worth))], np.full(len(offered), np.inf)

@@ -39,7 +39,14 @@ from humangs_jax.data.cameras import (
 )
 from humangs_jax.data.capture_checks import CaptureError, checked_text, expect, floats
 from humangs_jax.data.formats import CameraFormat
-from humangs_jax.io.reading import Refused, check_limit, check_nesting, limits, parse_json, reading
+from humangs_jax.io.reading import (
+    InvalidFileError,
+    check_limit,
+    check_nesting,
+    limits,
+    parse_json,
+    reading,
+)
 
 FISHEYE = ("fisheye", "is_fisheye", "equidistant")
 """Values of `model` and the like, or keys that are true, of lenses with another formula."""
@@ -227,7 +234,7 @@ def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
         else:
             values = _yaml(text, file)
         if not isinstance(values, dict):
-            raise Refused("expected keys with values")
+            raise InvalidFileError("expected keys with values")
         return values
 
 
@@ -253,7 +260,7 @@ class _Loader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(problem="aliases are not supported", problem_mark=where)
         self.depth += 1
         if self.depth > limits().nesting:
-            raise Refused("nested too deeply")
+            raise InvalidFileError("nested too deeply")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -482,7 +489,7 @@ def read_qualisys(source: Source, format: CameraFormat) -> Calibration:
     """The cameras of a file. Raises: CaptureError naming the camera and what is missing."""
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):
-        raise Refused("XML with entities, which are not read")
+        raise InvalidFileError("XML with entities, which are not read")
     elements = [
         each
         for each in tree.fromstring(source.text).iter("camera")

@@ -39,7 +39,7 @@ from humangs_jax.data.capture_checks import (
     required,
 )
 from humangs_jax.data.formats import CameraFormat
-from humangs_jax.io.reading import Refused, read_bytes, reading, shown
+from humangs_jax.io.reading import InvalidFileError, read_bytes, reading, shown
 
 Registered = tuple[str, str, str, Sequence[float], np.ndarray]
 """An image: where it stands, its name, the number of the camera, quaternion and translation, (n, 3)
@@ -213,7 +213,7 @@ def _text_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
 class _Bytes:
     """Numbers of a file, little-endian, one after the other.
 
-    Raises: Refused where it ends before.
+    Raises: InvalidFileError where it ends before.
     """
 
     def __init__(self, file: Path):
@@ -223,7 +223,7 @@ class _Bytes:
         """The next bytes."""
         self.at += size
         if self.at > len(self.data):
-            raise Refused("not a readable COLMAP model: cut short, or damaged")
+            raise InvalidFileError("not a readable COLMAP model: cut short, or damaged")
         return self.data[self.at - size : self.at]
 
     def read(self, kinds: str) -> tuple[Any, ...]:

@@ -32,7 +32,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.folders import VIDEO_SUFFIXES, is_video, scan_folder
 from humangs_jax.io.color_spaces import Encoding, cube, of_code_points
 from humangs_jax.io.images import image_in
-from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
+from humangs_jax.io.reading import InvalidFileError, check_limit, limits, open_file, reading
 
 CONTAINERS = "mov,matroska,avi,mpegts"
 """Formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat,
@@ -268,9 +268,9 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
     places = [place for place, number in enumerate(chosen) if number is not None]
     numbers = [number for number in chosen if number is not None]
     if not numbers:
-        raise Refused("has no frame at the moments of the others")
+        raise InvalidFileError("has no frame at the moments of the others")
     if _run(path, folder, _expression(numbers), len(numbers), shown) != len(numbers):
-        raise Refused(
+        raise InvalidFileError(
             f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it"
             " goes with"
         )
@@ -286,7 +286,7 @@ MOST_RUNS = 2000
 def _expression(numbers: Sequence[int]) -> str:
     """ffmpeg's condition for frames of these numbers.
 
-    Raises: Refused for too many that follow no rule.
+    Raises: InvalidFileError for too many that follow no rule.
     """
     terms = []
     for first, step, last in progressions(numbers):
@@ -296,7 +296,7 @@ def _expression(numbers: Sequence[int]) -> str:
             terms.append(f"eq(n\\,{first})")
     if len(terms) > MOST_RUNS:
         count = f"{len(numbers):,} frames to be paired by time with those of other rates"
-        raise Refused(f"{count}: expected a larger step, or fewer frames")
+        raise InvalidFileError(f"{count}: expected a larger step, or fewer frames")
     return "+".join(terms)
 
 
@@ -339,7 +339,10 @@ TABLE = "colors.cube"
 
 
 def _shown(path: Path) -> _Shown:
-    """What ffmpeg prints of a video. Raises: OSError; Refused for pixels that nobody shows."""
+    """What ffmpeg prints of a video.
+
+    Raises: OSError; InvalidFileError for pixels that nobody shows.
+    """
     open_file(path).close()
     # without an output ffmpeg fails, after it has printed what is there
     printed = subprocess.run(
@@ -362,7 +365,7 @@ def _shown(path: Path) -> _Shown:
                 f"its pixels are {wide} to {high} wide to high: expected at most {WIDEST_PIXEL} to"
                 " 1, or square ones"
             )
-            raise Refused(problem)
+            raise InvalidFileError(problem)
         found = found._replace(shape=SQUARE)
     return found if colors is None else _with_colors(found, *colors.groups())
 
@@ -421,7 +424,7 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
         folder.mkdir(parents=True)
         select = "+".join(f"eq(n\\,{i})" for i in chosen)
         if _run(path, folder, select, len(chosen), _shown(path)) != len(chosen):
-            raise Refused("its frames are not the same when they are read again")
+            raise InvalidFileError("its frames are not the same when they are read again")
         for i, frame in enumerate(chosen):
             (folder / f"{i:08d}.png").rename(folder / f"frame_{frame:08d}.png")
 
@@ -550,7 +553,7 @@ def _finished(path: Path, command: Sequence[str], folder: Path | None = None) ->
             command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False
         )
     except subprocess.TimeoutExpired:
-        raise Refused(
+        raise InvalidFileError(
             f"its frames take more than {LONGEST_SECONDS:,} seconds: expected a shorter video"
         ) from None
     if done.returncode:

@@ -73,7 +73,7 @@ from humangs_jax.data.datasets.subject import (
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import PHOTO_SUFFIXES, image_in, read_grey, read_image
 from humangs_jax.io.reading import (
-    Refused,
+    InvalidFileError,
     check_limit,
     limits,
     open_file,
@@ -485,7 +485,7 @@ class Smc:
             if not hasattr(found, "keys") or part not in found:
                 return None
             if type(found.get(part, getlink=True)).__name__ != "HardLink":
-                raise Refused("refused a link")
+                raise InvalidFileError("refused a link")
             found = found[part]
         return found
 
@@ -500,11 +500,11 @@ class Smc:
         with reading(f"{self.path}: {key}", "data set", CaptureError):
             data = self._at(key)
             if data is None:
-                raise Refused("missing")
+                raise InvalidFileError("missing")
             if not hasattr(data, "dtype") or data.dtype.kind not in "fiu":
-                raise Refused("expected numbers")
+                raise InvalidFileError("expected numbers")
             if data.is_virtual or data.external:
-                raise Refused("refused numbers that lie in other files")
+                raise InvalidFileError("refused numbers that lie in other files")
             check_limit(
                 limit, int(np.prod(data.shape, dtype=np.float64)) * data.dtype.itemsize, "bytes"
             )
@@ -521,7 +521,9 @@ class Smc:
         data = self.array(key, "image_bytes")
         with reading(f"{self.path}: {key}", "image", CaptureError):
             if data.dtype != np.uint8 or data.ndim != 1:
-                raise Refused(f"expected encoded bytes, got {data.dtype} of shape {data.shape}")
+                raise InvalidFileError(
+                    f"expected encoded bytes, got {data.dtype} of shape {data.shape}"
+                )
             with image_in(data.tobytes()) as image:
                 return made_of(image)
 

@@ -37,7 +37,7 @@ from humangs_jax.data.datasets.subject import (
 )
 from humangs_jax.io.arrays import check_array, check_indices
 from humangs_jax.io.mesh import read_obj
-from humangs_jax.io.reading import Refused, read_text, reading
+from humangs_jax.io.reading import InvalidFileError, read_text, reading
 
 Kind = Literal["A", "B", "C"]
 PCA_NUMBERS = 12
@@ -232,7 +232,7 @@ def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
                 expected = "three corners of a triangle"
                 if kind == "v":
                     expected = "three coordinates of a vertex"
-                raise Refused(f"line {number}: expected {expected}, got {len(words)}")
+                raise InvalidFileError(f"line {number}: expected {expected}, got {len(words)}")
             if kind == "v":
                 vertices.append(words[:3])
             elif kind == "f":
@@ -252,16 +252,16 @@ def read_scan(file: str | Path) -> Scan:
     with reading(file, "scan", CaptureError):
         meshes = read_obj(file)
         if len(meshes) != 1:
-            raise Refused(f"{len(meshes)} meshes: expected one mesh with one texture")
+            raise InvalidFileError(f"{len(meshes)} meshes: expected one mesh with one texture")
         mesh = meshes[0]
         uvs = getattr(mesh.visual, "uv", None)
         image = getattr(getattr(mesh.visual, "material", None), "image", None)
         if uvs is None:
-            raise Refused("no texture coordinates: expected a textured scan")
+            raise InvalidFileError("no texture coordinates: expected a textured scan")
         if (
             image is None or max(image.size) <= 2
         ):  # trimesh leaves out what it cannot read, or puts a placeholder there
-            raise Refused(
+            raise InvalidFileError(
                 "no texture image: expected a material (.mtl) beside the scan that names a PNG or"
                 " JPEG file"
             )
