@@ -2,8 +2,14 @@
 and one camera of a real capture against all four.
 """
 
+import os
+import resource
+import subprocess
+import sys
 import tempfile
+import time
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +22,7 @@ from humangs_jax.apps.video_motion import fit_video, look_at_video, rate_and_cou
 from humangs_jax.body.joints import BODY_NAMES, FINGERS, JOINT_NAMES
 from humangs_jax.body.landmarks import landmark_model
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body, without_expression
 from humangs_jax.capture.detection.face_and_hands import SHAPE_NAMES, FaceAndHands, hand_columns
 from humangs_jax.capture.detection.people import Networks, find_people
 from humangs_jax.capture.fitting.landmark_fit import fit_landmarks
@@ -39,8 +45,12 @@ STRONG = {
 """Expressions that are varied, and the shapes that move together in each."""
 FACE_SIDE, HEAD_PIXELS, HEAD_METRES = 512, 150, 0.24
 """Pixels of a picture and of the head in it; a usual height of a head."""
-TRIANGULATED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-"""Landmarks that are joints of the body, too, up to some centimetres."""
+FEET = [BODY_NAMES.index(name) for name in ("left_foot", "right_foot")]
+"""The balls of the feet among the joints of the body."""
+LOW_SHARE, LOW = 0.1, 0.02
+"""A foot stands while its ball is at most so many metres above this quantile of its heights."""
+SMOOTHNESS = 0.002
+"""Expected acceleration of the body that all cameras give, metres a frame^2: 7 m/s^2."""
 ARMS_DOWN = 1.25
 """Radians of the shoulders."""
 
@@ -203,68 +213,165 @@ def finger_errors(joints, truth):
 
 
 @entry
-def motion_cameras(run: Run, folder: Path, height: float = 1.75) -> None:
+def motion_cameras(run: Run, folder: Path, height: float = 1.75, timed_frames: int = 240) -> None:
     """The motion that each of four cameras finds alone in the real capture of `real_capture`, a man
-    on a treadmill, against triangulated landmarks of all four: joints, how far they jitter.
+    on a treadmill, against the body that all four find together.
+
+    joints: of the body, mean distance from those of the body of all four, measured from the pelvis
+    in the axes of the camera. bends: the same with the joints turned to agree best, so that what
+    remains is how limbs bend. third difference: mean length, over joints and frames. feet: how far
+    the ball of a foot that stands on the belt moves in a frame, across the belt's direction.
 
     Options:
     folder: with the unpacked wheel of pose2sim, see real_capture
-    height: the man's, metres: as the triangulated landmarks have it
+    height: the man's, metres
+    timed_frames: of the first video, forwards and backwards, whose motion is found by the command
+    in a process of its own, which has the time of the table; 0: none
     """
     demo = unpacked(folder)
-    lenses, rows, numbers = read_cameras(demo / "calibration" / "Calib.qca.txt"), [], {}
-    found = {}
+    lenses, found = read_cameras(demo / "calibration" / "Calib.qca.txt"), {}
     with tempfile.TemporaryDirectory() as place:
         for name in CAMERAS:
             lens, video = lenses[name], demo / "videos" / f"{name}.mp4"
             kept = Path(place) / f"{name}.npz"  # each video is looked at once
             seen, size = look_at_video(video, rate_and_count(video)[1], None, kept)
-            focal = DIAGONAL_35MM * lens.K[0, 0] / np.hypot(*size)
+            # frames are looked at smaller than they are
+            scale = max(size) / max(video_size(video))
+            focal = DIAGONAL_35MM * scale * lens.K[0, 0] / np.hypot(*size)
             fitted = fit_video(video, height=height, focal_mm=focal, kept=kept)
-            found[name] = (lens, seen, fitted)
-    truth, names = triangulated([(lens, seen) for lens, seen, _ in found.values()])
-    for name, (lens, _, fit) in found.items():
-        joints = fit.fit.joints[: len(truth)]
-        own = np.stack([joints[:, JOINT_NAMES.index(each)] for each in names], axis=1)
-        # in the axes of the camera, from the middle of the hips
-        theirs = truth @ lens.cam_from_world[:3, :3].T
-        ours = own @ fit.fit.cam_from_world[:3, :3].T
-        error = np.linalg.norm(from_hips(ours, names) - from_hips(theirs, names), axis=-1)
-        jitter = lambda x: np.linalg.norm(np.diff(x, n=3, axis=0), axis=-1).mean()
-        body = fit.fit.joints[:, : len(BODY_NAMES)]
+            found[name] = (lens, scale, seen, fitted.fit)
+        numbers: dict[str, Any] = {}
+        if timed_frames:
+            numbers["command"] = command_time(
+                demo / "videos" / f"{CAMERAS[0]}.mp4", timed_frames, Path(place)
+            )
+    truth = body_of_all([each[:3] for each in found.values()])
+    belt, standing = on_the_belt(truth)
+    numbers["all four"] = {
+        "third_difference_mm": third_difference(truth),
+        "feet_mm": feet_slide(truth, belt, standing),
+    }
+    for name, (lens, _, _, fit) in found.items():
+        # from the world of the motion to that of the calibration
+        turn = lens.cam_from_world[:3, :3].T @ fit.cam_from_world[:3, :3]
+        own = fit.joints[: len(truth), : len(BODY_NAMES)] @ turn.T
         numbers[name] = {
-            "mm": 1000 * float(np.nanmean(error)),
-            "third_difference_mm": 1000 * float(jitter(body)),
-            "third_difference_of_triangulated_mm": 1000 * float(np.nanmean(jitter(truth))),
+            "joints_mm": 1000 * distance(own - own[:, :1], truth - truth[:, :1]),
+            "bends_mm": 1000 * distance(turned_onto(own, truth), truth - truth[:, :1]),
+            "third_difference_mm": third_difference(own),
+            "feet_mm": feet_slide(own, belt, standing),
         }
-        rows.append([name, *(f"{value:.1f}" for value in numbers[name].values())])
-    header = ["camera", "joints, mm", "third differences, mm a frame^3", "of triangulated points"]
-    run.show(markdown_table(header, rows), {"cameras": numbers})
+    keys = ("joints_mm", "bends_mm", "third_difference_mm", "feet_mm")
+    rows = [
+        [name, *(f"{each[key]:.1f}" if key in each else "" for key in keys)]
+        for name, each in numbers.items()
+        if name != "command"
+    ]
+    header = ["camera", "joints, mm", "bends, mm", "third difference, mm a frame^3"]
+    text = markdown_table([*header, "feet, mm a frame"], rows)
+    if timed_frames:
+        taken = numbers["command"]
+        text += (
+            f"\n\n`humangs motion` of {timed_frames} frames: {taken['wall']:.0f} s,"
+            f" {taken['cpu']:.0f} s of CPU time."
+        )
+    run.show(text, numbers)
 
 
-def from_hips(joints, names):
-    """Joints measured from the middle of the hips."""
-    hips = [names.index("left_hip"), names.index("right_hip")]
-    return joints - joints[:, hips].mean(1, keepdims=True)
+def video_size(video: Path) -> tuple[int, int]:
+    """Pixels of a video's frames, width and height."""
+    import imageio_ffmpeg
+
+    reader = imageio_ffmpeg.read_frames(str(video))
+    size = next(reader)["size"]
+    reader.close()
+    return size
 
 
-def triangulated(cameras):
-    """Joints (m, j, 3) of all cameras, metres in the world of the calibration, by least squares
-    with the landmarks as weights, and their names.
+def command_time(video: Path, frames: int, folder: Path) -> dict[str, float]:
+    """Seconds of `humangs motion` on as many frames of a video, played forwards and backwards, with
+    an empty cache of compiled programs.
     """
-    names = [f"{side}_{part}" for side in ("left", "right") for part in TRIANGULATED]
-    columns = [MEDIAPIPE_69.names.index(name) for name in names]
-    count = min(len(seen["points"]) for _, seen in cameras)
-    points = np.zeros((count, len(names), 3))
-    projections = [lens.K @ lens.cam_from_world[:3] for lens, _ in cameras]
-    for i in range(count):
-        for j, column in enumerate(columns):
-            equations = []
-            for (lens, seen), projection in zip(cameras, projections, strict=True):
-                x, y = lens.undistorted(seen["points"][i, column].astype(float)[None])[0]
-                weight = seen["confidences"][i, column]
-                rows = [x * projection[2] - projection[0], y * projection[2] - projection[1]]
-                equations += [weight * row / np.linalg.norm(row[:3]) for row in rows]
-            point = np.linalg.svd(np.asarray(equations))[2][-1]
-            points[i, j] = point[:3] / point[3]
-    return points, names
+    import imageio_ffmpeg
+
+    long = folder / "long.mp4"
+    swing = "[0]split=4[a][b][c][d];[b]reverse[e];[d]reverse[f];[a][e][c][f]concat=n=4"
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(video)]
+    cut = ["-filter_complex", swing, "-frames:v", str(frames), str(long)]
+    subprocess.run([*ffmpeg, *cut], check=True)
+    environment = os.environ | {"HUMANGS_COMPILE_CACHE": str(folder / "cache")}
+    command = [sys.executable, "-m", "humangs_jax", "motion", str(long)]
+    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(
+        [*command, "--out", str(folder / "long.npz")],
+        check=True,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return {"frames": frames, "wall": time.perf_counter() - began, "cpu": cpu}
+
+
+def body_of_all(cameras: list[tuple[Any, float, dict[str, np.ndarray]]]) -> np.ndarray:
+    """Joints of the body (m, j, 3) that the landmarks of all cameras give together, frame by frame
+    smoothed as `humangs fit` does: metres in the world of the calibration.
+
+    Arguments: cameras: of each its lens, pixels of a looked-at frame for one of the video, and what
+    was seen.
+    """
+    count = min(len(seen["points"]) for _, _, seen in cameras)
+    points, confidences = [], []
+    for lens, scale, seen in cameras:
+        straight = lens.undistorted(seen["points"][:count].astype(float).reshape(-1, 2) / scale)
+        points.append(straight.reshape(count, -1, 2))
+        confidences.append(seen["confidences"][:count])
+    matrices = [np.stack([lens.K for lens, _, _ in cameras])] * count
+    places = [np.stack([lens.cam_from_world for lens, _, _ in cameras])] * count
+    observations = make_observations(
+        np.stack(points, axis=1),
+        np.stack(confidences, axis=1),
+        np.stack(matrices),
+        np.stack(places),
+    )
+    kind = MEDIAPIPE_69
+    model = landmark_model(without_expression(load_body()), kind.names, kind.places, kind.certainty)
+    fit = fit_landmarks(model, observations, smoothness=SMOOTHNESS)
+    return np.asarray(fit.joints)[:, : len(BODY_NAMES)]
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean distance of corresponding points."""
+    return float(np.linalg.norm(a - b, axis=-1).mean())
+
+
+def turned_onto(joints: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Joints of each frame from the pelvis, turned to agree best with the true ones."""
+    ours, theirs = joints - joints[:, :1], truth - truth[:, :1]
+    pairs = zip(ours, theirs, strict=True)
+    return np.stack([Rotation.align_vectors(b, a)[0].apply(a) for a, b in pairs])
+
+
+def third_difference(joints: np.ndarray) -> float:
+    """Mean length of the third differences over time, mm a frame^3."""
+    return 1000 * float(np.linalg.norm(np.diff(joints, n=3, axis=0), axis=-1).mean())
+
+
+def on_the_belt(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The direction in which the belt moves, and from which frames to the next each foot is on it:
+    those in which the ball of the foot is low. y is up.
+    """
+    feet = joints[:, FEET]
+    heights = feet[..., 1]
+    low = heights < np.quantile(heights, LOW_SHARE, axis=0) + LOW
+    standing = low[1:] & low[:-1]
+    moved = np.diff(feet, axis=0)[standing] * [1.0, 0.0, 1.0]
+    belt = np.linalg.svd(moved)[2][0]
+    return belt, standing
+
+
+def feet_slide(joints: np.ndarray, belt: np.ndarray, standing: np.ndarray) -> float:
+    """Mean length of the moves of the feet that stand, without the belt's direction, mm a frame."""
+    moved = np.diff(joints[:, FEET], axis=0)[standing]
+    across = moved - (moved @ belt)[:, None] * belt
+    return 1000 * float(np.linalg.norm(across, axis=-1).mean())
