@@ -206,7 +206,7 @@ def compute_stages(
         )
         maps = convolution.apply(part_variables(variables, "reader"), maps)
     pixels, texture = (
-        encoder_pixels(inputs, config.run()),
+        encoder_pixels(inputs, config.forward_context()),
         variables["params"]["encoder"]["tokenizer"]["texture"],
     )
     heads = lambda name: stages[f"decoder.{name}_out"].reshape(

@@ -138,12 +138,12 @@ def compare(
     inputs, encoding = subject(width, views, vertices, size)
     runs, found = {}, {}
     for name, config in configurations(width, size).items():
-        reader, run = config.architecture.reader, config.run()
+        reader, ctx = config.architecture.reader, config.forward_context()
         shapes = jax.eval_shape(
-            lambda reader=reader, run=run: reader.init(jax.random.key(0), encoding, inputs, run)
+            lambda reader=reader, ctx=ctx: reader.init(jax.random.key(0), encoding, inputs, ctx)
         )
         variables = jax.tree.map(lambda x: np.full(x.shape, 0.02, x.dtype), shapes)
-        read = lambda v, e, x, reader=reader, run=run: reader.apply(v, e, x, run).local
+        read = lambda v, e, x, reader=reader, ctx=ctx: reader.apply(v, e, x, ctx).local
         traced = jax.jit(read).trace(variables, encoding, inputs)
         program = traced.lower().compile()
         sums = READ_OPERATIONS * views * vertices * width if name == "back-projection" else 0
@@ -218,7 +218,7 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
             jnp.broadcast_to(points, (photos, *points.shape)),
         )
         inputs = HumanGSInputs(colors, camera, posed, points, colors, grid, grid > 0)
-        return Encoding(tokens, None, jnp.zeros((), jnp.int32)), inputs, config.run()
+        return Encoding(tokens, None, jnp.zeros((), jnp.int32)), inputs, config.forward_context()
 
     forward = lambda v, *given: reader.apply(v, *arguments(*given))
     tokens = jax.ShapeDtypeStruct((*grid.shape, getattr(reader, "width")), jnp.float32)  # noqa: B009 (of a TwoStreamReader)

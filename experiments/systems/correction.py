@@ -97,7 +97,7 @@ class CorrectionMLP(GaussianDriver):
 
     @nn.compact
     def __call__(
-        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+        self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """See `parts.TargetDecoder`.
 

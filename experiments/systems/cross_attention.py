@@ -47,14 +47,14 @@ class CrossAttentionReader(Reader):
 
     @nn.compact
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+        self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for an encoder with an upsampler."""
         tokens, count = image_tokens(encoding, inputs)
         canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
         x = nn.Dense(self.width, kernel_init=INIT, name="position")(positional_encoding(canonical))
         for index in range(self.layers):
-            x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(
+            x = CrossBlock(self.head_width, self.mlp_ratio, ctx.runtime, name=f"block_{index}")(
                 x, tokens, count
             )
         local = layer_norm(None, "norm", use_bias=True)(x)

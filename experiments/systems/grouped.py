@@ -61,7 +61,7 @@ class GroupReader(Reader):
 
     @nn.compact
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+        self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> Float[Array, "a r d"]:
         """Tokens of the 5 attributes of r groups.
 
@@ -74,9 +74,9 @@ class GroupReader(Reader):
         )
         init = nn.initializers.normal(INIT_STD)
         for index in range(self.layers):
-            own = Attention(self.head_width, True, run.runtime, init, name=f"self_{index}")
-            x = x + own(layer_norm(run.runtime.compute_dtype, f"self_norm_{index}")(x), None)
-            x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(
+            own = Attention(self.head_width, True, ctx.runtime, init, name=f"self_{index}")
+            x = x + own(layer_norm(ctx.runtime.compute_dtype, f"self_norm_{index}")(x), None)
+            x = CrossBlock(self.head_width, self.mlp_ratio, ctx.runtime, name=f"block_{index}")(
                 x, tokens, count
             )
         return layer_norm(None, "norm", use_bias=True)(x).reshape(
@@ -97,7 +97,7 @@ class GroupDecoder(Decoder):
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "a r d"], inputs: HumanGSInputs, run: ForwardContext
+        self, features: Float[Array, "a r d"], inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """A Gaussian a vertex. Raises ValueError for a body of more vertices than the groups
         have.

@@ -61,7 +61,7 @@ class NoReader(Reader):
     encoding.
     """
 
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
         return encoding
 
 
@@ -77,10 +77,10 @@ class PhotoDecoder(Decoder):
     """No Gaussians: the photos, for a `QueryDriver`."""
 
     def __call__(
-        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+        self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
         return HumanGSOutputs(
-            no_gaussians(), scene=Photos(encoder_pixels(inputs, run), inputs.view_count)
+            no_gaussians(), scene=Photos(encoder_pixels(inputs, ctx), inputs.view_count)
         )
 
 
@@ -128,11 +128,11 @@ class QueryDriver(PixelDriver):
 
     @nn.compact
     def __call__(
-        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+        self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext
     ) -> Float[Array, "i j 3"]:
         """The image of a target in [0, 1], on white; its sides are multiples of the patch size."""
         photos: Photos = outputs.scene
-        patch, dtype, width = self.patch_size, run.runtime.compute_dtype, self.transformer.width
+        patch, dtype, width = self.patch_size, ctx.runtime.compute_dtype, self.transformer.width
         query = cast(Array, target.pixels)
         seen, asked = photos.pixels[..., 3:9], query[..., :6]
         if self.texture is not None:
@@ -159,13 +159,13 @@ class QueryDriver(PixelDriver):
         count = None if real is None else targets + real * (len(seen) // len(photos.pixels))
         if self.latents is not None:
             learned = self.param("latents", nn.initializers.normal(INIT_STD), (self.latents, width))
-            encoder = Transformer(self.transformer, run.runtime, name="encoder")
+            encoder = Transformer(self.transformer, ctx.runtime, name="encoder")
             encoded = encoder(
                 jnp.concatenate([learned, seen]),
                 None if count is None else count - targets + self.latents,
             )[-1]
             seen, count = encoded[: self.latents], None
-        transformer = Transformer(self.transformer, run.runtime, name="transformer")
+        transformer = Transformer(self.transformer, ctx.runtime, name="transformer")
         depths = transformer(jnp.concatenate([asked, seen]), count)
         rows, columns = query.shape[0] // patch, query.shape[1] // patch
         maps = [x[:targets].reshape(1, rows, columns, width) for x in depths]

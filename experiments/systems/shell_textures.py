@@ -66,7 +66,7 @@ class PlainPhotos(Encoder):
 
     patch_size: Patch = 1
 
-    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
+    def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
         return Encoding(inputs.images, None, jnp.zeros((), jnp.int32))
 
 
@@ -87,7 +87,7 @@ class ShellTextureReader(Reader):
             )
 
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+        self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> ShellTextures:
         """Textures of the shells.
 
@@ -99,7 +99,7 @@ class ShellTextureReader(Reader):
             )
         unit, texels = subject_unit(inputs.canonical_vertices), inputs.texels
         steps = jnp.asarray(self.shells, inputs.images.dtype)
-        size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
+        size, grid = (inputs.cameras.width, inputs.cameras.height), ctx.conventions.pixel_grid
         covered = texels.covered
 
         def look(best, view):
@@ -185,7 +185,7 @@ class ShellDecoder(Decoder):
 
     @nn.compact
     def __call__(
-        self, features: ShellTextures, inputs: HumanGSInputs, run: ForwardContext
+        self, features: ShellTextures, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """A Gaussian a texel of every shell; those that show no point of the body, or were not
         seen, are transparent.

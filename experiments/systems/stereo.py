@@ -89,13 +89,13 @@ class StereoDecoder(Decoder):
 
     @nn.compact
     def __call__(
-        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+        self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """See `parts.Decoder`. A photo without another one is compared with itself."""
         images, cameras, vertices = inputs.images, inputs.cameras, inputs.posed_vertices
         size, grid, unit = (
             (cameras.width, cameras.height),
-            run.conventions.pixel_grid,
+            ctx.conventions.pixel_grid,
             subject_unit(inputs.canonical_vertices),
         )
         middle = jnp.mean(vertices[0], axis=0)
@@ -176,7 +176,7 @@ class NearestPairDriver(TargetDecoder):
     moves = False
 
     def __call__(
-        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+        self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """The outputs: which photos are near, their cameras say."""
         return outputs

@@ -98,7 +98,7 @@ class TextureReader(Reader):
     """Of the softmax over the cosines of visible views; larger: the best view."""
 
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+        self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> SurfaceTexture:
         """The texture. Raises: ValueError if the inputs lack the map of the surface or posed
         normals.
@@ -109,7 +109,7 @@ class TextureReader(Reader):
                 "a TextureReader needs posed_normals of the inputs, see `prepare_inputs`"
             )
         unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
-        size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
+        size, grid = (inputs.cameras.width, inputs.cameras.height), ctx.conventions.pixel_grid
 
         def view(image, depth_map, camera, vertices, normals, present):
             points = texels.interpolate(vertices).reshape(-1, 3)
@@ -150,7 +150,7 @@ class SurfaceDecoder(Decoder):
     surface_map: SurfaceMap = SurfaceMap()
 
     def __call__(
-        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+        self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """See `parts.Decoder`.
 
@@ -217,7 +217,7 @@ class TextureDriver(GaussianDriver):
 
     @nn.compact
     def __call__(
-        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+        self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """See `parts.TargetDecoder`.
 
@@ -256,7 +256,7 @@ class PoseMapDriver(GaussianDriver):
 
     @nn.compact
     def __call__(
-        self, outputs: HumanGSOutputs, target: Target, run: ForwardContext
+        self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext
     ) -> HumanGSOutputs:
         surface: Surface = outputs.scene
         upright = quaternion.matrix_from_axis_angle(target.pose.rotations[0])

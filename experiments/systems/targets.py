@@ -53,7 +53,9 @@ class GaussianDriver(TargetDecoder):
     ) -> tuple[Gaussians, HumanGSOutputs]:
         """The Gaussians of one frame, posed, and before that. variables: the driver's own."""
         target = Target(pose, person_vertices(body, betas, pose))
-        driven = cast(HumanGSOutputs, self.apply(variables, outputs, target, config.run()))
+        driven = cast(
+            HumanGSOutputs, self.apply(variables, outputs, target, config.forward_context())
+        )
         return skin(make_avatar(driven, body, shape_body(body, betas), config), pose), driven
 
     @nn.nowrap
@@ -109,7 +111,10 @@ class PixelDriver(TargetDecoder):
         @jax.checkpoint
         def one(target):
             return self.apply(
-                variables, outputs, Target(BodyPose(*target[:2]), *target[2:]), config.run()
+                variables,
+                outputs,
+                Target(BodyPose(*target[:2]), *target[2:]),
+                config.forward_context(),
             )
 
         arguments = (targets.rotations, targets.translations, vertices, pixels)
@@ -153,7 +158,7 @@ def target_queries(
     cameras = replace(cameras, width=width, height=height)
     hidden = replace(targets, images=blank, masks=blank[..., 0], cameras=cameras, view_count=None)
     views = jax.lax.stop_gradient(prepare_inputs(body, hidden, config))
-    return views.posed_vertices, encoder_pixels(views, config.run())[..., 3:]
+    return views.posed_vertices, encoder_pixels(views, config.forward_context())[..., 3:]
 
 
 def drawn(

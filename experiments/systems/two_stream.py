@@ -62,7 +62,7 @@ class TwoStreamReader(Reader):
 
     @nn.compact
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+        self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> VertexFeatures:
         """Features of the n vertices.
 
@@ -92,7 +92,7 @@ class TwoStreamReader(Reader):
         pooled = jnp.sum(tokens * present[:, None], axis=0) / jnp.maximum(jnp.sum(present), 1)
         for index in range(self.blocks):
             last, sizes = index + 1 == self.blocks, (self.width, self.mlp_ratio, self.head_width)
-            block = TwoStreamBlock(*sizes, run.runtime, last, name=f"block_{index}")
+            block = TwoStreamBlock(*sizes, ctx.runtime, last, name=f"block_{index}")
             points, tokens = block(points, tokens, count, pooled)
         points = layer_norm(None, "norm", use_bias=True)(points)
         local = points if cluster is None else points[cluster] + dense("skip")(embedded)

@@ -111,9 +111,9 @@ class HumanGSConfig:
     @property
     def tokens(self) -> TokenSelection:
         """The selection of tokens in force."""
-        return self.run().tokens
+        return self.forward_context().tokens
 
-    def run(self, train: bool = False, axis_name: Any = None) -> ForwardContext:
+    def forward_context(self, train: bool = False, axis_name: Any = None) -> ForwardContext:
         """How one pass of this network runs."""
         return ForwardContext(self.conventions, self.runtime, train, axis_name)
 

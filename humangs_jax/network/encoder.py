@@ -147,7 +147,7 @@ class PatchTransformer(Encoder):
             raise ValueError(f"layers must be even and at least 4, to have quarters; got {layers}")
 
     @nn.compact
-    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
+    def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
         """See `parts.Encoder`.
 
         Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
@@ -156,12 +156,12 @@ class PatchTransformer(Encoder):
         see = photo_pixels
         if self.geometry == "rays_and_positions":
             see = encoder_pixels
-        patches = patchify(see(inputs, run), self.patch_size)
+        patches = patchify(see(inputs, ctx), self.patch_size)
         views, height, width = (
             len(inputs.images),
             *(side // self.patch_size for side in inputs.images.shape[1:3]),
         )
-        dtype, present = run.runtime.compute_dtype, inputs.view_count
+        dtype, present = ctx.runtime.compute_dtype, inputs.view_count
         packing = None
         dropped = jnp.zeros((), jnp.int32)
         count = None
@@ -169,10 +169,10 @@ class PatchTransformer(Encoder):
             count = present * height * width
         # only patches that the person touches, packed to the front; the rest of the capacity is
         # padding
-        if run.tokens == "foreground":
+        if ctx.tokens == "foreground":
             touched = touched_patches(inputs.foreground, present, self.patch_size)
             packing = pack_patches(
-                touched, min(run.runtime.token_capacity or len(touched), len(touched))
+                touched, min(ctx.runtime.token_capacity or len(touched), len(touched))
             )
             dropped, count = jnp.sum(touched, dtype=jnp.int32) - packing.count, packing.count
             patches = patches.at[packing.indices].get(mode="fill", fill_value=0)
@@ -188,7 +188,7 @@ class PatchTransformer(Encoder):
                 count = count + 1
 
         # maps of the layers that are read; patches without a token are 0
-        depths = Transformer(self.transformer, run.runtime, name="transformer")(tokens, count)
+        depths = Transformer(self.transformer, ctx.runtime, name="transformer")(tokens, count)
         global_token = depths[-1][0] if class_token else None
         depths = [x[int(class_token) :] for x in depths]
         if self.upsampler is None or self.upsampler.features == "final":
@@ -201,13 +201,13 @@ class PatchTransformer(Encoder):
         real = None
         if present is not None:
             real = jnp.arange(views) < present
-        upsampled = Upsampler(self.upsampler, dtype, run.axis_name, name="upsampler")(
-            maps, run.train, real
+        upsampled = Upsampler(self.upsampler, dtype, ctx.axis_name, name="upsampler")(
+            maps, ctx.train, real
         )
         return Encoding(upsampled, global_token, dropped, packing, self.patch_size)
 
 
-def encoder_pixels(inputs: HumanGSInputs, run: ForwardContext) -> Float[Array, "v h w 12"]:
+def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
     """What the encoder sees of every pixel: rgb, ray (moment, direction), canonical position.
 
     Raises ValueError if images and cameras differ in size.
@@ -220,13 +220,13 @@ def encoder_pixels(inputs: HumanGSInputs, run: ForwardContext) -> Float[Array, "
         )
     unit = subject_unit(inputs.canonical_vertices)
     cameras = inputs.cameras.in_units(unit)
-    if run.conventions.ray_origins == "twice_normalized":
+    if ctx.conventions.ray_origins == "twice_normalized":
         cameras = cameras.in_units(unit)
     rays = jax.vmap(plucker_rays)(cameras).astype(inputs.images.dtype)
     return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
 
 
-def photo_pixels(inputs: HumanGSInputs, run: ForwardContext) -> Float[Array, "v h w 12"]:
+def photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
     """What an encoder without cameras and poses sees of every pixel: rgb, then its place (x, y) in
     [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
     """

@@ -52,11 +52,11 @@ class HumanGS(nn.Module):
     keeps_features: bool = False
     """Whether a driver works from the features."""
 
-    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> HumanGSOutputs:
+    def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> HumanGSOutputs:
         """The pass."""
-        encoding = self.encoder(inputs, run)
-        features = self.reader(encoding, inputs, run)
-        outputs = self.decoder(features, inputs, run)
+        encoding = self.encoder(inputs, ctx)
+        features = self.reader(encoding, inputs, ctx)
+        outputs = self.decoder(features, inputs, ctx)
         if self.keeps_features and outputs.scene is None:
             outputs = replace(outputs, scene=features)
         return replace(outputs, dropped_tokens=encoding.dropped_tokens)
@@ -85,13 +85,13 @@ def apply_humangs(
     Raises: ValueError if images and cameras differ in size, the patch size does not divide it, or
     inputs lack normals that the configuration needs.
     """
-    statistics, run = variables.get("batch_stats", {}), config.run(train, axis_name)
+    statistics, ctx = variables.get("batch_stats", {}), config.forward_context(train, axis_name)
     if not (train and statistics):
         return cast(
-            HumanGSOutputs, network(config.architecture).apply(variables, inputs, run)
+            HumanGSOutputs, network(config.architecture).apply(variables, inputs, ctx)
         ), statistics
     outputs, updated = network(config.architecture).apply(
-        variables, inputs, run, mutable=["batch_stats"]
+        variables, inputs, ctx, mutable=["batch_stats"]
     )
     return cast(HumanGSOutputs, outputs), cast(Variables, updated)["batch_stats"]
 
@@ -131,7 +131,7 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     Examples:
         >>> variables = hg.init_humangs(jax.random.key(0), config)
     """
-    run, parts = config.run(), config.architecture
+    ctx, parts = config.forward_context(), config.architecture
     encoder_key, decoder_key = jax.random.split(key)
     inputs = _example_inputs(parts)
 
@@ -139,14 +139,14 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
 
     def after(part, variables, *given):
-        return zeros(jax.eval_shape(lambda v: part.apply(v, *given, run), variables))
+        return zeros(jax.eval_shape(lambda v: part.apply(v, *given, ctx), variables))
 
     # each part is initialized on the shapes of what the part before it gives
-    made = {"encoder": parts.encoder.init(encoder_key, inputs, run)}
+    made = {"encoder": parts.encoder.init(encoder_key, inputs, ctx)}
     encoding = after(parts.encoder, made["encoder"], inputs)
-    made["reader"] = parts.reader.init(jax.random.fold_in(key, 2), encoding, inputs, run)
+    made["reader"] = parts.reader.init(jax.random.fold_in(key, 2), encoding, inputs, ctx)
     features = after(parts.reader, made["reader"], encoding, inputs)
-    made["decoder"] = parts.decoder.init(decoder_key, features, inputs, run)
+    made["decoder"] = parts.decoder.init(decoder_key, features, inputs, ctx)
     if parts.driver is not None:
         outputs = after(parts.decoder, made["decoder"], features, inputs)
         if outputs.scene is None:
@@ -154,7 +154,7 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
         pose = BodyPose(jnp.zeros((getattr(parts.driver, "joints", 1), 3)), jnp.zeros(3))
         pixels = inputs.images[0, ..., :1]
         target = Target(pose, inputs.canonical_vertices, jnp.repeat(pixels, 9, axis=-1))
-        made["driver"] = parts.driver.init(jax.random.fold_in(key, 3), outputs, target, run)
+        made["driver"] = parts.driver.init(jax.random.fold_in(key, 3), outputs, target, ctx)
 
     # variables by their kind, then by the name of the part
     def collect(kind):
@@ -169,7 +169,7 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
     return cast(
         Encoding,
         config.architecture.encoder.apply(
-            part_variables(variables, "encoder"), inputs, config.run()
+            part_variables(variables, "encoder"), inputs, config.forward_context()
         ),
     )
 
@@ -180,7 +180,7 @@ def read(
 ) -> PyTree:
     """The second part of `apply_humangs`: features of the body. Raises: as it."""
     return config.architecture.reader.apply(
-        part_variables(variables, "reader"), encoding, inputs, config.run()
+        part_variables(variables, "reader"), encoding, inputs, config.forward_context()
     )
 
 
@@ -193,7 +193,8 @@ def decode(
     """
     own = part_variables(variables, "decoder")
     return cast(
-        HumanGSOutputs, config.architecture.decoder.apply(own, features, inputs, config.run())
+        HumanGSOutputs,
+        config.architecture.decoder.apply(own, features, inputs, config.forward_context()),
     )
 
 

@@ -100,7 +100,7 @@ def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
 
 class ForwardContext(NamedTuple):
     """How one pass of the network runs: all that a part knows besides its fields. See
-    `HumanGSConfig.run`.
+    `HumanGSConfig.forward_context`.
     """
 
     conventions: Conventions
@@ -252,7 +252,7 @@ class Encoder(Part, nn.Module):
     patch_size: Patch = 1
     """The side of photos is a multiple of it, pixels."""
 
-    def __call__(self, inputs: HumanGSInputs, run: ForwardContext) -> Encoding:
+    def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
         """The encoding."""
         raise NotImplementedError
 
@@ -260,7 +260,7 @@ class Encoder(Part, nn.Module):
 class Reader(Part, nn.Module):
     """`Encoding` -> features of the body, in whatever form the decoder takes."""
 
-    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext) -> PyTree:
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext) -> PyTree:
         """Features."""
         raise NotImplementedError
 
@@ -269,7 +269,7 @@ class Decoder(Part, nn.Module):
     """Features of the body -> canonical Gaussians."""
 
     def __call__(
-        self, features: PyTree, inputs: HumanGSInputs, run: ForwardContext
+        self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """Gaussians; `dropped_tokens` is set by the pass."""
         raise NotImplementedError
@@ -283,7 +283,7 @@ class TargetDecoder(Part, nn.Module):
     has_alpha = True
     """Whether its images can be put on any background; else they are on white."""
 
-    def __call__(self, outputs: HumanGSOutputs, target: Target, run: ForwardContext) -> PyTree:
+    def __call__(self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext) -> PyTree:
         """The outputs corrected for a target, or its image."""
         raise NotImplementedError
 

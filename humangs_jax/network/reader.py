@@ -84,10 +84,10 @@ class PixelAlignedReader(Reader):
 
     @nn.compact
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+        self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
-        grid = run.conventions.pixel_grid
+        grid = ctx.conventions.pixel_grid
         unit = subject_unit(inputs.canonical_vertices)
         maps = encoding.maps
         # where each view sees each vertex, and whether it counts
@@ -96,7 +96,7 @@ class PixelAlignedReader(Reader):
             cameras, vertices, inputs.depth_maps, inputs.present, grid
         )
         pooled = visible
-        if run.conventions.pool != "visible":
+        if ctx.conventions.pool != "visible":
             pooled = inputs.present[:, None]
         weights = jnp.broadcast_to(pooled, visible.shape).astype(pixels.dtype)
         size = (cameras.width, cameras.height)
@@ -116,7 +116,7 @@ class PixelAlignedReader(Reader):
                 "kernel", KAIMING, (KERNEL, KERNEL, maps.shape[-1], self.output_width)
             )
             bias = self.param("bias", nn.initializers.zeros, (self.output_width,))
-            local = convolve_neighborhoods(*local, kernel, bias, run.runtime.compute_dtype)
+            local = convolve_neighborhoods(*local, kernel, bias, ctx.runtime.compute_dtype)
         # what photos show at the vertices and along their normals
         colors = fraction = shells = None
         if self.sample_rgb:

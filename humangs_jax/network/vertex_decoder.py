@@ -100,7 +100,7 @@ class VertexDecoder(Decoder):
 
     @nn.compact
     def __call__(
-        self, features: VertexFeatures, inputs: HumanGSInputs, run: ForwardContext
+        self, features: VertexFeatures, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
         """Gaussians of the n vertices, vertex-major, metres.
 
@@ -119,7 +119,7 @@ class VertexDecoder(Decoder):
             decoder_input(entering, canonical), 0 if shells is None else len(shells.distances)
         )
         made = activate(raw, self, features)
-        if run.conventions.pixels == "person" and shells is not None:
+        if ctx.conventions.pixels == "person" and shells is not None:
             # where the body is wider than the person, all photos show the background
             kept = on_the_person(shells)[:, None]
             made = replace(made, opacities=jnp.where(kept, made.opacities, 0.0))

@@ -59,7 +59,7 @@ def draw(config, variables, inputs, queries):
     outputs, _ = apply_humangs(variables, inputs, config)
     own, nobody = part_variables(variables, "driver"), BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
     one = lambda query: config.architecture.driver.apply(
-        own, outputs, Target(nobody, jnp.zeros((1, 3)), query), config.run()
+        own, outputs, Target(nobody, jnp.zeros((1, 3)), query), config.forward_context()
     )
     return jnp.stack([one(query) for query in queries])
 
@@ -67,7 +67,7 @@ def draw(config, variables, inputs, queries):
 def frame_outputs(variables, outputs, body, at, config):
     target = Target(at, person_vertices(body, BETAS, at))
     return config.architecture.driver.apply(
-        part_variables(variables, "driver"), outputs, target, config.run()
+        part_variables(variables, "driver"), outputs, target, config.forward_context()
     )
 
 
@@ -365,7 +365,7 @@ def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
     for sharpness in (2.0, 4.0):
         reader = dataclasses.replace(config.architecture.reader, sharpness=sharpness)
         read = lambda inputs, reader=reader: reader.apply(
-            {}, Encoding(inputs.images, None, jnp.int32(0)), inputs, config.run()
+            {}, Encoding(inputs.images, None, jnp.int32(0)), inputs, config.forward_context()
         )
         colors[sharpness] = jax.jit(read)(inputs).colors
     red = lambda sharpness: np.asarray(colors[sharpness][..., 0]).ravel()
@@ -505,7 +505,7 @@ def test_parts_that_do_not_fit_are_refused():
         jax.eval_shape(
             lambda v: apply_humangs(v, inputs_of("lca"), config)[0], random_variables(config)
         ),
-        config.run(),
+        config.forward_context(),
     )
     for driver, said in (
         (CorrectionMLP(8, 1, joints=5), r"driver\.joints 5: the pose has 2 joints"),

@@ -124,7 +124,9 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_color_of_the_photos():
     )
     variables = variables_of(plain)
     features = read(variables, encode(variables, inputs, plain), inputs, plain)
-    decoder = plain.architecture.decoder.init(jax.random.key(0), features, inputs, plain.run())
+    decoder = plain.architecture.decoder.init(
+        jax.random.key(0), features, inputs, plain.forward_context()
+    )
     variables = {**variables, "params": {**variables["params"], "decoder": decoder["params"]}}
     fresh = run(variables, inputs, plain)[1].gaussians
     unit, k = subject_unit(inputs.canonical_vertices), DECODER.gaussians_per_vertex

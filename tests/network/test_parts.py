@@ -49,7 +49,7 @@ class LookingReader(Reader):
 
     @nn.compact
     def __call__(
-        self, encoding: Encoding, inputs: HumanGSInputs, run: ForwardContext
+        self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> VertexFeatures:
         tokens = encoding.maps.reshape(-1, encoding.maps.shape[-1])
         dense = lambda name: nn.Dense(self.width, use_bias=False, name=name)

@@ -128,7 +128,7 @@ def test_views_that_do_not_see_a_vertex_do_not_dilute_its_feature(pool):
     maps = jnp.asarray([2.0, 6.0, 50.0])[:, None, None, None] * jnp.ones((3, 32, 32, 1))
     reader, how = (
         PixelAlignedReader(output_width=None, sample_rgb=True),
-        TINY.with_conventions(pool=pool).run(),
+        TINY.with_conventions(pool=pool).forward_context(),
     )
     features = jax.jit(
         lambda maps, inputs: reader.apply({}, Encoding(maps, None, jnp.int32(0)), inputs, how)

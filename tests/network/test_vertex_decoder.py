@@ -125,7 +125,7 @@ def biases_of(decoder, features):
     """Fresh biases of the last layers: what Gaussians start from, but for tiny weights."""
     init = jax.jit(
         lambda features: decoder.init(
-            jax.random.key(0), features, random_inputs(vertices=2), TINY.run()
+            jax.random.key(0), features, random_inputs(vertices=2), TINY.forward_context()
         )
     )
     params = init(features)["params"]
@@ -185,11 +185,11 @@ def test_scales_follow_the_spacing_of_vertices_and_nothing_else_does():
     inputs = random_inputs(vertices=4)
     decoder = VertexDecoder(hidden=8, tight=1, free=1)
     features = VertexFeatures(jnp.ones((4, 3)), jnp.ones(2))
-    run = TINY.run()
-    variables = decoder.init(jax.random.key(0), features, inputs, run)
+    ctx = TINY.forward_context()
+    variables = decoder.init(jax.random.key(0), features, inputs, ctx)
     spacing = jnp.asarray([1.0, 0.5, 0.25, 2.0])
-    as_trained = decoder.apply(variables, features, inputs, run).gaussians
-    finer = decoder.apply(variables, features, replace(inputs, spacing=spacing), run).gaussians
+    as_trained = decoder.apply(variables, features, inputs, ctx).gaussians
+    finer = decoder.apply(variables, features, replace(inputs, spacing=spacing), ctx).gaussians
     np.testing.assert_allclose(
         finer.scales, as_trained.scales * jnp.repeat(spacing, 2)[:, None], rtol=1e-6
     )
@@ -213,10 +213,10 @@ def test_a_person_twice_as_large_has_gaussians_twice_as_large():
         VertexDecoder(hidden=8, tight=1, free=1),
         VertexFeatures(jnp.ones((4, 3)), jnp.ones(2)),
     )
-    inputs, run = random_inputs(vertices=4), TINY.run()
-    variables = decoder.init(jax.random.key(0), features, inputs, run)
+    inputs, ctx = random_inputs(vertices=4), TINY.forward_context()
+    variables = decoder.init(jax.random.key(0), features, inputs, ctx)
     larger = replace(inputs, canonical_vertices=2 * inputs.canonical_vertices)
-    one, two = (decoder.apply(variables, features, x, run) for x in (inputs, larger))
+    one, two = (decoder.apply(variables, features, x, ctx) for x in (inputs, larger))
     for name, factor in {"means": 2, "scales": 2, "quats": 1, "opacities": 1, "colors": 1}.items():
         np.testing.assert_allclose(
             getattr(two.gaussians, name), factor * getattr(one.gaussians, name), rtol=1e-5
