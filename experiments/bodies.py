@@ -113,7 +113,7 @@ def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
     for name, divisor in FRACTIONS.items():
         small = decimate(body, len(body.template) // divisor)
         cases[name] = BodyCase(small, small)
-    if config.conventions.longest_edge is not None:
+    if config.conventions.max_edge_length is not None:
         for name in FRACTIONS:
             small = cases[name].body
             cases[f"{name}, edges split"] = BodyCase(small, gaussian_body(small, config))
@@ -122,7 +122,7 @@ def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
 
 def as_it_is(config: HumanGSConfig) -> HumanGSConfig:
     """The configuration for a body whose vertices carry the Gaussians as they are."""
-    return config.with_conventions(body_vertices=None, longest_edge=None)
+    return config.with_conventions(body_vertices=None, max_edge_length=None)
 
 
 def smplx_body(body: BodyModel) -> BodyModel:

@@ -178,7 +178,9 @@ KNOBS: dict[str, tuple[Any, ...]] = {
 SCHEDULE = ("tile_size", "block", "chunk")
 """Knobs that do not change the image: left out of the plot."""
 HIDDEN = (0.01, 0.03, 0.1)
-"""Weights on any pixel of any camera below which a Gaussian is dropped (`splatting.seen_from`)."""
+"""Weights on any pixel of any camera below which a Gaussian is dropped
+(`splatting.visible_gaussians`).
+"""
 VIEWS = 24
 """Cameras that ask what is hidden, besides the one that is drawn."""
 COMBINED: tuple[dict[str, Any], ...] = (

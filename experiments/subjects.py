@@ -150,11 +150,11 @@ class Start(NamedTuple):
         )
 
 
-def shipped_person(longest_edge: float | None = None) -> Avatar:
+def shipped_person(max_edge_length: float | None = None) -> Avatar:
     """The person of the demo from four photos, feed-forward."""
     variables, config = load_weights()
     return reconstruct(
-        variables, config.with_runtime(longest_edge=longest_edge), load_capture(DEMO_CAPTURE)
+        variables, config.with_runtime(max_edge_length=max_edge_length), load_capture(DEMO_CAPTURE)
     )
 
 

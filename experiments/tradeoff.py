@@ -138,7 +138,7 @@ def random_start(avatar: Any, seed: int) -> Any:
         scales=jnp.full((count, 3), 0.01),
         opacities=jnp.full(count, 0.5),
         colors=jnp.asarray(rng.random((count, 3)), jnp.float32),
-        low_pass=None,
+        pixel_footprint=None,
     )
     return replace(avatar, gaussians=gaussians, light=None)
 

@@ -65,7 +65,7 @@ def points() -> list[Point]:
     found += [point(dtype, "precision", dtype=dtype) for dtype in ("bfloat16", "float16")]
     found += [point(f"body of {n}", "Gaussians", body_vertices=n) for n in (1000, 2000, 3000)]
     found += [
-        point(f"edges of {edge * 1e3:g} mm", "Gaussians", longest_edge=edge)
+        point(f"edges of {edge * 1e3:g} mm", "Gaussians", max_edge_length=edge)
         for edge in (0.024, 0.017)
     ]
     found += [refined(*limits) for limits in ITERATIONS]
@@ -117,7 +117,7 @@ COMBINED: tuple[dict[str, Any], ...] = (
         "splat": "fast",
     },
     {"crop": True, "image_size": 384, "refine_iterations": 4, "refine_size": 512},
-    {"crop": True, "longest_edge": 0.02, "refine_iterations": 4, "refine_size": 256},
+    {"crop": True, "max_edge_length": 0.02, "refine_iterations": 4, "refine_size": 256},
 )
 """Several knobs at once."""
 
@@ -126,7 +126,7 @@ SHORT = {
     "image_size": "of {}",
     "crop": "cropped",
     "body_vertices": "body of {}",
-    "longest_edge": "edges of {} m",
+    "max_edge_length": "edges of {} m",
     "refine_iterations": "{} iterations",
     "refine_steps": "{} steps",
     "refine_size": "at {}",

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from experiments.harness import Run, entry
 from experiments.refinement import body_off
 from experiments.results import write_json
-from humangs_jax.avatar.animate import without_low_pass
+from humangs_jax.avatar.animate import without_pixel_footprint
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
@@ -172,7 +172,7 @@ def make_samples(out: Path, first: int, people: int, count: int, options: Refini
             names=tuple(map(str, range(PHOTOS))),
         )
         folder.mkdir(parents=True, exist_ok=True)
-        without_low_pass(reconstruct(*weights, capture)).save(folder / "avatar.npz")
+        without_pixel_footprint(reconstruct(*weights, capture)).save(folder / "avatar.npz")
         arrays = {name: to_uint8(getattr(both, name)) for name in ("images", "masks")}
         arrays |= {
             "rotations": np.asarray(poses.rotations),

@@ -39,5 +39,5 @@ def small_system(name: str) -> HumanGSConfig:
         shrunk[field] = dataclasses.replace(part, **own)
     config = config.with_parts(**shrunk).with_runtime(token_capacity=0)
     return config.with_conventions(
-        image_size=32, body_vertices=None, longest_edge=None, tokens="all"
+        image_size=32, body_vertices=None, max_edge_length=None, tokens="all"
     )

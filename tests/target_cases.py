@@ -51,7 +51,7 @@ def small(name: str) -> HumanGSConfig:
         }
         sizes = {"pose_width": 8, "pose_tokens": 2, "joints": 2} if name == "giga" else {}
         config = config.with_parts(**moved, driver=change(parts.driver, widths=(4, 8), **sizes))
-    return config.with_conventions(image_size=SIZE, body_vertices=None, longest_edge=None)
+    return config.with_conventions(image_size=SIZE, body_vertices=None, max_edge_length=None)
 
 
 def mapped_tube(config: HumanGSConfig):

@@ -205,7 +205,7 @@ def test_files_that_comments_name_exist():
 NOWHERE = (
     "splatting.default_pair",
     "splatting.render_view",
-    "avatar.low_pass",
+    "avatar.pixel_footprint",
     "Rendering.overflows",
     "seeds.SPLITS",
 )

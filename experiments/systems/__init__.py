@@ -39,7 +39,7 @@ Size = Literal["published", "bench"]
 BENCH_WIDTH, BENCH_HEAD = 128, 32
 BENCH_TRANSFORMER = TransformerConfig(width=BENCH_WIDTH, layers=4, head_width=BENCH_HEAD)
 BENCH_BLOCKS = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
-BENCH = {"image_size": 32, "body_vertices": 800, "longest_edge": None}
+BENCH = {"image_size": 32, "body_vertices": 800, "max_edge_length": None}
 """Conventions of the bench; the others are the published ones."""
 
 
@@ -71,7 +71,9 @@ def ours(size: Size = "published") -> HumanGSConfig:
     encoder = encoder.clone(
         texture=TriplaneConfig(resolution=32, channels=8), transformer=BENCH_TRANSFORMER
     )
-    conventions = dataclasses.replace(_scaled(config.conventions), skinning_reach=None, light=False)
+    conventions = dataclasses.replace(
+        _scaled(config.conventions), leg_blend_distance=None, light=False
+    )
     return HumanGSConfig(
         Architecture(encoder, reader, decoder.clone(hidden=BENCH_WIDTH)), conventions
     )
@@ -217,7 +219,7 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
             VertexDecoder(hidden=BENCH_WIDTH),
         )
     decoder = decoder.clone(tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
-    conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.0128)
+    conventions = Conventions(tokens="foreground", pixels="person", max_edge_length=0.0128)
     return _sized(size, conventions, encoder, reader, decoder)
 
 

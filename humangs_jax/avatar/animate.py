@@ -5,8 +5,8 @@ every size.
 A renderer adds `EPS2D` pixels^2 to the variances of each Gaussian, whatever the size of the image.
 Gaussians that fit images of one size are therefore too wide in smaller images, and too narrow in
 larger ones. Here all but `MIP_EPS2D` of it goes into the scales, for the size of the images that
-they fit (after Mip-Splatting, https://arxiv.org/abs/2311.16493), and `Gaussians.low_pass` tells
-renderers so.
+they fit (after Mip-Splatting, https://arxiv.org/abs/2311.16493), and `Gaussians.pixel_footprint`
+tells renderers so.
 """
 
 import jax
@@ -179,47 +179,51 @@ def _animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
 # --------------------------------------------------------------------------------------------------
 
 
-def with_low_pass(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
+def with_pixel_footprint(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
     """The avatar whose scales contain the low-pass of images with pixels of this size in metres.
 
     One that is drawn by other conventions than "exact", or has a low-pass already, is returned as
     it is.
     """
     gaussians = avatar.gaussians
-    if avatar.rendering != "exact" or gaussians.low_pass is not None:
+    if avatar.rendering != "exact" or gaussians.pixel_footprint is not None:
         return avatar
-    low_pass = jnp.broadcast_to(
+    pixel_footprint = jnp.broadcast_to(
         jnp.asarray(pixel, gaussians.scales.dtype), gaussians.opacities.shape
     )
     return replace(
         avatar,
-        gaussians=replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass),
+        gaussians=replace(
+            gaussians,
+            scales=widened(gaussians.scales, pixel_footprint),
+            pixel_footprint=pixel_footprint,
+        ),
     )
 
 
-def without_low_pass(avatar: Avatar) -> Avatar:
-    """The avatar that `with_low_pass` had."""
+def without_pixel_footprint(avatar: Avatar) -> Avatar:
+    """The avatar that `with_pixel_footprint` had."""
     gaussians = avatar.gaussians
-    scales = widened(gaussians.scales, gaussians.low_pass, -1)
-    return replace(avatar, gaussians=replace(gaussians, scales=scales, low_pass=None))
+    scales = widened(gaussians.scales, gaussians.pixel_footprint, -1)
+    return replace(avatar, gaussians=replace(gaussians, scales=scales, pixel_footprint=None))
 
 
-def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
+def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
     """The avatar with the low-pass of the photos that it will be fitted to, unless its own is that
     of smaller pixels.
 
     It looks as before: by how much its low-pass was larger is now part of the scales, which a fit
     can reduce.
     """
-    return replace(avatar, gaussians=_low_pass_of(avatar, views))
+    return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))
 
 
 @jax.jit
-def _low_pass_of(avatar: Avatar, views: SubjectViews) -> Gaussians:
+def _pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Gaussians:
     gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
-    if gaussians.low_pass is None:
-        return with_low_pass(avatar, sizes).gaussians
-    return replace(gaussians, low_pass=jnp.minimum(gaussians.low_pass, sizes))
+    if gaussians.pixel_footprint is None:
+        return with_pixel_footprint(avatar, sizes).gaussians
+    return replace(gaussians, pixel_footprint=jnp.minimum(gaussians.pixel_footprint, sizes))
 
 
 @jax.jit

@@ -181,8 +181,8 @@ _ARRAYS = (
 ALIKE = 1e-3
 """Skinning weights that differ by less are those of one vertex."""
 _LIGHT = ("coefficients", "normals", "shading")
-_OPTIONAL = ("low_pass", "harmonics")
-"""Arrays that only some Gaussians have."""
+_OPTIONAL = {"low_pass": "pixel_footprint", "harmonics": "harmonics"}
+"""Key of the file -> field of `Gaussians`, of arrays that only some have."""
 
 
 @pytree_dataclass
@@ -241,7 +241,7 @@ class Avatar(Batchable):
         if len(weights) % vertices:
             return None
         own = weights.reshape(vertices, -1, weights.shape[1])
-        # those between the legs may have other weights (`body.model.spread_weights`): most
+        # those between the legs may have other weights (`body.model.blend_leg_weights`): most
         # of a vertex's agree
         alike = np.isclose(own, own[:, :1], atol=ALIKE).all(axis=(1, 2))
         return own.shape[1] if alike.mean() > 0.5 else None
@@ -330,7 +330,7 @@ class Avatar(Batchable):
         # what only some avatars have
         if self.light is not None:
             values |= {f"light_{name}": getattr(self.light, name) for name in _LIGHT}
-        optional = {name: getattr(self.gaussians, name) for name in _OPTIONAL}
+        optional = {name: getattr(self.gaussians, field) for name, field in _OPTIONAL.items()}
         values |= {name: x for name, x in optional.items() if x is not None}
         values = {
             name: np.asarray(x if name == "faces" else at_least_float32(x))
@@ -427,7 +427,7 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     return cls(
         Gaussians(
             *(loaded[name] for name in _ARRAYS[:5]),
-            **{name: loaded.get(name) for name in _OPTIONAL},
+            **{field: loaded.get(name) for name, field in _OPTIONAL.items()},
         ),
         *(loaded[name] for name in _ARRAYS[5:]),
         parents=tuple(header["parents"]),
@@ -518,15 +518,17 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
         )
     # shapes by the annotations of the records that the arrays are of, and numbers of some size
     sizes = {"g": g, "n": n, "j": j}
+    keys = {field: key for key, field in _OPTIONAL.items()}
     for record, prefix in ((Gaussians, ""), (Avatar, ""), (Light, "light_")):
         for field, annotated in array_fields(record).items():
-            array = arrays.get(prefix + field)
+            key = keys.get(field, prefix + field)
+            array = arrays.get(key)
             if array is None or field == "faces":
                 continue
-            values = _RANGES.get(prefix + field, annotated.values or FINITE)
+            values = _RANGES.get(key, annotated.values or FINITE)
             shape = annotated.shape(array, sizes)
             least, most = max(values.low, -LARGEST), min(values.high, LARGEST)
-            check_array(prefix + field, array, shape, least, most)
+            check_array(key, array, shape, least, most)
     if "harmonics" in arrays:
         check_count(arrays["harmonics"].shape[1])
     # what shapes and ranges do not say

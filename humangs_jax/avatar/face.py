@@ -133,8 +133,10 @@ def with_hidden(gaussians: Gaussians, hidden: Gaussians) -> Gaussians:
     if gaussians.harmonics is not None:
         shape = (len(hidden.means), *gaussians.harmonics.shape[1:])
         fields["harmonics"] = jnp.zeros(shape, gaussians.harmonics.dtype)
-    if gaussians.low_pass is not None:
-        fields["low_pass"] = jnp.full(len(hidden.means), jnp.median(gaussians.low_pass))
+    if gaussians.pixel_footprint is not None:
+        fields["pixel_footprint"] = jnp.full(
+            len(hidden.means), jnp.median(gaussians.pixel_footprint)
+        )
     if gaussians.deformations is not None:
         fields["deformations"] = jnp.broadcast_to(jnp.eye(3), (len(hidden.means), 3, 3))
     hidden = replace(hidden, **fields)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.avatar.animate import with_low_pass
+from humangs_jax.avatar.animate import with_pixel_footprint
 from humangs_jax.avatar.avatar import (
     Avatar,
     Light,
@@ -26,9 +26,9 @@ from humangs_jax.body.model import (
     BodyModel,
     BodyPose,
     RestBody,
+    blend_leg_weights,
     blend_transforms,
     joint_transforms,
-    spread_weights,
 )
 from humangs_jax.core.array_types import Array, Bool, Int
 from humangs_jax.core.arrays import from_host
@@ -454,14 +454,16 @@ def completed_avatar(
     """
     conventions = config.conventions
     avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)
-    if conventions.skinning_reach is not None and outputs.skinning_weights is None:
-        avatar = with_spread_weights(
-            avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach
+    if conventions.leg_blend_distance is not None and outputs.skinning_weights is None:
+        avatar = with_blended_leg_weights(
+            avatar,
+            BodyPose(views.rotations[0], views.translations[0]),
+            conventions.leg_blend_distance,
         )
     if conventions.light and outputs.skinning_weights is None:
         avatar = with_light(avatar, views)
-    if conventions.low_pass is not None:
-        avatar = with_low_pass(avatar, conventions.low_pass)
+    if conventions.pixel_footprint is not None:
+        avatar = with_pixel_footprint(avatar, conventions.pixel_footprint)
     return avatar
 
 
@@ -505,8 +507,8 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
     return replace(avatar, light=Light(coefficients, normals, log_brightness(terms, coefficients)))
 
 
-def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
-    """The avatar with the weights of `spread_weights`. In `pose`, that of the first photo, the
+def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
+    """The avatar with the weights of `blend_leg_weights`. In `pose`, that of the first photo, the
     means stay where they were.
 
     The shapes of Gaussians are not corrected. Gradients do not pass through the weights.
@@ -516,7 +518,7 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     points = jax.lax.stop_gradient(gaussians.means)
     distances = jnp.linalg.norm(points - jnp.repeat(vertices, per_vertex, axis=0), axis=-1)
     legs = jnp.asarray([[name in names for name in avatar.joint_names] for names in LEGS])
-    spread = spread_weights(points, distances, own, vertices, own[::per_vertex], legs, reach)
+    spread = blend_leg_weights(points, distances, own, vertices, own[::per_vertex], legs, reach)
     transforms = joint_transforms(
         avatar.rest_joints, avatar.parents, pose.rotations, pose.translation
     )

@@ -108,7 +108,7 @@ def blend_transforms(
     return jnp.einsum("nj,jab->nab", weights, transforms, precision=EXACT)
 
 
-def spread_weights(
+def blend_leg_weights(
     points: Float[Array, "g 3"],
     distances: Float[Array, " g"],
     weights: Float[Array, "g j"],
@@ -244,7 +244,7 @@ class BodyModel:
     """Order in which vertices vanish in progressive decimation, (n,): `body.resolution`."""
     collapse_into: Int[Array, " n"] | None = None
     """Vertex that each of them is merged with, (n,)."""
-    spacing: Float[Array, " n"] | None = None
+    relative_vertex_spacing: Float[Array, " n"] | None = None
     """Distance to neighboring vertices relative to the mesh that was subdivided: `body.resolution`.
     """
     texels: Texels | None = None
@@ -259,7 +259,7 @@ class BodyModel:
     """Names of the s shape directions."""
     name: str = static_field(default="body")
     """Name of the body in messages."""
-    made_for: tuple | None = static_field(default=None)
+    remesh_key: tuple | None = static_field(default=None)
     """What `data.views.gaussian_body` has made it for; None: a body as it was read."""
 
 

@@ -56,8 +56,8 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
 
     Faces are cut into two, three or four along the midpoints of their long edges, consistently on
     both sides. Texture coordinates and decimation order are dropped: they belong to the original
-    mesh. `spacing` is the root of the area around a vertex over what it was: 1/2 where every edge
-    has been halved.
+    mesh. `relative_vertex_spacing` is the root of the area around a vertex over what it was: 1/2
+    where every edge has been halved.
 
     Raises: ValueError if `longest` is not positive, or less than 1/64 of the longest edge.
     """
@@ -116,13 +116,13 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
         **{name: from_host(x) for name, x in linear.items()},
         faces=from_host(faces, body.faces.dtype),
         joint_regressor=regressor,
-        spacing=from_host(spacing, body.template.dtype),
+        relative_vertex_spacing=from_host(spacing, body.template.dtype),
         expressions=None if moves is None else moves.expressions(),
         uvs=None,
         uv_faces=None,
         collapse_order=None,
         collapse_into=None,
-        made_for=None,
+        remesh_key=None,
     )
     return finer, weights
 
@@ -580,7 +580,7 @@ def decimate_with_kept(
         expressions=_kept_moves(body.expressions, renumber),
         uvs=uvs,
         uv_faces=uv_faces,
-        made_for=None,
+        remesh_key=None,
         collapse_order=from_host(order[kept], jnp.int32),
         collapse_into=from_host(renumber[into[kept]], jnp.int32),
     )

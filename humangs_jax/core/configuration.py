@@ -6,6 +6,8 @@ Numbers are annotated with their range, which every way to make a configuration 
     class Fit:
         steps: Annotated[int, Range(1, 1000)] = 100
 
+A class variable `renamed_fields` maps names that fields had in earlier files to those of today.
+
 A field annotated with a class of `Part` may hold any `part` that derives from it. Its JSON names
 the class under "kind", as "PatchTransformer". Reading imports nothing: a part of another package is
 known once its module is imported.
@@ -465,6 +467,10 @@ def _find_part(kind: Any, base: Any, path: str) -> type:
 def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object, got {values!r}")
+    values = dict(values)
+    for before, now in getattr(cls, "renamed_fields", {}).items():
+        if before in values and now not in values:
+            values[now] = values.pop(before)
     annotations = {
         name: hint for name, hint in typing.get_type_hints(cls).items() if name in field_names(cls)
     }

@@ -91,12 +91,14 @@ def add_skirt(
         count:
     ]
     sides = np.sqrt(vertex_areas(rest + moved, faces))
-    if body.spacing is None:
+    if body.relative_vertex_spacing is None:
         own = np.ones(count)
     else:
-        own = np.asarray(body.spacing)
+        own = np.asarray(body.relative_vertex_spacing)
     spacing = np.concatenate([own, sides[count:] / np.median(sides[:count] / own)])
-    return replace(worn, spacing=from_host(spacing, body.template.dtype)), moved.astype(np.float32)
+    return replace(
+        worn, relative_vertex_spacing=from_host(spacing, body.template.dtype)
+    ), moved.astype(np.float32)
 
 
 def find_hem(body: BodyModel, capture: Capture) -> float | None:
@@ -176,8 +178,10 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     # joints stay where they are
     regressor = np.pad(np.asarray(body.joint_regressor), ((0, 0), (0, added)))
     spacing = None
-    if body.spacing is not None:
-        spacing = from_host(np.pad(np.asarray(body.spacing), (0, added), constant_values=1))
+    if body.relative_vertex_spacing is not None:
+        spacing = from_host(
+            np.pad(np.asarray(body.relative_vertex_spacing), (0, added), constant_values=1)
+        )
     return replace(
         body,
         **{name: from_host(x) for name, x in linear.items()},
@@ -185,7 +189,7 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
             np.concatenate([np.asarray(body.faces), len(body.template) + tube]), body.faces.dtype
         ),
         joint_regressor=from_host(regressor),
-        spacing=spacing,
+        relative_vertex_spacing=spacing,
         uvs=None,
         uv_faces=None,
         collapse_order=None,

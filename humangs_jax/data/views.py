@@ -92,17 +92,17 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the
     weights want it; with the map of its surface where the network works on one.
 
-    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless
-    `runtime.longest_edge` asks for more vertices or `runtime.body_vertices` for fewer. The last
-    four results are kept: making one takes as long as a small network does on a CPU.
+    Its `relative_vertex_spacing` is relative to the mesh that the weights were trained with: 1
+    unless `runtime.max_edge_length` asks for more vertices or `runtime.body_vertices` for fewer.
+    The last four results are kept: making one takes as long as a small network does on a CPU.
 
     Raises: ValueError if `runtime` has both.
     """
     asked = config.runtime
-    if None not in (asked.body_vertices, asked.longest_edge):
+    if None not in (asked.body_vertices, asked.max_edge_length):
         raise ValueError(
-            "runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of"
-            " them"
+            "runtime: body_vertices asks for fewer vertices, max_edge_length for more: expected one"
+            " of them"
         )
     if has_mesh_of(body, config):
         return body
@@ -114,7 +114,7 @@ def has_mesh_of(body: BodyModel, config: HumanGSConfig) -> bool:
     asks for nothing.
     """
     key = remesh_key(config)
-    return body.made_for == key or not any(key)
+    return body.remesh_key == key or not any(key)
 
 
 def remesh_key(config: HumanGSConfig) -> tuple[Any, ...]:
@@ -122,9 +122,9 @@ def remesh_key(config: HumanGSConfig) -> tuple[Any, ...]:
     trained, asked = config.conventions, config.runtime
     return (
         trained.body_vertices,
-        trained.longest_edge,
+        trained.max_edge_length,
         asked.body_vertices,
-        asked.longest_edge,
+        asked.max_edge_length,
         config.architecture.surface_map,
     )
 
@@ -164,7 +164,7 @@ def _remeshed(
     whole, of_whole = body, weights
     if edge is not None:
         body, split = split_with_weights(body, edge)
-        body, weights = replace(body, spacing=None), split @ weights
+        body, weights = replace(body, relative_vertex_spacing=None), split @ weights
     if fewer is not None and fewer < len(whole.template):
         coarse, kept = decimate_with_kept(whole, fewer)
         of_coarse = of_whole[kept]
@@ -174,13 +174,13 @@ def _remeshed(
             of_coarse = split @ of_coarse
         wider = np.sqrt(len(body.template) / len(coarse.template))
         spacing = from_host(np.full(len(coarse.template), wider), body.template.dtype)
-        body, weights = replace(coarse, spacing=spacing), of_coarse
+        body, weights = replace(coarse, relative_vertex_spacing=spacing), of_coarse
     if longest is not None:
         body, split = split_with_weights(body, longest)
         weights = split @ weights
     if wanted is not None:
         body = replace(body, texels=wanted.texels(body))
-    return replace(body, made_for=(vertices, edge, fewer, longest, wanted)), weights
+    return replace(body, remesh_key=(vertices, edge, fewer, longest, wanted)), weights
 
 
 def on_gaussian_body(
@@ -254,7 +254,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
         view_count=views.view_count,
         posed_normals=jax.vmap(normals)(posed),
         canonical_normals=normals(rest.vertices),
-        spacing=body.spacing,
+        relative_vertex_spacing=body.relative_vertex_spacing,
         skinning_weights=body.skinning_weights,
         texels=body.texels,
     )

@@ -74,7 +74,7 @@ class HumanGSInputs:
     """Unit normals of the canonical vertices, (n, 3), used where the decoder's frame is
     "normal".
     """
-    spacing: Float[Array, " n"] | None = None
+    relative_vertex_spacing: Float[Array, " n"] | None = None
     """Distance between vertices relative to the mesh that the weights were trained with, (n,);
     None: 1.
     """

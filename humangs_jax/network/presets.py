@@ -64,10 +64,10 @@ def small() -> HumanGSConfig:
             image_size=256,
             tokens="foreground",
             pixels="person",
-            skinning_reach=0.04,
+            leg_blend_distance=0.04,
             light=True,
             body_vertices=4000,
-            longest_edge=0.03,
+            max_edge_length=0.03,
         ),
         Runtime(token_capacity=1344),
     )

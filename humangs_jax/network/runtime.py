@@ -2,7 +2,7 @@
 trained with.
 """
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 
@@ -84,7 +84,7 @@ class Runtime:
     """What a block recomputes in the backward pass instead of keeping it: nothing, all ("full"), or
     all but the results of attention and of products with weights ("dots"). On a CPU only a `scan`
     recomputes: XLA merges what is computed twice outside of loops."""
-    longest_edge: Edge | None = knob(
+    max_edge_length: Edge | None = knob(
         None,
         cost="three times the Gaussians at 0.017",
         gain="detail where photos have more than the vertices of the body",
@@ -128,6 +128,7 @@ class Runtime:
     which else comes first, and a skirt (`data.skirt`) are left out, too."""
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""
+    renamed_fields: ClassVar[dict[str, str]] = {"longest_edge": "max_edge_length"}
 
     @property
     def compute_dtype(self) -> Any:
@@ -170,15 +171,15 @@ class Conventions:
     """How the Gaussians are posed."""
     rendering: Literal["exact", "inria"] = "exact"
     """How they are drawn."""
-    skinning_reach: Length | None = None
+    leg_blend_distance: Length | None = None
     """Gaussians between the legs farther than this from their vertex, metres, move with both
-    (`body.model.spread_weights`);
+    (`body.model.blend_leg_weights`);
     None: all with their vertex."""
     light: bool = False
     """Other poses are drawn in the light of the photos (`Avatar.light`)."""
-    low_pass: Length | None = None
+    pixel_footprint: Length | None = None
     """Metres that a pixel of the training images shows of the person, if their low-pass is to be
-    part of the scales (`Gaussians.low_pass`); None: it stays with the renderer."""
+    part of the scales (`Gaussians.pixel_footprint`); None: it stays with the renderer."""
     body_vertices: Vertices | None = knob(
         None,
         cost="detail of the body",
@@ -186,10 +187,15 @@ class Conventions:
         measured=EVALUATION,
     )
     """Number of vertices to which bodies are decimated; None: they are not."""
-    longest_edge: Edge | None = knob(
+    max_edge_length: Edge | None = knob(
         None,
         cost="Gaussians grow as it shrinks",
         gain="detail where the body is coarse",
         measured=EVALUATION,
     )
     """Metres to which their edges are split afterwards; None: they are not."""
+    renamed_fields: ClassVar[dict[str, str]] = {
+        "skinning_reach": "leg_blend_distance",
+        "low_pass": "pixel_footprint",
+        "longest_edge": "max_edge_length",
+    }

@@ -123,8 +123,8 @@ class VertexDecoder(Decoder):
             # where the body is wider than the person, all photos show the background
             kept = on_the_person(shells)[:, None]
             made = replace(made, opacities=jnp.where(kept, made.opacities, 0.0))
-        if inputs.spacing is not None:
-            made = replace(made, scales=made.scales * inputs.spacing[:, None, None])
+        if inputs.relative_vertex_spacing is not None:
+            made = replace(made, scales=made.scales * inputs.relative_vertex_spacing[:, None, None])
 
         def flat(x):
             return x.reshape(-1, *x.shape[2:])

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.avatar.animate import with_low_pass_of
+from humangs_jax.avatar.animate import with_pixel_footprint_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
@@ -99,7 +99,7 @@ def sharpened(
     with clock.compiling():
         photos, drawn = photos_of(crops.views), avatar.select(crops.drawn)
         if crops.finer:
-            drawn = with_low_pass_of(drawn, crops.views)
+            drawn = with_pixel_footprint_of(drawn, crops.views)
         parameters = unconstrained(drawn.gaussians)
         share = from_host(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
         state = started(parameters, share, settings, crops.splat)

@@ -101,21 +101,27 @@ def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
             "refine: gaussians.harmonics: expected none: colors that depend on the view are not"
             " refined"
         )
-    return unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
+    return unconstrain(
+        replace(gaussians, scales=widened(gaussians.scales, gaussians.pixel_footprint, -1))
+    )
 
 
 @compiled
 def gaussians_of(
-    parameters: UnconstrainedGaussians, low_pass: Float[Array, " g"] | None
+    parameters: UnconstrainedGaussians, pixel_footprint: Float[Array, " g"] | None
 ) -> Gaussians:
     """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
     gaussians = constrain(parameters)
-    return replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass)
+    return replace(
+        gaussians,
+        scales=widened(gaussians.scales, pixel_footprint),
+        pixel_footprint=pixel_footprint,
+    )
 
 
 def avatar_of(parameters: UnconstrainedGaussians, avatar: Avatar) -> Avatar:
     """The avatar with the Gaussians that the parameters stand for."""
-    return replace(avatar, gaussians=gaussians_of(parameters, avatar.gaussians.low_pass))
+    return replace(avatar, gaussians=gaussians_of(parameters, avatar.gaussians.pixel_footprint))
 
 
 # Images and their difference from the photos

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from humangs_jax.avatar.animate import with_low_pass_of
+from humangs_jax.avatar.animate import with_pixel_footprint_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.capture import Capture
@@ -191,12 +191,12 @@ def refine_with_report(
         try:
             with clock.compiling():
                 compiler.shutdown()
-                begin = with_low_pass_of(result, views)
+                begin = with_pixel_footprint_of(result, views)
                 if len(best.used) < len(task.photos):
                     crops = _crops(begin, photos.select(best.used), config)
             if crops is not None:
                 sharp = sharpened(begin, best.state.trust, crops, config, clock)
-                drawn = with_low_pass_of(sharp, views)
+                drawn = with_pixel_footprint_of(sharp, views)
                 sharp_there = avatar_comparison(task, drawn, fitted, best.state.splat).together()
                 if sharp_there.loss < after.loss:
                     result, after, head_steps = sharp, sharp_there, config.head_steps

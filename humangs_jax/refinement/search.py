@@ -20,7 +20,11 @@ from typing import Any, NamedTuple, TypeVar, cast
 import jax
 import numpy as np
 
-from humangs_jax.avatar.animate import with_low_pass, with_low_pass_of, without_low_pass
+from humangs_jax.avatar.animate import (
+    with_pixel_footprint,
+    with_pixel_footprint_of,
+    without_pixel_footprint,
+)
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
@@ -232,8 +236,8 @@ def prepare(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, clock: Clock
 ) -> tuple[Task, Candidate, Comparison]:
     """The task, the start and its comparison with each photo."""
-    start = with_low_pass_of(avatar, views)
-    fresh = replace(avatar, gaussians=_fresh(avatar, start.gaussians.low_pass))
+    start = with_pixel_footprint_of(avatar, views)
+    fresh = replace(avatar, gaussians=_fresh(avatar, start.gaussians.pixel_footprint))
     photos, held = list(photos_of(views)), np.zeros(views.masks.shape, bool)
     if len(photos) < HELD_OUT_PHOTOS:
         held = held_out_blocks(views.masks.shape, config.held_out, config.seed)
@@ -253,9 +257,11 @@ def prepare(
 
 
 @jax.jit
-def _fresh(avatar: Avatar, low_pass: Float[Array, " g"] | None) -> Gaussians:
+def _fresh(avatar: Avatar, pixel_footprint: Float[Array, " g"] | None) -> Gaussians:
     """See `Task.fresh`."""
-    return with_low_pass(without_low_pass(avatar), cast(Array, low_pass)).gaussians
+    return with_pixel_footprint(
+        without_pixel_footprint(avatar), cast(Array, pixel_footprint)
+    ).gaussians
 
 
 def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from humangs_jax.avatar.animate import with_low_pass_of
+from humangs_jax.avatar.animate import with_pixel_footprint_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.arrays import from_host
@@ -147,7 +147,7 @@ def refine_views(
     that did not fit. Batch over people whose arrays have the same shapes with `jax.vmap(...,
     in_axes=(0, 0, None, None, None))`.
     """
-    avatar, photos = with_low_pass_of(avatar, views), photos_of(views)
+    avatar, photos = with_pixel_footprint_of(avatar, views), photos_of(views)
     parameters = parameters_of(avatar.gaussians)
     found = jax.lax.map(lambda photo: compare(parameters, avatar, photo, config, splat), photos)
     state = replace(init_state(parameters, found.together(), config, splat), total=steps)

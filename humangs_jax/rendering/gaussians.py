@@ -48,7 +48,7 @@ class Gaussians(Batchable):
     """Linear maps that are applied to the covariances after the rotation, never to the means, (g,
     3, 3), or None.
     """
-    low_pass: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
+    pixel_footprint: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
     """Side of the pixels of the images whose low-pass the scales contain (`avatar.animate`), (g,),
     metres, or None. Renderers then add no more than `MIP_EPS2D` pixels^2, and dim what this makes
     larger in images of larger pixels.
@@ -60,24 +60,24 @@ class Gaussians(Batchable):
     """
 
 
-def added_variance(low_pass: Float[Array, " g"] | None, eps2d: float) -> float:
+def added_variance(pixel_footprint: Float[Array, " g"] | None, eps2d: float) -> float:
     """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the
     scales contain a low-pass.
     """
-    if low_pass is None:
+    if pixel_footprint is None:
         return eps2d
     return min(eps2d, MIP_EPS2D)
 
 
 def widened(
-    scales: Float[Array, "g 3"], low_pass: Float[Array, " g"] | None, sign: int = 1
+    scales: Float[Array, "g 3"], pixel_footprint: Float[Array, " g"] | None, sign: int = 1
 ) -> Float[Array, "g 3"]:
     """Scales with the low-pass of pixels of a size in metres, all but `MIP_EPS2D` of it. sign: -1
     takes it away again.
     """
-    if low_pass is None:
+    if pixel_footprint is None:
         return scales
-    added = sign * (EPS2D - MIP_EPS2D) * jnp.square(low_pass)
+    added = sign * (EPS2D - MIP_EPS2D) * jnp.square(pixel_footprint)
     return jnp.sqrt(jnp.maximum(jnp.square(scales) + added[:, None], THINNEST**2))
 
 

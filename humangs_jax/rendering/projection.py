@@ -17,9 +17,9 @@ cov2d, where float32 cancels for needles, but as a sum of squares: |m0 x m1|^2 +
 cov2d^-1 / 2, whose gradient is written by hand for the same reason.
 
 The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels
-of s metres (`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d),
-where e = eps2d (s fx/Z)^2 <= eps2d is what was added in images of such pixels: what they weigh
-together stays the same in smaller images (Mip-Splatting's 2D filter,
+of s metres (`Gaussians.pixel_footprint`) have their opacity times sqrt(det(M M^T + e I) / det
+cov2d), where e = eps2d (s fx/Z)^2 <= eps2d is what was added in images of such pixels: what they
+weigh together stays the same in smaller images (Mip-Splatting's 2D filter,
 https://arxiv.org/abs/2311.16493, equation 9, which has e = 0). `SplatConfig.antialiased` dims all
 others with e = 0.
 
@@ -124,7 +124,7 @@ def project_gaussians(
     half field of view beyond the border, for cameras without lens.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
-    eps2d = added_variance(gaussians.low_pass, config.eps2d)
+    eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)
     jacobian_margin = config.jacobian_margin
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -171,8 +171,8 @@ def project_gaussians(
     xx, xy, yy, determinant = _covariance(m0, m1, eps2d)
     # opacity is dimmed by what the added variance enlarges
     dimming = None
-    if gaussians.low_pass is not None and eps2d > 0:
-        dimming = _dimming(m0, m1, determinant, eps2d, gaussians.low_pass * zx)
+    if gaussians.pixel_footprint is not None and eps2d > 0:
+        dimming = _dimming(m0, m1, determinant, eps2d, gaussians.pixel_footprint * zx)
     elif config.antialiased and eps2d > 0:
         dimming = _dimming(m0, m1, determinant, eps2d, jnp.zeros_like(determinant))
     r00, r01, r11 = _conic_factor(m0, m1, eps2d)
@@ -211,11 +211,14 @@ def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Ar
     return xx + eps2d, xy, yy + eps2d, determinant
 
 
-def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, low_pass: Array) -> Array:
-    """Factor of the opacity; low_pass in pixels. 1 for footprints whose determinant overflows."""
+def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, footprint: Array) -> Array:
+    """Factor of the opacity; `footprint` is in pixels.
+
+    1 for footprints whose determinant overflows.
+    """
     finite = determinant < jnp.inf
     m0, m1 = ([jnp.where(finite, entry, 0.0) for entry in row] for row in (m0, m1))
-    contained = _covariance(m0, m1, eps2d * jnp.minimum(jnp.square(low_pass), 1.0))[3]
+    contained = _covariance(m0, m1, eps2d * jnp.minimum(jnp.square(footprint), 1.0))[3]
     share = jnp.where(finite, contained / jnp.where(finite, determinant, 1.0), 1.0)
     return jnp.sqrt(jnp.maximum(share, LEAST_DIMMING**2))
 

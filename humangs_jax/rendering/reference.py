@@ -80,11 +80,11 @@ def _reference(
     centers, axes, depths, visible = _project(gaussians, camera, config)
     if shifts is not None:
         centers = centers + shifts
-    eps2d = added_variance(gaussians.low_pass, config.eps2d)
+    eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
-    if gaussians.low_pass is not None and eps2d > 0:  # dimmed as `projection` says
+    if gaussians.pixel_footprint is not None and eps2d > 0:  # dimmed as `projection` says
         away = 1.0 if camera.lens == "orthographic" else depths
-        contained = eps2d * jnp.minimum((gaussians.low_pass * camera.K[0, 0] / away) ** 2, 1)
+        contained = eps2d * jnp.minimum((gaussians.pixel_footprint * camera.K[0, 0] / away) ** 2, 1)
         opacities = opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
     elif config.antialiased and eps2d > 0:
         opacities = opacities * _root(_determinant(axes, 0.0) / determinants)

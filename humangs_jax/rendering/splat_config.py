@@ -75,7 +75,7 @@ class SplatConfig:
     antialiased: bool = False
     """Opacities are dimmed by what these pixels^2 add to the footprint, so that what a Gaussian
     weighs stays the same (gsplat's "antialiased"; Mip-Splatting's 2D filter). Gaussians with a
-    `low_pass` are dimmed by theirs anyway."""
+    `pixel_footprint` are dimmed by theirs anyway."""
     alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
     """Alphas below are skipped."""
     alpha_max: Share = ALPHA_MAX
@@ -109,8 +109,8 @@ class SplatConfig:
         False,
         cost="memory of one number a Gaussian",
         gain=(
-            "`seen_from(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop 0.001: 0.75"
-            " of the time at 53.9 dB"
+            "`visible_gaussians(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop"
+            " 0.001: 0.75 of the time at 53.9 dB"
         ),
         measured=MEASURED,
     )

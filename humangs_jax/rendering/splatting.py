@@ -61,7 +61,7 @@ __all__ = [
     "plan_buffers",
     "render",
     "render_views",
-    "seen_from",
+    "visible_gaussians",
 ]
 
 
@@ -209,7 +209,7 @@ def render_views(
 
 
 @checked_arguments
-def seen_from(
+def visible_gaussians(
     gaussians: Gaussians,
     cameras: Camera,
     config: SplatConfig | str = DEFAULT_CONFIG,

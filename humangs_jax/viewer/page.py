@@ -141,8 +141,8 @@ def pack(
         "skinning": avatar.skinning,
         "splatting": {name: getattr(how, name) for name in DRAWN_FIELDS}
         | {
-            "eps2d": added_variance(avatar.gaussians.low_pass, how.eps2d),
-            "low_pass": _low_pass(avatar),
+            "eps2d": added_variance(avatar.gaussians.pixel_footprint, how.eps2d),
+            "low_pass": _median_footprint(avatar),
         },
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
@@ -169,11 +169,11 @@ def pack(
     return _joined(header, arrays)
 
 
-def _low_pass(avatar: Avatar) -> float:
+def _median_footprint(avatar: Avatar) -> float:
     """Metres; one for all Gaussians, whose photos were taken from similar distances. 0: none."""
-    if avatar.gaussians.low_pass is None:
+    if avatar.gaussians.pixel_footprint is None:
         return 0.0
-    return float(np.median(avatar.gaussians.low_pass))
+    return float(np.median(avatar.gaussians.pixel_footprint))
 
 
 def largest_weights(

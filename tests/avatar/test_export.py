@@ -188,10 +188,12 @@ def test_viewers_that_add_their_own_low_pass_draw_what_we_draw(tmp_path_factory,
     means = gaussians.means * jnp.asarray([0.05, 0.05, 0]) + jnp.asarray([0, 0, depth])
     gaussians = replace(gaussians, means=means, scales=gaussians.scales / 10)  # about a pixel
     pixel = jnp.full(20, depth / 512)
-    write_ply(file, replace(gaussians, scales=widened(gaussians.scales, pixel), low_pass=pixel))
+    write_ply(
+        file, replace(gaussians, scales=widened(gaussians.scales, pixel), pixel_footprint=pixel)
+    )
     assert off_by(gaussians, load_gaussians(file))[0] < 1e-4  # float32: a difference of squares
     ours = project(
-        replace(gaussians, scales=widened(gaussians.scales, pixel), low_pass=pixel), camera
+        replace(gaussians, scales=widened(gaussians.scales, pixel), pixel_footprint=pixel), camera
     )
     theirs = project(load_gaussians(file), camera)
     for name in ("xx", "yy"):

@@ -9,7 +9,7 @@ import pytest
 from changes import edit_npz
 from small import small_avatar
 
-from humangs_jax.avatar.animate import animate, skin, with_low_pass
+from humangs_jax.avatar.animate import animate, skin, with_pixel_footprint
 from humangs_jax.avatar.attach_face import with_face
 from humangs_jax.avatar.avatar import Avatar, Light
 from humangs_jax.avatar.face import between_lips
@@ -149,11 +149,11 @@ def test_hidden_gaussians_take_what_the_others_have(someone):
     g = len(plain.gaussians.means)
     normals = jnp.tile(jnp.asarray([0, 0, 1.0]), (g, 1))
     lit = replace(avatar, light=Light(0.1 * jnp.ones(8), normals, jnp.zeros(g)))
-    lit = with_low_pass(lit, 0.002)
+    lit = with_pixel_footprint(lit, 0.002)
     gaussians = replace(lit.gaussians, harmonics=jnp.zeros((g, 3, 3)))
     opened = animate(replace(lit, gaussians=gaussians), pose_with(avatar, body, jawOpen=1.0))
     q = len(avatar.face.in_mouth)
-    assert opened.harmonics.shape == (g + q, 3, 3) and opened.low_pass.shape == (g + q,)
+    assert opened.harmonics.shape == (g + q, 3, 3) and opened.pixel_footprint.shape == (g + q,)
     assert np.isfinite(opened.colors).all()
 
 

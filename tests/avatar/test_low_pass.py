@@ -5,7 +5,12 @@ import pytest
 from avatar_cases import two_balls
 from changes import edit_npz
 
-from humangs_jax.avatar.animate import pixel_sizes, skin, with_low_pass, without_low_pass
+from humangs_jax.avatar.animate import (
+    pixel_sizes,
+    skin,
+    with_pixel_footprint,
+    without_pixel_footprint,
+)
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
@@ -33,23 +38,25 @@ def flat_avatar():
 
 def test_variances_grow_by_the_low_pass_and_back():
     avatar = flat_avatar()
-    wide = with_low_pass(avatar, PIXEL)
+    wide = with_pixel_footprint(avatar, PIXEL)
     grown = np.square(np.asarray(wide.gaussians.scales, np.float64)) - np.square(
         avatar.gaussians.scales, dtype=np.float64
     )
     np.testing.assert_allclose(grown, (EPS2D - MIP_EPS2D) * PIXEL**2, rtol=ROUNDING)
     np.testing.assert_array_equal(
-        wide.gaussians.low_pass, jnp.full_like(wide.gaussians.opacities, PIXEL)
+        wide.gaussians.pixel_footprint, jnp.full_like(wide.gaussians.opacities, PIXEL)
     )
-    back = without_low_pass(wide)
+    back = without_pixel_footprint(wide)
     np.testing.assert_allclose(back.gaussians.scales, avatar.gaussians.scales, rtol=ROUNDING)
-    assert back.gaussians.low_pass is None
+    assert back.gaussians.pixel_footprint is None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("draw", [render, render_reference])
 def test_renderers_add_what_the_scales_do_not_contain(draw):
-    gaussians = skin(with_low_pass(two_balls(1), PIXEL), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))
+    gaussians = skin(
+        with_pixel_footprint(two_balls(1), PIXEL), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3))
+    )
     camera = orbit(
         jnp.asarray([0.0, 0.9, 0.0]),
         3.0,
@@ -59,9 +66,9 @@ def test_renderers_add_what_the_scales_do_not_contain(draw):
         48,
         48,
     )[0]
-    plain, less = replace(gaussians, low_pass=None), SplatConfig(eps2d=MIP_EPS2D)
+    plain, less = replace(gaussians, pixel_footprint=None), SplatConfig(eps2d=MIP_EPS2D)
     of_larger_pixels = replace(
-        gaussians, low_pass=jnp.full_like(gaussians.opacities, 1.0)
+        gaussians, pixel_footprint=jnp.full_like(gaussians.opacities, 1.0)
     )  # nothing is dimmed
     np.testing.assert_allclose(
         draw(of_larger_pixels, camera).rgb, draw(plain, camera, less).rgb, atol=1e-6
@@ -73,17 +80,17 @@ def test_renderers_add_what_the_scales_do_not_contain(draw):
 
 def test_only_avatars_that_are_drawn_exactly_are_widened():
     avatar = replace(flat_avatar(), rendering="inria")
-    assert with_low_pass(avatar, PIXEL) is avatar
-    jax.tree.map(np.testing.assert_array_equal, without_low_pass(avatar), avatar)
-    wide = with_low_pass(flat_avatar(), PIXEL)
-    assert with_low_pass(wide, 2 * PIXEL) is wide
+    assert with_pixel_footprint(avatar, PIXEL) is avatar
+    jax.tree.map(np.testing.assert_array_equal, without_pixel_footprint(avatar), avatar)
+    wide = with_pixel_footprint(flat_avatar(), PIXEL)
+    assert with_pixel_footprint(wide, 2 * PIXEL) is wide
 
 
 def test_files_keep_the_size_of_the_pixels(tmp_path):
-    wide = with_low_pass(flat_avatar(), PIXEL)
+    wide = with_pixel_footprint(flat_avatar(), PIXEL)
     wide.save(tmp_path / "a.npz")
     loaded = Avatar.load(tmp_path / "a.npz")
-    np.testing.assert_array_equal(loaded.gaussians.low_pass, wide.gaussians.low_pass)
+    np.testing.assert_array_equal(loaded.gaussians.pixel_footprint, wide.gaussians.pixel_footprint)
     edit_npz(tmp_path / "a.npz", low_pass=lambda sizes: -sizes)
     with pytest.raises(FileError, match="low_pass"):
         Avatar.load(tmp_path / "a.npz")
@@ -101,7 +108,9 @@ def test_fine_things_weigh_the_same_in_small_images():
         jnp.asarray([0.5]),
         jnp.ones((1, 3)),
     )
-    wide = replace(one, scales=widened(one.scales, jnp.full(1, fine)), low_pass=jnp.full(1, fine))
+    wide = replace(
+        one, scales=widened(one.scales, jnp.full(1, fine)), pixel_footprint=jnp.full(1, fine)
+    )
 
     def weight(gaussians, size):
         camera = orbit(
@@ -120,7 +129,7 @@ def test_fine_things_weigh_the_same_in_small_images():
         assert weight(wide, size)[0] == pytest.approx(exact, rel=1e-3)
     larger, _ = weight(wide, 4096)
     assert larger < exact  # nothing becomes more opaque than it is
-    assert weight(replace(wide, low_pass=jnp.full(1, 1.0)), 32)[0] > 20 * exact
+    assert weight(replace(wide, pixel_footprint=jnp.full(1, 1.0)), 32)[0] > 20 * exact
 
 
 def test_nothing_is_dimmed_in_the_photos_that_give_the_size_of_the_pixels():
@@ -134,16 +143,16 @@ def test_nothing_is_dimmed_in_the_photos_that_give_the_size_of_the_pixels():
         blank, blank[..., 0], cameras, rest.rotations[None], rest.translation[None], jnp.zeros(2)
     )
     avatar = flat_avatar()
-    seen = project(skin(with_low_pass(avatar, pixel_sizes(avatar, views)), rest), cameras[0])
+    seen = project(skin(with_pixel_footprint(avatar, pixel_sizes(avatar, views)), rest), cameras[0])
     np.testing.assert_allclose(seen.dimming, 1.0, atol=ROUNDING)
-    smaller = with_low_pass(avatar, 0.5 * pixel_sizes(avatar, views))
+    smaller = with_pixel_footprint(avatar, 0.5 * pixel_sizes(avatar, views))
     assert project(skin(smaller, rest), cameras[0]).dimming.max() < 0.99
 
 
 @pytest.mark.slow
 def test_dimmed_splats_are_drawn_as_defined():
     gaussians = skin(
-        with_low_pass(flat_avatar(), PIXEL / 10), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3))
+        with_pixel_footprint(flat_avatar(), PIXEL / 10), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3))
     )
     camera = orbit(
         jnp.asarray([0.0, 0.9, 0.0]),
@@ -158,7 +167,7 @@ def test_dimmed_splats_are_drawn_as_defined():
     np.testing.assert_allclose(
         drawn.rgb, exact.rgb, atol=1e-4
     )  # float32; another order of operations
-    undimmed = replace(gaussians, low_pass=jnp.ones_like(gaussians.opacities))
+    undimmed = replace(gaussians, pixel_footprint=jnp.ones_like(gaussians.opacities))
     assert jnp.abs(render(undimmed, camera).alpha - drawn.alpha).max() > 0.05
 
 
@@ -171,7 +180,12 @@ def test_dimming_is_differentiable_at_any_size(float64):
     quats = jnp.asarray([[1.0, 0.2, 0.1, 0]] * 4)
     scales = jnp.asarray([[1e-9, 1e-9, 0.1], [0, 0, 0], [0.01, 0.02, 0.03], [1e7, 1e7, 1e7]])
     gaussians = Gaussians(
-        jnp.zeros((4, 3)), quats, scales, jnp.ones(4), jnp.ones((4, 3)), low_pass=jnp.full(4, 1e-3)
+        jnp.zeros((4, 3)),
+        quats,
+        scales,
+        jnp.ones(4),
+        jnp.ones((4, 3)),
+        pixel_footprint=jnp.full(4, 1e-3),
     )
     dimming = lambda scales: jnp.sum(project(replace(gaussians, scales=scales), camera).dimming)
     assert jnp.all(jnp.isfinite(jax.grad(dimming)(scales)))

@@ -17,7 +17,7 @@ from humangs_jax.avatar.reconstruct import (
     reconstruct_batch,
     reconstruct_views,
     stack_captures,
-    with_spread_weights,
+    with_blended_leg_weights,
 )
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, person_vertices, shape_body
@@ -141,7 +141,7 @@ def made(body, means, size, betas=(0.0,) * 4):
     )
 
 
-def test_spread_weights_leave_gaussians_where_the_photos_saw_them(body):
+def test_blended_leg_weights_leave_gaussians_where_the_photos_saw_them(body):
     rng = np.random.default_rng(0)
     pose = BodyPose(jnp.asarray(0.3 * rng.normal(size=(55, 3)), jnp.float32), jnp.ones(3))
     count = len(body.template)
@@ -149,7 +149,7 @@ def test_spread_weights_leave_gaussians_where_the_photos_saw_them(body):
         rng.normal(size=(count, 3)) * 0.1 * (rng.random((count, 1)) < 0.2), jnp.float32
     )
     avatar = made(body, means, 1.0)
-    spread = with_spread_weights(avatar, pose, 0.04)
+    spread = with_blended_leg_weights(avatar, pose, 0.04)
     changed = np.any(spread.skinning_weights != avatar.skinning_weights, axis=1)
     assert (
         0.05 < changed.mean() <= 0.25
@@ -336,22 +336,22 @@ def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
 
 
 def test_bodies_of_fewer_vertices_have_wider_gaussians(body):
-    config = tiny().with_conventions(body_vertices=400, longest_edge=0.2)
+    config = tiny().with_conventions(body_vertices=400, max_edge_length=0.2)
     usual, fewer = (
         gaussian_body(body, config),
         gaussian_body(body, config.with_runtime(body_vertices=200)),
     )
-    assert len(fewer.template) < 0.7 * len(usual.template) and usual.spacing is None
+    assert len(fewer.template) < 0.7 * len(usual.template) and usual.relative_vertex_spacing is None
     np.testing.assert_allclose(
-        fewer.spacing, np.sqrt(len(usual.template) / len(fewer.template)), rtol=1e-6
+        fewer.relative_vertex_spacing, np.sqrt(len(usual.template) / len(fewer.template)), rtol=1e-6
     )
     assert (
-        gaussian_body(body, config.with_runtime(body_vertices=900)).spacing is None
+        gaussian_body(body, config.with_runtime(body_vertices=900)).relative_vertex_spacing is None
     )  # no fewer than usual
     with pytest.raises(
-        ValueError, match="body_vertices asks for fewer vertices, longest_edge for more"
+        ValueError, match="body_vertices asks for fewer vertices, max_edge_length for more"
     ):
-        gaussian_body(body, config.with_runtime(body_vertices=200, longest_edge=0.1))
+        gaussian_body(body, config.with_runtime(body_vertices=200, max_edge_length=0.1))
 
 
 def test_a_body_that_was_read_twice_is_remeshed_once(body):
@@ -521,7 +521,7 @@ def test_the_body_is_displaced_by_the_capture_or_its_masks_if_the_network_looks_
     for each in (given, dataclasses.replace(given, masks=None)):
         np.testing.assert_array_equal(moved(each, on), given.displacement)
     assert moved(given, config.with_conventions(**all_pixels)) is None and moved(given, off) is None
-    finer = config.with_conventions(longest_edge=0.05)
+    finer = config.with_conventions(max_edge_length=0.05)
     assert len(moved(given, finer)) == len(gaussian_body(body, finer).template) > len(body.template)
 
 
@@ -550,7 +550,10 @@ def test_a_kept_displacement_gives_the_avatar_of_one_that_is_computed(body, netw
 
 @pytest.mark.slow
 def test_a_known_displacement_moves_the_skin_and_no_joint_alone_and_in_a_batch(body, network):
-    variables, config = network[0], network[1].with_conventions(pixels="person", longest_edge=0.05)
+    variables, config = (
+        network[0],
+        network[1].with_conventions(pixels="person", max_edge_length=0.05),
+    )
     bare = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]
     captures = [outward(bare[0]), dataclasses.replace(bare[1], masks=None)]  # with and without
     still = dataclasses.replace(

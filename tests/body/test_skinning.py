@@ -7,7 +7,7 @@ from scipy.special import ndtr
 from humangs_jax.body import model
 
 ATOL = 5e-6  # float32
-spread_weights = jax.jit(model.spread_weights, static_argnums=6)
+blend_leg_weights = jax.jit(model.blend_leg_weights, static_argnums=6)
 
 
 @pytest.mark.parametrize("parents", [(0, 0), (-1, -1), (-1, 2, 1), (-1, 7), (-1, -2), (1, 2, 0)])
@@ -26,17 +26,17 @@ def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own
     distances = np.concatenate([np.full(100, 0.1), np.zeros(800)])
     arrays = [jnp.asarray(x, jnp.float32) for x in (points, distances, own, vertices, joints)]
     legs = jnp.eye(2, dtype=bool)
-    found = spread_weights(*arrays, legs, 0.04)
+    found = blend_leg_weights(*arrays, legs, 0.04)
     np.testing.assert_allclose(found[:100], 0.5, atol=ATOL)
     np.testing.assert_array_equal(found[100:], own[100:])
     np.testing.assert_allclose(np.sum(found, axis=1), 1, atol=ATOL)
     np.testing.assert_array_equal(
-        spread_weights(*arrays, legs[:1].repeat(2, 0) & False, 0.04), own
+        blend_leg_weights(*arrays, legs[:1].repeat(2, 0) & False, 0.04), own
     )  # two limbs that are no legs
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.1])
-def test_the_kernel_of_spread_weights_is_as_wide_as_the_distance(distance):
+def test_the_kernel_of_blended_leg_weights_is_as_wide_as_the_distance(distance):
     """Vertices along x, those with x > 0 of the other leg: its share at x is the normal
     distribution function of x / distance.
     """
@@ -52,7 +52,7 @@ def test_the_kernel_of_spread_weights_is_as_wide_as_the_distance(distance):
     distances = np.where(np.arange(16) % 4 == 0, distance, 0.0)
     own = np.tile([1.0, 0.0], (16, 1))
     arrays = [jnp.asarray(each, jnp.float32) for each in (points, distances, own, vertices, of)]
-    found = spread_weights(*arrays, jnp.eye(2, dtype=bool), 0.04)
+    found = blend_leg_weights(*arrays, jnp.eye(2, dtype=bool), 0.04)
     np.testing.assert_allclose(
         found[::4, 1], ndtr(at / distance), atol=0.02
     )  # every eighth vertex: steps of 2 mm

@@ -73,7 +73,9 @@ def test_spacing_says_how_much_closer_vertices_are(body):
     around = lambda mesh: vertex_areas(np.asarray(mesh.template), np.asarray(mesh.faces))
     np.testing.assert_allclose(around(fine).sum(), 1, rtol=1e-6)
     # the four corners keep their faces' shape: a quarter of the length is a sixteenth of the area
-    np.testing.assert_allclose(fine.spacing[:n], 0.25, rtol=1e-5)
-    np.testing.assert_allclose(coarse.spacing[:n], 0.5, rtol=1e-5)
+    np.testing.assert_allclose(fine.relative_vertex_spacing[:n], 0.25, rtol=1e-5)
+    np.testing.assert_allclose(coarse.relative_vertex_spacing[:n], 0.5, rtol=1e-5)
     same = split_long_edges(flat, 10.0)
-    assert same.spacing == pytest.approx(1.0) and np.array_equal(same.faces, flat.faces)
+    assert same.relative_vertex_spacing == pytest.approx(1.0) and np.array_equal(
+        same.faces, flat.faces
+    )

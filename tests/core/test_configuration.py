@@ -20,6 +20,7 @@ from humangs_jax.core.configuration import (
     configuration,
     vary,
 )
+from humangs_jax.network.runtime import Conventions, Runtime
 from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig
 from humangs_jax.training import config
 
@@ -200,3 +201,13 @@ def test_fields_are_varied_by_their_paths():
             vary(run, {path: 1.0})
     with pytest.raises(ValueError, match="squared"):
         vary(run, {"loss.squared": -1.0})
+
+
+def test_files_with_earlier_names_of_fields_are_read():
+    text = '{"skinning_reach": 0.04, "low_pass": 0.01, "longest_edge": 0.03}'
+    read = config_from_json(Conventions, text)
+    assert read == Conventions(leg_blend_distance=0.04, pixel_footprint=0.01, max_edge_length=0.03)
+    assert config_from_json(Runtime, '{"longest_edge": 0.02}') == Runtime(max_edge_length=0.02)
+    assert config_from_json(Conventions, config_to_json(read)) == read
+    with pytest.raises(ValueError, match=r"config\.longest_edge: Runtime has no such field"):
+        config_from_json(Runtime, '{"longest_edge": 0.02, "max_edge_length": 0.03}')

@@ -195,7 +195,7 @@ def test_a_field_that_does_not_fit_is_named(name):
 
 
 def test_what_fits_has_no_fault():
-    none = replace(GAUSSIANS, low_pass=None)
+    none = replace(GAUSSIANS, pixel_footprint=None)
     of_numpy = jax.tree.map(np.asarray, GAUSSIANS)
     half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), GAUSSIANS)
     for tree in (

@@ -135,11 +135,11 @@ def test_only_a_body_that_sticks_out_of_the_masks_needs_it(body, dressed):
 
 
 REMESHED = {
-    "decimated and split": dict(body_vertices=200, longest_edge=0.1),
+    "decimated and split": dict(body_vertices=200, max_edge_length=0.1),
     "decimated": dict(body_vertices=200),
-    "split": dict(longest_edge=0.03),
-    "coarser than its weights": dict(longest_edge=0.1, runtime=dict(body_vertices=200)),
-    "finer than its weights": dict(body_vertices=250, runtime=dict(longest_edge=0.05)),
+    "split": dict(max_edge_length=0.03),
+    "coarser than its weights": dict(max_edge_length=0.1, runtime=dict(body_vertices=200)),
+    "finer than its weights": dict(body_vertices=250, runtime=dict(max_edge_length=0.05)),
 }
 
 

@@ -140,7 +140,7 @@ def test_a_skirt_is_found_and_lies_on_the_masks(body, monkeypatch):
     assert abs(find_hem(body, capture) - hem) <= HEM
     worn, moved = add_skirt(body, capture, np.zeros(body.template.shape))
     count = len(body.template)
-    assert not moved[:count].any() and np.isfinite(worn.spacing).all()
+    assert not moved[:count].any() and np.isfinite(worn.relative_vertex_spacing).all()
     own = np.asarray(worn.template)[count:] + moved[count:]
     joints = np.asarray(body.joint_regressor @ body.template)
     leg = joints[[list(body.joint_names).index(name) for name in LEGS[0]]]

@@ -90,7 +90,7 @@ def test_other_joints_are_no_smplx(body, tmp_path):
 @pytest.mark.slow
 def test_fractions_are_as_they_are_and_split(body, monkeypatch):
     monkeypatch.setattr(bodies, "SMPLX_SEED_VERTICES", 600)
-    config = tiny().with_conventions(body_vertices=1000, longest_edge=0.05)
+    config = tiny().with_conventions(body_vertices=1000, max_edge_length=0.05)
     cases = bodies.body_cases(body, config)
     assert list(cases) == [
         "default",

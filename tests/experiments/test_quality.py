@@ -140,7 +140,9 @@ def test_bodies_see_the_same_photos(weights, tmp_path, monkeypatch):
     }
 
     def reconstructed(variables, config, capture):
-        assert config.conventions.body_vertices is None and config.conventions.longest_edge is None
+        assert (
+            config.conventions.body_vertices is None and config.conventions.max_edge_length is None
+        )
         seen.append((len(capture.body.template), capture.images))
         return SimpleNamespace(
             gaussians=SimpleNamespace(means=np.zeros((3 * len(capture.body.template), 3)))

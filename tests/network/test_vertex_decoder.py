@@ -189,7 +189,9 @@ def test_scales_follow_the_spacing_of_vertices_and_nothing_else_does():
     variables = decoder.init(jax.random.key(0), features, inputs, ctx)
     spacing = jnp.asarray([1.0, 0.5, 0.25, 2.0])
     as_trained = decoder.apply(variables, features, inputs, ctx).gaussians
-    finer = decoder.apply(variables, features, replace(inputs, spacing=spacing), ctx).gaussians
+    finer = decoder.apply(
+        variables, features, replace(inputs, relative_vertex_spacing=spacing), ctx
+    ).gaussians
     np.testing.assert_allclose(
         finer.scales, as_trained.scales * jnp.repeat(spacing, 2)[:, None], rtol=1e-6
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from refinement_cases import HEIGHT, SAME
 
-from humangs_jax.avatar.animate import with_low_pass_of
+from humangs_jax.avatar.animate import with_pixel_footprint_of
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.capture.fitting.own_poses import with_own_poses
 from humangs_jax.core.pytree import replace
@@ -53,7 +53,7 @@ def test_the_head_comes_closer_and_nothing_else_moves(four):
     report = refinement.refine_with_report(avatar, capture, ALONE)
     assert report.kept and report.head_steps == 20 and "20 on the head" in report.summary()
     moved = of_head(avatar)
-    start = with_low_pass_of(avatar, crop_to_person(prepare_capture(capture)))
+    start = with_pixel_footprint_of(avatar, crop_to_person(prepare_capture(capture)))
     for name in ("means", "quats", "scales", "opacities", "colors"):
         before, after = (np.asarray(getattr(x.gaussians, name)) for x in (start, report.avatar))
         np.testing.assert_array_equal(after[~moved], before[~moved])

@@ -12,9 +12,9 @@ from refinement_cases import HEIGHT, STEPS, WIDTH, assert_nearly_all_close, toy_
 
 from humangs_jax.avatar.animate import (
     pixel_sizes,
-    with_low_pass,
-    with_low_pass_of,
-    without_low_pass,
+    with_pixel_footprint,
+    with_pixel_footprint_of,
+    without_pixel_footprint,
 )
 from humangs_jax.avatar.frames import capture_renderings, posed
 from humangs_jax.core.pytree import replace
@@ -74,10 +74,12 @@ def test_refined_avatars_look_the_same_at_other_sizes(person):
     """
     avatar, capture = person
     refined = refinement.refine(avatar, capture, STEPS)
-    raw = without_low_pass(refined)
+    raw = without_pixel_footprint(refined)
     camera, pose = capture.cameras[0], capture.pose(0)
     drawn = lambda a, camera: render(posed(a, pose), camera, SPLAT_PRESETS[a.rendering]).alpha
-    assert refined.gaussians.low_pass is not None and avatar.gaussians.low_pass is None
+    assert (
+        refined.gaussians.pixel_footprint is not None and avatar.gaussians.pixel_footprint is None
+    )
     assert jnp.abs(drawn(refined, camera) - drawn(raw, camera)).mean() < SAME_SIZE
     reduced = drawn(raw, camera).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
     errors = [
@@ -86,7 +88,9 @@ def test_refined_avatars_look_the_same_at_other_sizes(person):
     ]
     assert errors[0] < 0.7 * errors[1]
     again = refinement.refine(refined, capture, dataclasses.replace(STEPS, steps=2))
-    np.testing.assert_allclose(again.gaussians.low_pass, refined.gaussians.low_pass, rtol=0.01)
+    np.testing.assert_allclose(
+        again.gaussians.pixel_footprint, refined.gaussians.pixel_footprint, rtol=0.01
+    )
 
 
 def squared_error(avatar, capture):
@@ -100,14 +104,14 @@ def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     """Also if its low-pass is that of smaller or larger pixels than theirs."""
     avatar, capture = person
     views = crop_to_person(prepare_capture(capture))
-    own = with_low_pass(avatar, times * pixel_sizes(avatar, views))
-    start = with_low_pass_of(own, views)
+    own = with_pixel_footprint(avatar, times * pixel_sizes(avatar, views))
+    start = with_pixel_footprint_of(own, views)
     # those of smaller pixels are dimmed where a photo shows the person smaller than another does
     np.testing.assert_allclose(
         squared_error(start, capture), squared_error(own, capture), rtol=0.01
     )
-    expected = own.gaussians.low_pass * min(1, 1 / times)
-    np.testing.assert_allclose(start.gaussians.low_pass, expected, rtol=1e-5)
+    expected = own.gaussians.pixel_footprint * min(1, 1 / times)
+    np.testing.assert_allclose(start.gaussians.pixel_footprint, expected, rtol=1e-5)
     report = refinement.refine_with_report(own, capture, STEPS)
     errors = [squared_error(own, capture), squared_error(report.avatar, capture)]
     np.testing.assert_allclose(
@@ -132,7 +136,7 @@ def test_photos_from_near_and_far_are_fitted_together(body, person):
         avatar, photos
     )
     nearest = pixel_sizes(avatar, crop_to_person(prepare_capture(photos)))
-    np.testing.assert_array_equal(report.avatar.gaussians.low_pass, nearest)
+    np.testing.assert_array_equal(report.avatar.gaussians.pixel_footprint, nearest)
     assert jnp.median(nearest) < 0.5 * 12.0 / float(
         photos.cameras.K[0, 0, 0]
     )  # heads and feet are not in all frames

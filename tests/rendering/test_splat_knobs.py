@@ -14,7 +14,7 @@ from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import render, seen_from
+from humangs_jax.rendering.splatting import render, visible_gaussians
 
 FLOAT64 = 1e-9
 """float64 rounding, relative to the largest entry."""
@@ -67,9 +67,9 @@ def test_seen_from_keeps_what_any_camera_sees():
         scene = wall_before(few(random_gaussians(4), np.arange(15, COUNT)))
         front = camera()
         beyond = replace(front, cam_from_world=front.cam_from_world.at[2, 3].add(-1.3))
-        hidden = seen_from(scene, stack_cameras([front]), SMALL)
+        hidden = visible_gaussians(scene, stack_cameras([front]), SMALL)
         assert hidden[0] and not hidden[3:].any()
-        assert seen_from(scene, stack_cameras([front, beyond]), SMALL)[3:].any()
+        assert visible_gaussians(scene, stack_cameras([front, beyond]), SMALL)[3:].any()
         kept = few(scene, np.flatnonzero(hidden))
         limit = np.count_nonzero(~hidden) / 255  # each may have weighed up to 1 / 255
         difference = np.abs(render(kept, front, SMALL).rgb - render(scene, front, SMALL).rgb).max()

@@ -47,7 +47,7 @@ def configuration() -> TrainConfig:
         reader=dataclasses.replace(reader, output_width=128),
         decoder=dataclasses.replace(decoder, tight=1, free=4),
     )
-    model = model.with_conventions(image_size=SIZE, longest_edge=0.03).with_runtime(
+    model = model.with_conventions(image_size=SIZE, max_edge_length=0.03).with_runtime(
         token_capacity=288
     )
     return TrainConfig(

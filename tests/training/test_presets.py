@@ -52,7 +52,7 @@ def shrunk(name):
     model = config.model.with_parts(
         encoder=encoder, reader=reader, decoder=dataclasses.replace(parts.decoder, hidden=16)
     )
-    model = model.with_conventions(image_size=SIZE, body_vertices=None, longest_edge=None)
+    model = model.with_conventions(image_size=SIZE, body_vertices=None, max_edge_length=None)
     return dataclasses.replace(
         config,
         model=model.with_runtime(token_capacity=16),

@@ -68,7 +68,7 @@ def test_a_step_moves_the_parameters_and_tells_of_it(body, source, variables, sa
 
 @pytest.mark.slow
 def test_it_draws_the_avatars_that_reconstruct_makes(body, source, variables):
-    model = CONFIG.model.with_conventions(light=True, low_pass=0.02)
+    model = CONFIG.model.with_conventions(light=True, pixel_footprint=0.02)
     example = jax.tree.map(lambda x: x[0], source.batch_at(0))
     run, compiled = (
         dataclasses.replace(CONFIG, model=model),

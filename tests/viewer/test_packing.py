@@ -122,7 +122,7 @@ def test_the_page_adds_no_more_than_the_scales_lack():
     refined = replace(
         avatar,
         gaussians=replace(
-            avatar.gaussians, low_pass=jnp.full_like(avatar.gaussians.opacities, 0.004)
+            avatar.gaussians, pixel_footprint=jnp.full_like(avatar.gaussians.opacities, 0.004)
         ),
     )
     drawn = [packing.pack(x).header["splatting"] for x in (avatar, refined)]

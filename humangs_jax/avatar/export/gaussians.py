@@ -134,8 +134,8 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
     float64, without deformations and without low-pass.
 
     Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain
-    a low-pass (`Gaussians.low_pass`). It is taken out, so that both draw the same in images of the
-    size that the Gaussians were fitted to.
+    a low-pass (`Gaussians.pixel_footprint`). It is taken out, so that both draw the same in images
+    of the size that the Gaussians were fitted to.
 
     Raises: ValueError for numbers that files cannot hold: not finite, or of more than
     `checks.LARGEST`.
@@ -158,8 +158,8 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
 @jax.jit
 def _plain(gaussians: Gaussians) -> Gaussians:
     """Without deformations and without low-pass."""
-    scales = widened(gaussians.scales, gaussians.low_pass, -1)
-    return factored(replace(gaussians, scales=scales, low_pass=None))
+    scales = widened(gaussians.scales, gaussians.pixel_footprint, -1)
+    return factored(replace(gaussians, scales=scales, pixel_footprint=None))
 
 
 def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
