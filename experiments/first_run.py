@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import textwrap
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,10 +19,10 @@ Command = Literal["demo", "start", "animate"]
 PROGRAMS = REPOSITORY / "experiments" / "programs.py"
 TIMES = {"empty": "the first time", "full": "every time after"}
 """State of the cache -> how the table calls it."""
-LABELLED = 0.12
-"""Share of a run's time from which on the figure names a stage."""
-LABEL = 24
-"""Letters that a stage's name has in the figure."""
+LABELLED = 0.04
+"""A stage has its name in the figure from this share of the longest run on."""
+LETTERS = 9
+"""Letters that fit into such a stage."""
 
 
 @entry
@@ -172,7 +173,8 @@ def draw_time_lines(path: Path, rows: dict[str, dict[str, Any]]) -> None:
     second thread compiled meanwhile do not prolong a stage: a stage is dark for as long as it took
     at most.
     """
-    with figure(path, 1, (11, 0.42 * len(rows) + 1.2)) as axis:
+    shortest = LABELLED * max(row["wall"] for row in rows.values())
+    with figure(path, 1, (12, 0.5 * len(rows) + 1.2)) as axis:
         for line, row in enumerate(reversed(shown(rows).values())):
             stages = row["stages"].items()
             begin = max(row["wall"] - sum(own["seconds"] for _, own in stages), 0.0)
@@ -181,10 +183,11 @@ def draw_time_lines(path: Path, rows: dict[str, dict[str, Any]]) -> None:
                 color = f"C{number % 10}"
                 compiling = min(own["compile"], own["seconds"])
                 axis.barh(line, own["seconds"], left=begin, color=color, alpha=0.35)
-                axis.barh(line, compiling, left=begin, color=color)
-                if own["seconds"] > LABELLED * row["wall"]:
-                    words = stage if len(stage) <= LABEL else f"{stage[:LABEL]}…"
-                    axis.text(begin + 0.2, line, words, va="center", fontsize=6, clip_on=True)
+                axis.barh(line, compiling, left=begin, color=color, alpha=0.7)
+                if own["seconds"] > shortest:
+                    letters = int(LETTERS * own["seconds"] / shortest)
+                    words = textwrap.fill(stage, letters, max_lines=3, placeholder=" …")
+                    axis.text(begin + 0.2, line, words, va="center", fontsize=6)
                 begin += own["seconds"]
         axis.set_yticks(range(len(rows)), list(reversed(shown(rows))), fontsize=7)
-        axis.set_xlabel("seconds; dark: compiling")
+        axis.set_xlabel("seconds; darker: compiling")
