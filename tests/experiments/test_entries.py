@@ -9,12 +9,17 @@ from experiments.harness import call, listed
 
 PEOPLE = "--subjects 1 --held-out 1 --poses 1 --pose-views 1 --size 64"
 CASES = {
+    "accelerator": "--small",
+    "evaluation_bodies": f"{PEOPLE} --views 1",
     "extremes": "--cases black",
     "fit_keypoints": "--people 1 --frames 1 --no-curves",
     "fit_sequences": "--people 2 --smoothness 0.02 --cases",
     "paper_claims": "",
     "misaligned": "--subjects 1 --held-out 1 --size 64 --centimetres 2",
     "people_faults": "--subjects 1 --size 64",
+    "reconstruction_benchmark": (
+        "--preset tiny --size 64 --repeats 1 --views 2 --memory 1 2 --memory-size 64"
+    ),
     "refinement": (
         f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg"
         " --plot FOLDER/a.png"

@@ -1,11 +1,9 @@
 """The experiments of the paper: variants that belong together, differences within noise, tables."""
 
-import argparse
 import dataclasses
 import functools
 import itertools
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -289,55 +287,6 @@ def test_the_queue_trains_and_goes_on(tmp_path, monkeypatch):
     assert (out / "results.json").stat().st_mtime_ns == before
 
 
-def measured_as(names, psnr=20.0):
-    asked = []
-
-    def measure(name, people, photos, varying=False):
-        asked.append((name, people, photos, varying))
-        scores = {
-            "psnr": psnr + photos + len(people.name if people else ""),
-            "ssim": 0.9,
-            "lpips_vgg": None,
-        }
-        found = {
-            "photos": photos,
-            "reconstruction": scores,
-            "animation": scores,
-            "model_s": 0.5,
-            "frame_s": 0.01,
-        }
-        return found if people and name in names else None
-
-    return measure, asked
-
-
-def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
-    measure, asked = measured_as(["mine"])
-    data, other, third = (tmp_path / name for name in ("p", "walking", "hats"))
-    options = tables.Compared(data=data, other=(other, third))
-    texts = {
-        name: table(["mine", "lhm"], measure, options) for name, table in tables.TABLES.items()
-    }
-    assert "| mine | 4 photos | 25.00 / 0.900 / - | 0.50 | 0.010 |" in texts["animation"]
-    assert ("mine", data, 4, True) in asked and (
-        "mine",
-        data,
-        4,
-        False,
-    ) in asked  # table 1 shows varying poses
-    assert "| HumanGS | paper | 25.24 / 0.960 / 0.040 | 0.29 | 0.048 |" in texts["animation"]
-    assert "| mine | standard | 22.00 / 0.900 / - |" in texts["views"]
-    assert "| LVSM | paper | 24.38 / 0.960 / 0.036 | - |" in texts["reconstruction"]
-    assert (
-        "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |"
-        in texts["domains"]
-    )
-    assert (
-        "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |"
-        in texts["gaussians"]
-    )
-
-
 @pytest.mark.slow
 def test_the_cost_of_the_readers_is_measured(tmp_path):
     files = tmp_path / "cost.json", tmp_path / "cost.png"
@@ -375,34 +324,6 @@ def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are():
     assert rows.varied(np.zeros(8, int), 4) == ([], [])
 
 
-def test_people_with_many_targets_come_in_parts(monkeypatch):
-    def find(people, photos, chosen, body):
-        load = lambda i: (("a", "b", "c")[i], list(chosen[("a", "b", "c")[i]]["target"]))
-        return argparse.Namespace(names=("a", "b", "c"), load=load)
-
-    monkeypatch.setattr(rows, "find_people", find)
-    views = {
-        name: {"context": [0], "target": list(range(1, 1 + count))}
-        for name, count in (("a", 450), ("c", 10))
-    }
-    found = list(rows.cases("somewhere", 4, None, views))
-    assert [(name, len(target)) for name, target in found] == [
-        ("a", 200),
-        ("a", 200),
-        ("a", 50),
-        ("c", 10),
-    ]
-    assert [x for name, target in found if name == "a" for x in target] == views["a"]["target"]
-
-
-LAYOUTS = {
-    "avatarrex": ("animation", {"frames": 2, "cameras": 4, "size": (48, 64)}),
-    "thuman4": ("reconstruction", {"frames": 2, "cameras": 5, "size": (56, 48)}),
-    "thuman": ("domains", {"texture_size": 128}),
-}
-"""The table that shows a data set, and how little of it is made up."""
-
-
 def checkpoint(path):
     """Of a small network, as the authors store theirs."""
     encoder, reader, decoder = paper_parts(tiny().model.architecture)
@@ -420,118 +341,33 @@ def checkpoint(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_table_is_one_command_on_the_layout_of_its_data(layout, tmp_path, monkeypatch, capsys):
-    """Rows: a checkpoint that was converted; of THuman also the weights that are shipped and a
-    network trained by the command.
+def test_a_table_is_one_command_on_a_data_set(tmp_path, monkeypatch, capsys):
+    """Rows: a checkpoint that was converted, a network trained by the command, and the shipped
+    weights, on scenes of THuman and on the same ones seen from nearer.
     """
-    table, how = LAYOUTS[layout]
-    raw, converted, out = (
-        tmp_path / "raw",
-        tmp_path / "converted.safetensors",
-        tmp_path / "out.json",
-    )
-    data, body = made_up.WRITERS[layout](raw, vertices=800, **how), raw / "body.npz"
+    raw, converted = tmp_path / "raw", tmp_path / "converted.safetensors"
+    data, body = made_up.WRITERS["thuman"](raw, vertices=800, texture_size=128), raw / "body.npz"
     code, _, error = run_command(
         monkeypatch, capsys, "convert", checkpoint(tmp_path / "a.safetensors"), "--out", converted
     )
     assert code == 0, error
-    rows_wanted, options = (
-        ["converted"],
-        ["--body", str(body), "--weights", f"converted={converted}", "--only", table],
+    for name, factors in (("scenes", (1.0, 1.75)), ("near", (2.0, 2.0))):
+        settings = Settings("thuman", size=64, views=10, factors=factors, supersample=1)
+        settings = dataclasses.replace(settings, train=1, test=1)
+        preprocess(data, tmp_path / name, str(body), settings, progress=False)
+    (tmp_path / "config.json").write_text(config_to_json(dataclasses.replace(tiny(), steps=2)))
+    words = (
+        f"--data {tmp_path}/scenes/test.json --other {tmp_path}/near/test.json --body {body}"
+        f" --weights converted={converted} --train {tmp_path}/mine"
+        f" --train-on {tmp_path}/scenes/train.json --config {tmp_path}/config.json"
+        f" --only domains --json {tmp_path}/out.json"
     )
-    if layout == "thuman":
-        for name, near in (("scenes", False), ("near", True)):
-            settings = Settings(
-                "thuman",
-                size=64,
-                views=10,
-                factors=(2.0, 2.0) if near else (1.0, 1.75),
-                supersample=1,
-            )
-            preprocess(
-                data,
-                tmp_path / name,
-                str(body),
-                dataclasses.replace(settings, train=1, test=1),
-                progress=False,
-            )
-        (tmp_path / "config.json").write_text(config_to_json(dataclasses.replace(tiny(), steps=2)))
-        data, rows_wanted = tmp_path / "scenes" / "test.json", ["converted", "mine", rows.SHIPPED]
-        options += [
-            "--other",
-            str(tmp_path / "near" / "test.json"),
-            "--train",
-            str(tmp_path / "mine"),
-        ]
-        options += [
-            "--train-on",
-            str(tmp_path / "scenes" / "train.json"),
-            "--config",
-            str(tmp_path / "config.json"),
-        ]
-    else:
-        # the shipped network takes long, and is a row of the other layout
-        monkeypatch.setattr(
-            tables, "trained", lambda *given: {"converted": rows.trained(*given)["converted"]}
-        )
-    if layout == "thuman4":
-        chosen = tmp_path / "indices.json"
-        chosen.write_text(json.dumps({"subject00": {"context": [0, 1, 2, 3], "target": [4, 8]}}))
-        options += ["--indices", str(chosen)]
-    assert call(tables.tables, ["--data", str(data), *options, "--json", str(out)]) == 0
-    text = capsys.readouterr().out
-    numbers = json.loads(out.read_text())["numbers"]["tables"]["rows"]
-    assert all(f"| {name} | 4 photos |" in text for name in rows_wanted) and f"**{table}**" in text
-    key = {
-        "avatarrex": "avatarrex_zzr, 4, varying poses",
-        "thuman4": "subject00, 4",
-        "thuman": "scenes, 4",
-    }[layout]
-    found = numbers[f"converted, {key}"]
-    tasks = {
-        "avatarrex": {"animation"},
-        "thuman4": {"reconstruction", "animation"},
-        "thuman": {"reconstruction"},
-    }[layout]
-    assert {task for task in bench.TASKS if found[task]} == tasks and all(
-        0 < found[task][0] < 60 for task in tasks
-    )
-    if layout == "thuman":
-        assert numbers["converted, near, 4"]["reconstruction"] != found["reconstruction"]
-
-
-def test_a_system_without_animation_has_a_row_and_one_without_scores_of_the_first_people_has_none():
-    scores, options = (
-        {"psnr": 20.0, "ssim": 0.9},
-        tables.Compared(data=Path("a"), other=(Path("b"),)),
-    )
-    found = {
-        "photos": 4,
-        "reconstruction": scores,
-        "animation": None,
-        "model_s": 1.5,
-        "frame_s": 0.5,
-    }
-    measure = lambda name, people, photos, varying=False: (
-        found if name == "lvsm" or people == Path("b") else None
-    )
-    shown = {
-        name: tables.TABLES[name](["lvsm", "others alone"], measure, options)
-        for name in tables.TABLES
-    }
-    assert "| lvsm | 4 photos | - | 1.5 | 0.50 |" in shown["animation"]
-    assert "| lvsm | 4 photos | 20.00 / 0.900 / - | 20.00 / 0.900 / - |" in shown["domains"]
-    assert not any("others alone" in text for text in shown.values())
-
-
-def test_people_of_one_name_are_refused(tmp_path):
-    options = tables.Compared(data=tmp_path / "a" / "x", near=tmp_path / "b" / "x")
-    with pytest.raises(
-        ValueError, match="people in folders of one name: x, x: expected a name for each"
-    ):
-        tables.settings_of(options, ())
-    assert tables.title(tmp_path / "scenes" / "test.json") == "scenes"
+    assert call(tables.tables, words.split()) == 0
+    numbers = json.loads((tmp_path / "out.json").read_text())["numbers"]["tables"]["rows"]
+    for row in ("converted", "mine", rows.SHIPPED):
+        assert 0 < numbers[f"{row}, scenes, 4"]["reconstruction"][0] < 60
+    scenes, near = (numbers[f"converted, {name}, 4"] for name in ("scenes", "near"))
+    assert near["reconstruction"] != scenes["reconstruction"]
 
 
 @pytest.mark.slow

@@ -3,14 +3,13 @@ done stays done, and what is too slow is cut.
 """
 
 import importlib
-import json
 import sys
 
 import pytest
 
 from experiments import quarter_hour
 from experiments.harness import listed, parser_of
-from experiments.quarter_hour import Stage, ran, spend, stages
+from experiments.quarter_hour import Stage, ran, stages
 
 
 @pytest.mark.parametrize("small", [True, False])
@@ -28,38 +27,6 @@ def test_the_list_fits_into_a_quarter_of_an_hour_when_stages_before_training_are
     whole = stages(tmp_path, small=False)
     trained = [stage.name for stage in whole].index("training by the clock")
     assert sum(stage.seconds for stage in whole[: trained - 3]) < 15 * 60
-
-
-@pytest.fixture
-def counted(monkeypatch):
-    """The list of three stages of a pretended program; the first fails."""
-    calls = []
-
-    def pretended(stage, limit, environment, log):
-        calls.append((stage.name, limit))
-        assert environment["XLA_FLAGS"].endswith(stage.flags)
-        return {"became": "failed" if stage.name == "first" else "done", "seconds": 1.0}
-
-    three = [Stage("first", (), 30), Stage("second", (), 50, "--flag"), Stage("third", (), 20)]
-    monkeypatch.setattr(quarter_hour, "stages", lambda out, small: three)
-    monkeypatch.setattr(quarter_hour, "ran", pretended)
-    return calls
-
-
-def test_a_second_call_goes_on_with_what_is_not_done(counted, tmp_path):
-    found = spend(tmp_path, 200, small=False)
-    assert [each["became"] for each in found.values()] == ["failed", "done", "done"]
-    assert json.loads((tmp_path / "clock.json").read_text()) == found
-    counted.clear()
-    spend(tmp_path, 200, small=False)
-    assert [name for name, _ in counted] == ["first"]
-
-
-def test_no_stage_gets_more_time_than_is_left(counted, tmp_path):
-    found = spend(tmp_path, 40 + quarter_hour.GRACE, small=False)
-    assert [round(limit) for _, limit in counted] == [30, 40, 20]
-    found = spend(tmp_path / "other", quarter_hour.GRACE + 1, small=False)
-    assert {each["became"] for each in found.values()} == {"no time"}
 
 
 def test_a_stage_that_takes_too_long_hears_ctrl_c_and_keeps_what_it_wrote(tmp_path, monkeypatch):

@@ -54,8 +54,3 @@ def test_the_careful_mask_is_what_moved():
     # the blurred edge is neither: two pixels of a video, of which a crop has half as many
     assert (np.abs(np.argwhere(careful).min(0) - [20, 30]) <= 2).all()
     assert (np.abs(np.argwhere(careful).max(0) - [99, 55]) <= 2).all()
-
-
-def rotation(rng):
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return turn * np.sign(np.linalg.det(turn))

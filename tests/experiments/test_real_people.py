@@ -4,7 +4,6 @@ from.
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from experiments import real_people
 from experiments.harness import Run
 from experiments.held_out_photos import in_shared_pose, psnr_corrected
 from experiments.real_capture import unpacked
-from experiments.real_people import Case, measure, section, turning_man, write_transforms
+from experiments.real_people import turning_man, write_transforms
 from humangs_jax.capture.fitting.own_poses import with_own_poses
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
@@ -72,34 +71,6 @@ def test_gains_of_channels_are_no_error_of_corrected_colors_and_detail_is():
     assert psnr_corrected(other * [0.7, 1.2, 0.9], photo, mask) > 100
     detail = photo + 0.1 * rng.choice([-1.0, 1.0], photo.shape)
     np.testing.assert_allclose(psnr_corrected(detail, photo, mask), 20.0, atol=0.5)
-
-
-def test_what_a_run_has_finished_is_not_made_again(tmp_path, monkeypatch):
-    out = tmp_path / "start"
-    started = []
-
-    def start(words, check):
-        started.append(words[2:4])
-        out.mkdir(exist_ok=True)
-        (out / "avatar.html").write_text("page")
-
-    scores = {"psnr": 20.0, "psnr_fg": 15.0, "psnr_corrected": 16.0, "alex": 0.1}
-    scores |= {"each": [14.0, 16.0]}
-    monkeypatch.setattr(real_people.subprocess, "run", start)
-    monkeypatch.setattr(real_people, "load_capture", lambda _: load_capture("demo_capture"))
-    monkeypatch.setattr(
-        real_people, "held_out_scores", lambda *_: {"own": scores, "shared": scores}
-    )
-    for _ in range(2):
-        numbers = measure(lambda: Case(Path("photos")), out, 2)
-        assert numbers["fg_own"] == 15 and numbers["worst_own"] == 14 and numbers["seconds"] > 0
-    assert len(started) == 1
-    (out / "avatar.html").unlink()  # an interrupted run
-    measure(lambda: Case(Path("photos")), out, 2)
-    assert len(started) == 2
-    assert "| turning man, photos | 20.0 | 15.00 | 14.0 | 16.00 |" in section(
-        {"turning man, photos": numbers}
-    )
 
 
 def test_folders_that_are_missing_are_one_line_and_nothing_is_fetched(tmp_path):

@@ -3,8 +3,6 @@
 import pytest
 
 from experiments import speed
-from experiments.harness import call
-from experiments.results import REPOSITORY
 
 
 def times(product, **others):
@@ -20,25 +18,6 @@ def test_a_busier_machine_changes_nothing_and_a_slower_program_is_named():
     assert speed.slower_than(before, now, 1.5) == speed.slower_than({}, now, 1.3) == []
     del before["render"]  # what the other commit cannot do is not compared
     assert speed.slower_than(before, now, 1.3) == []
-
-
-def test_a_change_that_is_too_slow_fails_and_the_report_has_code_by_room(monkeypatch, capsys):
-    asked = []
-
-    def measured(place, repeats):
-        asked.append(place)
-        return times(1.0, gradient=30.0 if place == REPOSITORY else 20.0)
-
-    monkeypatch.setattr(speed, "_measured", measured)
-    monkeypatch.setattr(speed, "checkout", speed.contextmanager(lambda commit: iter([commit])))
-    monkeypatch.setattr(speed, "code_by_room", lambda place: {"core/": 5, "public names": 2})
-    assert call(speed.speed, ["--turns", "2"]) == 0 and len(asked) == 2
-    assert call(speed.speed, ["--turns", "2", "--before", "v1"]) == 1
-    shown = capsys.readouterr().out
-    assert asked[2:] == ["v1", REPOSITORY] * 2  # in turns
-    assert "| the same with its gradient | 20 | 30 |" in shown and "code tokens, core/" in shown
-    assert "30.00 plain products, 20.00 before: 1.50 times" in shown
-    assert call(speed.speed, ["--turns", "1", "--before", "v1", "--slower", "2"]) == 0
 
 
 def test_rooms_are_those_of_the_package(tmp_path):

@@ -4,17 +4,14 @@ import typing
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import tyro
 
-from experiments import train_by_clock, train_shipped
-from humangs_jax.core.pytree import replace
+from experiments import train_shipped
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights
 from humangs_jax.training.config import tiny as tiny_run
-from humangs_jax.training.state import TrainState
 
 HALF_PRECISION = 2**-11
 """Relative: the file has float16."""
@@ -51,19 +48,3 @@ def test_wrong_first_weights_are_an_error(tmp_path):
         train_shipped.main(tmp_path, start_share=0.5)
     with pytest.raises(ValueError, match="shipped: tensor"):
         train_shipped.main(tmp_path, init_weights="shipped", config=tiny_run())
-
-
-def test_a_share_of_the_learning_rate_is_that_share_of_an_update(monkeypatch):
-    state = TrainState(jnp.zeros((), jnp.int32), {"a": jnp.ones(3)}, {}, (), None)
-    step_on = lambda state, *_: (
-        replace(state, step=state.step + 1, params={"a": state.params["a"] + 4}),
-        {},
-    )
-    monkeypatch.setattr(train_by_clock, "update", step_on)
-    step = train_by_clock.stepper(tiny())
-    for at, decay in ((0, 0.1), (100_000, train_by_clock.EMA)):
-        given = replace(state, step=jnp.asarray(at, jnp.int32), params={"a": jnp.ones(3)})
-        after, average, _ = step(given, {"a": jnp.zeros(3)}, None, None, None, None, 0.25)
-        assert int(after.step) == at + 1
-        np.testing.assert_allclose(after.params["a"], 2)
-        np.testing.assert_allclose(average["a"], 2 * (1 - decay), rtol=1e-4)
