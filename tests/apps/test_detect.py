@@ -3,7 +3,6 @@
 import dataclasses
 import shutil
 import sys
-import tracemalloc
 from pathlib import Path
 
 import jax
@@ -23,7 +22,6 @@ from humangs_jax.apps.detect import (
     same_people,
     write_found,
 )
-from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.capture.detection.people import Crop, Detection, Landmarks, mask_in_photo
 from humangs_jax.capture.detection.sharpening import sharpened
 from humangs_jax.capture.keypoints.formats import SeenPerson
@@ -34,8 +32,6 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import read_grey, to_uint8, write_png
 
 SIZE = (40, 30)
-BESIDE = np.asarray([0.8, 0.0, 0.3])
-"""Metres from the demo's person to the other one."""
 DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 
 
@@ -148,45 +144,6 @@ def test_without_litert_it_is_one_line(tmp_path, capsys, monkeypatch):
         "error: finding people in photos needs LiteRT: pip install 'humangs_jax[photos]'" in said
         and said.count("\n") == 1
     )
-
-
-def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path, monkeypatch):
-    """The second person of one view comes first there: only the cameras tell."""
-    capture = load_capture("demo_capture")
-    shutil.copytree(DEMO, tmp_path / "c")
-    edit_json(
-        tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]]
-    )
-    model = landmark_model(capture.body, MEDIAPIPE_33.names)
-    points = np.asarray(pose_landmarks(model, jnp.asarray(capture.betas), capture.pose(0))[0])
-    shown = []
-    for v in range(4):
-        K, transform = (
-            np.asarray(x[v], float) for x in (capture.cameras.K, capture.cameras.cam_from_world)
-        )
-        people = []
-        for area, place in ((50.0, points), (40.0, points + BESIDE)):
-            local = (place @ transform[:3, :3].T + transform[:3, 3]) @ K.T
-            pixels = np.c_[local[:, :2] / local[:, 2:], np.asarray(model.known, float)]
-            people.append(
-                found(0, area)._replace(person=SeenPerson(pixels, np.zeros((33, 3)), 1.0))
-            )
-        if v == 2:
-            mirrored = people[1].person.points[np.asarray(MEDIAPIPE_33.mirror)]
-            people[1] = people[1]._replace(
-                person=SeenPerson(mirrored, np.zeros((33, 3)), 1.0), area=70.0
-            )
-            people.reverse()
-        shown.append(photo(f"{capture.names[v]}.png", *people))
-    monkeypatch.setattr(detect, "detect_photos", lambda names, photos: shown)
-    ordered = detect.found_in_photos(tmp_path / "c")
-    assert [p.people[0].area for p in ordered] == [50.0, 50.0, 50.0, 50.0]
-    repaired = lambda person: [
-        line for line in detect.remarks(ordered, person) if line.endswith("repaired")
-    ]
-    assert repaired(0) == [] and [line.split(":")[0] for line in repaired(1)] == [
-        f"{capture.names[2]}.png"
-    ]
 
 
 # One person in front of calibrated cameras is one person
@@ -395,20 +352,6 @@ def test_masks_and_keypoints_choose_in_each_photo_whatever_the_matching_says(kin
     assert all(each.known for each in settled)
 
 
-def test_a_photo_without_keypoints_whose_people_are_rivals_is_asked_about(tmp_path):
-    photos = [
-        dataclasses.replace(photo(name, found(1, 90.0), found(2, 80.0)), known=False)
-        for name in "ab"
-    ]
-    points = np.full((2, 33, 2), [11.0, 7.0], np.float32)
-    confidences = np.repeat([[1.0], [0.0]], 33, axis=1).astype(np.float32)
-    with pytest.raises(
-        ValueError,
-        match=r"^b: which of the people of .* is meant\? There are no keypoints of the person: add",
-    ):
-        detect.person_of(photos, Keypoints(points, confidences, MEDIAPIPE_33), tmp_path / "s.png")
-
-
 def looked_at(center, side):
     """What the landmark network says of a crop: an ellipse."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, 256)] * 2)
@@ -452,33 +395,6 @@ def test_landmarks_beyond_the_photo_or_under_what_hides_it_are_not_seen():
     assert detect.without_hidden_landmarks([whole], None)[0] is whole
 
 
-def test_masks_of_many_people_take_no_more_than_the_people_do(monkeypatch):
-    people = [looked_at((500 + 600 * i, 1500), 400.0) for i in range(5)]
-    monkeypatch.setattr(detect, "Networks", lambda: None)
-    monkeypatch.setattr(detect, "find_people", lambda networks, photo: people)
-    large = np.zeros((3000, 4000, 3), np.float32)
-    tracemalloc.start()
-    (photo,) = detect.detect_photos(["a"], [large])
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert len(photo.people) == 5 and peak < large[..., 0].nbytes
-
-
-def test_photos_of_a_capture_without_masks_are_read_once(tmp_path, monkeypatch):
-    shutil.copytree(DEMO, tmp_path / "c")
-    edit_json(
-        tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]]
-    )
-    read = []
-    monkeypatch.setattr(detect, "read_image", lambda *_: read.append(1))
-    monkeypatch.setattr(
-        detect,
-        "detect_photos",
-        lambda names, photos: [photo(name) for name, _ in zip(names, photos, strict=True)],
-    )
-    assert len(detect.found_in_capture(tmp_path / "c")) == 4 and not read
-
-
 def test_two_photos_never_share_a_mask(tmp_path):
     photos = same_people([photo("a.jpg", found(1, 90.0)), photo("a.png", found(2, 90.0))])
     with pytest.raises(ValueError, match=r"a\.jpg and a\.png: both masks would be masks/a\.png"):
@@ -498,59 +414,3 @@ def test_others_hide_the_person_where_they_stand_unless_they_are_behind(tmp_path
     given = person_mask(shown, 1)
     assert detect.hidden_by_others(shown, 0, given) is None
     assert detect.hidden_by_others(photo("a", person), 0) is None
-
-
-def test_where_nobody_has_the_mask_the_detector_sees_its_pixels_alone(monkeypatch):
-    """The one in front was found in the second photo; the person is found once the rest is white."""
-    person, front = found(1, 32.0, corner=(5, 10)), found(2, 32.0, corner=(15, 25))
-    photos = [photo("a", person, front), photo("b", front)]
-    masks = [person_mask(photos[0], 0)] * 2
-    asked = []
-
-    def cut(names, images):
-        asked.extend(names)
-        return [photo(name, person) for name in names]
-
-    monkeypatch.setattr(detect, "detect_photos", cut)
-    result = detect.with_masked(photos, masks, [np.ones((30, 40, 3))] * 2)
-    assert asked == ["b"] and result[0] is photos[0]
-    assert {each.corner for each in result[1].people} == {(5, 10), (15, 25)}
-
-
-def test_others_who_are_given_are_painted_over_and_stay_unknown(tmp_path, monkeypatch):
-    """Of a capture without masks: nobody is found in others' pixels, and they are kept."""
-    shutil.copytree(DEMO, tmp_path / "c")
-    whole = load_capture(tmp_path / "c")
-    unknown = np.zeros(whole.masks.shape[1:], bool)
-    unknown[200:300, 150:350] = True
-    shutil.rmtree(tmp_path / "c" / "masks")
-    (tmp_path / "c" / "unknown").mkdir()
-    name = whole.names[0]
-    write_png(tmp_path / "c" / "unknown" / f"{name}.png", unknown.astype(np.float32))
-
-    def change(description):
-        for view in description["views"]:
-            view.pop("mask")
-        description["views"][0]["unknown"] = f"unknown/{name}.png"
-
-    edit_json(tmp_path / "c" / "capture.json", change)
-    seen = []
-
-    def look(names, photos):
-        seen.extend(photos)
-        size = whole.images.shape[2:0:-1]
-        return [
-            PhotoPeople(each, size, np.ones((4, 4, 3)), (found(1, 90.0, (240, 240)),))
-            for each in names
-        ]
-
-    monkeypatch.setattr(detect, "detect_photos", look)
-    people, number = detect.person_in_capture(tmp_path / "c", load_capture(tmp_path / "c"))
-    photos = [detect.read_image(DEMO / "images" / f"{each}.png")[0] for each in whole.names]
-    changed = [np.abs(a - b).max(axis=-1) > 0.01 for a, b in zip(seen, photos, strict=True)]
-    assert changed[0][unknown].any() and not changed[0][:190].any()
-    assert not any(each.any() for each in changed[1:])
-    write_found(tmp_path / "c", people, number, to_capture=True)
-    read = load_capture(tmp_path / "c")
-    np.testing.assert_array_equal(read.unknown[0], unknown)
-    assert not read.unknown[1:].any() and not read.masks[0][unknown].any()

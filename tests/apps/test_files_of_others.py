@@ -3,7 +3,6 @@ name.
 """
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from humangs_jax import cli
 from humangs_jax.apps import demo, detect
 from humangs_jax.avatar.export import mesh
 from humangs_jax.avatar.video import write_video
-from humangs_jax.capture.detection import people as blazepose
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import MASK, is_own_picture, mark_of, write_png
 from tests.apps.test_detect import found, photo
@@ -56,21 +54,6 @@ def test_detect_replaces_what_it_wrote_and_nothing_else(name, here, capsys):
     assert cli.execute([*command, "--overwrite"]) == 0 and file.read_bytes() != before
     assert mark_of("photos/masks/a.png") == MASK and is_own_picture("photos/people.png")
     assert cli.execute(command) == 0  # its own
-
-
-def test_fit_keeps_keypoints_of_others_in_the_capture(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(DEMO, "me")
-    description = json.loads(Path("me/capture.json").read_text())
-    for view in description["views"]:
-        view.pop("mask")
-    Path("me/capture.json").write_text(json.dumps(description))
-    Path("me/keypoints.json").write_text("[]")
-    Path("me/body.npz").unlink()
-    monkeypatch.setattr(blazepose, "available", lambda: True)
-    assert cli.execute(["fit", "me"]) == cli.BAD_DATA
-    assert "me/keypoints.json" in (said := capsys.readouterr().err) and "--keypoints FILE" in said
-    assert Path("me/keypoints.json").read_text() == "[]"
 
 
 def test_a_sheet_of_numbers_replaces_no_picture_of_others(tmp_path):

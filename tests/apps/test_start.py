@@ -14,7 +14,7 @@ from PIL import Image
 from experiments.your_photos import landmarks_in, write_material
 from humangs_jax import cli
 from humangs_jax.apps import detect, photos_alone, start
-from humangs_jax.apps.detect import PersonInPhoto, PhotoPeople, detect_photos
+from humangs_jax.apps.detect import PersonInPhoto, PhotoPeople
 from humangs_jax.apps.from_photos import FromPhotos, avatar_from_photos
 from humangs_jax.apps.start import better_body, held_out_psnr, inspect_folder, missing
 from humangs_jax.avatar.avatar import Avatar
@@ -22,27 +22,18 @@ from humangs_jax.avatar.video import write_video
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.resolution import decimate
-from humangs_jax.capture.calibration.importing import import_calibration
 from humangs_jax.capture.detection import people as blazepose
-from humangs_jax.capture.fitting import fit_capture
-from humangs_jax.capture.fitting.person_cameras import PersonCameras
-from humangs_jax.capture.fitting.person_moments import PersonViews
-from humangs_jax.capture.fitting.refine import usual_config
 from humangs_jax.capture.keypoints.formats import SeenPerson
-from humangs_jax.capture.keypoints.keypoints import COCO_17, MEDIAPIPE_33
+from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.data import exposure
-from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
+from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.exposure import apply_gain, equalize_exposure
 from humangs_jax.data.photos import load_photos
-from humangs_jax.geometry.camera import Camera, orbit
+from humangs_jax.geometry.camera import orbit
 from humangs_jax.io.images import read_image, to_uint8, write_png
 from humangs_jax.io.reading import write_json
 from humangs_jax.network.presets import tiny
 from tests.refinement.refinement_cases import toy_avatar, toy_capture
-
-DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 
 
 @pytest.fixture(scope="module")
@@ -244,146 +235,6 @@ def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(
     np.testing.assert_allclose(imported.masks, truth.masks, atol=1 / 255)
 
 
-def test_fit_and_check_find_what_a_capture_lacks_too(mine, detected, capsys, monkeypatch):
-    given = []
-
-    def fit(photos, keypoints, *arguments, **options):
-        given.append((photos, keypoints))
-        raise ValueError("the fit")
-
-    truth, shown = load_capture("demo_capture"), detect.found_in_capture("me")
-    named = lambda folder: [
-        dataclasses.replace(each, name=f"{name}.png")
-        for each, name in zip(shown, load_photos(folder).names, strict=True)
-    ]
-    monkeypatch.setattr(detect, "found_in_capture", named)
-    cameras = [
-        "import",
-        "cameras",
-        str(mine / "calibration.json"),
-        "--images",
-        str(mine / "images"),
-        "--out",
-        "me",
-    ]
-    monkeypatch.setattr(fit_capture, "fit_photos", fit)
-    assert cli.execute(cameras) == 0 and load_photos("me").masks is None
-    assert (
-        cli.execute(["fit", "me"]) == cli.BAD_DATA
-        and "Person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
-    )
-    assert cli.execute(["fit", "me", "--person", "1"]) == cli.BAD_DATA
-    out, err = capsys.readouterr()
-    assert (
-        err.endswith("error: the fit\n")
-        and "keypoints and masks found in the photos: me/people.png shows them" in out
-    )
-    ((photos, keypoints),) = given
-    np.testing.assert_allclose(photos.masks, truth.masks, atol=1 / 255)
-    np.testing.assert_allclose(
-        keypoints.points, np.nan_to_num(landmarks_in(truth, MEDIAPIPE_33.names)), atol=1e-3
-    )
-    assert cli.execute(["fit", "me"]) == cli.BAD_DATA  # what was found is taken
-    assert "found" not in capsys.readouterr().out and len(given) == 2
-    monkeypatch.setattr(blazepose, "available", lambda: False)
-    assert cli.execute(["fit", "me"]) == cli.BAD_USAGE
-    assert "pip install 'humangs_jax[photos]'" in capsys.readouterr().err
-
-
-@pytest.mark.slow  # draws and examines
-def test_check_compares_a_capture_without_keypoints_with_what_is_found(mine, detected, capsys):
-    assert cli.execute(["check", str(DEMO), "--person", "1", "--out", "x.png"]) == 0
-    assert "keypoints, median error" in capsys.readouterr().out and Path("x_fit.png").is_file()
-    assert not (DEMO / "keypoints.json").exists()
-
-
-@pytest.fixture
-def two_people(mine, detected, monkeypatch):
-    """Photos without cameras of two people who are found in another order in each; their keypoints
-    have one order.
-    """
-    truth = load_capture("demo_capture")
-    without(mine, *TOOLS)
-    shown = detect.found_in_capture("me")
-    beside = np.full((60, 30), 255, np.uint8)
-    for v, photo in enumerate(shown):
-        bystander, person = photo.people
-        people = (bystander._replace(mask=beside), person)
-        name = f"cam{v}.png"
-        shown[v] = dataclasses.replace(
-            photo, name=name, people=people[:: 1 if v % 2 else -1], known=False
-        )
-    points = {
-        "person": landmarks_in(truth, COCO_17.names),
-        "bystander": np.random.default_rng(0).uniform(5, 29, (4, 17, 2)),
-    }
-    (mine / "keypoints").mkdir()
-    for v in range(4):
-        both = [
-            {"keypoints": points[who][v].tolist(), "keypoint_scores": [0.9] * 17}
-            for who in ("bystander", "person")
-        ]
-        write_json(mine / "keypoints" / f"cam{v}.json", both)
-    write_masks(mine / "masks", truth.masks)
-    monkeypatch.setattr(photos_alone.detect, "detect_photos", lambda names, photos: shown)
-    monkeypatch.setattr(photos_alone, "same_people", lambda photos: photos)
-    return mine
-
-
-def write_masks(folder, masks):
-    folder.mkdir()
-    for v, mask in enumerate(masks):
-        write_png(folder / f"cam{v}.png", mask)
-
-
-@pytest.mark.parametrize(("who", "area"), [(0, 2e5), (1, 1e5)])
-def test_without_cameras_keypoints_of_several_people_choose_in_each_photo(who, area, two_people):
-    """`--person` counts in the keypoint file; the person that the detector found there has the
-    cameras and masks.
-    """
-    files = sorted((two_people / "images").iterdir())
-    choice = photos_alone._Choice(who, two_people / "keypoints", None, Path("me"))
-    looked = photos_alone._look(two_people / "images", files, files, choice)
-    assert (
-        looked.shown == [0, 1, 2, 3]
-        and [photo.people[looked.number].area for photo in looked.photos] == [area] * 4
-    )
-    with pytest.raises(CaptureError, match="2 people: expected one"):
-        photos_alone._look(two_people / "images", files, files, choice._replace(person=None))
-
-
-def test_without_cameras_masks_choose_in_each_photo(two_people):
-    files = sorted((two_people / "images").iterdir())
-    choice = photos_alone._Choice(None, None, two_people / "masks", Path("me"))
-    looked = photos_alone._look(two_people / "images", files, files, choice)
-    assert [photo.people[looked.number].area for photo in looked.photos] == [1e5] * 4
-
-
-@pytest.mark.slow  # finds the cameras
-def test_start_goes_on_with_the_person_whom_the_keypoints_choose(
-    two_people, detected, monkeypatch, capsys
-):
-    strangers = detect.detect_photos(None, None)
-
-    def with_strangers(names, photos):
-        found = detect_photos(names, photos)
-        others = [max(photo.people, key=lambda each: each.area) for photo in strangers]
-        return [
-            dataclasses.replace(p, people=(other, *p.people))
-            for p, other in zip(found, others, strict=True)
-        ]
-
-    monkeypatch.setattr(detect, "detect_photos", with_strangers)
-    shutil.rmtree(two_people / "masks")
-    command = ["start", str(two_people), "--out", "me", "--height", "1.7"]
-    assert cli.execute(command) == cli.BAD_DATA
-    assert "2 people: expected one. Person I is the I-th" in capsys.readouterr().err
-    assert cli.execute([*command, "--person", "1"]) == cli.BAD_DATA
-    assert capsys.readouterr().err.endswith("humangs: error: the fit\n")
-    apart = np.abs(load_photos("me").masks - load_capture("demo_capture").masks).mean()
-    assert apart < 0.02 and detected[0].keypoints == two_people / "keypoints"
-
-
 @pytest.mark.slow  # finds the cameras
 def test_photos_alone_are_enough(mine, detected, capsys):
     """Cameras, masks and keypoints are those of the person; only LiteRT is needed."""
@@ -401,55 +252,6 @@ def test_photos_alone_are_enough(mine, detected, capsys):
     np.testing.assert_allclose(
         apart(centers) / apart(centers)[0], apart(true) / apart(true)[0], rtol=0.2
     )
-
-
-def test_cameras_from_the_person_are_no_calibrated_ones_in_the_capture(tmp_path):
-    points = np.full((1, 2, 2), 4.0)
-    seen = PersonViews(
-        points,
-        np.ones((1, 2)),
-        np.ones((1, 2, 3)),
-        ("nose", "neck"),
-        ((8, 8),),
-        np.asarray([8.0]),
-        ("a.png",),
-    )
-    cam_from_world = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
-    camera = Camera.from_opencv([[8, 0, 4], [0, 8, 4], [0, 0, 1]], cam_from_world, 8, 8)
-    found = PersonCameras(
-        (0,), (camera,), np.ones((1, 2, 3)), np.zeros(1, bool), 1, np.zeros(1), ()
-    )
-    (tmp_path / "photos").mkdir()
-    write_png(tmp_path / "photos" / "a.png", np.ones((8, 8, 3)))
-    import_calibration(
-        photos_alone._calibration(seen, found, tmp_path / "photos"),
-        tmp_path / "photos",
-        tmp_path / "me",
-    )
-    assert not load_photos(tmp_path / "me").calibrated
-
-
-def test_refinement_takes_cameras_for_calibrated_if_the_capture_says_so(tmp_path, monkeypatch):
-    """A capture with a pose for each photo tells nothing about its cameras: they stay."""
-    configs = []
-
-    def refine_capture(capture, *, keypoints, config):
-        configs.append(config)
-        raise ValueError("far enough")
-
-    monkeypatch.setattr("humangs_jax.capture.fitting.refine.refine_capture", refine_capture)
-    demo = load_capture("demo_capture")
-    alone = dataclasses.replace(demo.select([0]), frames=np.zeros(1, np.int32))
-    for capture, calibrated in ((demo, True), (demo, False), (alone, True), (alone, False)):
-        save_capture(
-            tmp_path / "me", dataclasses.replace(capture, calibrated=calibrated), overwrite=True
-        )
-        assert cli.execute(["fit", str(tmp_path / "me"), "--refine", "--overwrite"]) != 0
-    starts = [usual_config(False, calibrated=calibrated) for calibrated in (True, False)] * 2
-    assert [config.keypoints_worse for config in configs] == [
-        config.keypoints_worse for config in starts
-    ]
-    assert [config.fixed_cameras for config in configs] == [False, False, False, True]
 
 
 def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypatch):
@@ -503,25 +305,6 @@ def test_without_the_detector_a_height_does_not_hide_how_to_install_it(mine, cap
     assert (
         "pip install 'humangs_jax[photos]'" in out and "cameras, masks and keypoints missing" in err
     )
-
-
-def test_a_run_that_was_interrupted_while_it_wrote_can_be_run_again(
-    mine, detected, monkeypatch, capsys
-):
-    """The mark of `start` appears together with the capture."""
-    without(mine, *TOOLS)
-
-    def interrupted(_, out, *, also, **options):
-        shutil.rmtree(out, ignore_errors=True)
-        out.mkdir()
-        for name, content in {"capture.json": {}, **also}.items():
-            write_json(out / name, content)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(photos_alone, "import_photos", interrupted)
-    for _ in range(2):
-        assert cli.execute(["start", str(mine), "--out", "me"]) == cli.INTERRUPTED
-        assert "not empty" not in capsys.readouterr().err
 
 
 def test_a_body_that_other_options_made_is_not_taken(mine, detected, capsys):
@@ -747,20 +530,6 @@ def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, toy
     assert held_out_psnr({}, tiny(), toy, None).psnr < found.psnr - 3
     for few in (toy.select([0, 1, 2]), dataclasses.replace(toy, masks=None)):
         assert held_out_psnr({}, tiny(), few, None) is None
-
-
-def test_photos_are_made_equal_once_before_one_is_held_out(body, toy, monkeypatch):
-    """What remains is not made equal again, by other gains."""
-    gains, given = np.linspace(0.8, 1.2, 12).reshape(4, 3), []
-    monkeypatch.setattr(exposure, "camera_gains", lambda capture: gains)
-    reconstructed(monkeypatch, body, lambda others: given.append(others) or 0.0)
-    held_out_psnr({}, tiny(), toy, None)
-    others = given[0]
-    assert equalize_exposure(others) is others
-    own = [toy.names.index(name) for name in others.names]
-    np.testing.assert_array_equal(others.gains, gains[own])
-    once = apply_gain(toy.images, toy.masks, gains)[own]
-    np.testing.assert_array_equal(others.images, once)
 
 
 def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):

@@ -129,12 +129,6 @@ def test_where_nothing_is_within_the_budget_the_fastest_is_named(monkeypatch):
         tuned(monkeypatch, frame_ms=1.0)
 
 
-def test_memory_that_cannot_be_measured_cannot_be_limited(monkeypatch):
-    monkeypatch.setitem(BY_PRESET, "realtime", Cost(1.0, 1.0))
-    with pytest.raises(ValueError, match=r"^memory_mb"):
-        tuned(monkeypatch, memory_mb=100.0)
-
-
 def test_without_masks_no_preset_that_refines_is_tried(monkeypatch):
     found = tuned(monkeypatch, masks=None, frame_ms=1e9)
     assert found.name == "realtime" and list(found.measured) == ["realtime"]

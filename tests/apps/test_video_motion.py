@@ -1,8 +1,5 @@
 """The motion of a video: who is followed, interrupted runs, and what is written."""
 
-import dataclasses
-import types
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,8 +12,6 @@ from humangs_jax.body.motion import Motion
 from humangs_jax.capture.detection.face_and_hands import Hand
 from humangs_jax.capture.detection.people import Crop, Detection, Landmarks
 from humangs_jax.capture.fitting.motion_fit import MotionFit
-from humangs_jax.cli.animate import Animate
-from humangs_jax.cli.options import PartOfMotion, UsageError
 from humangs_jax.motion import load_motion, made_from_of, save_motion
 from humangs_jax.motion.skeleton import shipped_joints
 
@@ -224,12 +219,3 @@ def test_the_command_writes_the_motion_and_refuses_the_files_of_others(scene, tm
         said = capsys.readouterr().err
         assert name in said and said.strip().count("\n") == 0
     assert scene.looks == looks
-
-
-def test_an_avatar_is_moved_by_a_video_and_its_file_options_are_refused(scene, tmp_path):
-    avatar = types.SimpleNamespace(rest_joints=shipped_joints())
-    command = Animate(avatar=tmp_path / "a.npz", motion=tmp_path / "me.mp4")
-    assert len(command._motion(avatar).translations) == COUNT
-    wrong = dataclasses.replace(command, part=PartOfMotion(motion_fps=30.0))
-    with pytest.raises(UsageError, match="--motion-fps: is for files of motions"):
-        wrong._motion(avatar)

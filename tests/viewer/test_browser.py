@@ -19,11 +19,11 @@ from experiments import page as evaluation
 from experiments.subjects import shipped_person
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
-from humangs_jax.body.motion import Motion, grounded
+from humangs_jax.body.motion import grounded
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import transform
-from humangs_jax.motion import load_motion, save_motion
-from humangs_jax.viewer.page import page_server, write_page
+from humangs_jax.motion import load_motion
+from humangs_jax.viewer.page import write_page
 
 pytestmark = [
     pytest.mark.slow,
@@ -96,20 +96,6 @@ def test_the_page_asks_for_nothing(browser):
     with pytest.raises(RuntimeError, match="fetch"):
         browser.run("await fetch('http://127.0.0.1:1/')")
     assert len(browser.problems()) > 0  # the browser's own protest
-
-
-def test_localhost_shows_the_same_page(page_file):
-    import threading
-
-    server = page_server({"/": page_file.read_text()})
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        with chromium.Chromium() as browser:
-            browser.open(f"http://127.0.0.1:{server.server_address[1]}/")
-            assert browser.run("return humangs.gaussians") == 20376 and browser.problems() == []
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
@@ -349,8 +335,3 @@ def test_a_file_that_is_no_motion_gets_one_line_and_changes_nothing(browser):
         and "\n" not in said
     )
     assert browser.run("return document.getElementById('motion-name').textContent") == before
-
-
-def test_python_writes_what_the_page_reads(browser, tmp_path):
-    save_motion(tmp_path / "ours.npz", Motion(jnp.zeros((2, 55, 3)), jnp.zeros((2, 3))))
-    assert "2 frames" in drop(browser, "ours.npz", (tmp_path / "ours.npz").read_bytes())

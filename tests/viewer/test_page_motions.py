@@ -543,14 +543,6 @@ def test_an_avatar_may_have_joints_of_any_name(name):
     )  # as its parent
 
 
-def test_the_page_has_no_tables_of_its_own():
-    from humangs_jax.viewer.page import read_part
-
-    own = "".join(read_part(f"{name}.js") for name in ("motion_files", "skeletons"))
-    for word in ("upleg", "toebase", "mocap", "smpl_", "body_pose", "clavicle", "0.35"):
-        assert word not in own, word
-
-
 def test_pictures_of_the_page_are_marked_as_ours(tmp_path):
     """So that no command takes them for photos, and outputs may replace them."""
     write_png(tmp_path / "page.png", np.linspace(0, 1, 60).reshape(4, 5, 3))
