@@ -86,26 +86,6 @@ def test_the_options_of_each_way_to_fit_exist():
         assert others | {way.removeprefix("--")} <= options
 
 
-def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatch, humangs):
-    """Their network and the way their Gaussians are drawn; the run's other knobs stay."""
-    from humangs_jax.network import presets, weights
-    from humangs_jax.training import loop, sources
-
-    started = []
-    model = presets.tiny().with_conventions(rendering="inria")
-    monkeypatch.setattr(weights, "load_weights", lambda path: ({}, model))
-    monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
-    monkeypatch.setattr(
-        loop, "train", lambda settings, *arguments, **options: started.append(settings)
-    )
-    for config in ("tiny", "published"):
-        arguments = ("--config", config, "--init-weights", "w", "--out", tmp_path)
-        code, _, error = humangs("train", "--on-the-fly", "1", *arguments)
-        assert code == 0, error
-    assert all(settings.splat.square and settings.splat.radius_sigma == 3 for settings in started)
-    assert [settings.model.conventions.rendering for settings in started] == ["inria", "inria"]
-
-
 @pytest.mark.parametrize(("done", "code"), [(3, cli.INTERRUPTED), (5, 0)])
 def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, monkeypatch, capsys):
     """Ctrl-C: `train` saves and raises, and the exit code tells that it was interrupted, unless all
@@ -309,27 +289,6 @@ def test_bars_are_hidden_by_quiet(capsys):
     finally:
         progress.end()
     assert capsys.readouterr().err == ""
-
-
-@pytest.mark.slow
-def test_a_check_goes_on_where_the_fit_does_not_know_a_view(
-    capture_folder, tmp_path, monkeypatch, humangs
-):
-    from humangs_jax.capture.fitting.files import UnknownViewError
-    from humangs_jax.cli.fit import Detections
-
-    def changed(*_):
-        raise UnknownViewError("the capture's fit knows no view x: fit it again")
-
-    monkeypatch.setattr(Detections, "read_or_recorded", changed)
-    monkeypatch.setattr("humangs_jax.capture.detection.people.available", lambda: False)
-    code, out, error = humangs("check", capture_folder, "--out", tmp_path / "check.png")
-    assert code == 0 and "no view x: fit it again; the check does without that fit" in error
-    assert (
-        "0_00" in out
-        and (tmp_path / "check.png").is_file()
-        and not (tmp_path / "check_fit.png").exists()
-    )
 
 
 def test_a_reader_that_has_gone_ends_a_command_quietly():

