@@ -36,8 +36,6 @@ def scaled_comparison(compare):
     """`np.testing.assert_allclose`, `np.allclose` or `np.isclose` with the switch applied where an
     array is float32.
     """
-    if SCALE == 1:
-        return compare
     defaults = (
         {"rtol": 1e-7, "atol": 0.0}
         if compare is np.testing.assert_allclose
