@@ -2,7 +2,6 @@
 (test_splat_files) and by npm's tools.
 """
 
-import importlib
 import os
 import shutil
 import struct
@@ -20,7 +19,7 @@ from small import random_gaussians
 
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import EXPORTS, ExportFormat, chosen_format
+from humangs_jax.avatar.export import EXPORTS, chosen_format
 from humangs_jax.avatar.export.gaussians import (
     BACKWARDS,
     SH_C0,
@@ -34,7 +33,6 @@ from humangs_jax.avatar.export.gaussians import (
 from humangs_jax.avatar.export.splats import write_glb, write_ply, write_splat
 from humangs_jax.avatar.export.spz import write_spz
 from humangs_jax.body.motion import Motion
-from humangs_jax.cli import avatars
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import imported
 from humangs_jax.geometry.camera import Camera
@@ -241,19 +239,6 @@ def test_the_suffix_decides_the_format_and_its_world(name, axis, tmp_path, monke
     assert heights.min() == pytest.approx(0, abs=1e-6)
     own = np.asarray(random_gaussians().means)[:, 1]
     np.testing.assert_allclose(np.sort(heights), np.sort(own - own.min()), atol=1e-5)
-
-
-def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
-    """Known to the command's help, to its check of suffixes, and to `export`."""
-    heights = lambda path, gaussians: path.write_text(f"{float(gaussians.means[:, 2].min()):.3f}")
-    monkeypatch.setitem(EXPORTS, "toy", ExportFormat("made up", heights, (".toy",), up="z"))
-    monkeypatch.setattr(avatars, "Export", avatars.Export)  # reloading replaces it
-    importlib.reload(avatars)
-    with pytest.raises(SystemExit):
-        exported(monkeypatch, "--help")
-    assert ".toy: made up" in " ".join(capsys.readouterr().out.split())
-    exported(monkeypatch, small_file(tmp_path), "--out", tmp_path / "x.toy")
-    assert (tmp_path / "x.toy").read_text() == "0.000"
 
 
 @pytest.mark.parametrize("each", EXPORTS.values(), ids=EXPORTS)

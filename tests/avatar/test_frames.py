@@ -58,15 +58,12 @@ def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
         assert rendering.overflow == 0 and rendering.alpha.max() > 0.5
 
 
-def test_each_camera_has_its_exposure(monkeypatch):
-    gaussians = blobs()
-    monkeypatch.setattr(frames, "posed", lambda avatar, pose: gaussians)
-    camera = Camera(
-        jnp.asarray([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64
-    )
-    pose = BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
-    gains, how = np.asarray([[1.0, 1, 1], [0.5, 0.7, 0.9]]), SPLAT_PRESETS["exact"]
-    plain, darker = frames.draw(two_balls(), [pose] * 2, [camera] * 2, jnp.zeros(3), how, gains)
+def test_each_camera_has_its_exposure():
+    avatar = two_balls(1)
+    pose, how = frames.rest_pose_of(avatar), SPLAT_PRESETS["exact"]
+    camera = frames.shot_cameras(Shot(size=64), CENTRES[None], np.zeros(1), None)[0]
+    gains = np.asarray([[1.0, 1, 1], [0.5, 0.7, 0.9]])
+    plain, darker = frames.draw(avatar, [pose] * 2, [camera] * 2, jnp.zeros(3), how, gains)
     np.testing.assert_allclose(darker.rgb, plain.rgb * gains[1], atol=ROUNDING)
     assert plain.rgb.max() > 0.1
 

@@ -1,17 +1,15 @@
 import dataclasses
-import sys
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Light
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import (
-    _reconstruct,
     make_avatar,
     reconstruct,
     reconstruct_batch,
@@ -543,9 +541,11 @@ def test_a_kept_displacement_gives_the_avatar_of_one_that_is_computed(body, netw
     photos = capture_of(body, 0, 2)
     kept = dataclasses.replace(photos, displacement=fit_vertex_offsets(body, photos))
     assert kept.displacement.any()
-    computed, programs = reconstruct(variables, config, photos), _reconstruct._cache_size()
-    jax.tree.map(np.testing.assert_array_equal, reconstruct(variables, config, kept), computed)
-    assert _reconstruct._cache_size() == programs
+    computed = reconstruct(variables, config, photos)
+    with compiled_programs() as programs:
+        again = reconstruct(variables, config, kept)
+    jax.tree.map(np.testing.assert_array_equal, again, computed)
+    assert "_reconstruct" not in programs
 
 
 @pytest.mark.slow
@@ -612,10 +612,10 @@ def test_a_person_in_a_skirt_has_one_alone_and_among_others(body, network, monke
 def test_programs_are_compiled_once_per_bucket(body, network):
     variables, config = network
     config = config.with_runtime(tokens="all")
-    before = _reconstruct._cache_size()
-    for views in (17, 18, 19):
-        reconstruct(variables, config, capture_of(body, 0, views))
-    assert _reconstruct._cache_size() == before + 1
+    with compiled_programs() as programs:
+        for views in (17, 18, 19):
+            reconstruct(variables, config, capture_of(body, 0, views))
+    assert programs.count("_reconstruct") == 1
 
 
 def test_what_cannot_be_one_batch_is_named(body, network):
@@ -681,22 +681,6 @@ def test_views_and_bodies_of_another_configuration_are_refused(body, network):
         ValueError, match=r"views\.images: expected shape \(v, h, w, 3\), got \(1, 2, 32, 32, 3\)"
     ):
         reconstruct_views(variables, config, made, jax.tree.map(lambda x: x[None], views))
-
-
-def test_worlds_with_and_without_light_are_no_batch(body, network, monkeypatch):
-    module = sys.modules[reconstruct_batch.__module__]
-    inputs = SimpleNamespace(posed_vertices=None, foreground=None, view_count=None)
-    monkeypatch.setattr(module, "_prepare_batch", lambda *_: inputs)
-    monkeypatch.setattr(module, "check_values", lambda *_: None)
-    monkeypatch.setattr(module, "fit_buffers", lambda *of: of[-1])
-    photos, config = capture(body, SIZE, SIZE), network[1].with_conventions(light=True)
-    turned = with_z_up(photos)
-    with pytest.raises(
-        ValueError, match=r"captures\[1\]: its world is not y-up, .*: stack them apart"
-    ):
-        stack_captures(config, [photos, turned])
-    assert not stack_captures(config, [turned, turned])[2].conventions.light
-    assert stack_captures(config, [photos])[2].conventions.light
 
 
 def test_views_are_padded_to_a_number_not_below_their_own():

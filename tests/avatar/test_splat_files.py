@@ -399,40 +399,19 @@ BAD = {
         lambda: ply(with_nan("scales", ...)),
         r"scale_\*: none of 20 Gaussians has finite numbers",
     ),
-    "ply of NaN in text": (
-        lambda: ply(with_nan("harmonics", ...), form="ascii"),
-        r"f_rest_\*: none of 20",
-    ),
     "ply of degree 4": (lambda: ply(of_degree_4()), "of degree 1 to 3, got 72 of degree 4"),
     "ply cut off": (lambda: ply(scene())[:-1], "element vertex: 20 of them are not in"),
-    "ply of few lines": (
-        lambda: ply(scene(), form="ascii").rsplit(b"\n", 2)[0],
-        "expected 20 lines of 14 numbers",
-    ),
     "ply of points": (
         lambda: ply(scene()).replace(b"f_dc_0", b"red"),
         "f_dc_0: missing: expected Gaussians",
-    ),
-    "ply of 8 harmonics": (
-        lambda: ply(scene(3)).replace(b"f_rest_8", b"rest_8"),
-        "properties, of degree 1 to 3, got 8",
     ),
     "ply of 10^15": (
         lambda: headed("element vertex 1000000000000000", "property float x"),
         "the limit gaussians is",
     ),
-    "ply of -1": (
-        lambda: headed("element vertex -1", "property float x"),
-        "header: 'element vertex -1'",
-    ),
-    "ply of nothing each": (lambda: headed("element vertex 9"), "element vertex: 9 of them"),
     "compressed without chunks": (
         lambda: compressed_ply(scene()).replace(b"chunk 1", b"chunk 0"),
         "chunk: expected one for each 256",
-    ),
-    "compressed of fewer harmonics": (
-        lambda: compressed_ply(scene(3)).replace(b"element sh 20", b"element sh 19"),
-        r"f_rest_\*: expected shape \(20,",
     ),
     "splat of 33 bytes": (lambda: bytes(33), "expected 32 bytes for each Gaussian"),
     "splat of a negative scale": (
@@ -445,65 +424,23 @@ BAD = {
     ),
     "spz bomb": (lambda: spz_of(count=19_000_000, degree=3), "bytes unpack to"),
     "spz cut off": (lambda: spz(scene(), 3)[:-30], "not a readable file of Gaussians"),
-    "spz too short": (lambda: spz_of(body=bytes(399)), "20 Gaussians in 400 bytes, got less"),
-    "spz with more behind": (
-        lambda: spz_of(body=bytes(400), behind=b"more"),
-        "not a readable file of Gaussians",
-    ),
-    "spz 4 in a gzip": (
-        lambda: spz_of(version=4),
-        "no .spz of version 1 to 4: version 4 in what begins as version 3 does",
-    ),
-    "spz of degree 4": (
-        lambda: spz_of(degree=4),
-        "harmonics of degree 4: expected .spz of degree 0 to 3",
-    ),
-    "spz 4 of degree 4": (lambda: spz_four(zeros(24), degree=4), "harmonics of degree 4"),
-    "spz 5": (lambda: spz(scene(), 4).replace(b"NGSP\4", b"NGSP\5"), "version 5"),
     "spz 4 of 2^32": (
         lambda: spz_four(zeros(), count=2**32 - 1),
         "4,294,967,295 Gaussians: the limit gaussians",
     ),
-    "spz 4 of 19 million": (lambda: spz_four(zeros(), count=19_000_000), "bytes unpack to"),
-    "spz 4 of longer streams": (lambda: spz_four(zeros(), count=19), "expected streams of 171, 19"),
     "spz 4, a bomb": (
         lambda: spz_four([bytes(1 << 24), *zeros()[1:]], sizes=SIZES),
         "unpacks to more than the 180",
     ),
-    "spz 4 of a short stream": (
-        lambda: spz_four([b"", *zeros()[1:]], sizes=SIZES),
-        "unpacks to less than the 180",
-    ),
     "spz 4 cut off": (lambda: spz(scene(), 4)[:-1], "cut short: a stream of"),
-    "spz 4 cut in its header": (
-        lambda: spz(scene(), 4)[:30],
-        "cut short: expected a header of 32 bytes",
-    ),
     "spz 4 with its table elsewhere": (
         lambda: spz_four(zeros(), toc=2**32 - 1),
         "table of 5 streams at 4,294,967,295",
     ),
-    "spz 4 of noise": (
-        lambda: spz(scene(), 4)[:112] + bytes(range(200)),
-        "cut short|not a readable file of Gaussians",
-    ),
-    "another gzip": (lambda: gzip.compress(b"hello"), "no .spz of version 1 to 4"),
     "glb of NaN": (lambda: glb(with_nan("opacities", ...)), "OPACITY: none of 20"),
     "glb without rotations": (
         lambda: glb(scene(), change=without("ROTATION")),
         "ROTATION: missing",
-    ),
-    "glb without a harmonic": (
-        lambda: glb(scene(3), change=without("SH_DEGREE_1_COEF_1")),
-        "SH_DEGREE_1_COEF_1: missing",
-    ),
-    "glb of many scales": (
-        lambda: glb(scene(), change=lambda c: c["accessors"][1].update(count=10**15)),
-        "bytes unpacked",
-    ),
-    "glb of a mesh": (
-        lambda: glb(scene(), change=lambda c: c["meshes"][0]["primitives"][0].pop("extensions")),
-        "no Gaussians",
     ),
     "glb of compressed Gaussians": (
         lambda: glb(scene(), change=lambda c: c.update(extensionsRequired=["SPZ_2"])),
@@ -571,11 +508,6 @@ def test_version_4_is_written_and_read(tmp_path):
         hg.save_gaussians(tmp_path / "a.ply", scene(), version=4)
 
 
-def test_six_streams_of_which_one_is_empty_are_read(tmp_path):
-    (tmp_path / "a.spz").write_bytes(spz_four([*zeros(), b""]))
-    assert len(hg.load_gaussians(tmp_path / "a.spz").means) == 20
-
-
 def test_what_a_spz_says_and_is_not_used_is_told(tmp_path, caplog):
     system = struct.pack("<III", 0xADBE0003, 4, 1)
     other = struct.pack("<II", 0x12340001, 3) + b"abc"
@@ -611,17 +543,6 @@ def test_gaussians_that_are_not_finite_are_left_out_and_counted(suffix, tmp_path
         found.opacities, np.asarray(scene().opacities)[good], atol=STEPS[suffix][2]
     )
     assert "3 of 20 Gaussians are left out" in caplog.text and str(path) in caplog.text
-
-
-def test_chunks_without_bounds_are_left_out(tmp_path, caplog):
-    many = scene(g=300)
-    data = compressed_ply(many)
-    at = data.index(b"end_header\n") + len(b"end_header\n")
-    (tmp_path / "a.ply").write_bytes(
-        data[:at] + np.full(1, np.nan, "<f4").tobytes() + data[at + 4 :]
-    )
-    assert len(hg.load_gaussians(tmp_path / "a.ply").means) == 300 - 256
-    assert "256 of 300 Gaussians are left out" in caplog.text
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])

@@ -5,7 +5,6 @@ import weakref
 import numpy as np
 import pytest
 
-from humangs_jax.avatar import video
 from humangs_jax.avatar.video import check_video, video_size, write_video
 from humangs_jax.io.images import read_image
 
@@ -116,18 +115,8 @@ NO_COLORS = {
         np.full((4, 6, 3), 200.0),
         r"frame 1: expected numbers in \[0, 1\], or uint8, got 200 to 200: divide",
     ),
-    "a little above": (
-        1.01 * np.ones((4, 6, 3)),
-        r"expected numbers in \[0, 1\], or uint8, got 1.01 to 1.01",
-    ),
     "below": (ONE - 1, r"expected numbers in \[0, 1\], or uint8, got -0.5 to -0.5"),
-    "whole numbers": (
-        np.full((4, 6, 3), 200),
-        "frame 1: expected floating-point numbers in .*, or uint8, got int64",
-    ),
-    "bits": (np.ones((4, 6, 3), bool), "expected floating-point numbers in .*, got bool"),
     "a hole": (ONE * np.nan, "frame 1 has numbers that are not finite"),
-    "gray": (ONE[..., 0], r"frame 1: expected shape \(h, w, 3\) or \(h, w, 4\), got \(4, 6\)"),
     "two channels": (
         ONE[..., :2],
         r"frame 1: expected shape \(h, w, 3\) or \(h, w, 4\), got \(4, 6, 2\)",
@@ -288,24 +277,6 @@ NAN[1, 2, 2, 0] = np.nan
 def test_errors_write_nothing(tmp_path, name, frames, fps, message):
     with pytest.raises(ValueError, match=message):
         write_video(tmp_path / name, frames, fps)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    (tmp_path / "a.mp4").write_text("old")
-    monkeypatch.setattr(video, "to_uint8", lambda frame: (_ for _ in ()).throw(MemoryError("full")))
-    with pytest.raises(MemoryError):
-        write_video(tmp_path / "a.mp4", moving_square(2), 24)
-    assert (tmp_path / "a.mp4").read_text() == "old" and len(list(tmp_path.iterdir())) == 1
-    with pytest.raises(MemoryError):
-        write_video(tmp_path / "nowhere" / "a.mp4", moving_square(2), 24)
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_ffmpeg_failing_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "CONSTANT_RATE_FACTOR", "no number")
-    with pytest.raises(OSError, match=r"ffmpeg failed: .*no number"):
-        write_video(tmp_path / "a.mp4", moving_square(200), 24)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,14 +9,9 @@ from pathlib import Path
 import pytest
 
 import humangs_jax
-from humangs_jax.avatar import reconstruct
 from humangs_jax.core import progress
 from humangs_jax.core.progress import printable
-from humangs_jax.data.capture import load_capture
 from humangs_jax.io.reading import FileError
-from humangs_jax.network import presets
-from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.search import Clock
 
 PACKAGE = Path(humangs_jax.__file__).parent
 OWN = ("core/progress.py", "cli/screen.py")
@@ -156,45 +151,6 @@ def test_a_bar_says_why_its_first_item_takes_long(capsys):
         list(progress.bar("abc", shown=False, first="x")) == ["a", "b", "c"]
         and capsys.readouterr().err == ""
     )
-
-
-def test_open_bars_and_stages_say_that_a_program_is_compiled_once(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LONG", 0.05)
-    monkeypatch.setattr(progress, "_compiled", set())
-    said = []
-    progress.begin()
-    for _ in range(2):  # without a bar the stage around it names it, the first time
-        with progress.stage("reconstructing"), progress.compiling("program"):
-            time.sleep(0.2)
-        said.append(capsys.readouterr().err)
-    progress.end()
-    assert said == ["reconstructing: compiling, once ...\n", "reconstructing ...\n"]
-    with progress.bar(total=2, desc="refine") as shown, progress.bar(total=1, shown=False):
-        shown.set_postfix_str("2 dB")
-        with progress.compiling(), progress.compiling():
-            assert shown.postfix == "compiling, once"
-        assert shown.postfix == "2 dB"
-    assert "refine:   0%" in (err := capsys.readouterr().err) and "compiling, once" in err
-
-
-def test_refinement_and_reconstruction_say_when_they_compile(capsys, monkeypatch):
-    clock = Clock(RefineConfig(), progress=True)
-    with clock.compiling():
-        assert clock.bar.postfix == "compiling, once"
-    clock.stopped()
-    assert "compiling, once" in capsys.readouterr().err
-    names = []
-
-    def stand_in(*_):
-        names.extend(progress.current().names)
-        raise ValueError("seen")
-
-    monkeypatch.setattr(reconstruct, "_prepare", stand_in)
-    monkeypatch.setattr(progress, "_compiled", set())
-    for _ in range(2):
-        with pytest.raises(ValueError, match="seen"):
-            reconstruct.reconstruct({}, presets.tiny(), load_capture("demo_capture"))
-    assert names == ["compiling, once"]
 
 
 def test_long_loops_show_bars_where_a_program_shows_stages(capsys):

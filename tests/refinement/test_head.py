@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -59,28 +58,6 @@ def test_the_head_comes_closer_and_nothing_else_moves(four):
         np.testing.assert_array_equal(after[~moved], before[~moved])
         assert (after[moved] != before[moved]).any()
     assert squared_error(report.avatar, capture) < squared_error(start, capture)
-
-
-def darker(avatar, by):
-    return replace(avatar, gaussians=replace(avatar.gaussians, colors=avatar.gaussians.colors - by))
-
-
-@pytest.mark.usefixtures("small_photos", "same_head_buffers")
-@pytest.mark.parametrize(("by", "better"), [(-0.05, True), (0.3, False), (0.0, False)])
-def test_steps_on_the_head_are_kept_only_where_the_whole_photos_are_fitted_better(
-    four, by, better, monkeypatch
-):
-    """The report is of the avatar that is returned. The photos show the person 0.15 lighter."""
-    avatar, capture = four
-    monkeypatch.setattr(refinement, "sharpened", lambda avatar, *_: darker(avatar, by))
-    report = refinement.refine_with_report(avatar, capture, ALONE)
-    assert report.kept is better and report.head_steps == (20 if better else 0)
-    assert (report.loss[1] < report.loss[0]) is better and (
-        report.psnr[1] > report.psnr[0]
-    ) is better
-    if not better:
-        jax.tree.map(np.testing.assert_array_equal, report.avatar, avatar)
-        assert report.loss[0] == report.loss[1]
 
 
 def test_crops_show_the_head(four):

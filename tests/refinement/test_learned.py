@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refinement_cases import STEPS, toy_avatar, toy_capture
+from refinement_cases import toy_avatar, toy_capture
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.prepared import prepare_capture
-from humangs_jax.refinement import learned, search
-from humangs_jax.refinement import refine as refinement
+from humangs_jax.refinement import learned
 from humangs_jax.refinement.learned import (
     COLUMNS,
     PERSON,
@@ -21,7 +20,6 @@ from humangs_jax.refinement.learned import (
     Signals,
     clusters_of,
     graph_of,
-    learned_update,
     load_refiner,
     neighbor_mean,
     neighbors_of,
@@ -38,7 +36,6 @@ from humangs_jax.rendering.splatting import render
 
 DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a color; float32 sums over some thousand pixels
 ROUNDING = 1e-5
-ONE_STEP = 1e-3  # metres: five times the rate of the means
 
 
 @pytest.fixture(scope="module")
@@ -221,81 +218,3 @@ def test_weights_are_read_as_written(tmp_path, monkeypatch):
     monkeypatch.setattr(learned.resources, "files", lambda _: tmp_path)
     monkeypatch.setattr(learned, "SHIPPED", "refiner.safetensors")
     jax.tree.map(np.testing.assert_array_equal, learned.load_refiner.__wrapped__(), changed)
-
-
-@pytest.mark.slow
-def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_fit(
-    scene, monkeypatch
-):
-    avatar, photo, parameters, splat = scene
-    looked, signals = [], learned.photo_signals
-    watched = lambda parameters, avatar, photo, *how: (
-        looked.append(id(photo)) or signals(parameters, avatar, photo, *how)
-    )
-    monkeypatch.setattr(learned, "photo_signals", watched)
-    photos = [replace(photo) for _ in range(9)]
-    graph, small = (
-        graph_of(np.asarray(avatar.gaussians.means)),
-        dataclasses.replace(splat, max_pairs=64),
-    )
-    assert learned_update(parameters, avatar, photos, graph, 1, small)[1] > 0
-    assert looked == [id(photos[i]) for i in (0, 1, 3, 4, 6, 7)]
-
-
-@pytest.mark.slow
-def test_what_only_the_avatar_after_the_iterations_shows_moves_in_steps(scene, body, monkeypatch):
-    """A Gaussian that is hidden at the start and seen after the iterations gets trust."""
-    gaussians = scene[0].gaussians
-    hidden = replace(
-        scene[0], gaussians=replace(gaussians, opacities=gaussians.opacities.at[0].set(0))
-    )
-    shown = lambda parameters, *_: (
-        replace(parameters, opacity_logits=jnp.full_like(parameters.opacity_logits, 4.0)),
-        jnp.zeros((), int),
-    )
-    monkeypatch.setattr(search, "learned_update", shown)
-    config = dataclasses.replace(STEPS, iterations=1)
-    views = crop_to_person(prepare_capture(toy_capture(body, toy_avatar(body, 0.15))))
-    task, start, _ = search.prepare(hidden, views, config, search.Clock(config))
-    after = search.iterated(task, start, start.used)[0].state
-    assert start.state.trust[0] == 0 and after.trust[0] > 0
-    jax.tree.map(np.testing.assert_array_equal, after.parameters, after.start)
-
-
-def interrupted(*_):
-    raise KeyboardInterrupt
-
-
-def worse(parameters, *_):
-    return replace(parameters, means=parameters.means + 0.3), jnp.zeros((), int)
-
-
-@pytest.mark.parametrize(
-    ("update", "steps"),
-    [
-        pytest.param(interrupted, 0, marks=pytest.mark.slow),
-        (worse, 0),
-        pytest.param(worse, 1, marks=pytest.mark.slow),
-    ],
-)
-def test_without_useful_iterations_the_avatar_is_that_of_the_steps_alone(
-    update, steps, scene, body, monkeypatch
-):
-    monkeypatch.setattr(search, "learned_update", update)
-    config = dataclasses.replace(STEPS, iterations=2, steps=steps, held_out=0.3)
-    report = refinement.refine_with_report(
-        scene[0], toy_capture(body, toy_avatar(body, 0.15)), config
-    )
-    assert report.interrupted == (update is interrupted) and (report.iterations, report.steps) == (
-        0,
-        steps,
-    )
-    if not steps:
-        assert not report.kept
-        jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])
-    assert (
-        np.abs(
-            np.asarray(report.avatar.gaussians.means) - np.asarray(scene[0].gaussians.means)
-        ).max()
-        < ONE_STEP
-    )

@@ -117,22 +117,6 @@ def test_photos_of_several_sizes_and_lenses_from_files_are_fitted_together(tmp_p
     np.testing.assert_array_equal(fit.gaussians.means, again.gaussians.means)
 
 
-@pytest.mark.slow
-def test_buffers_that_have_become_too_small_are_planned_again(posed, monkeypatch):
-    photos, cameras = posed
-    monkeypatch.setattr(fitting, "MARGIN", 0.2)
-    planned, plan = [], fitting.plan_buffers
-
-    def counted(*arguments, margin):
-        planned.append(margin)
-        return plan(*arguments, margin=0.2 if len(planned) == 1 else 2.0)
-
-    monkeypatch.setattr(fitting, "plan_buffers", counted)
-    points = np.random.default_rng(0).uniform(-1, 1, (140, 3))
-    hg.fit_scene(photos, cameras, points, dataclasses.replace(FAST, steps=30))
-    assert len(planned) >= 3  # at first, when it overflowed, and for the scores
-
-
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
