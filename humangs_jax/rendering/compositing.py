@@ -41,7 +41,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree
 from humangs_jax.rendering.projection import ProjectedGaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists, blocks_by_length, expand
@@ -65,6 +65,7 @@ Z = 9
 HALF = 0.5
 """The transmittance at the median depth."""
 Schedule = Callable[[TileGrid, SplatConfig], Callable[..., PyTree]]
+"""Makes the function that draws, or its gradient, for one grid and one configuration."""
 EXACT = lax.Precision.HIGHEST
 """GPUs and TPUs would otherwise round the factors of a product to 10 or 8 bits."""
 
@@ -75,8 +76,8 @@ def pack_splats(
     features: Float[Array, "g n"],
     alpha_min: float,
 ) -> Float[Array, "g width"]:
-    """Rows x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features; finite where not
-    drawn.
+    """Packs splats into rows: x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features. All
+    numbers are finite, also those of splats that are not drawn.
     """
     p = projected
     drawn = p.visible & (opacities >= alpha_min)
@@ -84,38 +85,49 @@ def pack_splats(
     return jnp.stack([p.x, p.y, p.r00, p.r01, p.r11, log_opacity, *features.T], axis=-1)
 
 
+class Composited(NamedTuple):
+    """What lists of splats look like: p pixels of each of t tiles, and what is known of each of g
+    splats.
+    """
+
+    features: Float[Array, "t n p"]
+    """Sum of w f, (t, n, p); 0 where lists are empty."""
+    transmittance: Float[Array, "t p"]
+    """The final T, (t, p); 1 where lists are empty."""
+    lengths: Int[Array, " t"]
+    """How many splats of each list were read until all pixels of its tile had ended, (t,)."""
+    peaks: Float[Array, " g"]
+    """The largest w of each splat, (g,); 0 unless `config.visibility`."""
+    medians: Float[Array, "t p"] | None
+    """The z of the splat at which T falls to one half, (t, p), metres; infinite where it never
+    does. Lists run front to back, so it is the smallest z behind which T is one half or less. None
+    unless `config.depth_median`."""
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def composite(
     splats: Float[Array, "g width"], lists: TileLists, grid: TileGrid, config: SplatConfig
-) -> tuple[
-    Float[Array, "t n p"], Float[Array, "t p"], Float[Array, " g"], Float[Array, "t p"] | None
-]:
+) -> Composited:
     """Draws lists of splats, which must be in depth order, into tiles.
 
-    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; the
-    largest w of each splat if `config.visibility`, else 0; and if `config.depth_median`, the z of
-    the splat at which T falls to one half, infinite where it never does, else None. The first two
-    are differentiable with respect to `splats`, in reverse mode only.
+    Features and transmittance are differentiable with respect to `splats`, in reverse mode only.
     """
     return _composite_fwd(splats, lists, grid, config)[0]
 
 
 def _composite_fwd(
     splats: Array, lists: TileLists, grid: TileGrid, config: SplatConfig
-) -> tuple[PyTree, PyTree]:
-    features, transmittance, lengths, peaks, medians = _scheduled(
-        forward_by_blocks, forward_by_chunks, grid, config, splats, *lists
-    )
-    outputs = features, transmittance, peaks, medians
-    return outputs, (splats, lists, features, transmittance, lengths)
+) -> tuple[Composited, PyTree]:
+    drawn = _scheduled(forward_by_blocks, forward_by_chunks, grid, config, splats, *lists)
+    return drawn, (splats, lists, drawn.features, drawn.transmittance, drawn.lengths)
 
 
 def _composite_bwd(
-    grid: TileGrid, config: SplatConfig, saved: PyTree, cotangents: PyTree
+    grid: TileGrid, config: SplatConfig, saved: PyTree, cotangents: Composited
 ) -> tuple[Array, None]:
     splats, lists, features, transmittance, lengths = saved
-    g, g_transmittance, *_ = cotangents
-    total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
+    g = cotangents.features
+    total = jnp.sum(g * features, axis=1) + cotangents.transmittance * transmittance
     arrays = splats, lists.items, lists.starts, lengths, g, total
     sums = _scheduled(backward_by_blocks, backward_by_chunks, grid, config, *arrays)
     return _splat_gradients(splats, sums), None
@@ -127,6 +139,7 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 def _scheduled(
     on_cpu: Schedule, elsewhere: Schedule, grid: TileGrid, config: SplatConfig, *arrays: Array
 ) -> PyTree:
+    """Calls what one of two schedules makes: the platform decides when the program is compiled."""
     return lax.platform_dependent(
         *arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config)
     )
@@ -135,8 +148,8 @@ def _scheduled(
 def _splat_gradients(
     splats: Float[Array, "g width"], sums: Float[Array, "g width"]
 ) -> Float[Array, "g width"]:
-    """Gradient of the rows from their sums over pixels of e (1, dx, dy, dx^2, dx dy, dy^2) and of w
-    g.
+    """Returns the gradient of the rows from their sums over pixels: of e (1, dx, dy, dx^2, dx dy,
+    dy^2), and of w g.
     """
     r00, r01, r11 = (splats[:, i] for i in (R00, R01, R11))
     e, ex, ey, exx, exy, eyy = sums[:, :6].T
@@ -152,11 +165,11 @@ def _splat_gradients(
 # -------------------------------------------------------------------------------------------
 
 
-def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """Under `vmap`, a function of (splats, items, starts, more per tile...) is called once, with
-    the tiles of all images.
+def _joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """Under `vmap`, calls a function of (splats, items, starts, more per tile...) once, with the
+    tiles of all images.
 
-    Its outputs must be arrays per tile or per splat; those of the images then follow one another.
+    It must return arrays per tile or per splat: they are cut into those of the images.
     """
     function = jax.custom_batching.custom_vmap(function)
 
@@ -176,7 +189,7 @@ def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     return function
 
 
-def take_chunk(
+def _take_chunk(
     splats: Float[Array, "g width"],
     items: Int[Array, " capacity"],
     starts: Int[Array, " b"],
@@ -187,23 +200,26 @@ def take_chunk(
 ) -> tuple[
     Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]
 ]:
-    """The first k splats of each of b lists, `items[starts : starts + counts]`, which lie on
+    """Takes the first k splats of each of b lists, `items[starts : starts + counts]`, which lie on
     `tiles`.
 
     Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw
     alphas (0 past the end).
     """
+    # numbers and rows of the splats
     slot = jnp.arange(k, dtype=jnp.int32)
     item = items.at[starts[:, None] + slot].get(mode="clip")
     item = jnp.where(slot < counts[:, None], item, splats.shape[0])
     row = lax.optimization_barrier(splats.at[item].get(mode="clip"))
-    place = tiles % grid.tiles  # of its image, if several were joined
+    # their centres, measured from that of the tile (of its image, if several were joined)
+    place = tiles % grid.tiles
     cx, cy = (
         (axis * grid.tile_size).astype(row.dtype)[:, None] + 0.5 * grid.tile_size
         for axis in (place % grid.columns, place // grid.columns)
     )
     centre = jnp.stack([row[..., X] - cx, row[..., Y] - cy])
     inside = jnp.arange(k, dtype=jnp.int32) < counts[:, None]
+    # raw alpha at the pixels, with the exponent as a sum of squares
     x, y = centre
     r00, r01, r11 = row[..., R00], row[..., R01], row[..., R11]
     offsets = jnp.asarray(grid.offsets(row.dtype))
@@ -213,7 +229,7 @@ def take_chunk(
     return item, row, centre, raw
 
 
-def largest_weights(
+def _largest_weights(
     weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid
 ) -> Float[Array, "b k"]:
     """Returns the largest weight of each splat on those pixels of its tile that lie inside the
@@ -227,22 +243,23 @@ def largest_weights(
     return jnp.max(jnp.where(inside[:, None], weights, 0.0), axis=2)
 
 
-def visible_alpha(raw: Float[Array, "*b"], config: SplatConfig) -> Float[Array, "*b"]:
-    """Alpha from its raw value: clamped above, 0 if it is skipped."""
+def _visible_alpha(raw: Float[Array, "*b"], config: SplatConfig) -> Float[Array, "*b"]:
+    """Returns alpha for its raw value: clamped above, 0 if it is skipped."""
     return jnp.where(raw < config.alpha_min, 0.0, jnp.minimum(raw, config.alpha_max))
 
 
-def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
-    """(p, 6): 1, x, y, x^2, xy, y^2 of a tile's pixels, from its centre."""
+def _monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
+    """Returns 1, x, y, x^2, xy, y^2 of a tile's pixels, (p, 6), measured from its centre."""
     x, y = grid.offsets(dtype)
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def moments_about_splat(
+def _moments_about_splat(
     moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
 ) -> Float[Array, "*b 6"]:
-    """Moments of d = (pixel - splat) from those of (pixel - centre of the tile); x, y: (splat -
-    centre).
+    """Returns the moments of (pixel - splat) for those of (pixel - centre of the tile).
+
+    x, y: (splat - centre of the tile), pixels.
     """
     m, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
     about = [
@@ -255,8 +272,8 @@ def moments_about_splat(
     return jnp.stack([*about, myy - 2 * y * my + y * y * m], axis=-1)
 
 
-product = functools.partial(jnp.matmul, precision=EXACT)
-"""Sums over pixels as a matrix product."""
+_product = functools.partial(jnp.matmul, precision=EXACT)
+"""Sums over pixels, as a matrix product."""
 
 
 # Small blocks of tiles, for CPUs
@@ -264,8 +281,8 @@ product = functools.partial(jnp.matmul, precision=EXACT)
 
 # Tiles come by falling list length in blocks of `config.block`; a block takes its lists in chunks
 # until the longest list ends or all its pixels have. A chunk's arrays (block, chunk, pixels) stay
-# in the cache, and its chain of splats is unrolled, once for each thing that the loop carries: XLA
-# makes of each ONE kernel that runs the chain in registers. Once a pixel has stopped, the loop
+# in the cache. Its chain of splats is unrolled, once for each array that the loop carries: XLA
+# makes ONE kernel of each, which runs the chain in registers. Once a pixel has stopped, the loop
 # carries -T, which keeps the final T. Compile with `core.processes.compiler_options`: sharing small
 # kernels out over threads costs more than it gains, and the barriers have to be kept.
 
@@ -274,35 +291,47 @@ LINK = 2
 the chain from the last stored link on; storing T after every splat costs more than that."""
 
 
-@functools.lru_cache
-def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the
-    lists (t,), peaks (g,), medians.
+class _Chain(NamedTuple):
+    """What a block carries from one chunk of its lists to the next."""
 
-    peaks: largest w of each splat; 0 unless `config.visibility`. medians: (t, p) z of the splat at
-    which T falls to one half, infinite where it never does; None unless `config.depth_median`.
-    Lists run front to back, so it is the smallest z behind which T is one half or less.
-    """
+    chunk: Array | int
+    """Number of the chunk."""
+    transmittance: Float[Array, "block p"]
+    """T in front of the chunk; -T once a pixel has ended."""
+    features: Float[Array, "block n p"]
+    """Sum of w f so far."""
+    lengths: Int[Array, " block"]
+    """How many splats of each list have been read."""
+    live: Bool[Array, " block"]
+    """Whether a list has splats left and some pixel of its tile has not ended."""
+    peaks: Float[Array, " g"]
+    """The largest w of each splat so far, in all blocks."""
+    medians: Float[Array, "block p"] | None
+    """The smallest z so far behind which T is one half or less."""
+
+
+@functools.lru_cache
+def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
+    """Makes the function (splats, items, starts, counts) -> `Composited`."""
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
-    @joined_over_batch
+    @_joined_over_batch
     def forward(splats, items, starts, counts):
         dtype, t = splats.dtype, counts.shape[0]
         blocks = blocks_by_length(counts, block)
 
-        def draw(b, carry):
-            *out, peaks, all_medians = carry
+        def draw(b, drawn):
             tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
             start, count = _lists_of(tile, starts, counts)
 
-            def body(carry):
-                i, transmittance, features, lengths, live, peaks, medians = carry
-                item, row, _, raw = take_chunk(
+            def body(chain):
+                i, transmittance, features, lengths, live, peaks, medians = chain
+                item, row, _, raw = _take_chunk(
                     splats, items, start + i * k, count - i * k, tile, grid, k
                 )
-                # one exp per pair: XLA would fuse it into each of its consumers
+                # one exp a pair: without the barrier each kernel that uses it computes it again
                 raw = lax.optimization_barrier(raw)
-                alpha = lax.optimization_barrier(visible_alpha(raw, config))
+                alpha = lax.optimization_barrier(_visible_alpha(raw, config))
                 # features, weights and medians in one chain: `before` is T in front of splat j
                 before, weights = transmittance[:, None], []
                 for j in range(k):
@@ -317,7 +346,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                         medians = jnp.where(reached, nearer, medians)
                 # the largest weight of each splat on the pixels of this block
                 if config.visibility:
-                    highest = largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
+                    highest = _largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
                     peaks = peaks.at[item].max(highest, mode="drop")
                 # T itself in a second chain; from the stop on its sign is negative
                 for j in range(k):
@@ -328,7 +357,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                 # a list is alive while it has items left and some pixel of its tile has not ended
                 lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
                 live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
-                return i + 1, transmittance, features, lengths, live, peaks, medians
+                return _Chain(i + 1, transmittance, features, lengths, live, peaks, medians)
 
             # every pixel of the block starts with T = 1 and no features
             ones = jnp.ones((block, grid.pixels), dtype)
@@ -336,46 +365,62 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             medians = None
             if config.depth_median:
                 medians = jnp.full_like(ones, jnp.inf)
-            carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks, medians
-            _, transmittance, features, lengths, _, peaks, medians = lax.while_loop(
-                lambda carry: jnp.any(carry[4]), body, carry
-            )
-            # the block's tiles take their places among all tiles; padding is dropped
-            results = features, jnp.abs(transmittance), lengths
-            drawn = (
-                o.at[tile].set(r, mode="drop", unique_indices=True)
-                for o, r in zip(out, results, strict=True)
-            )
-            if medians is not None:
-                all_medians = all_medians.at[tile].set(medians, mode="drop", unique_indices=True)
-            return *drawn, peaks, all_medians
+            chain = _Chain(0, ones, zeros, jnp.zeros_like(count), count > 0, drawn.peaks, medians)
+            chain = lax.while_loop(lambda chain: jnp.any(chain.live), body, chain)
 
-        out = (
-            jnp.zeros((t, splats.shape[1] - FEATURES.start, grid.pixels), dtype),
-            jnp.ones((t, grid.pixels), dtype),
-            jnp.zeros(t, jnp.int32),
-            jnp.zeros(splats.shape[0], dtype),
-            jnp.full((t, grid.pixels), jnp.inf, dtype) if config.depth_median else None,
+            final = jnp.abs(chain.transmittance)  # the sign marked pixels that had ended
+
+            def placed(of_all, of_block):
+                """Puts the block's tiles at their places among all tiles; padding is dropped."""
+                return of_all.at[tile].set(of_block, mode="drop", unique_indices=True)
+
+            medians = None
+            if config.depth_median:
+                medians = placed(drawn.medians, chain.medians)
+            features = placed(drawn.features, chain.features)
+            transmittance = placed(drawn.transmittance, final)
+            lengths = placed(drawn.lengths, chain.lengths)
+            return Composited(features, transmittance, lengths, chain.peaks, medians)
+
+        empty = Composited(
+            features=jnp.zeros((t, splats.shape[1] - FEATURES.start, grid.pixels), dtype),
+            transmittance=jnp.ones((t, grid.pixels), dtype),
+            lengths=jnp.zeros(t, jnp.int32),
+            peaks=jnp.zeros(splats.shape[0], dtype),
+            medians=jnp.full((t, grid.pixels), jnp.inf, dtype) if config.depth_median else None,
         )
-        return lax.fori_loop(0, blocks.used, draw, out)
+        return lax.fori_loop(0, blocks.used, draw, empty)
 
     return forward
 
 
+class _BackwardChain(NamedTuple):
+    """What a block carries from one chunk of its lists to the next, in the backward pass."""
+
+    chunk: Array | int
+    """Number of the chunk."""
+    transmittance: Float[Array, "block p"]
+    """T in front of the chunk."""
+    seen: Float[Array, "block p"]
+    """Sum of w g . f so far."""
+    sums: Float[Array, "g width"]
+    """What is returned, of all splats so far."""
+
+
 @functools.lru_cache
-def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over pixels for each splat,
-    (g, 6 + n).
+def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
+    """Makes the function (splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over
+    pixels for each splat, (g, 6 + n).
 
     Columns: the moments of e = dL/d log alpha about the splat's centre (1, dx, dy, dx^2, dx dy,
     dy^2), then the gradient of the features, the sums of w g.
     """
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
-    @joined_over_batch
+    @_joined_over_batch
     def backward(splats, items, starts, lengths, cotangents, totals):
         dtype = splats.dtype
-        powers = jnp.asarray(monomials(grid, dtype))
+        powers = jnp.asarray(_monomials(grid, dtype))
         blocks = blocks_by_length(lengths, block)
 
         def draw(b, sums):
@@ -384,19 +429,19 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             g, total = (v.at[tile].get(mode="fill", fill_value=0) for v in (cotangents, totals))
             trips = (jnp.max(count) + k - 1) // k
 
-            def body(carry):
-                i, transmittance, seen, sums = carry
-                item, row, offset, raw = take_chunk(
+            def body(chain):
+                i, transmittance, seen, sums = chain
+                item, row, offset, raw = _take_chunk(
                     splats, items, start + i * k, count - i * k, tile, grid, k
                 )
-                # one exp per pair: XLA would fuse it into each of its consumers
+                # one exp a pair: without the barrier each kernel that uses it computes it again
                 raw = lax.optimization_barrier(raw)
                 # the chain of T front to back, with the decisions of the forward pass
                 weights, slopes = [], []
                 for j in range(k):
                     if j > 0 and j % LINK == 0:
                         transmittance, seen = lax.optimization_barrier((transmittance, seen))
-                    alpha = visible_alpha(raw[:, j], config)
+                    alpha = _visible_alpha(raw[:, j], config)
                     after = transmittance * (1 - alpha)
                     weight = jnp.where(after > stop, alpha * transmittance, 0.0)
                     along = sum(
@@ -412,14 +457,16 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
                     transmittance = after
                 weights, slopes = jnp.stack(weights, axis=1), jnp.stack(slopes, axis=1)
                 # matrix products: XLA's row reductions are slow on CPUs
-                moments = product(slopes.reshape(block * k, -1), powers).reshape(block, k, 6)
-                features = product(weights, jnp.moveaxis(g, 1, 2))
-                rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
-                return i + 1, transmittance, seen, sums.at[item].add(rows, mode="drop")
+                moments = _product(slopes.reshape(block * k, -1), powers).reshape(block, k, 6)
+                features = _product(weights, jnp.moveaxis(g, 1, 2))
+                rows = jnp.concatenate([_moments_about_splat(moments, *offset), features], axis=-1)
+                following = i + 1
+                sums = sums.at[item].add(rows, mode="drop")
+                return _BackwardChain(following, transmittance, seen, sums)
 
             ones = jnp.ones((block, grid.pixels), dtype)
-            carry = 0, ones, jnp.zeros_like(ones), sums
-            return lax.while_loop(lambda carry: carry[0] < trips, body, carry)[3]
+            chain = _BackwardChain(0, ones, jnp.zeros_like(ones), sums)
+            return lax.while_loop(lambda chain: chain.chunk < trips, body, chain).sums
 
         return lax.fori_loop(0, blocks.used, draw, jnp.zeros(splats.shape, dtype))
 
@@ -427,24 +474,30 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
 
 
 def _lists_of(tile: Array, starts: Array, counts: Array) -> Iterator[Array]:
+    """Gives starts and lengths of the lists of some tiles; padding has empty lists."""
     return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))
 
 
 # Few fat steps, for accelerators
 # -------------------------------------------------------------------------------------
 
-# A sequential step costs microseconds there, however little it does. Every list is cut into chunks
-# of `CHUNK` splats, and the chunks of ALL lists of all images of a batch, B at once, become arrays
-# (B, k, p) (p pixels of a tile). The chain over a list becomes products, because along it only log
-# T accumulates:
-# log T_j = (sum of the log(1 - alpha) before the chunk) + (strict lower triangle (k, k)) @ log(1 -
-# alpha) The sum before the chunk is a product, too, with the 0-1 matrix (B, B) of "earlier chunk of
-# the same list", plus what the list that runs on from the step before has come to, all that steps
-# hand on. The sums over i <= j of w_i g . f_i of the backward pass are formed by the same two
-# products. T agrees with the other schedule's to |log T| eps. Past the stop log T can rise by
-# rounding only while alpha is 0; hence the final log T sums log(1 - alpha) over the splats before
-# the stop. A NaN spreads to other tiles of its step. Scatter-adds: on a GPU the last bit may differ
-# between runs.
+# A sequential step costs microseconds there, however little it does. So every list is cut into
+# chunks of `CHUNK` splats, and the chunks of ALL lists of all images of a batch, B at once, become
+# arrays (B, k, p) (p pixels of a tile). The chain over a list becomes products, because along it
+# only log T accumulates:
+#
+#     log T_j = (sum of the log(1 - alpha) before the chunk)
+#               + (strict lower triangle (k, k)) @ log(1 - alpha)
+#
+# The sum before the chunk is a product, too, with the 0-1 matrix (B, B) of "earlier chunk of the
+# same list". To it comes the sum of the list that runs on from the step before, which is all that
+# steps hand on. The sums over i <= j of w_i g . f_i of the backward pass are formed by the same two
+# products.
+#
+# T agrees with the other schedule's to |log T| eps. Past the stop log T can rise by rounding only
+# while alpha is 0; hence the final log T sums log(1 - alpha) over the splats before the stop. A NaN
+# spreads to other tiles of its step. Sums over splats are scattered: on a GPU the last bit may
+# differ between runs.
 
 CHUNK = 64
 """Splats of a list in one chunk.
@@ -497,22 +550,46 @@ def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step:
     )
 
 
+class _Tail(NamedTuple):
+    """A sum along the list that runs on from one step into the next."""
+
+    tile: Int[Array, ""]
+    """Tile of the list."""
+    sum: Float[Array, " p"]
+    """Sum at the pixels of the tile so far."""
+
+
+class _Step(NamedTuple):
+    """What one step of the forward pass hands to the next."""
+
+    sums: Float[Array, "t n+1 p"]
+    """Sums of w f, and behind them that of log(1 - alpha), the final log T."""
+    lengths: Int[Array, " t"]
+    """As those of `Composited`."""
+    peaks: Float[Array, " g"]
+    """As those of `Composited`."""
+    medians: Float[Array, "t p"] | None
+    """As those of `Composited`."""
+    tail: _Tail
+    """log T of the last list."""
+
+
 @functools.lru_cache
-def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """As `forward_by_blocks`."""
+def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
+    """Makes the same function as `forward_by_blocks`."""
     log_stop = _log_stop(config)
 
-    @joined_over_batch
+    @_joined_over_batch
     def forward(splats, items, starts, counts):
         dtype, t, p = splats.dtype, counts.shape[0], grid.pixels
         step = _chunks_per_step(grid, dtype, items.shape[0], t)
         chunks = cut(starts, counts, items.shape[0], step)
 
-        def draw(i, carry):
-            sums, lengths, peaks, medians, tail = carry
+        def draw(i, handed):
+            sums, lengths, peaks, medians, tail = handed
             # log(1 - alpha) of all pairs of this step, and log T in front of each
             c = _slice(chunks, i, step)
-            item, row, _, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+            item, row, _, raw = _take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
             alpha, fading = _fading(raw, config)
             before, since = _sums_before(fading, c.tiles, tail)
             # a pair counts while T behind it is above the stop
@@ -529,12 +606,12 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             reached = jnp.where(jnp.max(before, axis=1) > log_stop, c.ends, 0)
             lengths = lengths.at[c.tiles].max(reached, mode="drop", indices_are_sorted=True)
             if config.visibility:
-                peaks = peaks.at[item].max(largest_weights(weights, c.tiles, grid), mode="drop")
+                peaks = peaks.at[item].max(_largest_weights(weights, c.tiles, grid), mode="drop")
             if medians is not None:
                 reached = (weights > 0) & (before[:, None] + since + fading <= math.log(HALF))
                 nearest = jnp.min(jnp.where(reached, row[..., Z, None], jnp.inf), axis=1)
                 medians = medians.at[c.tiles].min(nearest, mode="drop", indices_are_sorted=True)
-            return sums, lengths, peaks, medians, _tail(c.tiles, before, since + fading)
+            return _Step(sums, lengths, peaks, medians, _tail(c.tiles, before, since + fading))
 
         # the last of the sums is log T; everything starts empty
         sums = jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype)
@@ -543,30 +620,31 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
         medians = None
         if config.depth_median:
             medians = jnp.full((t, p), jnp.inf, dtype)
-        carry = sums, lengths, peaks, medians, _no_tail(t, p, dtype)
-        sums, lengths, peaks, medians, _ = lax.fori_loop(0, chunks.steps, draw, carry)
-        return sums[:, :-1], jnp.exp(sums[:, -1]), lengths, peaks, medians
+        empty = _Step(sums, lengths, peaks, medians, _no_tail(t, p, dtype))
+        last = lax.fori_loop(0, chunks.steps, draw, empty)
+        features, transmittance = last.sums[:, :-1], jnp.exp(last.sums[:, -1])
+        return Composited(features, transmittance, last.lengths, last.peaks, last.medians)
 
     return forward
 
 
 @functools.lru_cache
-def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """As `backward_by_blocks`."""
+def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
+    """Makes the same function as `backward_by_blocks`."""
     log_stop = _log_stop(config)
 
-    @joined_over_batch
+    @_joined_over_batch
     def backward(splats, items, starts, lengths, cotangents, totals):
         dtype, t, p = splats.dtype, lengths.shape[0], grid.pixels
         step = _chunks_per_step(grid, dtype, items.shape[0], t)
         chunks = cut(starts, lengths, items.shape[0], step)
-        powers = jnp.asarray(monomials(grid, dtype))
+        powers = jnp.asarray(_monomials(grid, dtype))
 
-        def draw(i, carry):
-            sums, faded_tail, seen_tail = carry
+        def draw(i, handed):
+            sums, faded_tail, seen_tail = handed
             # alpha and T of all pairs of this step, as in the forward pass
             c = _slice(chunks, i, step)
-            item, row, centre, raw = take_chunk(
+            item, row, centre, raw = _take_chunk(
                 splats, items, c.starts, c.counts, c.tiles, grid, CHUNK
             )
             g, total = (v.at[c.tiles].get(mode="fill", fill_value=0) for v in (cotangents, totals))
@@ -587,15 +665,14 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             slopes = jnp.where((weights > 0) & (raw < config.alpha_max), slopes, 0.0)
 
             # sums over pixels, moved from the tile's centre to the splat's
-            moments = product(slopes.reshape(-1, p), powers).reshape(step, CHUNK, 6)
-            features = product(weights, jnp.moveaxis(g, 1, 2))
-            rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
+            moments = _product(slopes.reshape(-1, p), powers).reshape(step, CHUNK, 6)
+            features = _product(weights, jnp.moveaxis(g, 1, 2))
+            rows = jnp.concatenate([_moments_about_splat(moments, *centre), features], axis=-1)
             # the list that runs on into the next step hands on its two sums
-            tails = (
-                _tail(c.tiles, b, s + own)
-                for b, s, own in ((before, since, fading), (seen_before, seen_since, gained))
-            )
-            return sums.at[item].add(rows, mode="drop"), *tails
+            sums = sums.at[item].add(rows, mode="drop")
+            faded_tail = _tail(c.tiles, before, since + fading)
+            seen_tail = _tail(c.tiles, seen_before, seen_since + gained)
+            return sums, faded_tail, seen_tail
 
         sums, tail = jnp.zeros(splats.shape, dtype), _no_tail(t, p, dtype)
         return lax.fori_loop(0, chunks.steps, draw, (sums, tail, tail))[0]
@@ -604,36 +681,40 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
 
 
 def _most_chunks(capacity: int, t: int) -> int:
-    """Full chunks, and for each list one that is not."""
+    """Returns how many chunks t lists can have: full ones, and for each list one that is not."""
     return capacity // CHUNK + min(t, capacity)
 
 
 def _chunks_per_step(grid: TileGrid, dtype: np.dtype | type, capacity: int, t: int) -> int:
+    """Returns B: what `STEP_BYTES` and `STEP_CHUNKS` allow, and no more than there are chunks."""
     fitting = STEP_BYTES // (CHUNK * grid.pixels * np.dtype(dtype).itemsize)
     return max(1, min(fitting, STEP_CHUNKS, _most_chunks(capacity, t)))
 
 
 def _log_stop(config: SplatConfig) -> float:
+    """Returns the log T at which a pixel ends."""
     if config.transmittance_stop > 0:
         return math.log(config.transmittance_stop)
     return -math.inf
 
 
 def _slice(chunks: Chunks, i: Array | int, step: int) -> Chunks:
+    """Returns the chunks of step i."""
     parts = (lax.dynamic_slice_in_dim(v, i * step, step) for v in chunks[:-1])
     return Chunks(*parts, chunks.steps)
 
 
 def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
-    alpha = visible_alpha(raw, config)
+    """Returns alpha and log(1 - alpha), which is finite."""
+    alpha = _visible_alpha(raw, config)
     return alpha, jnp.maximum(jnp.log1p(-alpha), _LOG_ZERO)
 
 
 def _sums_before(
-    x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: tuple[Array, Array]
+    x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: _Tail
 ) -> tuple[Array, Array]:
-    """Sums of x (B, k, p) along its lists: of what comes before each chunk (B, p), and from there
-    to each splat.
+    """Returns the sums of x (B, k, p) along its lists: of all that comes before each chunk, (B, p),
+    and from there to the splat before each one, (B, k, p).
     """
     b, k, _ = x.shape
     triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))
@@ -641,13 +722,14 @@ def _sums_before(
     chunk = jnp.arange(b)
     earlier = (tiles[:, None] == tiles) & (chunk[:, None] > chunk)
     before = jnp.matmul(earlier.astype(x.dtype), since[:, -1] + x[:, -1], precision=EXACT)
-    tail_tile, tail_sum = tail
-    return before + jnp.where((tiles == tail_tile)[:, None], tail_sum, 0.0), since
+    return before + jnp.where((tiles == tail.tile)[:, None], tail.sum, 0.0), since
 
 
-def _tail(tiles: Array, before: Array, through: Array) -> tuple[Array, Array]:
-    return tiles[-1], before[-1] + through[-1, -1]
+def _tail(tiles: Array, before: Array, through: Array) -> _Tail:
+    """Returns the sum of the step's last list: before its chunk, and through the chunk."""
+    return _Tail(tiles[-1], before[-1] + through[-1, -1])
 
 
-def _no_tail(t: int, p: int, dtype: np.dtype | type) -> tuple[Array, Array]:
-    return jnp.asarray(t, jnp.int32), jnp.zeros(p, dtype)
+def _no_tail(t: int, p: int, dtype: np.dtype | type) -> _Tail:
+    """What the first step gets: no list has this tile."""
+    return _Tail(jnp.asarray(t, jnp.int32), jnp.zeros(p, dtype))

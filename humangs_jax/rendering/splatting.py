@@ -106,7 +106,7 @@ class Rendering(Batchable):
     """
 
     def _repr_png_(self) -> bytes:
-        """The image, or those of a batch side by side, for notebooks."""
+        """Shows the image, or those of a batch side by side, in notebooks."""
         images = np.asarray(self.rgb)
         return png_bytes(image_row(images.reshape(-1, *images.shape[-3:]), images.shape[-3]))
 
@@ -215,7 +215,8 @@ def visible_gaussians(
     config: SplatConfig | str = DEFAULT_CONFIG,
     threshold: float = ALPHA_MIN,
 ) -> Bool[Array, " g"]:
-    """Which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis v).
+    """Says which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis
+    v).
 
     The others can be left out for cameras like these: an avatar's inside is never seen.
     """
@@ -277,7 +278,7 @@ def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
 
 @jax.custom_vjp
 def _once_per_image(array: Array, camera: Camera) -> Array:
-    """The same array; where `vmap` shares it among cameras, each camera gets its own.
+    """Returns the same array; where `vmap` shares it among cameras, each camera gets a copy.
 
     Its gradient is then summed over the cameras once, and not at each of the dozen operations of
     the projection that mix what is shared with what is not, which on a CPU cost a fifth of the
@@ -311,12 +312,18 @@ def _own_in_batch(
 def with_background(
     gaussians: Gaussians, cameras: Camera, background: Background
 ) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
-    """What is drawn, in float32 at least. Raises: ValueError for a background that is no color."""
+    """Returns what is drawn, in float32 at least.
+
+    Raises: ValueError for a background that is no color.
+    """
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 
 
 def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array, "g n"] | None:
-    """In float32 at least. Raises: ValueError for those of another number of Gaussians."""
+    """Returns features in float32 at least.
+
+    Raises: ValueError for those of another number of Gaussians.
+    """
     if features is not None and features.shape[:1] != (count,):
         raise ValueError(f"features: expected shape ({count}, n), got {features.shape}")
     return at_least_float32(features)
@@ -355,7 +362,7 @@ def _color(background: object, dtype: np.dtype) -> Array:
 
 
 def _of_bytes(color: Any) -> bool:
-    """Whether an array of integers is no color in [0, 1]. Traced values are not looked at."""
+    """Says whether an array of integers is no color in [0, 1]. Traced values are not looked at."""
     if isinstance(color, Tracer) or jnp.issubdtype(color.dtype, jnp.inexact):
         return False
     return bool(np.any(np.asarray(color) > 1))
@@ -369,7 +376,9 @@ def draw(
     features: Float[Array, "g n"] | None = None,
     shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
-    """`render` with buffers that are decided, `config.max_pairs`: pure, and without checks."""
+    """Does what `render` does with buffers that are decided, `config.max_pairs`: pure, and
+    without checks.
+    """
     gaussians, features = jax.tree.map(
         lambda leaf: _once_per_image(leaf, camera), (gaussians, features)
     )
@@ -386,7 +395,7 @@ def draw_views(
     config: SplatConfig,
     features: Array | None = None,
 ) -> Rendering:
-    """`draw` for every camera of a batch, one after the other."""
+    """Calls `draw` for every camera of a batch, one after the other."""
 
     def project(camera):
         return project_gaussians(gaussians, camera, config)
@@ -433,17 +442,19 @@ def _draw(
     assert config.max_pairs is not None  # callers have fitted the buffers
     pairs = emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs)
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
-    features, transmittance, peaks, medians = composite(splats, lists, grid, config)
-    peaks = lax.stop_gradient(peaks)
+    drawn = composite(splats, lists, grid, config)
+    peaks = lax.stop_gradient(drawn.peaks)
     visibility = None
     if config.visibility:
         visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True)
+    transmittance = drawn.transmittance[:, None]
     rendering = _blended(
-        features, transmittance[:, None], grid, background, nearest, pairs.overflow, config
+        drawn.features, transmittance, grid, background, nearest, pairs.overflow, config
     )
     depth_median, radii = None, None
-    if medians is not None:
-        medians = lax.stop_gradient(jnp.where(medians < jnp.inf, nearest + medians, 0.0))
+    if drawn.medians is not None:
+        reached = drawn.medians < jnp.inf
+        medians = lax.stop_gradient(jnp.where(reached, nearest + drawn.medians, 0.0))
         depth_median = tiles_to_image(medians[:, None], grid)[..., 0]
     if config.radii:
         radii = radii_on_image(found, camera.width, camera.height)
@@ -463,7 +474,7 @@ def _blank(
     config: SplatConfig,
     others: Array | None,
 ) -> Rendering:
-    """The image of no Gaussians."""
+    """Returns the image of no Gaussians."""
     count = 4 + 2 * config.distortion
     if others is not None:
         count += others.shape[1]
@@ -479,7 +490,9 @@ def _blank(
 
 
 def _powers(behind: Float[Array, " g"], visible: Array) -> Float[Array, "g 2"]:
-    """z and its square, about the mean of what is drawn: small numbers have small squares."""
+    """Returns z and its square, about the mean of what is drawn: small numbers have small
+    squares.
+    """
     count = jnp.maximum(jnp.sum(visible), 1)
     z = jnp.where(visible, behind - lax.stop_gradient(jnp.sum(behind) / count), 0.0)
     return jnp.stack([z, z * z], axis=-1)
@@ -494,8 +507,10 @@ def _blended(
     overflow: Array,
     config: SplatConfig,
 ) -> Rendering:
-    """features: (t, 4 + n, p) premultiplied rgb, z - nearest and others. transmittance: (t, 1, p)
-    the final one.
+    """Puts what was composited over the background.
+
+    features: (t, 4 + n, p) premultiplied rgb, z - nearest and others. transmittance: (t, 1, p) the
+    final one.
 
     Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor
     does its gradient.
