@@ -42,16 +42,16 @@ from humangs_jax.geometry import transform
 
 
 class _FacePart(NamedTuple):
-    """Points of the face, from `first` to before `end`. Two are mirror images if their numbers add
-    up to `total`.
-
-    left_is_later: whether the one with the larger number is on the person's left.
-    """
+    """A run of points of the face that holds the mirror image of each of them."""
 
     first: int
+    """Number of the first point."""
     end: int
+    """Number behind the last point."""
     total: int
+    """Sum of the numbers of a point and its mirror image."""
     left_is_later: bool = True
+    """Whether the one with the larger number is on the person's left."""
 
 
 _FACE_PARTS = (
@@ -64,12 +64,12 @@ _FACE_PARTS = (
     _FacePart(65, 68, 132, left_is_later=False),  # lower lip, inside
 )
 _FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
-"""Of the right eye, and of the left."""
+"""Points of the right eye, and their mirror images of the left one."""
 
 
 def mirrored_name(name: str) -> str:
-    """Returns the landmark that a mirror puts in the place of `name`; what is in the middle is its
-    own mirror image.
+    """Returns the landmark that a mirror puts in the place of `name`: a landmark in the middle
+    stays.
     """
     kind, _, rest = name.partition("_")
     if kind == "face":
@@ -89,14 +89,18 @@ def side_of(name: str) -> int:
 
 
 def _mirrored_face(i: int) -> tuple[int, int]:
-    """The number of the mirror image of a point of the face, and the side of the point."""
+    """Returns the number of the mirror image of a point of the face, and the side of the point: -1
+    on the right, else 1.
+    """
     for first, end, total, left_is_later in _FACE_PARTS:
         if first <= i < end:
-            right = i < total - i if left_is_later else i > total - i
-            return total - i, -1 if right else 1
+            mirrored = total - i
+            on_the_right = (i < mirrored) if left_is_later else (i > mirrored)
+            return mirrored, -1 if on_the_right else 1
     if i in _FACE_EYES:
         return _FACE_EYES[i], -1
-    return {left: right for right, left in _FACE_EYES.items()}.get(i, i), 1
+    right_of_left = {left: right for right, left in _FACE_EYES.items()}
+    return right_of_left.get(i, i), 1
 
 
 # Places of detectors
@@ -124,7 +128,7 @@ class Place(NamedTuple):
 
 
 def place(name: str, base: str, joints: tuple[str, ...], millimetres: Millimetres) -> Place:
-    """A landmark whose offset is in millimetres."""
+    """Makes a landmark whose offset is in millimetres."""
     x, y, z = millimetres
     return Place(name, base, (x / 1000, y / 1000, z / 1000), joints)
 
@@ -143,40 +147,34 @@ CARRIERS = {
 
 
 def plain_places(names: tuple[str, ...]) -> tuple[Place, ...]:
-    """Landmarks that lie where this module has them, as far as fits may find them elsewhere."""
-    sides = [
-        name.split("_", 1) if name.startswith(("left_", "right_")) else ("", name) for name in names
-    ]
-    known = [
-        (name, side, part)
-        for name, (side, part) in zip(names, sides, strict=True)
-        if part in CARRIERS
-    ]
-    return tuple(
-        Place(n, n, (0.0, 0.0, 0.0), tuple(j.format(side=side) for j in CARRIERS[part]))
-        for n, side, part in known
-    )
+    """Makes a place for each landmark that has `CARRIERS`, where this module has it: fits may find
+    it elsewhere.
+    """
+    places = []
+    for name in names:
+        part = kind_of(name)
+        if part in CARRIERS:
+            side = name.removesuffix(f"_{part}")
+            joints = tuple(joint.format(side=side) for joint in CARRIERS[part])
+            places.append(Place(name, name, (0.0, 0.0, 0.0), joints))
+    return tuple(places)
 
 
 def both_sides(
     names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres
 ) -> tuple[Place, Place]:
-    """A landmark of the left side and its mirror image.
+    """Makes a landmark of the left side and its mirror image.
 
-    Arguments: names: of the left and the right one. base, joints: with {side} for the side.
-    millimetres: the left one's.
+    Arguments: names: names of the left and the right one. base, joints: with {side} for the side.
+    millimetres: the offset of the left one.
     """
     x, y, z = millimetres
-    left, right = (
-        place(
-            name,
-            base.format(side=side),
-            tuple(joint.format(side=side) for joint in joints),
-            (sign * x, y, z),
-        )
-        for name, side, sign in zip(names, ("left", "right"), (1, -1), strict=True)
-    )
-    return left, right
+
+    def one(name: str, side: str, offset: Millimetres) -> Place:
+        carriers = tuple(joint.format(side=side) for joint in joints)
+        return place(name, base.format(side=side), carriers, offset)
+
+    return one(names[0], "left", (x, y, z)), one(names[1], "right", (-x, y, z))
 
 
 # Landmarks
@@ -184,13 +182,7 @@ def both_sides(
 
 
 SIDES = {"left": 1.0, "right": -1.0}
-"""And the sign of x that is outwards in T-pose."""
-MEMBER = 0.5
-"""A vertex belongs to the segment whose joints have at least this share of its weight."""
-CARRIES = 0.1
-"""A joint moves a point that has at least this share of its weight from it."""
-MIDLINE = 0.006
-"""Half-width of the middle of the face, metres."""
+"""The sign of x that points outwards on each side, in T-pose."""
 FOOT = {
     "foot_index": (0.0, 1.0),
     "big_toe": (-0.3, 1.0),
@@ -200,10 +192,24 @@ FOOT = {
 """The direction in which landmarks of the foot are farthest: outwards and forwards."""
 
 
+class PlacedLandmark(NamedTuple):
+    """A landmark whose place a fit may move, as one of a group: a left and a right one move alike.
+    A tuple without names, as files of `jax.export` give it back, can be unpacked like it.
+    """
+
+    landmark: int
+    """Number of the landmark."""
+    group: int
+    """Number of the group: a pair of mirror images, or one landmark in the middle."""
+    side: int
+    """1, and -1 for the right one of a pair, whose x moves the other way."""
+
+
 @pytree_dataclass
 class LandmarkModel:
-    """What of a body its landmarks depend on: k landmarks from j joints and p points of the
-    surface.
+    """The part of a body that k landmarks need, which is posed without the rest of it.
+
+    landmarks = `regressor` @ [the j posed joints, the p posed `points` of the surface]
     """
 
     joints: Float[Array, "j 3"]
@@ -211,46 +217,43 @@ class LandmarkModel:
     joint_directions: Float[Array, "j 3 s"]
     """Change of the rest joints per unit of a shape coefficient, (j, 3, s), metres."""
     points: SurfacePoints
-    """The points of the surface that landmarks need; those of `places` come last."""
+    """The points of the surface that landmarks need, p of them; those of `placed` come last."""
     regressor: Float[Array, "k jp"]
-    """Landmarks from posed joints and points, (k, j + p); rows sum to 1, or are 0 where the body
-    lacks a landmark.
+    """Weights of joints and points in each landmark, (k, j + p); rows sum to 1, or are 0 where the
+    body lacks the landmark.
     """
     certainty: Float[Array, " k"]
-    """Weights of errors, (k,), see `LESS_CERTAIN`."""
+    """Weights of the landmarks' errors, (k,), in (0, 1], see `LESS_CERTAIN`."""
     names: tuple[str, ...] = static_field(default=())
-    """Names of the landmarks, k of them."""
+    """Names of the k landmarks."""
     known: tuple[bool, ...] = static_field(default=())
-    """Whether the body has each landmark, k of them."""
+    """Whether the body has each of the k landmarks."""
     parents: tuple[int, ...] = static_field(default=())
     """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field(default=())
     """Names of the j joints."""
     movers: tuple[int, ...] = static_field(default=())
     """The joints whose turning moves a landmark."""
-    placed: tuple[int, ...] = static_field(default=())
-    """Landmark of each of the last points, which are those of `places`."""
-    groups: tuple[tuple[int, int], ...] = static_field(default=())
-    """(group, side) of each of these points: a group is a pair, or what is in the middle; side 1,
-    and -1 for what is mirrored.
-    """
+    placed: tuple[PlacedLandmark, ...] = static_field(default=())
+    """The landmarks whose places a fit may move, in the order of their points."""
 
     def moved(self, offsets: Float[Array, "g 3"]) -> "LandmarkModel":
-        """The model with more offsets of its places, metres, one for each group; x of a mirrored
-        one is turned round.
+        """Returns the model with its placed landmarks moved, each group by its offset.
+
+        offsets: metres in T-pose, for the left one of a pair.
         """
         if not self.placed:
             return self
-        which, sides = np.asarray(self.groups).T
-        own = offsets[which] * np.stack([sides, np.ones_like(sides), np.ones_like(sides)], axis=-1)
-        rest = self.points.rest.at[-len(which) :].add(own)
+        _, groups, sides = np.asarray(self.placed).T
+        own = offsets[groups] * np.stack([sides, np.ones_like(sides), np.ones_like(sides)], axis=-1)
+        rest = self.points.rest.at[-len(groups) :].add(own)
         return replace(self, points=replace(self.points, rest=rest))
 
     def by_landmark(self, offsets: Float[Array, "g 3"]) -> Float[np.ndarray, "k 3"]:
-        """The same offsets by landmark; 0 for those without a place."""
+        """Returns the offset of each landmark for those of the groups; 0 for what is not placed."""
         found = np.zeros((len(self.names), 3))
-        for row, (group, side) in zip(self.placed, self.groups, strict=True):
-            found[row] = np.asarray(offsets[group]) * (side, 1, 1)
+        for landmark, group, side in self.placed:
+            found[landmark] = np.asarray(offsets[group]) * (side, 1, 1)
         return found
 
 
@@ -259,12 +262,12 @@ LESS_CERTAIN = {"hip": 2.0, "shoulder": 1.5, "neck": 1.5, "mid_hip": 1.5, "ear":
 
 
 def usual_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
-    """(k,) the weight of a landmark's error in (0, 1], see `LESS_CERTAIN`."""
+    """Returns the weight of each landmark's error, (k,), in (0, 1], see `LESS_CERTAIN`."""
     return np.asarray([1 / LESS_CERTAIN.get(kind_of(name), 1.0) for name in names], np.float32)
 
 
 def kind_of(name: str) -> str:
-    """The name without its side."""
+    """Returns the name without its side."""
     if name.startswith(("left_", "right_")):
         return name.split("_", 1)[1]
     return name
@@ -277,81 +280,86 @@ def landmark_model(
     places: tuple[Place, ...] = (),
     certainty: tuple[float, ...] = (),
 ) -> LandmarkModel:
-    """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the
-    joints alone.
+    """Prepares the landmarks of a body by name; those that it lacks get rows of zeros. Without
+    names there are the joints alone.
 
     Arguments: places: of the landmarks that may be elsewhere than the module says; ignored where
     the body lacks what they depend on. certainty: of each, if it is known.
     Raises: ValueError if it has none of them, which is so when its joints have other names than
     SMPL-X's.
     """
-    # sources of each landmark: joints and vertices, or a place that the caller gives
     finder = _Finder(body)
-    moved = {
+    # where each landmark is: at a place that the caller gives, or at the mean of its sources
+    placed = {
         place.name: place
         for place in places
-        if finder.find(place.base) and finder.has(place.joints)
+        if finder.find(place.base) and finder.has(place.joints) and place.name in names
     }
-    sources = [[] if name in moved else finder.find(name) for name in names]
-    known = tuple(bool(found) or name in moved for name, found in zip(names, sources, strict=True))
+    sources = {name: [] if name in placed else finder.find(name) for name in names}
+    known = tuple(bool(sources[name]) or name in placed for name in names)
     if names and not any(known):
         raise ValueError(
             f"body '{body.name}' has none of these landmarks: are its joints named like SMPL-X's"
             f" (left_hip, ...)? They are {', '.join(body.joint_names[:4]) or 'not named'}"
         )
-    # points of the surface: vertices that are sources, then the places; left and right share a
-    # group
-    vertices = sorted({source for found in sources for source in found if source >= 0})
-    joints, placed = len(body.parents), [moved[name] for name in names if name in moved]
-    pairs = [
-        place.name if side_of(place.name) > 0 else mirrored_name(place.name) for place in placed
-    ]
-    numbers = sorted(set(pairs))
-    # each landmark is the mean of its sources, or its place
-    regressor = np.zeros((len(names), joints + len(vertices) + len(placed)), np.float32)
-    for row, name, found in zip(regressor, names, sources, strict=True):
-        for source in found:
+
+    # the surface's points: vertices that are sources, then the places in the order of landmarks
+    vertices = sorted({source for found in sources.values() for source in found if source >= 0})
+    order = [name for name in names if name in placed]
+    points = [_rows(surface_points(body), vertices)]
+    points += [_placed(body, finder, placed[name]) for name in order]
+
+    # the weights of joints, vertices and places in each landmark
+    joints = len(body.parents)
+    regressor = np.zeros((len(names), joints + len(vertices) + len(order)), np.float32)
+    for row, name in zip(regressor, names, strict=True):
+        for source in sources[name]:
             column = -1 - source
             if source >= 0:
                 column = joints + vertices.index(source)
-            row[column] += 1 / len(found)
-        if name in moved:
-            row[joints + len(vertices) + placed.index(moved[name])] = 1.0
-    points = _concatenated(
-        [_rows(surface_points(body), vertices), *(_placed(body, finder, place) for place in placed)]
-    )
+            row[column] += 1 / len(sources[name])
+        if name in placed:
+            row[joints + len(vertices) + order.index(name)] = 1.0
+
+    all_points = _concatenated(points)
+    used = np.any(regressor[:, :joints], axis=0)
     return LandmarkModel(
         joints=_regressed(body, body.template),
         joint_directions=_regressed(body, body.shape_directions),
-        points=points,
+        points=all_points,
         regressor=jnp.asarray(regressor),
         certainty=jnp.asarray(certainty or usual_certainty(names), jnp.float32),
         names=names,
         known=known,
         parents=body.parents,
         joint_names=body.joint_names,
-        movers=_movers(
-            body.parents, np.any(regressor[:, :joints], axis=0), np.asarray(points.weights)
-        ),
-        placed=tuple(names.index(place.name) for place in placed),
-        groups=tuple(
-            (numbers.index(pair), side_of(each.name))
-            for pair, each in zip(pairs, placed, strict=True)
-        ),
+        movers=_movers(body.parents, used, np.asarray(all_points.weights)),
+        placed=_grouped(names, order),
+    )
+
+
+def _grouped(names: tuple[str, ...], placed: Sequence[str]) -> tuple[PlacedLandmark, ...]:
+    """Puts left and right landmarks into one group, named by the left one."""
+    pairs = [name if side_of(name) > 0 else mirrored_name(name) for name in placed]
+    groups = sorted(set(pairs))
+    return tuple(
+        PlacedLandmark(names.index(name), groups.index(pair), side_of(name))
+        for name, pair in zip(placed, pairs, strict=True)
     )
 
 
 def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j *b"]:
-    """Values of the joints from those of the vertices (n, ...)."""
+    """Returns what joints have of a quantity that is linear in the vertices."""
     return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=EXACT)
 
 
 def _rows(points: SurfacePoints, rows: Int[np.ndarray, " p"] | list[int]) -> SurfacePoints:
+    """Returns some of the points."""
     return jax.tree.map(lambda leaf: leaf[np.asarray(rows, np.int32)], points)
 
 
 def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
-    """A joint as a point that it carries itself."""
+    """Makes a point of a joint: the joint carries it."""
     row = body.joint_regressor[joint : joint + 1]
 
     def product(values):
@@ -366,8 +374,8 @@ def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
 
 
 def _placed(body: BodyModel, finder: "_Finder", place: Place) -> SurfacePoints:
-    """One point beside the sources of a landmark: it grows with them, and turns with the joints of
-    the place.
+    """Makes a point beside the sources of a landmark: it grows with them, and turns with the joints
+    of the place.
     """
     every, sources = surface_points(body), finder.find(place.base)
     points = [
@@ -383,13 +391,14 @@ def _placed(body: BodyModel, finder: "_Finder", place: Place) -> SurfacePoints:
 
 
 def _concatenated(points: Sequence[SurfacePoints]) -> SurfacePoints:
+    """Joins points."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *points)
 
 
 def pose_landmarks(
     model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
-    """Landmarks and joints of a person in a pose, metres.
+    """Returns landmarks and joints of a person in a pose, metres.
 
     Landmarks that the body lacks are at the origin.
     """
@@ -401,7 +410,7 @@ def pose_landmarks(
 def pose_joints(
     model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "j 4 4"], Float[Array, "j 3"]]:
-    """Transforms of the joints from rest, and where the joints are, metres."""
+    """Returns the transforms of the joints from rest, and where the joints are, metres."""
     rest = shaped(model.joints, model.joint_directions, betas)
     transforms = joint_transforms(rest, model.parents, pose.rotations, pose.translation)
     return transforms, transform.apply(transforms, rest)
@@ -410,7 +419,7 @@ def pose_joints(
 def landmarks_from(
     model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]
 ) -> Float[Array, "k 3"]:
-    """Landmarks from posed joints and points."""
+    """Returns the landmarks of posed joints and points."""
     return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=EXACT)
 
 
@@ -419,10 +428,12 @@ def _movers(
     joints_used: Bool[np.ndarray, " j"],
     point_weights: Float[np.ndarray, "p j"],
 ) -> tuple[int, ...]:
-    """Joints above the used joints, and those that move a used point (p, j): turning a joint does
-    not move itself.
+    """Returns the joints that move a point or lie above one that does, and those above a joint that
+    is used: turning a joint does not move the joint.
+
+    Arguments: point_weights: skinning weights of the points, (p, j).
     """
-    moving = point_weights.max(axis=0, initial=0.0) > CARRIES
+    moving = point_weights.max(axis=0, initial=0.0) > 0.1  # less is hardly seen
     for j in np.flatnonzero(joints_used | moving):
         parent = parents[j]
         while parent >= 0:
@@ -432,11 +443,11 @@ def _movers(
 
 
 Score = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
-"""What the best of some places has most of."""
+"""Scores of places; the best has the largest."""
 
 
 class _Finder:
-    """Sources of landmarks on one body: vertices as they are, joints as -1 - joint."""
+    """Finds the sources of landmarks on one body: a vertex by its number, joint j as -1 - j."""
 
     def __init__(self, body: BodyModel) -> None:
         self.template = np.asarray(body.template, np.float64)
@@ -445,17 +456,19 @@ class _Finder:
         self.index = {name: j for j, name in enumerate(body.joint_names)}
 
     def has(self, joints: tuple[str, ...]) -> bool:
-        """Whether the body has these joints."""
+        """Says whether the body has these joints."""
         return all(name in self.index for name in joints)
 
     def find(self, name: str) -> list[int]:
-        """The sources whose mean is the landmark; none if the body lacks it."""
+        """Returns the sources whose mean is the landmark; none if the body lacks it."""
         try:
             return self._find(name)
         except (KeyError, ValueError):  # a joint that it lacks, or no vertex where a rule looks
             return []
 
     def _find(self, name: str) -> list[int]:
+        """Does the same. Raises: KeyError, ValueError if the body lacks it."""
+
         def joint(x):
             return -1 - self.index[x]
 
@@ -510,25 +523,30 @@ class _Finder:
         raise KeyError(name)
 
     def _segment(self, *joints: str) -> Int[np.ndarray, " n"]:
-        """Vertices that belong to some joints together; joints that the body lacks are left out."""
-        owned = self.weights[:, [self.index[name] for name in joints if name in self.index]].sum(1)
-        return np.flatnonzero(owned > MEMBER)
+        """Returns the vertices that have most of their weight from some joints together; joints
+        that the body lacks are left out.
+        """
+        present = [self.index[name] for name in joints if name in self.index]
+        return np.flatnonzero(self.weights[:, present].sum(1) > 0.5)
 
     def _best(self, vertices: Int[np.ndarray, " n"], score: Score) -> int:
+        """Returns the vertex with the largest score."""
         return int(vertices[np.argmax(score(self.template[vertices]))])
 
     def _eyes(self) -> Float[np.ndarray, "3"]:
+        """Returns the middle between the eyes, metres."""
         return self.joints[[self.index["left_eye"], self.index["right_eye"]]].mean(0)
 
     def _head(self, low: float, high: float) -> Int[np.ndarray, " n"]:
-        """Vertices of the head between two heights."""
+        """Returns the vertices of the head between two heights, metres."""
         head = self._segment("head", "jaw")
         height = self.template[head, 1]
         return head[(height > low) & (height < high)]
 
     def _on_midline(self, score: Score, highest: float = np.inf) -> int:
-        """The best vertex of the front of the face's middle."""
+        """Returns the best vertex in front, within 6 mm of the middle of the face."""
         head = self._segment("head", "jaw")
         p = self.template[head]
         front = p[:, 2] > 0.5 * (self._eyes()[2] + p[:, 2].max()) - 0.02
-        return self._best(head[front & (np.abs(p[:, 0]) < MIDLINE) & (p[:, 1] < highest)], score)
+        middle = np.abs(p[:, 0]) < 0.006
+        return self._best(head[front & middle & (p[:, 1] < highest)], score)

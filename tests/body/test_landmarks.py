@@ -110,7 +110,7 @@ def test_left_and_right_are_mirror_images(body, whole):
 def test_mirror_images_share_one_offset_with_x_turned_round(body, kind):
     """Points of the face, too: the corners of the eyes and of the mouth are pairs."""
     model = landmark_model(body, kind.names, kind.places)
-    groups = {model.names[row]: own for row, own in zip(model.placed, model.groups, strict=True)}
+    groups = {model.names[landmark]: (group, side) for landmark, group, side in model.placed}
     assert len({group for group, _ in groups.values()}) == len(
         {frozenset((n, mirrored_name(n))) for n in groups}
     )

@@ -275,10 +275,7 @@ def test_a_set_without_a_table_has_places_that_change_nothing():
 
 
 def kind_groups(model):
-    return {
-        kind_of(model.names[row]): group
-        for row, (group, _) in zip(model.placed, model.groups, strict=True)
-    }
+    return {kind_of(model.names[each.landmark]): each.group for each in model.placed}
 
 
 @pytest.mark.slow

@@ -381,10 +381,7 @@ def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
     if fit.state.places is None:
         return
     moved = 1000 * PLACE_STD * np.linalg.norm(np.asarray(fit.state.places), axis=-1)
-    kinds = {
-        group: kind_of(model.names[row])
-        for row, (group, _) in zip(model.placed, model.groups, strict=True)
-    }
+    kinds = {group: kind_of(model.names[landmark]) for landmark, group, _ in model.placed}
     far = [
         f"{kinds[group]} {moved[group]:.0f} mm"
         for group in np.argsort(-moved)[:3]

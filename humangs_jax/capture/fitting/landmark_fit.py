@@ -131,7 +131,7 @@ def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit
     observations = replace(observations, noise=_noise_found(problem, observations, states))
     model = replace(model, certainty=_certainty_found(problem, observations, states))
     problem = keypoint_problem(model)
-    groups = len({group for group, _ in model.groups})
+    groups = len({group for _, group, _ in model.placed})
     frames, views = observations.points.shape[:2]
     placed = groups and frames >= PLACED_FRAMES and views > 1
     places = jnp.zeros((groups, 3)) if placed else None
