@@ -83,7 +83,7 @@ def _shipped() -> dict[str, np.ndarray]:
 
 
 def read_face(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of a face file, with `rows`: for each offset its vertex and its shape.
+    """Reads the arrays of a face file; adds `rows`: for each offset its vertex and its shape.
 
     Raises: ValueError, naming the key.
     """
@@ -115,7 +115,7 @@ def read_face(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _dense(arrays: dict[str, np.ndarray], count: int) -> Float[np.ndarray, "count 3 e"]:
-    """The offsets of this many vertices in metres, those inside of the mouth last."""
+    """Returns the offsets of this many vertices in metres, those inside of the mouth last."""
     dense = np.zeros((count, 3, len(arrays["names"])), np.float32)
     vertices, shapes = arrays["rows"].T
     dense[vertices, :, shapes] = arrays["offsets"].T * np.float32(STEP)
@@ -124,7 +124,7 @@ def _dense(arrays: dict[str, np.ndarray], count: int) -> Float[np.ndarray, "coun
 
 @functools.cache
 def shipped_expressions(body_vertices: int) -> Expressions:
-    """The 52 shapes of ARKit on the shipped body; eyes turn by their joints."""
+    """Returns the 52 shapes of ARKit on the shipped body; eyes turn by their joints."""
     arrays = _shipped()
     names = tuple(str(name) for name in arrays["names"])
     dense = _dense(arrays, body_vertices + len(arrays["inside_vertices"]))[:body_vertices]
@@ -141,7 +141,7 @@ def shipped_expressions(body_vertices: int) -> Expressions:
 
 
 def shipped_parts(template: Float[np.ndarray, "n 3"]) -> FaceParts:
-    """Teeth, tongue, lids and the inside of the mouth. template: of the shipped body."""
+    """Returns teeth, tongue, lids and the inside of the mouth. template: of the shipped body."""
     arrays = _shipped()
     places = np.concatenate([template, arrays["inside_vertices"]]).astype(np.float32)
     faces = arrays["part_faces"].astype(np.int64)

@@ -44,7 +44,9 @@ JOINT_NAMES = (
 
 
 def _hand_parents(wrist: int, first: int) -> list[int]:
-    """Parents of the 15 joints of a hand: five fingers of three joints each, from the wrist on."""
+    """Returns parents of the 15 joints of a hand: five fingers of three joints each, from the
+    wrist on.
+    """
     return [parent for j in range(first, first + 15, 3) for parent in (wrist, j, j + 1)]
 
 

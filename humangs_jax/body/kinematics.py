@@ -12,7 +12,8 @@ def posed_tree(
     bones: Float[np.ndarray, "*m j 3"],
     parents: Sequence[int],
 ) -> tuple[Float[np.ndarray, "*m j 3 3"], Float[np.ndarray, "*m j 3"]]:
-    """Rotations and places of joints in space, in numpy; `body.model.joint_transforms` in JAX.
+    """Returns rotations and places of joints in space, by numpy; `body.model.joint_transforms` is
+    the same in JAX.
 
     turns: rotations of joints relative to their parents. bones: from a parent to each joint in the
     rest pose, and the place of the root. parents: -1 for roots; each comes before its children.
@@ -28,6 +29,6 @@ def posed_tree(
 
 
 def bones_of(joints: Float[np.ndarray, "j 3"], parents: Sequence[int]) -> Float[np.ndarray, "j 3"]:
-    """From its parent to each joint of a rest pose; of a root its place."""
+    """Returns the vector from its parent to each joint of a rest pose; for a root its place."""
     above = np.asarray(parents)
     return np.where(above[:, None] < 0, joints, joints - joints[above])

@@ -57,7 +57,7 @@ KEYS = {
 
 @checked_arguments
 def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel:
-    """A body model: the CC0 body that comes with the package, or one of a file.
+    """Loads a body model: the CC0 body that comes with the package, or one of a file.
 
     Args:
         path: None for the shipped body (13,380 vertices, 55 joints in SMPL-X order, facing +z,
@@ -100,13 +100,13 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
 
 
 def _indices(array: np.ndarray) -> np.ndarray:
-    """Non-negative integers in 2 bytes where they fit."""
+    """Stores non-negative integers in 2 bytes where they fit."""
     return array.astype(np.uint16 if array.max(initial=0) < 2**16 else np.int32)
 
 
 def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and values (rows, k) of the non-zero entries, k the most in any row, padded with
-    zeros.
+    """Returns columns and values (rows, k) of the entries that are not 0, k the most in any row,
+    padded with zeros.
     """
     count = max(1, int((matrix != 0).sum(1).max()))
     columns = np.argsort(-np.abs(matrix), axis=1, kind="stable")[:, :count]
@@ -252,7 +252,7 @@ EXPRESSION_FIELDS = ("vertices", "directions", "joint_directions", "joint_turns"
 
 
 def expression_arrays(expressions: Expressions) -> dict[str, np.ndarray]:
-    """What files hold of expressions, by key; the arrays as they are."""
+    """Returns what files hold of expressions, by key; the arrays are as they are."""
     found = {name: getattr(expressions, name) for name in EXPRESSION_FIELDS}
     return {
         f"{EXPRESSION}{name}": np.asarray(value)
@@ -264,8 +264,8 @@ def expression_arrays(expressions: Expressions) -> dict[str, np.ndarray]:
 def read_expressions(
     arrays: dict[str, np.ndarray], vertices: int, joints: int
 ) -> Expressions | None:
-    """The expressions of a body or an avatar with so many vertices and joints; None if its file has
-    none.
+    """Reads the expressions of a body or an avatar with so many vertices and joints; None if its
+    file has none.
 
     Raises: InvalidFileError, naming the key.
     """
@@ -419,7 +419,7 @@ def _parents(file: ArrayFile) -> tuple[int, ...]:
 
 
 def load_hands(path: str | Path) -> HandBasis:
-    """Mean and principal components of the hand poses of an SMPL-X model file.
+    """Reads the mean and the principal components of the hand poses of an SMPL-X model file.
 
     Raises as `load_smplx`.
     """

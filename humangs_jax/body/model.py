@@ -41,8 +41,8 @@ BLOCK = 2048
 
 
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
-    """Indices (j,) of every joint's parent, then grandparent, then the fourth, eighth ... ancestor;
-    j where there is none.
+    """Returns the indices (j,) of every joint's parent, then grandparent, then the fourth, eighth
+    ... ancestor; j where there is none.
 
     Raises: ValueError unless all joints descend from one root (-1).
     """
@@ -67,7 +67,7 @@ def joint_transforms(
     rotations: Float[Array, "j 3"],
     translation: Float[Array, "3"],
 ) -> Float[Array, "j 4 4"]:
-    """G_j of every joint.
+    """Returns the G_j of every joint.
 
     Arguments: rest_joints in metres; parents, root -1; rotations as axis-angle in radians, relative
     to the parent; translation in metres, applied last. Returns: rigid transforms from rest to posed
@@ -93,7 +93,7 @@ def joint_transforms(
 
 
 def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Array, "*b i k"]:
-    """Matrix product by multiplying and adding: exact on every backend.
+    """Multiplies matrices by multiplying and adding: exact on every backend.
 
     XLA's CPU compiler (jax 0.10 to 0.12) rejects the batched `dot` that two nested vmaps make of
     this product.
@@ -104,7 +104,7 @@ def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Arra
 def blend_transforms(
     weights: Float[Array, "n j"], transforms: Float[Array, "j 4 4"]
 ) -> Float[Array, "n 4 4"]:
-    """T_n = sum_j w_nj G_j. Its linear part is in general no rotation."""
+    """Returns T_n = sum_j w_nj G_j. Its linear part is in general no rotation."""
     return jnp.einsum("nj,jab->nab", weights, transforms, precision=EXACT)
 
 
@@ -117,8 +117,8 @@ def blend_leg_weights(
     legs: Bool[Array, "2 j"],
     reach: float,
 ) -> Float[Array, "g j"]:
-    """Skinning weights of points off the skin between the legs, by the body around them and not by
-    one vertex.
+    """Returns skinning weights of points off the skin between the legs, by the body around them and
+    not by one vertex.
 
     A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d
     from the vertex that it belongs to takes the mean of the weights of the vertices around it, by a
@@ -168,7 +168,7 @@ class SurfacePoints:
 
 
 def surface_points(body: "BodyModel") -> SurfacePoints:
-    """All vertices."""
+    """Returns all vertices as points."""
     return SurfacePoints(
         body.template, body.shape_directions, body.pose_directions, body.skinning_weights
     )
@@ -177,7 +177,7 @@ def surface_points(body: "BodyModel") -> SurfacePoints:
 def shaped(
     mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]
 ) -> Float[Array, "p 3"]:
-    """Points or joints of a person in T-pose, metres; missing coefficients are 0."""
+    """Returns the points or joints of a person in T-pose, metres; missing coefficients are 0."""
     return mean + jnp.einsum("pas,s->pa", directions[..., : betas.shape[0]], betas, precision=EXACT)
 
 
@@ -187,8 +187,8 @@ def pose_points(
     features: Float[Array, " q"] | None,
     transforms: Float[Array, "j 4 4"],
 ) -> Float[Array, "p 3"]:
-    """Where the points of a person are, metres. features: of the pose; ignored by bodies without
-    correctives.
+    """Returns where the points of a person are, metres. features: of the pose; ignored by bodies
+    without correctives.
     """
     rest = shaped(points.rest, points.directions, betas)
     if points.corrections is not None:
@@ -215,7 +215,7 @@ class Texels:
         return jnp.any(self.weights > 0, axis=-1)
 
     def interpolate(self, values: Float[Array, "n c"]) -> Float[Array, "h w c"]:
-        """Values at vertices, as the texels have them; 0 where a texel shows nothing."""
+        """Interpolates values at vertices for each texel; 0 where a texel shows nothing."""
         a, b, c = (self.weights[..., i : i + 1] * values[self.corners[..., i]] for i in range(3))
         return a + b + c
 
@@ -301,14 +301,14 @@ class PosedBody(Batchable):
 
 @checked_arguments
 def rest_pose(body: BodyModel) -> BodyPose:
-    """The T-pose: no rotation, no translation."""
+    """Returns the T-pose: no rotation, no translation."""
     dtype = body.template.dtype
     return BodyPose(jnp.zeros((len(body.parents), 3), dtype), jnp.zeros(3, dtype))
 
 
 @checked_arguments
 def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
-    """The T-pose of a person.
+    """Returns a person in T-pose.
 
     Arguments: betas, coefficients of the first directions; missing ones are 0.
     Raises: ValueError if there are more coefficients than directions.
@@ -333,8 +333,8 @@ def _shaped_body(
 
 
 def without_expression(body: BodyModel) -> BodyModel:
-    """The body without the directions of facial expressions, which come last in SMPL-X models:
-    those are no shape of a person.
+    """Returns the body without the directions of facial expressions, which come last in SMPL-X
+    models: those are no shape of a person.
     """
     count = sum(not name.startswith("expression_") for name in body.shape_names)
     if not body.shape_names or count == len(body.shape_names):
@@ -380,7 +380,7 @@ def expressed(
 
 
 def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
-    """R_j - I of joints 1 and up, row-major: what the pose correctives are linear in."""
+    """Returns R_j - I of joints 1 and up, row-major: what the pose correctives are linear in."""
     matrices = quaternion.matrix_from_axis_angle(rotations[1:])
     return (matrices - jnp.eye(3, dtype=matrices.dtype)).reshape(-1)
 
@@ -388,7 +388,7 @@ def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
 def person_vertices(
     body: BodyModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> Float[Array, "n 3"]:
-    """Vertices of a person in a pose, metres."""
+    """Returns the vertices of a person in a pose, metres."""
     return pose_body(body, shape_body(body, betas), pose).vertices
 
 

@@ -37,7 +37,7 @@ class Motion:
     """Which expressions these are, such as ARKit's "jawOpen"."""
 
     def pose(self, frame: int, expression_names: Sequence[str] = ()) -> BodyPose:
-        """One frame, with its expression for a face that has these expressions
+        """Returns one frame, with its expression for a face that has these expressions
         (`avatar.expression_names`).
         """
         faces = self.expressions_of(expression_names)
@@ -48,7 +48,7 @@ class Motion:
         return BodyPose(*pose, expression)
 
     def part(self, frames: slice) -> "Motion":
-        """Some of the frames, at the same rate."""
+        """Returns some of the frames, at the same rate."""
         faces = None
         if self.expressions is not None:
             faces = taken(self.expressions, frames)
@@ -60,8 +60,8 @@ class Motion:
         )
 
     def expressions_of(self, names: Sequence[str]) -> Float[Array, "m e"] | None:
-        """The coefficients of a face that has these expressions, 0 where the motion says nothing;
-        None if it has none of them.
+        """Returns the coefficients of a face that has these expressions, 0 where the motion says
+        nothing; None if it has none of them.
         """
         own = self.expression_names
         if self.expressions is None or not set(names) & set(own):
@@ -72,8 +72,8 @@ class Motion:
         return known[:, np.asarray(index)]
 
     def at_rate(self, fps: float | int) -> "Motion":
-        """The motion at another frame rate, between two frames interpolated: rotations on the
-        shortest way, positions linearly.
+        """Returns the motion at another frame rate, between two frames interpolated: rotations on
+        the shortest way, positions linearly.
 
         Raises: ValueError for a rate that is not positive, or more frames than the limit.
         """
@@ -108,14 +108,14 @@ def _between(
     next_translations: Float[Array, "m 3"],
     share: Float[Array, " m"],
 ) -> tuple[Float[Array, "m j 3"], Float[Array, "m 3"]]:
-    """Frames between frames; those with share 0 as they are."""
+    """Returns frames between frames; where the share is 0, the frame itself."""
     turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
     moved = translations + share[:, None] * (next_translations - translations)
     return jnp.where(share[:, None, None] > 0, turned, rotations), moved
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
-    """The motion moved by a constant so that the person starts at x = z = 0 and, at its lowest,
+    """Moves a motion by a constant so that the person starts at x = z = 0 and, at its lowest,
     stands on y = 0.
 
     Arguments:
@@ -133,7 +133,7 @@ def _on_the_floor(
     rotations: Float[Array, "m j 3"],
     translations: Float[Array, "m 3"],
 ) -> Float[Array, "m 3"]:
-    """The translations of `grounded`."""
+    """Returns the translations of `grounded`."""
     transforms = jax.vmap(joint_transforms, in_axes=(None, None, 0, 0))
     transforms = transforms(rest.joints, parents, rotations, translations)
     joints = transform.apply(transforms, rest.joints)

@@ -51,8 +51,8 @@ in another unit.
 
 
 def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
-    """The body with edges of its template at most `longest` metres; the original vertices stay
-    first, in their order.
+    """Splits edges until those of the template are at most `longest` metres; the original vertices
+    stay first, in their order.
 
     Faces are cut into two, three or four along the midpoints of their long edges, consistently on
     both sides. Texture coordinates and decimation order are dropped: they belong to the original
@@ -65,8 +65,9 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
 
 
 def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, sparse.csr_array]:
-    """What `split_long_edges` returns, and the matrix (finer, n) whose product with a linear
-    quantity of the original vertices is that of the result's: a midpoint has the mean of its ends.
+    """Does what `split_long_edges` does. Also returns the matrix (finer, n) whose product with a
+    linear quantity of the original vertices is that of the result's: a midpoint has the mean of its
+    ends.
 
     Raises: ValueError, as it.
     """
@@ -154,7 +155,7 @@ class _Moves:
         self.row = np.concatenate([row, added])
 
     def expressions(self) -> Expressions:
-        """Those of the mesh as it is now."""
+        """Returns the expressions of the mesh as it is now."""
         vertices = np.flatnonzero(self.row < len(self.directions) - 1)
         return replace(
             self.of_body,
@@ -166,7 +167,9 @@ class _Moves:
 def _kept_moves(
     expressions: Expressions | None, renumber: Int[np.ndarray, " n"]
 ) -> Expressions | None:
-    """Expressions of the vertices that stay. renumber: their new numbers, -1 for those that go."""
+    """Returns expressions of the vertices that stay. renumber: their new numbers, -1 for those
+    that go.
+    """
     if expressions is None:
         return None
     vertices = renumber[np.asarray(expressions.vertices)]
@@ -181,7 +184,7 @@ def _kept_moves(
 def _cut(
     faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]
 ) -> Int[np.ndarray, "finer 3"]:
-    """Faces cut at the midpoints of their sides; middles (f, 3): the vertex on side i to i + 1, -1
+    """Cuts faces at the midpoints of their sides. middles (f, 3): the vertex on side i to i + 1, -1
     for none.
     """
     count = (middles >= 0).sum(1)
@@ -243,7 +246,7 @@ nothing.
 
 
 def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
-    """Points on the faces, corners included, about `spacing` apart."""
+    """Spreads points over the faces, corners included, about `spacing` apart, metres."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     steps = np.clip(np.ceil(longest / spacing), 1, MOST_STEPS).astype(int)
@@ -255,8 +258,8 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> 
 
 
 def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The share of `VIEWS` parallel projections, in [0, 1], in which each vertex (n, 3) is not
-    hidden.
+    """Returns the share of `VIEWS` parallel projections, in [0, 1], in which each vertex (n, 3) is
+    not hidden.
     """
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
@@ -302,8 +305,8 @@ class _Mesh:
         return [f for f in self.around[u] if v in self.faces[f]]
 
     def uv_moves(self, u: int, shared: list[int], v: int) -> dict[int, int] | None:
-        """Texture vertex of u -> that of v in the same chart, or None if some chart at u does not
-        reach v.
+        """Maps texture vertices of u to that of v in the same chart; None if some chart at u
+        does not reach v.
         """
         moves = {self.uv_at(f, u): self.uv_at(f, v) for f in shared}
         if all(self.uv_at(f, u) in moves for f in self.around[u]):
@@ -314,8 +317,8 @@ class _Mesh:
         return self.uv_faces[face][self.faces[face].index(vertex)]
 
     def allowed(self, u: int, v: int) -> bool:
-        """Whether u -> v keeps the topology, the texture charts whole, and folds no face nor makes
-        it a needle.
+        """Says whether u -> v keeps the topology, the texture charts whole, and folds no face nor
+        makes it a needle.
         """
         shared = self.between(u, v)
         common = self.beside[u] & self.beside[v]
@@ -389,8 +392,8 @@ def _quality(
 def _vertex_quadrics(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 11"]:
-    """Per vertex: area-weighted sums over its faces of the outer product of (normal, d), and of the
-    area: (n, 11).
+    """Sums over the faces of each vertex, weighted by area, the outer product of (normal, d), and
+    the area: (n, 11).
     """
     normal = face_crosses(vertices, faces)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -409,7 +412,7 @@ def _vertex_quadrics(
 def collapse_sequence(
     vertices: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All half-edge collapses of a triangle mesh, best first.
+    """Finds all half-edge collapses of a triangle mesh, best first.
 
     Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3), whose seams are then kept
     closed.
@@ -453,7 +456,7 @@ def collapse_sequence(
 
 
 def _follow(into: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """For each vertex the kept one that it ends on."""
+    """Returns for each vertex the kept one that it ends on."""
     target = np.where(kept, np.arange(len(into)), into)
     while not kept[target].all():
         target = target[target]
@@ -461,8 +464,8 @@ def _follow(into: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
 
 def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """A joint regressor on the kept vertices that gives the joints of the full body, whatever its
-    shape.
+    """Makes a joint regressor on the kept vertices that gives the joints of the full body, whatever
+    its shape.
 
     The weights of lost vertices move to where those went; the smallest change of the nearby weights
     then removes the error.
@@ -497,8 +500,8 @@ def _carry_uvs(
     target: Int[np.ndarray, " n"],
     kept_faces: Bool[np.ndarray, " f"],
 ) -> tuple[Float[Array, "u 2"], Int[Array, "kept 3"]]:
-    """Texture vertices of the remaining corners: of the vertex a corner moved onto, the one nearest
-    in the texture.
+    """Finds texture vertices for the remaining corners: of the vertex a corner moved onto, the one
+    nearest in the texture.
     """
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
     pairs = np.unique(
@@ -520,7 +523,7 @@ def _carry_uvs(
 
 @checked_arguments
 def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
-    """A body on `vertex_count` of the body's own vertices, with the same joints for every shape.
+    """Reduces a body to `vertex_count` of its vertices, with the same joints for every shape.
 
     Host-side numpy: about 0.1 s if the body carries its collapses (the shipped one does), seconds
     to find them otherwise; the result carries its own.
@@ -533,7 +536,8 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
 def decimate_with_kept(
     body: BodyModel, vertex_count: int
 ) -> tuple[BodyModel, Int[np.ndarray, " kept"]]:
-    """What `decimate` returns, and the numbers of the vertices that it keeps, in their order.
+    """Does what `decimate` does. Also returns the numbers of the vertices that it keeps, in their
+    order.
 
     Raises: ValueError, as it.
     """

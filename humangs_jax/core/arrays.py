@@ -15,7 +15,7 @@ SMALL = 1 << 16
 
 
 def from_host(array: Any, dtype: Any = None) -> Any:
-    """The numbers of a list or of an array of numpy as an array of JAX; one of JAX stays.
+    """Makes an array of JAX of the numbers of a list or of an array of numpy; one of JAX stays.
 
     `jnp.asarray` makes the same, by a program for each shape.
     """
@@ -27,14 +27,16 @@ def from_host(array: Any, dtype: Any = None) -> Any:
 
 
 def on_host(array: Any) -> bool:
-    """Whether numpy can read an array at once: it is numpy's, or JAX's on a CPU of this process."""
+    """Says whether numpy can read an array at once: it is numpy's, or JAX's on a CPU of this
+    process.
+    """
     if isinstance(array, np.ndarray):
         return True
     return _plain(array) and all(device.platform == "cpu" for device in array.devices())
 
 
 def taken(array: Any, index: Any) -> Any:
-    """`array[index]`, by numpy where it can read the array, or the array is small."""
+    """Returns `array[index]`, by numpy where it can read the array, or the array is small."""
     small = _plain(array) and array.size <= SMALL
     if isinstance(index, Tracer) or isinstance(array, np.ndarray) or not (small or on_host(array)):
         return array[index]
@@ -44,14 +46,14 @@ def taken(array: Any, index: Any) -> Any:
 
 
 def joined(arrays: Sequence[Any]) -> Any:
-    """`jnp.stack`, by numpy where it can read the arrays."""
+    """Returns `jnp.stack(arrays)`, by numpy where it can read the arrays."""
     if all(on_host(array) for array in arrays):
         return from_host(np.stack(arrays))
     return jnp.stack(arrays)
 
 
 def _plain(array: Any) -> bool:
-    """Whether it is an array of JAX, with numbers, whose values this process has."""
+    """Says whether it is an array of JAX, with numbers, whose values this process has."""
     if isinstance(array, Tracer) or not isinstance(array, jax.Array):
         return False
     numbers = jnp.issubdtype(array.dtype, jnp.number) or array.dtype == bool

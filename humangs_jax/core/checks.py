@@ -54,8 +54,8 @@ HINTS = {
 
 
 def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: arguments are of the classes of their annotations, and arrays of one pytree fit
-    each other.
+    """Decorates a function so that its arguments are of the classes of their annotations, and the
+    arrays of one pytree fit each other.
 
     Parameters that may be something else than plain classes, sequences or arrays (numbers,
     callables) are left alone.
@@ -106,8 +106,8 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _arrays(annotation: Any) -> tuple[Any, ...]:
-    """The types of arrays that an annotation stands for, with None where it may be that; none if it
-    may be something else.
+    """Returns the types of arrays that an annotation stands for, with None where it may be None;
+    nothing if it may be something else.
     """
     options = typing.get_args(annotation) or (annotation,)
     known = all(hasattr(x, "dims") or x is type(None) for x in options)
@@ -117,7 +117,7 @@ def _arrays(annotation: Any) -> tuple[Any, ...]:
 
 
 def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
-    """What is wrong with a value that should be an array; numbers are arrays without axes."""
+    """Says what is wrong with a value that should be an array; numbers are arrays without axes."""
     if value is None and type(None) in options:
         return None
     types_ = [x for x in options if hasattr(x, "dims")]
@@ -134,7 +134,7 @@ def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
 
 
 def _classes(annotation: Any) -> tuple[type, ...]:
-    """The classes that an annotation stands for; none if that is not all that it says."""
+    """Returns the classes that an annotation stands for; nothing if it says more than that."""
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     options = typing.get_args(annotation) if union else (annotation,)
     options = tuple(SEQUENCES.get(typing.get_origin(x), x) for x in options)
@@ -152,7 +152,7 @@ def _classes(annotation: Any) -> tuple[type, ...]:
 
 
 def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
-    """The function with its parameters: those without a default, the others as dots."""
+    """Shows the function with its parameters: those without a default, the others as dots."""
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     parameters = signature.parameters.values()
     needed = [
@@ -186,7 +186,7 @@ def _other_class(classes: tuple[type, ...], value: Any) -> str:
 def _of_a_field(
     keywords: Any, signature: inspect.Signature, expected: dict[str, tuple[type, ...]]
 ) -> str | None:
-    """Where a name belongs that the function does not have: into one of its configurations."""
+    """Says where a name belongs that the function does not have: into one of its configurations."""
     for name in keywords:
         if name in signature.parameters:
             continue
@@ -280,7 +280,9 @@ def _extremes_on_host(array: Any) -> tuple[Any, Any]:
 
 @jax.jit
 def _extremes(arrays: tuple[Array, ...]) -> Array:
-    """(arrays, 2): least and largest entry of each; both NaN if an entry is."""
+    """Returns the least and the largest entry of each array, (arrays, 2); both are NaN if an
+    entry is.
+    """
     return jnp.stack([jnp.stack([jnp.min(array), jnp.max(array)]) for array in arrays])
 
 

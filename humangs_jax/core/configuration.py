@@ -55,7 +55,7 @@ class Range(NamedTuple):
 
 
 def at_least(low: float | int) -> Range:
-    """Finite numbers from `low` on."""
+    """Makes the range of finite numbers from `low` on."""
     return Range(low, LARGEST)
 
 
@@ -99,7 +99,7 @@ Edge = Annotated[float, Range(0.005, 10)]
 
 
 def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
-    """A field that trades accuracy or memory for speed: a row of docs/knobs.md.
+    """Makes a field that trades accuracy or memory for speed: a row of docs/knobs.md.
 
     cost, gain: in a few words. measured: the page of docs/ with the measurement.
     """
@@ -118,7 +118,7 @@ class ArgumentError(ValueError):
         super().__init__(self.line(argument))
 
     def line(self, name: str) -> str:
-        """The message, with this name of the argument."""
+        """Returns the message, with this name of the argument."""
         if self.problem.startswith(":"):
             return f"{name}{self.problem}"
         return f"{name} {self.problem}"
@@ -169,7 +169,7 @@ def _annotations(cls: Any) -> dict[str, Any]:
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Whether a value has the annotated type; parts and arrays are not checked here."""
+    """Says whether a value has the annotated type; parts and arrays are not checked here."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, option) for option in arguments)
@@ -197,7 +197,7 @@ def _fits(value: Any, annotation: Any) -> bool:
 
 
 def in_words(annotation: Any) -> str:
-    """What an annotation allows, for a message."""
+    """Returns what an annotation allows, for a message."""
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     words = []
     options = typing.get_args(annotation) if union else [annotation]
@@ -213,8 +213,8 @@ def in_words(annotation: Any) -> str:
 
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
 def configuration(cls: type[T]) -> type[T]:
-    """A frozen dataclass whose fields are checked when it is made: ValueError naming class, field,
-    value and what it may be.
+    """Makes a frozen dataclass, whose fields are checked when it is made: ValueError naming class,
+    field, value and what it may be.
     """
     own = getattr(cls, "__post_init__", None)
 
@@ -252,7 +252,7 @@ PLACE = ("parent", "name")
 
 @functools.cache
 def field_names(cls: Any) -> tuple[str, ...]:
-    """Names of the fields of a configuration."""
+    """Returns the names of the fields of a configuration."""
     place = PLACE if issubclass(cls, Part) else ()
     return tuple(field.name for field in dataclasses.fields(cls) if field.name not in place)
 
@@ -261,7 +261,7 @@ _PARTS: dict[str, type] = {}
 
 
 def part(cls: type[T]) -> type[T]:
-    """A `Part` that files may name by its class; its fields are checked as those of a
+    """Registers a `Part` that files may name by its class; its fields are checked as those of a
     `configuration`.
 
     Raises: ValueError if there is another part of this name.
@@ -277,7 +277,7 @@ def part(cls: type[T]) -> type[T]:
 
 
 def vary(config: T, changes: Mapping[str, Any]) -> T:
-    """A configuration with fields exchanged, each named by its path.
+    """Returns a configuration with fields exchanged, each named by its path.
 
     Args:
         config: a frozen dataclass.
@@ -313,7 +313,9 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
 
 
 def field_paths(config: Any, before: str = "") -> dict[str, Any]:
-    """All fields of a configuration by path, those of nested ones too, with their values."""
+    """Returns all fields of a configuration by path, those of nested ones too, with their
+    values.
+    """
     found: dict[str, Any] = {}
     for name in field_names(type(config)):
         value = getattr(config, name)
@@ -350,7 +352,7 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
 
 @functools.cache
 def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
-    """Of the fields that have one."""
+    """Returns the ranges of the fields that have some."""
     hints = typing.get_type_hints(cls, include_extras=True)
     found = {name: tuple(marks_in(hints[name], Range)) for name in field_names(cls)}
     return {name: ranges for name, ranges in found.items() if ranges}
@@ -367,12 +369,12 @@ def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
 
 
 def config_to_json(config: Any, indent: int | None = None) -> str:
-    """A configuration as JSON, sub-configurations nested."""
+    """Writes a configuration as JSON, sub-configurations nested."""
     return json.dumps(_plain(config), indent=indent)
 
 
 def _plain(value: Any, kind: bool = False) -> Any:
-    """A configuration as what JSON has. kind: whether the class must be named."""
+    """Turns a configuration into what JSON has. kind: whether the class must be named."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         annotations = typing.get_type_hints(type(value))
         if kind and _PARTS.get(type(value).__name__) is not type(value):
@@ -391,7 +393,7 @@ def _plain(value: Any, kind: bool = False) -> Any:
 
 
 def _holds_part(annotation: Any) -> bool:
-    """Whether a field holds a part, or a part or None."""
+    """Says whether a field holds a part, or a part or None."""
     return any(_is_part(option) for option in (annotation, *typing.get_args(annotation)))
 
 
@@ -400,8 +402,8 @@ def _is_part(annotation: Any) -> bool:
 
 
 def config_from_json(cls: type[T], text: str) -> T:
-    """Inverse of `config_to_json` for a configuration of class `cls`; missing fields take their
-    defaults.
+    """Reads what `config_to_json` wrote of a configuration of class `cls`; missing fields take
+    their defaults.
 
     Raises: ValueError for a field that the configuration does not have or a value of another type,
     naming it.
@@ -414,7 +416,7 @@ def config_from_json(cls: type[T], text: str) -> T:
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
-    """A JSON value as its annotation has it, if it fits."""
+    """Turns a JSON value into what its annotation says, if it fits."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     # a part names its class, a dataclass is known by the annotation
     if _is_part(annotation) and isinstance(value, dict):
@@ -451,7 +453,7 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
 
 
 def _find_part(kind: Any, base: Any, path: str) -> type:
-    """The class that a "kind" names."""
+    """Finds the class that a "kind" names."""
     known = {name: cls for name, cls in _PARTS.items() if issubclass(cls, base)}
     name = (
         kind.rpartition(".")[2] if isinstance(kind, str) else ""

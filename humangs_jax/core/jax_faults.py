@@ -41,6 +41,6 @@ def avoid_wrong_sums() -> None:
 
 
 def _has_started() -> bool:
-    """Whether JAX has started a backend in this process."""
+    """Says whether JAX has started a backend in this process."""
     bridge = sys.modules.get("jax._src.xla_bridge")
     return bridge is not None and bool(getattr(bridge, "_backends", {}))

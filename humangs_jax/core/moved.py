@@ -20,7 +20,7 @@ MOVED = {
 
 
 def new_name(name: str) -> str | None:
-    """The name that a module has now, by its old one; None for what has not moved.
+    """Returns the name that a module has now, by its old one; None for what has not moved.
 
     Examples:
         >>> new_name("humangs_jax.people.bank")
@@ -41,13 +41,16 @@ class MovedModules:
     def find_spec(
         self, name: str, path: Any = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """A spec that leads to the module of today; None for every other name."""
+        """Returns a spec that leads to the module of today; None for every other name."""
         if not name.startswith("humangs_jax.") or new_name(name) is None:
             return None
         return ModuleSpec(name, self)  # ty: ignore[invalid-argument-type]
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """The module of today. Raises: ModuleNotFoundError by its new name if there is none."""
+        """Imports the module of today.
+
+        Raises: ModuleNotFoundError by its new name if there is none.
+        """
         new = str(new_name(spec.name))
         module = importlib.import_module(new)
         message = f"{spec.name} is {new} now; its old name goes in version 0.3"
@@ -56,7 +59,7 @@ class MovedModules:
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Nothing is run again; the module keeps the spec of its new name."""
+        """Runs nothing again; the module keeps the spec of its new name."""
         old = getattr(module.__spec__, "name", "")
         module.__spec__ = self._specs.pop(old, module.__spec__)
 

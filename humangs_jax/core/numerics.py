@@ -12,7 +12,7 @@ from humangs_jax.core.array_types import Array, Float, PyTree
 
 
 def at_least_float32(tree: PyTree) -> PyTree:
-    """The tree with its bfloat16 and float16 arrays in float32; wider ones unchanged.
+    """Returns the tree with its bfloat16 and float16 arrays in float32; wider ones unchanged.
 
     Gradients come back in the narrow type.
     """
@@ -29,13 +29,13 @@ def at_least_float32(tree: PyTree) -> PyTree:
 def safe_divide(
     numerator: Float[Array, "*#n"], denominator: Float[Array, "*#n"]
 ) -> Float[Array, "*n"]:
-    """numerator / denominator, and 0 with zero gradient where the denominator is 0."""
+    """Returns numerator / denominator, and 0 with zero gradient where the denominator is 0."""
     zero = denominator == 0
     return jnp.where(zero, 0.0, numerator / jnp.where(zero, 1.0, denominator))
 
 
 def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """sqrt(max(x, 0)) with zero gradient where x <= 0, where the true one is infinite or
+    """Returns sqrt(max(x, 0)) with zero gradient where x <= 0, where the true one is infinite or
     undefined.
     """
     positive = x > 0
@@ -43,14 +43,14 @@ def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def absolute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """|x| with zero gradient at 0, where that of `jnp.abs` is 1: an L1 of images would push where
-    they agree.
+    """Returns |x| with zero gradient at 0, where that of `jnp.abs` is 1: an L1 of images would push
+    where they agree.
     """
     return x * jax.lax.stop_gradient(jnp.sign(x))
 
 
 def safe_normalize(x: Float[Array, "*b d"], fallback: Float[Array, " d"]) -> Float[Array, "*b d"]:
-    """x / |x|, and `fallback` with zero gradient where |x| is 0.
+    """Returns x / |x|, and `fallback` with zero gradient where |x| is 0.
 
     Scaled by the largest magnitude first, so that neither squares overflow nor small vectors
     underflow.
@@ -63,6 +63,6 @@ def safe_normalize(x: Float[Array, "*b d"], fallback: Float[Array, " d"]) -> Flo
 
 
 def inverse_sigmoid(p: Float[Array, "*n"], margin: float = 1e-6) -> Float[Array, "*n"]:
-    """log(p / (1 - p)) with p clamped to [margin, 1 - margin]."""
+    """Returns log(p / (1 - p)) with p clamped to [margin, 1 - margin]."""
     p = jnp.clip(p, margin, 1 - margin)
     return jnp.log(p) - jnp.log1p(-p)

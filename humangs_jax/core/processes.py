@@ -45,8 +45,8 @@ def keep_freed_memory() -> bool:
 
 @contextlib.contextmanager
 def peak_memory() -> Generator[list[float | None]]:
-    """What the work inside adds to the memory of the process at its peak, MiB, in a list of one
-    number.
+    """Measures what the work inside adds to the memory of the process at its peak, MiB, in a list
+    of one number.
 
     None where the system does not tell: it is read from Linux's /proc, with glibc. Memory of a GPU
     or TPU is not in it.
@@ -71,7 +71,7 @@ def peak_memory() -> Generator[list[float | None]]:
 
 
 def memory_status(name: str) -> float:
-    """A line of /proc/self/status, MiB: "VmRSS", resident now; "VmHWM", at the peak.
+    """Reads a line of /proc/self/status, MiB: "VmRSS", resident now; "VmHWM", at the peak.
 
     Linux alone.
     """
@@ -81,7 +81,9 @@ def memory_status(name: str) -> float:
 
 @contextlib.contextmanager
 def undisturbed() -> Generator[None]:
-    """Ctrl-C waits until the block is over: for what is short and must not be left half-done."""
+    """Makes Ctrl-C wait until the block is over: for what is short and must not be left
+    half-done.
+    """
     if threading.current_thread() is not threading.main_thread():  # only that one gets it
         yield
         return
@@ -97,8 +99,9 @@ def undisturbed() -> Generator[None]:
 
 @contextlib.contextmanager
 def started_deaf() -> Generator[None]:
-    """Processes that are started in the block never hear Ctrl-C, which reaches all processes of a
-    terminal: this one decides.
+    """Keeps Ctrl-C, which reaches all processes of a terminal, from processes that are started in
+    the
+    block: this one decides.
 
     Else it ends, with tracebacks, those that are still importing. Windows has no such masks: there
     it does.
@@ -154,7 +157,7 @@ def in_processes(
 
 
 def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
-    """One thread each: the processes are the parallelism."""
+    """Prepares a working process, which gets one thread: the processes are the parallelism."""
     import signal
 
     import jax
@@ -254,7 +257,10 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
 
 
 def user_cache() -> Path:
-    """The user's cache folder, as the platform has it. Raises: RuntimeError without a home."""
+    """Returns the user's cache folder, as the platform has it.
+
+    Raises: RuntimeError without a home.
+    """
     folder = os.environ.get("XDG_CACHE_HOME")
     if folder:
         return Path(folder)
@@ -265,8 +271,8 @@ def user_cache() -> Path:
 
 
 def _processor() -> str:
-    """A short mark of the processor and its instructions: machines of a cluster share a home, not
-    their programs.
+    """Returns a short mark of the processor and its instructions: machines of a cluster share a
+    home, but not their programs.
     """
     about = platform.machine() + platform.processor()
     with contextlib.suppress(OSError):
@@ -307,7 +313,7 @@ barriers). Eager calls use it; your own jitted functions need it themselves. Wor
 
 
 def compiler_options() -> dict[str, Any] | None:
-    """Options for `jax.jit` that make programs like these faster on CPUs.
+    """Returns options for `jax.jit` that make programs like these faster on CPUs.
 
     Call it late: asking for the backend starts it.
 

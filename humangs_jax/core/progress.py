@@ -30,8 +30,7 @@ JOINERS = "\u200c\u200d"
 
 
 def printable(text: object, lines: bool = False) -> str:
-    r"""The text with every character that a terminal would act on escaped as in Python (\x1b,
-    \u202e, \n).
+    r"""Escapes every character that a terminal would act on as Python does (\x1b, \u202e, \n).
 
     These are control characters, C1 included, marks of direction and other format characters,
     separators of lines, and bytes of file names that are not UTF-8 (\xe9). lines: line feeds and
@@ -55,8 +54,8 @@ def _escaped(c: str) -> str:
 
 
 def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Lines of a table: the first columns (left) aligned to the left, the others to the right; rows
-    may end early.
+    """Lays out a table in lines: the first columns (left) aligned to the left, the others to the
+    right; rows may end early.
     """
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows)))]
 
@@ -121,7 +120,7 @@ def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
 
 
 def current() -> Progress:
-    """What is shown now."""
+    """Returns what is shown now."""
     return _current
 
 
@@ -158,7 +157,7 @@ def say(text: object, *, error: bool = False, lines: bool = True) -> None:
 
 @contextlib.contextmanager
 def stage(name: str) -> Generator[None]:
-    """A part of long work."""
+    """Shows a part of long work while the block runs, and measures it."""
     current, paused, bars = _current, _current.paused, set(_bars)
     name = printable(name)
     current.names.append(name)
@@ -229,8 +228,8 @@ def compiling(program: Hashable = None) -> Generator[None]:
 def bar(
     iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any
 ) -> Any:
-    """A bar of tqdm, whose options `how` are. It takes the place of the line of the stage around
-    it.
+    """Makes a bar of tqdm, whose options `how` are. It takes the place of the line of the stage
+    around it.
 
     Where stderr is no terminal (a log, a notebook) it moves every `LONG` seconds.
 
@@ -256,7 +255,7 @@ def bar(
 
 
 def _without_postfix(items: Iterable[Any], made: Any) -> Iterator[Any]:
-    """The items; what a bar says about the first one goes when it is there."""
+    """Yields the items; what a bar says about the first one goes when it is there."""
     for i, item in enumerate(items):
         if i == 0:
             made.set_postfix_str("", refresh=False)
@@ -269,12 +268,12 @@ def _close(bars: set[Any]) -> None:
 
 
 def followed() -> bool:
-    """Whether a program shows stages, on a terminal or in a log."""
+    """Says whether a program shows stages, on a terminal or in a log."""
     return _current.ticking or _current.naming
 
 
 def watched() -> bool:
-    """Whether a program shows stages on a terminal: then long loops that have
+    """Says whether a program shows stages on a terminal: then long loops that have
     no bar show one.
     """
     return _current.ticking
@@ -286,7 +285,7 @@ def _name(current: Progress, stop: threading.Event, _: float) -> None:
 
 
 def _named(current: Progress) -> str:
-    """The outermost and the innermost of the stages that run."""
+    """Returns the outermost and the innermost of the stages that run."""
     return ": ".join(dict.fromkeys((current.names[0], current.names[-1])))
 
 

@@ -28,15 +28,15 @@ _PYTREES: set[type] = set()
 
 
 def static_field(**kwargs: Any) -> Any:
-    """A dataclass field that belongs to the tree structure (hashable, compared by `==`), not to its
-    leaves.
+    """Makes a dataclass field that belongs to the tree structure (hashable, compared by `==`), not
+    to its leaves.
     """
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static_field, dataclasses.field))
 def pytree_dataclass(cls: type[T]) -> type[T]:
-    """Class decorator: a frozen, keyword-friendly dataclass registered as a pytree with named
+    """Makes a class a frozen, keyword-friendly dataclass that is registered as a pytree with named
     leaves.
 
     With `Batchable` as a base class, batches of it can be indexed and iterated over.
@@ -100,7 +100,7 @@ def _make_exportable(cls: type[Any]) -> None:
 
 
 def _static_bytes(values: tuple[Any, ...]) -> bytes:
-    """Static fields as JSON.
+    """Writes static fields as JSON.
 
     Raises: TypeError for one that is more than numbers, texts and tuples of them.
     """
@@ -108,7 +108,7 @@ def _static_bytes(values: tuple[Any, ...]) -> bytes:
 
 
 def _static_values(data: bytes | bytearray) -> tuple[Any, ...]:
-    """Inverse of `_static_bytes`: lists were tuples, because static fields can be hashed."""
+    """Reads what `_static_bytes` wrote: lists were tuples, because static fields can be hashed."""
 
     def as_tuples(x):
         if isinstance(x, list):
@@ -123,7 +123,7 @@ SHORT = 80
 
 
 def short_repr(tree: Any) -> str:
-    """A dataclass on one line, arrays by type and shape, as equinox prints them:
+    """Shows a dataclass on one line, arrays by type and shape, as equinox prints them:
     "Gaussians(means=f32[100,3], ...)". Fields that nobody has set are left out.
     """
     values = {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
@@ -178,7 +178,7 @@ class Batchable:
         return ()
 
     def __len__(self) -> int:
-        """Size of the first batch axis. Raises: TypeError for one example."""
+        """Returns the size of the first batch axis. Raises: TypeError for one example."""
         shape = self.batch_shape
         if shape:
             return shape[0]
@@ -188,12 +188,12 @@ class Batchable:
         )
 
     def __bool__(self) -> bool:
-        """True, whatever the length: `if camera` asks whether there is one."""
+        """Is True, whatever the length: `if camera` asks whether there is one."""
         return True
 
     def __getitem__(self: B, index: Any) -> B:
-        """One example of a batch (integer), or some of them (slice, mask or array of integers),
-        along the first axis.
+        """Returns one example of a batch (integer), or some of them (slice, mask or array of
+        integers), along the first axis.
 
         Raises: TypeError for one example; IndexError for an integer out of range. JAX clamps traced
         integers and arrays.
@@ -208,12 +208,14 @@ class Batchable:
         return jax.tree.map(lambda leaf: taken(leaf, index), self)
 
     def __iter__(self: B) -> Iterator[B]:
-        """The examples of a batch, one by one. Raises: TypeError for one example."""
+        """Yields the examples of a batch, one by one. Raises: TypeError for one example."""
         return map(self.__getitem__, range(len(self)))
 
 
 def types_and_marks(annotation: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """The types that an annotation stands for, and the marks of what is `Annotated` in it."""
+    """Returns the types that an annotation stands for, and the marks of what is `Annotated` in
+    it.
+    """
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         options = [types_and_marks(each) for each in typing.get_args(annotation)]
         found = tuple(kind for kinds, _ in options for kind in kinds)
@@ -225,8 +227,8 @@ def types_and_marks(annotation: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
 
 
 def _annotated_rank(annotation: Any) -> int | None:
-    """Number of axes in a jaxtyping annotation, or in that of an optional array; None for any other
-    annotation.
+    """Returns the number of axes in a jaxtyping annotation, or in that of an optional array; None
+    for any other annotation.
     """
     for option in types_and_marks(annotation)[0]:
         dims = getattr(option, "dims", None)
@@ -236,8 +238,8 @@ def _annotated_rank(annotation: Any) -> int | None:
 
 
 def shape_fault(tree: Any) -> str | None:
-    """What is wrong with the fields of a pytree dataclass, by their annotations: ".colors: expected
-    shape ...".
+    """Says what is wrong with the fields of a pytree dataclass, by their annotations: ".colors:
+    expected shape ...".
 
     Axes of one name have one size. In a batch they come behind its own axes, as many as most of the
     arrays have. Arrays that are annotated as floating-point numbers hold no integers, and sizes
@@ -276,7 +278,7 @@ class _Field:
 
 
 def _batch_ranks(tree: Any, fields: dict[str, _Field]) -> Iterator[int]:
-    """Of each array of a pytree: how many axes it has more than its annotation."""
+    """Counts for each array of a pytree how many axes it has more than its annotation."""
     for name, field in fields.items():
         shape = getattr(getattr(tree, name), "shape", None)
         if field.axes is not None and isinstance(shape, tuple):
@@ -284,8 +286,8 @@ def _batch_ranks(tree: Any, fields: dict[str, _Field]) -> Iterator[int]:
 
 
 def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, int]) -> str | None:
-    """What is wrong with one array. sizes: of the axes that are known, to which those of this array
-    are added.
+    """Says what is wrong with one array. sizes: of the axes that are known, to which those of this
+    array are added.
     """
     axes = field.axes
     assert axes is not None
@@ -327,7 +329,7 @@ def _shown_kind(value: Any) -> str:
 
 
 def _advice(dtype: Any) -> str:
-    """What to do with integers."""
+    """Says what to do with integers."""
     if dtype == np.uint8:
         return "; colors of 0 to 255 are divided by 255"
     return "; x.astype(float) makes them"
@@ -348,7 +350,7 @@ def _size_fault(tree: Any) -> str | None:
 
 @functools.cache
 def _annotated_axes(cls: Any) -> dict[str, _Field]:
-    """The fields that are not static, without arrays of any shape."""
+    """Returns the fields that are not static, without arrays of any shape."""
     found = {}
     for field in dataclasses.fields(cls):
         if field.metadata.get("static"):
@@ -369,13 +371,13 @@ def _annotated_axes(cls: Any) -> dict[str, _Field]:
 
 
 def _is_floating(annotation: Any) -> bool:
-    """Whether a jaxtyping annotation stands for floating-point numbers only."""
+    """Says whether a jaxtyping annotation stands for floating-point numbers only."""
     kinds = annotation.dtypes
     return isinstance(kinds, list | tuple) and all("float" in str(kind) for kind in kinds)
 
 
 def replace(tree: T, **changes: Any) -> T:
-    """A copy of a pytree with some fields exchanged, without checks of shapes, so that it works on
+    """Copies a pytree with some fields exchanged, without checks of shapes, so that it works on
     batches, too.
 
     Args:
@@ -404,7 +406,9 @@ def replace(tree: T, **changes: Any) -> T:
 
 
 def inexact_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
-    """(path, leaf) of all floating-point arrays of a tree, as "cameras.K"; "" for a bare array."""
+    """Yields (path, leaf) of all floating-point arrays of a tree, as "cameras.K"; "" for a bare
+    array.
+    """
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.inexact):
             yield jax.tree_util.keystr(path, simple=True, separator="."), leaf

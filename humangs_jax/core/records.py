@@ -50,7 +50,7 @@ class ArrayField(NamedTuple):
     def shape(
         self, array: Any, sizes: dict[str, int], batch: tuple[str, ...] = ()
     ) -> tuple[int | str, ...]:
-        """The shape that an array should have; names stand for sizes that are not known.
+        """Returns the shape that an array should have; names stand for sizes that are not known.
 
         Arguments: sizes: of axes by their names; those that this array is the first to have are
         added. batch: names of the axes that come first.
@@ -68,7 +68,7 @@ class ArrayField(NamedTuple):
 
 @functools.cache
 def array_fields(record: Any) -> dict[str, ArrayField]:
-    """The fields of a record that are arrays, by their names."""
+    """Returns the fields of a record that are arrays, by their names."""
     found = {}
     for field in dataclasses.fields(record):
         types_, marks = types_and_marks(field.type)
@@ -88,7 +88,7 @@ def array_fields(record: Any) -> dict[str, ArrayField]:
 
 @functools.cache
 def _batches(record: Any) -> dict[str, tuple[str, ...]]:
-    """The batch axes of the records in a record that are looked into."""
+    """Returns the batch axes of the records in a record that are looked into."""
     found = {}
     for field in dataclasses.fields(record):
         for mark in types_and_marks(field.type)[1]:
@@ -117,7 +117,7 @@ def named_arrays(
 def record_values(
     record: Any, name: str = "", *, on_host: bool = False
 ) -> dict[str, tuple[Any, Values]]:
-    """The arrays of a record with the values that each may have, for `check_values`.
+    """Returns the arrays of a record with the values that each may have, for `check_values`.
 
     Arguments: name: of the record, in errors. on_host: read all there, since they are few numbers.
     """

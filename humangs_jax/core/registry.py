@@ -30,7 +30,7 @@ class Format:
     """
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """What the code makes of the arguments."""
+        """Returns what the code makes of the arguments."""
         return imported(self.code)(*arguments, **options)
 
 
@@ -46,15 +46,15 @@ class Formats(dict[str, F]):
         return tuple(dict.fromkeys(suffix for each in self.values() for suffix in each.suffixes))
 
     def of(self, path: Path) -> "Formats[F]":
-        """Those whose files are called like this one, or are folders."""
+        """Returns the formats whose files are named like this one, or are folders."""
         suffix = FOLDER
         if not path.is_dir():
             suffix = path.suffix.lower()
         return self.where(lambda each: suffix in each.suffixes)
 
     def recognized(self, path: Path) -> F | None:
-        """The first of them that the file is, None for none; those that look into it are asked
-        first.
+        """Returns the first format that the file has, None if it has none; formats that look into
+        it are asked first.
         """
         found = sorted(self.of(path).values(), key=lambda each: each.recognizes is None)
         return next(
@@ -63,12 +63,12 @@ class Formats(dict[str, F]):
         )
 
     def where(self, holds: Callable[[F], bool]) -> "Formats[F]":
-        """Those for which this holds."""
+        """Returns the formats for which this holds."""
         return Formats({name: each for name, each in self.items() if holds(each)})
 
     def listed(self) -> str:
-        """All in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or by
-        name where names do not tell.
+        """Lists all in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or
+        by name where names do not tell.
         """
         groups: dict[tuple[str, ...], dict[str, None]] = {}  # each name once
         for name, each in self.items():
@@ -81,13 +81,15 @@ class Formats(dict[str, F]):
 
 
 def alternatives(suffixes: tuple[str, ...]) -> str:
-    """As errors name them: ".bvh, .glb or a folder"."""
+    """Lists suffixes as errors name them: ".bvh, .glb or a folder"."""
     words = [suffix for suffix in suffixes if suffix] + ["a folder"] * (FOLDER in suffixes)
     return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def imported(code: str | Callable[..., Any]) -> Callable[..., Any]:
-    """The function that "package.module:function" names; a function is itself."""
+    """Returns the function that "package.module:function" names; a function is returned as it
+    is.
+    """
     if not isinstance(code, str):
         return code
     module, _, name = code.partition(":")

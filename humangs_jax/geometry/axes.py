@@ -23,19 +23,19 @@ axis.
 
 
 def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
-    """The rotation that turns the named axis to +y: a matrix of 0 and +-1."""
+    """Returns the rotation that turns the named axis to +y: a matrix of 0 and +-1."""
     return np.asarray(quaternion.to_matrix(jnp.asarray(UPRIGHT[up])), np.float64).round()
 
 
 def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
-    """The name of the axis that a vector points along most, and how far it does."""
+    """Returns the name of the axis that a vector points along most, and its component there."""
     axis = int(np.argmax(np.abs(direction)))
     return ("-" if direction[axis] < 0 else "") + "xyz"[axis], float(np.abs(direction[axis]))
 
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
-    """The axis of the world that the pelvis's own y axis points along on average; None if none is
-    clear.
+    """Returns the axis of the world that the pelvis's own y axis points along on average; None if
+    none is clear.
 
     Arguments: root: axis-angle of the pelvis in each frame.
     """

@@ -75,8 +75,8 @@ class Camera(Batchable):
         distortion: object = None,
         lens: str = "pinhole",
     ) -> "Camera":
-        """A camera from array-likes (3, 3), (4, 4) and perhaps (n,), checked. Under `jit`, `vmap`
-        and `grad` only shapes are.
+        """Makes a camera of array-likes (3, 3), (4, 4) and perhaps (n,), checked. Under `jit`,
+        `vmap` and `grad` only shapes are checked.
 
         Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have
         it.
@@ -154,7 +154,7 @@ class Camera(Batchable):
         return self.world_from_cam[..., :3, 3]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same camera for the image resampled to another size.
+        """Returns the same camera for the image resampled to another size.
 
         Raises: ValueError for sides that are no whole numbers.
         """
@@ -164,7 +164,7 @@ class Camera(Batchable):
         return replace(self, K=from_host(K * scale[:, None]), width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
-        """The same camera for a world whose lengths are divided by `unit`."""
+        """Returns the same camera for a world whose lengths are divided by `unit`."""
         translation = self.cam_from_world[..., :3, 3] / unit
         moved = replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
         if self.lens != "orthographic":
@@ -173,7 +173,7 @@ class Camera(Batchable):
         return replace(moved, K=self.K * scale)
 
     def moved(self, twist: Float[Array, "*b 6"]) -> "Camera":
-        """The camera after a rigid motion in its own frame, exp(twist) `cam_from_world`.
+        """Returns the camera after a rigid motion in its own frame, exp(twist) `cam_from_world`.
 
         twist: a rotation vector, radians, then a velocity, metres, in the camera's axes; for
         optimizers: zeros are no motion, and the result stays a rotation (`transform.from_twist`).
@@ -200,7 +200,7 @@ def require_pinhole(what: str, camera: Camera) -> None:
 
 
 def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
-    """The sides of an image as integers.
+    """Returns the sides of an image as integers.
 
     Raises: ValueError for an empty image and for parts of pixels.
     """
@@ -215,7 +215,7 @@ def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
 
 @checked_arguments
 def stack_cameras(cameras: list[Camera]) -> Camera:
-    """A batch from cameras of one image size and lens.
+    """Makes a batch of cameras of one image size and lens.
 
     Raises ValueError if they differ or the list is empty.
     """
@@ -231,7 +231,7 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
 def project(
     camera: Camera, points: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
-    """World points of one camera -> pixel positions and depths z (metres).
+    """Projects world points into one camera: pixel positions, and depths z in metres.
 
     No guard at z = 0: see `rendering.projection`.
     """
@@ -255,7 +255,8 @@ def project(
 
 
 def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, height: int) -> Matrix3:
-    """K of a camera with square pixels and a centred axis; field of view in radians.
+    """Returns the K of a camera with square pixels and a centred axis; the field of view is in
+    radians.
 
     Raises: ValueError for an angle that is not between 0 and pi.
     """
@@ -277,7 +278,7 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
 def look_at(
     eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, height: int
 ) -> Camera:
-    """A camera that looks at a point.
+    """Makes a camera that looks at a point.
 
     Args:
         eye: (3,) the camera's centre, metres.
@@ -316,7 +317,7 @@ def orbit(
     width: int,
     height: int,
 ) -> Camera:
-    """Cameras on circles around a point, y up; azimuth 0 stands at +z.
+    """Makes cameras on circles around a point, y up; azimuth 0 stands at +z.
 
     Args:
         target: (3,) what they look at, metres.
@@ -361,8 +362,8 @@ def orbit(
 
 
 def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]]:
-    """Camera centre and unit directions through the pixel centres (x + 0.5, y + 0.5) of one pinhole
-    camera.
+    """Returns the centre of one pinhole camera and the unit directions through its pixel centres (x
+    + 0.5, y + 0.5).
 
     Raises: ValueError for another lens.
     """
@@ -380,8 +381,8 @@ def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]
 
 
 def plucker_rays(camera: Camera) -> Float[Array, "h w 6"]:
-    """Moment, then direction, of every pixel's ray (reference: HumanGS, after Sitzmann et al.,
-    Light Field Networks).
+    """Returns the moment, then the direction, of every pixel's ray (reference: HumanGS, after
+    Sitzmann et al., Light Field Networks).
     """
     origin, directions = pixel_rays(camera)
     moments = jnp.cross(jnp.broadcast_to(origin, directions.shape), directions)

@@ -55,7 +55,7 @@ def check_lens(lens: object, count: int | None) -> None:
 def distorted(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> tuple[Array, Array]:
-    """Where the lens puts points of the plane z = 1. Raises: as `check_lens`."""
+    """Returns where the lens puts points of the plane z = 1. Raises: as `check_lens`."""
     check_lens(lens, None if coefficients is None else coefficients.shape[-1])
     if lens == "fisheye":
         scale = _fisheye_scale(coefficients, u * u + v * v)
@@ -72,7 +72,7 @@ def distorted(
 
 
 def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
-    """t / r (1 + k1 t^2 + ...) from r^2, smooth on the axis."""
+    """Returns t / r (1 + k1 t^2 + ...) from r^2, smooth on the axis."""
     small = rr < SMALL_SQUARE
     near = jnp.where(small, rr, 0.0)
     series = 1 - near * (1 / 3 - near * (1 / 5 - near * (1 / 7 - near * (1 / 9 - near / 11))))
@@ -88,7 +88,7 @@ def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
 def distorted_with_slopes(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> tuple[Array, Array, list[list[Array]]]:
-    """x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]], by forward mode: it has a
+    """Returns x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]], by forward mode: it has a
     gradient itself.
     """
 
@@ -104,8 +104,8 @@ def distorted_with_slopes(
 def within_reach(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> Bool[Array, "*b"]:
-    """Whether the image grows outwards all the way from the axis to a point: beyond that, a lens's
-    polynomial folds the image back over itself. Tangential terms are left out. No gradient.
+    """Says whether the image grows outwards all the way from the axis to a point: beyond that, a
+    lens's polynomial folds the image back over itself. Tangential terms are left out. No gradient.
     """
     u, v = jax.lax.stop_gradient((u, v))
     if coefficients is None:

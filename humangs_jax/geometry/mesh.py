@@ -8,7 +8,7 @@ from humangs_jax.core.array_types import Bool, Float, Int
 def face_crosses(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "f 3"]:
-    """The normal of each face, twice its area long; outwards where corners go round
+    """Returns the normal of each face, twice its area long; outwards where corners go round
     counter-clockwise.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -18,21 +18,22 @@ def face_crosses(
 def face_areas(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " f"]:
-    """Areas of the faces, in the unit of the vertices squared."""
+    """Returns areas of the faces, in the unit of the vertices squared."""
     return 0.5 * np.linalg.norm(face_crosses(vertices, faces), axis=-1)
 
 
 def vertex_areas(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """A third of the area of the faces around each vertex."""
+    """Returns a third of the area of the faces around each vertex."""
     return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), len(vertices))
 
 
 def vertex_area_vectors(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """The sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of it.
+    """Returns the sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of
+    it.
 
     0 where there is no face.
     """
@@ -55,12 +56,12 @@ def mesh_edges(
 
 
 def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
-    """Vectors over their lengths; those without length as they are."""
+    """Divides vectors by their lengths; those without length stay."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def directions_around(count: int, turned: float = 0.5) -> Float[np.ndarray, "d 3"]:
-    """Unit vectors, evenly spread over the sphere (a Fibonacci lattice), the first turned by
+    """Spreads unit vectors evenly over the sphere (a Fibonacci lattice), the first turned by
     `turned` golden angles.
     """
     i = np.arange(count)
@@ -76,8 +77,8 @@ def in_front(
     cell: float,
     behind: float,
 ) -> Bool[np.ndarray, " q"]:
-    """Which of some points are at most `behind` behind the nearest of all points in their cell of a
-    grid across `forward`.
+    """Says which of some points are at most `behind` behind the nearest of all points in their cell
+    of a grid across `forward`, metres.
     """
     right = np.linalg.svd(forward[None])[2][1]
     frame = np.stack([right, np.cross(forward, right), forward])
@@ -97,8 +98,8 @@ def in_front(
 def smallest_turns(
     a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], opposite: float = 1e-6
 ) -> Float[np.ndarray, "*n 3 3"]:
-    """The rotation matrices that turn unit vectors a into b by the smallest angle; none where one
-    is zero.
+    """Returns the rotation matrices that turn unit vectors a into b by the smallest angle; the
+    identity where one is zero.
 
     Where 1 + a.b is less than `opposite`, it is half a turn about some axis across a.
     """

@@ -27,12 +27,12 @@ rounding.
 
 
 def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
-    """q / |q|; the identity, with zero gradient, where q is 0."""
+    """Returns q / |q|; the identity, with zero gradient, where q is 0."""
     return safe_normalize(q, jnp.asarray(IDENTITY, q.dtype))
 
 
 def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
-    """Hamilton product p q: first rotates by q, then by p."""
+    """Returns the Hamilton product p q: first rotates by q, then by p."""
     pw, px, py, pz = jnp.moveaxis(p, -1, 0)
     qw, qx, qy, qz = jnp.moveaxis(q, -1, 0)
     return jnp.stack(
@@ -47,8 +47,8 @@ def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array,
 
 
 def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, "*b 4"]:
-    """The shortest rotation from one unit vector to another; half a turn across `a` where they are
-    opposite.
+    """Returns the shortest rotation from one unit vector to another; half a turn across `a` where
+    they are opposite.
     """
     real = jnp.sum(jnp.square(a + b), axis=-1, keepdims=True) / 2  # 1 + a.b without cancellation
     across = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a), axis=-1)])
@@ -58,7 +58,7 @@ def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, 
 
 
 def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
-    """Rotation matrix of a unit quaternion.
+    """Returns the rotation matrix of a unit quaternion.
 
     For |q| != 1 the polynomial is used as it is (see `normalize`).
     """
@@ -74,7 +74,8 @@ def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
 def candidates_from_matrix(
     m: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
-    """The four quaternions that a rotation matrix can be read as, and how well conditioned each is.
+    """Returns the four quaternions that a rotation matrix can be read as, and how well conditioned
+    each is.
 
     q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, 0.1). Of
     a rotation they are all the same; of another matrix they are not.
@@ -102,8 +103,8 @@ def candidates_from_matrix(
 
 
 def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
-    """Quaternion of a rotation matrix, by the best conditioned of the four candidates (see
-    `candidates_from_matrix`).
+    """Returns the quaternion of a rotation matrix, by the best conditioned of the four candidates
+    (see `candidates_from_matrix`).
 
     A matrix that is no rotation is not repaired: the result then has |q| != 1, as in the published
     network ("rotation" skinning).
@@ -116,7 +117,7 @@ def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
 def sine_and_cosine_ratios(
     angle_squared: Float[Array, "*b"],
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """sin(t)/t and (1 - cos t)/t^2 from t^2, smooth through 0."""
+    """Returns sin(t)/t and (1 - cos t)/t^2 from t^2, smooth through 0."""
     small = angle_squared < SMALL_ANGLE_SQUARED
     squared = jnp.where(small, 1.0, angle_squared)
     angle = jnp.sqrt(squared)
@@ -129,7 +130,9 @@ def sine_and_cosine_ratios(
 
 
 def matrix_from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Rodrigues' formula, with exact derivatives at the zero rotation."""
+    """Returns the matrix of a rotation vector by Rodrigues' formula, with exact derivatives at the
+    zero rotation.
+    """
     x, y, z = jnp.moveaxis(axis_angle, -1, 0)
     sine, cosine = sine_and_cosine_ratios(x * x + y * y + z * z)
     rows = [
@@ -141,7 +144,9 @@ def matrix_from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b
 
 
 def from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
-    """Unit quaternion of a rotation vector, with exact derivatives at the zero rotation."""
+    """Returns the unit quaternion of a rotation vector, with exact derivatives at the zero
+    rotation.
+    """
     half = 0.5 * axis_angle
     squared = jnp.sum(jnp.square(half), axis=-1)
     sine, cosine = sine_and_cosine_ratios(squared)
@@ -149,8 +154,8 @@ def from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
 
 
 def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
-    """The rotation vector, no longer than pi, of a unit quaternion, with exact derivatives at the
-    zero rotation.
+    """Returns the rotation vector, no longer than pi, of a unit quaternion, with exact derivatives
+    at the zero rotation.
     """
     q = jnp.where(q[..., :1] < 0, -q, q)
     squared = jnp.sum(jnp.square(q[..., 1:]), axis=-1, keepdims=True)
@@ -183,8 +188,8 @@ SWEEPS = 6
 def left_singular_vectors(
     m: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3"]]:
-    """Rotations U (det +1) and singular values s >= 0, in no particular order, with m m^T = U
-    diag(s)^2 U^T.
+    """Returns rotations U (det +1) and singular values s >= 0, in no particular order, with m m^T =
+    U diag(s)^2 U^T.
 
     Not meant to be differentiated: U is not unique where singular values coincide. A zero column is
     completed to a rotation.

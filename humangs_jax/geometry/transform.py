@@ -17,7 +17,7 @@ EXACT = jax.lax.Precision.HIGHEST
 def make(
     rotation: Float[Array, "*#b 3 3"], translation: Float[Array, "*#b 3"]
 ) -> Float[Array, "*b 4 4"]:
-    """[[rotation, translation], [0, 0, 0, 1]]."""
+    """Returns [[rotation, translation], [0, 0, 0, 1]]."""
     batch = jnp.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     rotation = jnp.broadcast_to(rotation, (*batch, 3, 3))
     translation = jnp.broadcast_to(translation, (*batch, 3))
@@ -37,7 +37,9 @@ def apply(
 
 
 def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
-    """Inverse of a rotation with translation (the linear part is not checked to be orthogonal)."""
+    """Returns the inverse of a rotation with translation (the linear part is not checked to be
+    orthogonal).
+    """
     rotation = jnp.swapaxes(transform[..., :3, :3], -1, -2)
     return make(
         rotation, -jnp.einsum("...ij,...j->...i", rotation, transform[..., :3, 3], precision=EXACT)
@@ -51,7 +53,7 @@ cancel.
 
 
 def from_twist(twist: Float[Array, "*b 6"]) -> Float[Array, "*b 4 4"]:
-    """The rigid motion exp(twist) of SE(3), with exact derivatives at the zero twist.
+    """Returns the rigid motion exp(twist) of SE(3), with exact derivatives at the zero twist.
 
     twist: a rotation vector w in radians, then a velocity v in metres: rotation exp([w]),
     translation V v with V = 1 + (1 - cos t) / t^2 [w] + (t - sin t) / t^3 [w]^2 and t = |w|.
@@ -73,8 +75,8 @@ BITS = 10
 
 
 def along_curve(positions: Float[Array, "n 3"], reach: float) -> Int[Array, " n"]:
-    """Rank of each position along the curve of the cube from -reach to reach; outside of it, that
-    of its border.
+    """Ranks positions along a space-filling curve (Morton's) of the cube from -reach to reach;
+    outside of it, as its border.
     """
     cells = 2**BITS
     at = jnp.floor((positions / (2 * reach) + 0.5) * cells).astype(jnp.int32)

@@ -111,8 +111,8 @@ def check_array(
     low: float = -math.inf,
     high: float = math.inf,
 ) -> None:
-    """Real numbers in [low, high] that are finite in float32, of a shape in which None and names
-    are any size.
+    """Checks that an array has real numbers in [low, high] that are finite in float32, and a shape
+    in which None and names are any size.
     """
     if not _fits(array, shape):
         raise InvalidFileError(f"{name}: expected shape {_in_words(shape)}, got {array.shape}")
@@ -136,7 +136,7 @@ SUM_TOLERANCE = 1e-2
 
 
 def check_row_sums(name: str, weights: np.ndarray) -> None:
-    """Rows of weights that sum to 1."""
+    """Checks that rows of weights sum to 1."""
     sums = weights.sum(axis=1, dtype=np.float64)
     if not sums.size:
         return
@@ -146,7 +146,7 @@ def check_row_sums(name: str, weights: np.ndarray) -> None:
 
 
 def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], bound: int) -> None:
-    """Integers in [0, bound)."""
+    """Checks that an array has integers in [0, bound)."""
     check_array(name, array, shape)
     if array.dtype.kind not in "iu" or (
         array.size and not 0 <= int(array.min()) <= int(array.max()) < bound
@@ -155,7 +155,7 @@ def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], b
 
 
 def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
-    """A tree of joints with names and one root, whose parent is -1."""
+    """Checks that joints have names and make a tree with one root, whose parent is -1."""
     check_limit("joints", len(parents), "joints")
     count = len(parents)
     if (
@@ -177,7 +177,9 @@ def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
 
 
 def checksum(arrays: Mapping[str, Any], *texts: str) -> str:
-    """SHA-256, in hexadecimal, of named arrays with their types and shapes, and of texts."""
+    """Returns the SHA-256, in hexadecimal, of named arrays with their types and shapes, and of
+    texts.
+    """
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -190,13 +192,13 @@ def checksum(arrays: Mapping[str, Any], *texts: str) -> str:
 
 
 def file_checksum(file: Path) -> str:
-    """SHA-256, in hexadecimal, of the bytes of a file. Raises: OSError."""
+    """Returns the SHA-256, in hexadecimal, of the bytes of a file. Raises: OSError."""
     with open(file, "rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 def check_checksum(recorded: Any, found: str) -> None:
-    """Whether a file records this checksum. None: a file of a version that wrote none."""
+    """Checks that a file records this checksum. None: a file of a version that wrote none."""
     if recorded not in (None, found):
         raise InvalidFileError(
             f"damaged: its contents have the checksum {found[:12]}, recorded is"
@@ -225,8 +227,8 @@ class ArrayFile:
         error: type[FileError] = FileError,
         wanted: Callable[[str], bool] | None = None,
     ) -> "ArrayFile":
-        """An npz archive, by suffix or content, or else a pickle (read without running anything in
-        it).
+        """Opens an npz archive, by suffix or content, or else a pickle (read without running
+        anything in it).
 
         Arguments: wanted: which arrays of an archive to read; None: all.
         Raises: `error` if the file is damaged or larger than the limits allow; for a missing file
@@ -243,7 +245,7 @@ class ArrayFile:
         return key in self.values
 
     def array(self, key: str) -> np.ndarray:
-        """What is under a key, as an array of any kind. Raises: `error`."""
+        """Returns what is under a key, as an array of any kind. Raises: `error`."""
         if key not in self.values:
             found = ", ".join(sorted(map(str, self.values))) or "none"
             reason = "a pickled object, which is never read"
@@ -264,11 +266,11 @@ class ArrayFile:
         )
 
     def number(self, key: str) -> float:
-        """A single number, however nested. Raises: as `numbers`."""
+        """Returns a single number, however nested. Raises: as `numbers`."""
         return float(self.numbers(key, (1,) * self.array(key).ndim).reshape(-1)[0])
 
     def indices(self, key: str, bound: int) -> np.ndarray:
-        """Triangles (f, 3) of integers in [0, bound)."""
+        """Returns triangles (f, 3) of integers in [0, bound)."""
         array = self.numbers(key, (None, 3)).astype(np.int64)
         if array.min() < 0 or array.max() >= bound:
             raise self.error(self.path, key, f"expected indices in [0, {bound})")
@@ -298,8 +300,8 @@ PLAIN_KINDS = "biufcSU"
 def read_npz(
     path: str | Path, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """The arrays of an npz archive by name, and the names of the entries that are pickled objects
-    (never read).
+    """Reads the arrays of an npz archive by name; also gives the names of the entries that are
+    pickled objects (never read).
 
     Arguments: wanted: which names to read; None: all.
     Raises: FileNotFoundError; FileError if the file is no npz archive, is damaged, or is larger
@@ -327,13 +329,16 @@ def read_npz(
 
 
 def read_npy(path: str | Path) -> np.ndarray | None:
-    """The array of an npy file; None for a pickled object. Raises: FileNotFoundError; FileError."""
+    """Reads the array of an npy file; None for a pickled object.
+
+    Raises: FileNotFoundError; FileError.
+    """
     with reading(path, "npy file"), open_file(path, "array_bytes") as file:
         return _read_array(file, os.path.getsize(path))
 
 
 def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
-    """A zip archive whose members together stay within the limits.
+    """Opens a zip archive whose members together stay within the limits.
 
     Raises: InvalidFileError; what zipfile raises for damaged archives.
     """
@@ -358,7 +363,8 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
 
 
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order (columns first?) and type of an npy array, whose bytes follow in the file.
+    """Reads the shape, the order (columns first?) and the type of an npy array, whose bytes follow
+    in the file.
 
     Raises: InvalidFileError.
     """
@@ -370,7 +376,7 @@ def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def _read_array(member: Any, size: int) -> np.ndarray | None:
-    """The array of a member of `size` bytes; None for pickled objects.
+    """Reads the array of a member of `size` bytes; None for pickled objects.
 
     Nothing is made before its size is checked.
     """

@@ -52,7 +52,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def encoded(text: str) -> bytes:
-    """What `write_text` writes. Half surrogates that are no bytes of a name are escaped."""
+    """Returns what `write_text` writes. Half surrogates that are no bytes of a name are escaped."""
     try:
         return text.encode("utf-8", "surrogateescape")
     except UnicodeEncodeError:
@@ -70,7 +70,7 @@ def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
 
 
 def replace_file(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
-    """`replace_files` of one file."""
+    """Writes one file by `replace_files`."""
     replace_files({path: write})
 
 
@@ -204,7 +204,7 @@ def check_replaceable(
     mark: str | None = None,
     inputs: Iterable[str | os.PathLike[str] | None] = (),
 ) -> None:
-    """Whether a folder can be replaced, to be asked before the work begins.
+    """Checks that a folder can be replaced, to be asked before the work begins.
 
     Arguments: mark: a file that all folders of this kind hold. Then the folder has to be empty or,
     with `overwrite`, of this kind. inputs: what the work reads (None is left out); it may not lie
@@ -255,8 +255,8 @@ def check_replaceable(
 
 
 def contents(folder: str | os.PathLike[str]) -> str:
-    """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is
-    nothing.
+    """Returns what is in a folder, in a few words: "capture.json, images (60 files)"; empty if
+    there is nothing.
     """
     entries = _entries(folder)
     told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
@@ -271,8 +271,8 @@ def _told(entry: Path) -> str:
 
 
 def _entries(folder: str | os.PathLike[str]) -> list[str]:
-    """Names in a folder, sorted; none if it does not exist (any more: another process may be
-    replacing it).
+    """Returns the names in a folder, sorted; none if it does not exist (any more: another process
+    may be replacing it).
     """
     try:
         return sorted(os.listdir(folder))
@@ -343,8 +343,8 @@ def add_files(
 def check_ours(
     files: Iterable[Path], ours: Callable[[Path], bool], advice: str = MOVE_AWAY
 ) -> None:
-    """Whether files can be written without losing what others wrote there, to be asked before the
-    work, too.
+    """Checks that files can be written without losing what others wrote there, to be asked before
+    the work, too.
 
     Arguments: ours: whether a file that is there may be replaced. advice: what the user can do.
     Raises: ValueError, naming the first that may not.
@@ -392,7 +392,7 @@ def remove_abandoned_lock(folder: str | os.PathLike[str]) -> None:
 
 
 def _lock_of(folder: Path) -> Path:
-    """The file beside a folder that `only_writer(replaced=True)` locks."""
+    """Returns the file beside a folder that `only_writer(replaced=True)` locks."""
     return folder.absolute().with_name(f".{folder.absolute().name}.lock")
 
 
@@ -422,8 +422,8 @@ def _locked(folder: Path, wait: bool, lock: Path | None = None) -> Generator[Non
 
 @contextlib.contextmanager
 def _naming(path: Path, temporary: Path) -> Generator[None]:
-    """A full or read-only disk and other errors of the temporary file or folder become errors of
-    `path`.
+    """Turns errors of a temporary file or folder, such as a full or read-only disk, into errors
+    of `path`.
     """
     try:
         yield
@@ -437,7 +437,7 @@ def _naming(path: Path, temporary: Path) -> Generator[None]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Whether a file, or a folder with all above it, can be made, to be asked before the work
+    """Checks that a file, or a folder with all above it, can be made, to be asked before the work
     begins.
 
     Tried, because permissions do not tell of full, read-only and network disks. Raises: OSError,

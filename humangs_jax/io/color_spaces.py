@@ -41,17 +41,17 @@ class Encoding(NamedTuple):
 
 
 def srgb_to_light(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The curve of sRGB, IEC 61966-2-1."""
+    """Applies the curve of sRGB, IEC 61966-2-1."""
     return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
 
 
 def light_to_srgb(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The inverse of `srgb_to_light`; of light in [0, 1]."""
+    """Applies the inverse of `srgb_to_light` to light in [0, 1]."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def light_to_bt709(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """How cameras encode light in [0, 1], ITU-R BT.709."""
+    """Encodes light in [0, 1] as cameras do, ITU-R BT.709."""
     return np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
 
 
@@ -62,7 +62,7 @@ PAPER_HLG = 0.265
 
 
 def _pq_to_light(levels: np.ndarray) -> np.ndarray:
-    """SMPTE ST 2084."""
+    """Applies the curve PQ, SMPTE ST 2084."""
     root = levels ** (1 / 78.84375)
     nits = 10_000 * (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (
         1 / 0.1593017578125
@@ -71,7 +71,7 @@ def _pq_to_light(levels: np.ndarray) -> np.ndarray:
 
 
 def _hlg_to_light(levels: np.ndarray) -> np.ndarray:
-    """ARIB STD-B67, the light before the camera."""
+    """Applies the curve HLG, ARIB STD-B67, which gives the light before the camera."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     light = np.where(levels <= 0.5, levels**2 / 3, (np.exp((levels - c) / a) + b) / 12)
     return light / PAPER_HLG
@@ -86,7 +86,9 @@ KNEE = 0.75
 
 
 def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Light whose largest channel is below 1; all three are scaled alike, so that the hue stays."""
+    """Compresses light so that its largest channel is below 1; all three are scaled alike, so that
+    the hue stays.
+    """
     largest = np.maximum(light.max(axis=-1, keepdims=True), 1e-6)
     beyond = np.maximum(largest - KNEE, 0) / (1 - KNEE)
     return light * np.where(largest > KNEE, (1 - (1 - KNEE) * np.exp(-beyond)) / largest, 1)
@@ -131,7 +133,9 @@ def _xyz(xy: tuple[float, float]) -> np.ndarray:
 
 
 def _to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, float]) -> np.ndarray:
-    """From light of three primaries to XYZ whose white is that of ICC profiles, D50."""
+    """Returns the matrix from light of three primaries to XYZ whose white is that of ICC
+    profiles, D50.
+    """
     columns = np.stack([_xyz(each) for each in primaries], axis=1)
     matrix = columns * np.linalg.solve(columns, _xyz(white))
     gains = (BRADFORD @ _xyz(D50)) / (BRADFORD @ _xyz(white))
@@ -142,8 +146,8 @@ FROM_XYZ = np.linalg.inv(_to_xyz(SRGB, D65))
 
 
 def of_code_points(primaries: int, transfer: int) -> Encoding | None:
-    """The encoding that numbers of H.273 name (PNG's cICP, nclx of HEIC and AVIF, videos); None
-    where that is sRGB's.
+    """Returns the encoding that numbers of H.273 name (PNG's cICP, nclx of HEIC and AVIF, videos);
+    None where that is sRGB's.
     """
     if primaries not in PRIMARIES and transfer not in CURVES:
         return None
@@ -161,8 +165,8 @@ shown as sRGB, too.
 
 
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
-    """The encoding of PNG's gAMA and cHRM (white, red, green, blue: x and y of each); None where
-    that is sRGB's.
+    """Returns the encoding of PNG's gAMA and cHRM (white, red, green, blue: x and y of each); None
+    where that is sRGB's.
     """
     curve, matrix = srgb_to_light, np.eye(3)
     if gamma is not None and 0.1 < gamma < 10 and abs(gamma - GAMMA_OF_SRGB) > GAMMA_SLACK:
@@ -187,7 +191,7 @@ SAME = 0.5 / 255
 
 
 def is_srgb(encoding: Encoding) -> bool:
-    """Whether the file's values are sRGB already."""
+    """Says whether the file's values are sRGB already."""
     steps = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     return bool(np.abs(in_srgb(grid, encoding) - grid).max() < SAME)
@@ -198,7 +202,7 @@ def is_srgb(encoding: Encoding) -> bool:
 
 
 def in_srgb(levels: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.ndarray, "n 3"]:
-    """Colors in sRGB of a file's levels, both in [0, 1]."""
+    """Converts a file's levels to colors in sRGB, both in [0, 1]."""
     curves = encoding.curves * (3 // len(encoding.curves))
     light = np.stack([curve(levels[:, i]) for i, curve in enumerate(curves)], axis=-1)
     return _encode(encoding)(_light_in_srgb(light, encoding))
@@ -226,8 +230,8 @@ BLOCK = 1 << 20
 def pixels_in_srgb(
     levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding
 ) -> Float[np.ndarray, "h w 3"]:
-    """Colors in sRGB, in [0, 1], of whole levels from 0 to `most`, of one channel (grey) or
-    three.
+    """Converts whole levels from 0 to `most`, of one channel (grey) or three, to colors in sRGB
+    in [0, 1].
     """
     height, width, channels = levels.shape
     curves = encoding.curves * (3 // len(encoding.curves))
@@ -247,7 +251,7 @@ def pixels_in_srgb(
 
 
 def cube(encoding: Encoding, side: int = 49) -> str:
-    """A table of `in_srgb` as ffmpeg's filter lut3d reads it (.cube): red changes first."""
+    """Writes a table of `in_srgb` as ffmpeg's filter lut3d reads it (.cube): red changes first."""
     steps = np.linspace(0, 1, side)
     blue, green, red = (axis.ravel() for axis in np.meshgrid(steps, steps, steps, indexing="ij"))
     rows = in_srgb(np.stack([red, green, blue], axis=-1), encoding)
@@ -281,7 +285,7 @@ class Profile(NamedTuple):
 
 
 def read_profile(data: bytes) -> Profile:
-    """What an ICC profile says.
+    """Reads an ICC profile.
 
     Raises: InvalidFileError for one that is damaged, or of no photo.
     """
@@ -318,8 +322,8 @@ def read_profile(data: bytes) -> Profile:
 
 
 def _within_white(curve: Curve) -> Curve:
-    """A curve of a file, whose formula may leave [0, 1], or numbers, between the levels that were
-    looked at.
+    """Bounds a curve of a file, whose formula may leave [0, 1], or the numbers, between the levels
+    that were looked at.
     """
 
     def bounded(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -352,7 +356,7 @@ def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
 
 
 def _curve(tag: bytes) -> Curve:
-    """The curve of a tag "curv" (a table, or an exponent) or "para" (numbers g, a to f of a
+    """Reads the curve of a tag "curv" (a table, or an exponent) or "para" (numbers g, a to f of a
     formula).
     """
     # "curv": no entry is the identity, one is an exponent, more are a table
@@ -387,7 +391,7 @@ def _curve(tag: bytes) -> Curve:
 
 
 def by_tables(image: Any, profile: bytes) -> Any:
-    """A PIL.Image in sRGB, of one whose profile is tables.
+    """Converts a PIL.Image whose profile is tables to sRGB.
 
     Raises: InvalidFileError for one that cannot be used.
     """

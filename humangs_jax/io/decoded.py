@@ -25,7 +25,9 @@ class Decoded:
         self.pixels: dict[bytes, UInt8[np.ndarray, "h w c"] | Float[np.ndarray, "h w c"]] = {}
 
     def find(self, key: bytes) -> Float[np.ndarray, "h w c"] | None:
-        """The pixels of a content, in an array that is the caller's; None if they are not kept."""
+        """Returns the pixels of a content, in an array that is the caller's; None if they are
+        not kept.
+        """
         pixels = self.pixels.get(key)
         if pixels is None:
             return None
@@ -50,8 +52,8 @@ _current: contextvars.ContextVar[Decoded | None] = contextvars.ContextVar("decod
 
 @contextlib.contextmanager
 def decoded_once(most: int = KEPT_BYTES) -> Generator[None]:
-    """Within it `io.images` decodes each photo once, as long as its pixels fit into `most` bytes;
-    then all are forgotten.
+    """Lets `io.images` decode each photo once within the block, as long as its pixels fit into
+    `most` bytes; then all are forgotten.
     """
     token = _current.set(Decoded(most))
     try:
@@ -68,10 +70,10 @@ def forget_decoded() -> None:
 
 
 def kept_photos() -> Decoded | None:
-    """What is kept at present; None outside of `decoded_once`."""
+    """Returns what is kept at present; None outside of `decoded_once`."""
     return _current.get()
 
 
 def content_key(data: bytes, as_stored: bool = False) -> bytes:
-    """The key of the pixels of a file. as_stored: whether its color profile is left out."""
+    """Returns the key of the pixels of a file. as_stored: whether its color profile is left out."""
     return hashlib.blake2b(data, salt=bytes([as_stored])).digest()

@@ -48,7 +48,7 @@ libjpeg ends there.
 
 
 def jpeg_scans(data: bytes) -> int:
-    """The number of scans of the picture that a JPEG file begins with.
+    """Counts the scans of the picture that a JPEG file begins with.
 
     Segments are stepped over, and what is behind the picture is not looked at.
     """
@@ -67,13 +67,13 @@ def jpeg_scans(data: bytes) -> int:
 
 
 def is_webp(data: bytes) -> bool:
-    """Whether a file begins as a WebP."""
+    """Says whether a file begins as a WebP."""
     return data[:4] == b"RIFF" and data[8:12] == b"WEBP"
 
 
 def webp_size(data: bytes) -> tuple[int, int]:
-    """Width and height of the canvas of a WebP, for which Pillow takes memory as soon as it opens
-    one. Raises: InvalidFileError.
+    """Returns width and height of the canvas of a WebP, for which Pillow takes memory as soon as it
+    opens one. Raises: InvalidFileError.
     """
     kind, body = data[12:16], data[20:30]
     if len(body) == 10 and kind == b"VP8X":
@@ -89,7 +89,7 @@ def webp_size(data: bytes) -> tuple[int, int]:
 
 
 def iso_kind(data: bytes) -> str | None:
-    """Pillow's name, HEIF or AVIF, for a file that begins as such a photo, else None.
+    """Returns Pillow's name, HEIF or AVIF, for a file that begins as such a photo, else None.
 
     A first brand mif1 may be either: the further brands tell.
     """
@@ -103,7 +103,7 @@ def iso_kind(data: bytes) -> str | None:
 
 
 def png_chunks(data: bytes) -> dict[bytes, bytes]:
-    """The chunks of a PNG file before its pixels, by name."""
+    """Returns the chunks of a PNG file before its pixels, by name."""
     at, found = 8, {}
     while at + 8 <= len(data):
         name = data[at + 4 : at + 8]
@@ -120,8 +120,8 @@ NCLX = b"colrnclx"
 
 
 def nclx_colors(data: bytes) -> tuple[int, int] | None:
-    """Code points (H.273) of the primaries and the curve of an AVIF, of the first box that has
-    some.
+    """Returns code points (H.273) of the primaries and the curve of an AVIF, of the first box that
+    has some.
     """
     at = data.find(NCLX)
     numbers = data[at + len(NCLX) : at + len(NCLX) + 4]
@@ -131,8 +131,8 @@ def nclx_colors(data: bytes) -> tuple[int, int] | None:
 
 
 def check_png_chunks(data: bytes) -> None:
-    """Whether a PNG file is whole: Pillow decodes some that are damaged, and pixels of a palette
-    that is not there.
+    """Checks that a PNG file is whole: Pillow decodes some that are damaged, and pixels of a
+    palette that is not there.
     """
     at, names = 8, set()
     while at < len(data) and b"IEND" not in names:
@@ -154,8 +154,8 @@ def check_png_chunks(data: bytes) -> None:
 
 
 def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
-    """Width and height in EXIF's tags if a photo of this size was cut out of such a frame, else
-    None.
+    """Returns the width and height in EXIF's tags if a photo of this size was cut out of such a
+    frame, else None.
     """
     width, height = (tags.get(tag) for tag in FRAME_TAGS)
     if not isinstance(width, int) or not isinstance(height, int):

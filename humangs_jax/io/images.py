@@ -102,8 +102,8 @@ GREY_AND_ALPHA = 4
 def read_image(
     path: str | Path,
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
-    """Colors in sRGB and, where the file has an alpha channel, alpha. Grey images become three
-    equal channels.
+    """Reads colors in sRGB and, where the file has an alpha channel, alpha. Grey images become
+    three equal channels.
 
     A color profile that cannot be used is warned of, and the values are taken as stored.
 
@@ -123,7 +123,7 @@ def _colors_and_alpha(
 
 
 def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
-    """A mask, coverage in [0, 1]: a grey image, or what else segmentation tools write.
+    """Reads a mask, coverage in [0, 1]: a grey image, or what else segmentation tools write.
 
     A palette or colors: 1 where the image has the one label (of a palette) or the one color that is
     not the background. The background is black, and label 0 if there is one. Several greys of a
@@ -165,7 +165,9 @@ def _is_grey(colors: np.ndarray) -> bool:
 
 
 def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """The mask of a palette image: labels (h, w), colors of the palette (256, 3) from 0 to 255."""
+    """Makes the mask of a palette image: labels (h, w), colors of the palette (256, 3) from 0 to
+    255.
+    """
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
     if (
@@ -203,7 +205,8 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def orientation(path: str | Path) -> int:
-    """The EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see `oriented`.
+    """Returns the EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see
+    `oriented`.
 
     Raises: as `open_image`.
     """
@@ -213,8 +216,8 @@ def orientation(path: str | Path) -> int:
 
 
 def focal_length(path: str | Path) -> float | None:
-    """Focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the photo; None
-    where that is missing or 0.
+    """Returns the focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the
+    photo; None where that is missing or 0.
 
     equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. Of a photo that was cut out
     of what EXIF describes, see `cropped_from`, it is not known. Raises: as `open_image`.
@@ -232,8 +235,8 @@ def focal_length(path: str | Path) -> float | None:
 
 
 def cropped_from(path: str | Path) -> tuple[int, int] | None:
-    """Width and height that EXIF says if the photo has another shape: it was cut out of that. Else
-    None.
+    """Returns the width and height that EXIF says if the photo has another shape, because it was
+    cut out of that; else None.
 
     Photos that were made smaller or turned have the shape that EXIF says. Raises: as `open_image`.
     """
@@ -242,8 +245,8 @@ def cropped_from(path: str | Path) -> tuple[int, int] | None:
 
 
 def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
-    """EXIF tags, of the photo or of a folder in them; none where they are damaged: nobody obeys
-    these.
+    """Returns the EXIF tags of the photo, or of a folder in them; none where they are damaged:
+    nobody obeys these.
     """
     if any(mark in data for mark in EXIF_MARKS):
         with warnings.catch_warnings(), contextlib.suppress(Exception):
@@ -256,8 +259,8 @@ def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
 
 
 def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
-    """Pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on height and
-    width are exchanged.
+    """Turns pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on
+    height and width are exchanged.
     """
     if flag >= 5:
         pixels = np.swapaxes(pixels, 0, 1)
@@ -292,7 +295,7 @@ def png_bytes(
     compress_level: int = 6,
     mark: str | None = None,
 ) -> bytes:
-    """The content of the file that `write_png` writes."""
+    """Returns the content of the file that `write_png` writes."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -307,8 +310,8 @@ def png_bytes(
 
 
 def mark_of(path: str | Path) -> str | None:
-    """The mark with which `write_png` wrote a file; None for other files, and for those that cannot
-    be read.
+    """Returns the mark with which `write_png` wrote a file; None for other files, and for those
+    that cannot be read.
     """
     with contextlib.suppress(OSError, ValueError), open_file(path, "image_bytes") as file:
         head = file.read(MARK_HEAD)
@@ -321,7 +324,7 @@ def mark_of(path: str | Path) -> str | None:
 
 
 def is_own_picture(path: str | Path) -> bool:
-    """Whether a file is a picture that shows results: a sheet, a rendering, a texture.
+    """Says whether a file is a picture that shows results: a sheet, a rendering, a texture.
 
     Photos and masks are none.
     """
@@ -329,7 +332,7 @@ def is_own_picture(path: str | Path) -> bool:
 
 
 def is_own_output(path: str | Path) -> bool:
-    """Whether a new output may replace a file of the same name: an own picture, or what is no
+    """Says whether a new output may replace a file of the same name: an own picture, or what is no
     picture of anybody.
     """
     if Path(path).suffix.lower() != ".png" or is_own_picture(path):
@@ -344,7 +347,7 @@ def is_own_output(path: str | Path) -> bool:
 def image_row(
     images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240
 ) -> Float[np.ndarray, "height w c"]:
-    """Images side by side, reduced to one height, pixels."""
+    """Puts images side by side, reduced to one height, pixels."""
     return np.concatenate(
         [resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images],
         axis=1,
@@ -354,14 +357,14 @@ def image_row(
 def to_uint8(
     image: Float[np.ndarray, "*shape"] | UInt8[np.ndarray, "*shape"],
 ) -> UInt8[np.ndarray, "*shape"]:
-    """[0, 1] -> 0..255, rounded to nearest and clipped; NaN becomes 0. Bytes stay as they are."""
+    """Rounds numbers in [0, 1] to 0..255, clipped; NaN becomes 0. Bytes stay as they are."""
     if np.asarray(image).dtype == np.uint8:
         return np.asarray(image)
     return np.rint(255 * np.clip(np.nan_to_num(np.asarray(image)), 0, 1)).astype(np.uint8)
 
 
 def named_color(name: str) -> tuple[float, float, float]:
-    """Red, green and blue in [0, 1] of a CSS name or "#rrggbb".
+    """Returns red, green and blue in [0, 1] of a CSS name or "#rrggbb".
 
     Raises: ValueError for what is no opaque color.
     """
@@ -379,7 +382,7 @@ def named_color(name: str) -> tuple[float, float, float]:
 def resized(
     image: Float[np.ndarray, "h w *c"] | UInt[np.ndarray, "h w *c"], width: int, height: int
 ) -> Float[np.ndarray, "height width *c"]:
-    """A float32 image at another size: an axis that becomes shorter is averaged by area, one that
+    """Resizes an image, in float32: an axis that becomes shorter is averaged by area, one that
     becomes longer is bicubic.
 
     The average is exact for every ratio; it is how the photos that the shipped weights have seen
@@ -396,7 +399,7 @@ def resized(
 
 
 def _axis_weights(old: int, new: int) -> Any:
-    """(new, old) sparse: what each pixel of an axis takes from those it had."""
+    """Returns what each pixel of an axis takes from those it had, a sparse matrix (new, old)."""
     from scipy.sparse import csr_array
 
     edges = np.arange(new + 1) * (old / new)
@@ -416,8 +419,8 @@ def _axis_weights(old: int, new: int) -> Any:
 
 @contextlib.contextmanager
 def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
-    """A photo as a PIL.Image that is not decoded yet but within the limits, and the bytes of its
-    file.
+    """Opens a photo as a PIL.Image that is not decoded yet but within the limits; also gives the
+    bytes of its file.
 
     Raises: FileNotFoundError; FileError, also for whatever goes wrong inside.
     """
@@ -428,13 +431,14 @@ def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
 
 
 def is_heic(path: str | Path) -> bool:
-    """Whether a file begins as a HEIC photo. Raises: FileNotFoundError; FileError."""
+    """Says whether a file begins as a HEIC photo. Raises: FileNotFoundError; FileError."""
     with reading(path, "image"), open_file(path, "image_bytes") as file:
         return iso_kind(file.read(HEAD)) == "HEIF"
 
 
 def _formats(data: bytes) -> tuple[str, ...]:
-    """The formats of Pillow, which knows them from now on, that a file with these bytes may have.
+    """Returns the formats of Pillow, which knows them from now on, that a file with these bytes may
+    have.
 
     Raises: InvalidFileError.
     """
@@ -461,7 +465,7 @@ def _formats(data: bytes) -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
-    """As `open_image`, of bytes in one of these formats of Pillow.
+    """Opens an image as `open_image` does, of bytes in one of these formats of Pillow.
 
     Raises: InvalidFileError; what Pillow raises for damaged images, which is of many types.
     """
@@ -489,8 +493,8 @@ def _check_size(width: int, height: int) -> None:
 
 
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
-    """((width, height), whether there is an alpha channel). PNG files are checked by their
-    checksums, others by decoding.
+    """Checks an image, PNG files by their checksums and others by decoding. Returns ((width,
+    height), whether there is an alpha channel).
 
     Raises: as `open_image`.
     """
@@ -501,14 +505,14 @@ def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height in pixels. Raises: as `open_image`."""
+    """Returns the width and height in pixels. Raises: as `open_image`."""
     with open_image(path) as (image, _):
         return image.size
 
 
 def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray, "h w c"]:
-    """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels; colors in sRGB, or
-    as stored.
+    """Reads pixels (h, w, channels) in float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels;
+    colors in sRGB, or as stored.
     """
     kept = kept_photos()
     with open_image(path) as (image, data):
@@ -534,7 +538,7 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
 
 
 def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
-    """Whole levels as stored, and the largest that there may be."""
+    """Returns whole levels as stored, and the largest that there may be."""
     if data[:8] == PNG_SIGNATURE:
         check_png_chunks(data)
         if data[24] == 16 and data[25] in PNG_COLOR_TYPES:
@@ -546,8 +550,8 @@ def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
 
 
 def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
-    """The pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it decodes
-    the lower ones, too.
+    """Reads the pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it
+    decodes the lower ones, too.
     """
     if data[26:28] != b"\0\0" or data[28] > 1:
         raise InvalidFileError("not a readable image: a PNG header with unknown methods")
@@ -559,7 +563,9 @@ def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
 
 
 def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
-    """Bytes of the pixels of a PNG file, chosen by the name that Pillow has for their layout."""
+    """Decodes bytes of the pixels of a PNG file, chosen by the name that Pillow has for their
+    layout.
+    """
     with image_in(data) as image:
         image.tile = [(*tile[:3], raw) for tile in image.tile]
         return np.asarray(image).astype(np.uint16)
@@ -572,7 +578,9 @@ def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
 def _colors_in_srgb(
     path: str | Path, image: Any, data: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Colors of a file that says how they are encoded; None where levels are in sRGB already."""
+    """Returns colors of a file that says how they are encoded; None where levels are in sRGB
+    already.
+    """
     own = levels[..., : 1 if levels.shape[-1] < 3 else 3]
     try:
         encoding = _encoding_in_header(image, data)
@@ -625,8 +633,8 @@ def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
 def _by_tables(
     image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones are added
-    as they are.
+    """Converts colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones
+    are added as they are.
     """
     from PIL import Image
 

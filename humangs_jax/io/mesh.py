@@ -50,7 +50,7 @@ INDICES = 34963
 
 
 def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, Any], bytes]:
-    """The JSON of a GLB file and the bytes that it describes.
+    """Splits a GLB file into its JSON and the bytes that this describes.
 
     Arguments: limit: of the JSON. By default that of files that nobody needs to be long.
     Raises: InvalidFileError, KeyError, TypeError, ... for sizes that do not fit the file or are
@@ -77,7 +77,7 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
 
 
 def view_of(view: dict[str, Any], binary: bytes) -> bytes:
-    """The bytes that a view of the buffer names. Raises: InvalidFileError."""
+    """Returns the bytes that a view of the buffer names. Raises: InvalidFileError."""
     start, size, step = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 1)
     if not all(type(n) is int and n >= 0 for n in (start, size)) or start + size > len(binary):
         raise InvalidFileError(f"{size} bytes from {start}, but there are {len(binary)}")
@@ -87,7 +87,7 @@ def view_of(view: dict[str, Any], binary: bytes) -> bytes:
 
 
 def count_of(accessor: dict[str, Any]) -> int:
-    """How many elements an accessor says that it has. Raises: InvalidFileError."""
+    """Counts how many elements an accessor says that it has. Raises: InvalidFileError."""
     count, start = accessor["count"], accessor.get("byteOffset", 0)
     if not all(type(n) is int and n >= 0 for n in (count, start)):
         raise InvalidFileError(f"{shown(count)} numbers from {shown(start)}")
@@ -95,7 +95,7 @@ def count_of(accessor: dict[str, Any]) -> int:
 
 
 def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
-    """The array (count, columns) of an accessor; integers that stand for numbers up to 1 are
+    """Reads the array (count, columns) of an accessor; integers that stand for numbers up to 1 are
     converted.
 
     Raises: InvalidFileError, KeyError, TypeError, ... for what does not fit the file.
@@ -121,7 +121,7 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
 
 
 def _index(value: Any) -> int:
-    """An index as JSON should have it: Python would count negative ones from the end."""
+    """Checks an index of JSON: Python would count negative ones from the end."""
     if type(value) is not int or value < 0:
         raise InvalidFileError(f"{shown(value)} is no index")
     return value
@@ -142,7 +142,7 @@ class GlbWriter:
         self.data, self.views, self.accessors = bytearray(), [], []
 
     def bytes_(self, data: bytes, target: int | None = None) -> int:
-        """Index of the view of some bytes, which start at a multiple of 4."""
+        """Adds bytes, which start at a multiple of 4; returns the index of their view."""
         self.data += bytes(-len(self.data) % 4)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
         self.views.append(view if target is None else view | {"target": target})
@@ -152,7 +152,8 @@ class GlbWriter:
     def array(
         self, kind: str, values: np.ndarray, target: int | None = None, bounds: bool = False
     ) -> int:
-        """Index of the accessor of an array: float32 unless it has unsigned integers.
+        """Adds an array, float32 unless it has unsigned integers; returns the index of its
+        accessor.
 
         Arguments: kind: as in COLUMNS. bounds: also tell the least and the largest of each column,
         as positions and times must.
@@ -174,8 +175,8 @@ class GlbWriter:
         return len(self.accessors) - 1
 
     def sparse(self, values: np.ndarray) -> int:
-        """Index of the accessor of an array (n, 3) of which most rows are 0: only the others are
-        in the file.
+        """Adds an array (n, 3) of which most rows are 0: only the others are in the file. Returns
+        the index of its accessor.
         """
         rows = np.flatnonzero(values.any(axis=1))
         accessor = {
@@ -217,8 +218,8 @@ class GlbWriter:
 
 
 def read_obj(path: str | Path) -> list[Any]:
-    """The triangle meshes of an OBJ file with materials and textures, as
-    trimesh.Trimesh; at least one.
+    """Reads the triangle meshes of an OBJ file with materials and textures, as trimesh.Trimesh; at
+    least one.
 
     Materials and textures that the file names but that cannot be read are left out, which is
     logged.
@@ -280,9 +281,9 @@ _GROUPS = re.compile(r"^(?:o|g|s)\b.*\n?", re.MULTILINE)
 
 
 def _grouped(text: str) -> str:
-    """An OBJ file with the faces of each material together, at its end. Without materials, and for
-    objects and groups, all faces are one: trimesh takes longer than linear for each change, even
-    for one that it finds in a comment.
+    """Brings the faces of each material together, at the end of an OBJ file. Without materials, and
+    for objects and groups, all faces are one: trimesh takes longer than linear for each change,
+    even for one that it finds in a comment.
     """
     text = text.replace("\r\n", "\n").replace("\\\n", "")
     begin, *changes = _MATERIAL.split(text)
@@ -363,7 +364,7 @@ _OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+")
 
 
 def _names_in(text: str) -> list[str]:
-    """What the name of a material or texture may be, the likeliest first.
+    """Returns what the name of a material or texture may be, the likeliest first.
 
     It may be meant as it stands, with spaces; without quotes, options of textures and separators of
     Windows; and, of several materials in one line, the first may be meant.

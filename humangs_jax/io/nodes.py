@@ -24,7 +24,10 @@ Tracks = dict[tuple[int, str], Track]
 
 
 def node_parents(nodes: Nodes) -> list[int]:
-    """Parent of each node, -1 for roots. Raises: InvalidFileError for a node with two parents."""
+    """Returns the parent of each node, -1 for roots.
+
+    Raises: InvalidFileError for a node with two parents.
+    """
     parents = [-1] * len(nodes)
     for i, node in enumerate(nodes):
         for child in node.get("children", []):
@@ -35,7 +38,7 @@ def node_parents(nodes: Nodes) -> list[int]:
 
 
 def with_ancestors(joints: Iterable[int], parents: Sequence[int]) -> list[int]:
-    """Joints and the nodes above them, parents first.
+    """Returns the joints and the nodes above them, parents first.
 
     Raises: InvalidFileError for nodes that are above themselves.
     """
@@ -73,7 +76,7 @@ def world_matrices(
 
 
 def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
-    """Where the nodes of a GLB file lie when nothing moves.
+    """Returns where the nodes of a GLB file lie when nothing moves.
 
     Raises: InvalidFileError; what damaged numbers raise.
     """

@@ -114,8 +114,8 @@ _current: Limits | None = None
 
 
 def limits() -> Limits:
-    """The limits in force: those of `set_limits`, else the default ones changed by the environment
-    variable HUMANGS_LIMITS.
+    """Returns the limits in force: those of `set_limits`, else the default ones changed by the
+    environment variable HUMANGS_LIMITS.
 
     Raises: ValueError for a variable that is not understood.
     """
@@ -162,7 +162,9 @@ class _Shown(reprlib.Repr):
         ) = 4
 
     def repr_int(self, x: int, level: int) -> str:
-        """Python refuses to write integers of thousands of digits."""
+        """Shows large integers by their size: Python refuses to write integers of thousands of
+        digits.
+        """
         if abs(x) < SHOWN_INTEGER:
             return repr(x)
         return f"an integer of {x.bit_length():,} bits"
@@ -177,7 +179,7 @@ class _Shown(reprlib.Repr):
 
 
 def shown(value: object) -> str:
-    """A value of a file for an error line: its beginning.
+    """Shows the beginning of a value of a file, for an error line.
 
     The parts of a list may be the list itself, or a million others.
     """
@@ -210,7 +212,9 @@ class FileError(ValueError):
 
 
 def is_unread(error: BaseException) -> bool:
-    """Whether there was no permission to read a file, so that nothing is known of what is in it."""
+    """Says whether a file could not be read for want of permission, so that nothing is known of
+    what is in it.
+    """
     return isinstance(error.__cause__, PermissionError)
 
 
@@ -222,7 +226,7 @@ class InvalidFileError(ValueError):
 
 @contextlib.contextmanager
 def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Generator[None]:
-    """Whatever goes wrong inside becomes one line that names the file.
+    """Turns whatever goes wrong inside into one line that names the file.
 
     Arguments: path: the file, for the message. kind: what it should be, as in "npz archive".
     raises: the class of the error.
@@ -302,7 +306,7 @@ def open_file(path: str | os.PathLike[str], limit: str = "file_bytes") -> Binary
 
 
 def read_bytes(path: str | os.PathLike[str], limit: str = "file_bytes") -> bytes:
-    """The bytes of a file. Raises: as `open_file`."""
+    """Reads the bytes of a file. Raises: as `open_file`."""
     with open_file(path, limit) as file:
         return file.read()
 
@@ -310,8 +314,8 @@ def read_bytes(path: str | os.PathLike[str], limit: str = "file_bytes") -> bytes
 def walk(
     folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda folder: False
 ) -> Generator[Path]:
-    """The files in a folder and in the folders in it, but for names that begin with a dot and
-    folders to `skip`.
+    """Yields the files in a folder and in the folders in it, but for names that begin with a dot
+    and folders to `skip`.
 
     Each folder is looked at once, however many links lead to it. Links that lead out are not
     followed, unless the limit `photos_outside` allows it; the first of them is logged. Raises:
@@ -350,7 +354,9 @@ def walk(
 
 
 def visible(paths: Iterable[Path]) -> list[Path]:
-    """Those whose names do not begin with a dot, as `._NAME` of macOS and what is not whole yet."""
+    """Returns the paths whose names do not begin with a dot, as `._NAME` of macOS and what is not
+    whole yet.
+    """
     return [path for path in paths if not path.name.startswith(".")]
 
 
@@ -366,8 +372,8 @@ def check_unpacked(size: int, unpacked: int) -> None:
 
 
 def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Path:
-    """The path `folder / name` that a file in the folder names, if it lies in there after symbolic
-    links are followed.
+    """Returns the path `folder / name` that a file in the folder names, if it lies in there after
+    symbolic links are followed.
 
     Arguments: photo: it is one of a photo or mask, which the limit `photos_outside` lets lie
     elsewhere.
@@ -398,7 +404,7 @@ T = TypeVar("T")
 
 
 def read_text(path: str | os.PathLike[str], limit: str = "text_bytes") -> str:
-    """The text of a file in UTF-8, with or without a byte order mark.
+    """Reads the text of a file in UTF-8, with or without a byte order mark.
 
     Raises: FileNotFoundError; FileError if it cannot be read, is too large or is not text.
     """
@@ -407,7 +413,7 @@ def read_text(path: str | os.PathLike[str], limit: str = "text_bytes") -> str:
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text; NaN and Infinity, which Python's tools write, are accepted.
+    """Parses a JSON text; NaN and Infinity, which Python's tools write, are accepted.
 
     Raises: InvalidFileError (a ValueError) naming the line.
     """
@@ -437,7 +443,7 @@ def check_nesting(value: Any) -> None:
 
 
 def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
-    """A configuration of class `cls` from its JSON, see `core.configuration`.
+    """Reads a configuration of class `cls` from its JSON, see `core.configuration`.
 
     Raises: FileNotFoundError; FileError.
     """
@@ -457,11 +463,14 @@ def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1)
 
 
 def json_text(value: Any, indent: int | None = 1) -> str:
-    """What `write_json` writes. Raises: TypeError for what JSON cannot hold."""
+    """Returns what `write_json` writes. Raises: TypeError for what JSON cannot hold."""
     return json.dumps(value, indent=indent) + "\n"
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """The value in a JSON file. Raises: FileNotFoundError; FileError, naming file and line."""
+    """Reads the value in a JSON file.
+
+    Raises: FileNotFoundError; FileError, naming file and line.
+    """
     with reading(path, "JSON file"):
         return parse_json(read_text(path))

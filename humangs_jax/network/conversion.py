@@ -129,7 +129,8 @@ FIELDS = {
 
 
 def release_name(path: str) -> tuple[str, Layout]:
-    """What the release calls one of our variables ("params/encoder/..."), and how it lies there.
+    """Returns what the release calls one of our variables ("params/encoder/..."), and how it lies
+    there.
 
     Raises: KeyError if the release has no such thing.
     """
@@ -160,8 +161,8 @@ def to_release(variables: Variables) -> StateDict:
 
 
 def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
-    """Shapes of the state dict that the release has for a configuration, without the body's
-    skinning weights.
+    """Returns the shapes of the state dict that the release has for a configuration, without the
+    body's skinning weights.
     """
     empty = jax.tree.map(
         lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), expected_variables(config)
@@ -170,8 +171,8 @@ def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
-    """Tensors of a checkpoint in any format of `io.tensors`, and how many of the loss networks were
-    skipped.
+    """Reads the tensors of a checkpoint in any format of `io.tensors`, and counts those of the loss
+    networks, which are skipped.
 
     Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
     """
@@ -181,8 +182,8 @@ def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
 
 
 def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:
-    """The configuration whose sizes are those of the tensors; what shapes do not tell is taken from
-    `presets.published`.
+    """Finds the configuration whose sizes are those of the tensors; what shapes do not tell is
+    taken from `presets.published`.
 
     head_width: of a network without normalised queries and keys, where no shape tells it. Of the
     Gaussians of a vertex one counts as tight. Raises: ValueError for a variant that is not
@@ -263,7 +264,7 @@ def _count_layers(state: StateDict) -> int:
 
 
 def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
-    """Width of a head, which is that of its norms, and whether there are norms."""
+    """Returns the width of a head, which is that of its norms, and whether there are norms."""
     if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
         if head_width is None:
             raise ValueError(
@@ -310,7 +311,8 @@ def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
 
 
 def load_checkpoint(path: str | os.PathLike[str], head_width: int | None = None) -> Converted:
-    """A released checkpoint as float32 variables, with the configuration that its shapes tell.
+    """Reads a released checkpoint as float32 variables, with the configuration that its shapes
+    tell.
 
     head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file
     cannot be read or asks for more than tensors, or if a tensor of the network is missing, unknown,
@@ -339,7 +341,7 @@ def _load_checkpoint(path: str | os.PathLike[str], head_width: int | None) -> Co
 
 
 def describe(converted: Converted) -> str:
-    """The network in one line."""
+    """Describes the network in one line."""
     config, leaves = converted.config, flatten_variables(converted.variables["params"]).values()
     encoder, _, decoder = paper_parts(config.architecture)
     transformer = encoder.transformer

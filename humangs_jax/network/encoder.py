@@ -49,7 +49,9 @@ class TriplaneConfig:
 def sample_triplane(
     texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]
 ) -> Float[Array, "*p 3*c"]:
-    """Features of canonical positions (normalised units): those of plane xy, then xz, then yz."""
+    """Returns the features of canonical positions (normalised units): those of plane xy, then
+    xz, then yz.
+    """
     middle = (texture.shape[1] - 1) / 2
     indices = (
         positions * middle
@@ -72,7 +74,7 @@ def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixel
 
 
 def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
-    """Indices of the foreground patches in a static number of slots; those beyond the capacity are
+    """Lists the foreground patches in a static number of slots; those beyond the capacity are
     left out.
     """
     indices = jnp.nonzero(foreground, size=capacity, fill_value=foreground.shape[0])[0]
@@ -82,7 +84,7 @@ def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
 def unpack_tokens(
     tokens: Float[Array, "l d"], packing: Packing, patches: int
 ) -> Float[Array, "p d"]:
-    """Tokens back at their patches, zeros elsewhere."""
+    """Puts tokens back at their patches, zeros elsewhere."""
     return (
         jnp.zeros((patches, tokens.shape[1]), tokens.dtype)
         .at[packing.indices]
@@ -148,7 +150,7 @@ class PatchTransformer(Encoder):
 
     @nn.compact
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
-        """See `parts.Encoder`.
+        """Makes feature maps and a global token of the photos, see `parts.Encoder`.
 
         Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
         """
@@ -208,7 +210,8 @@ class PatchTransformer(Encoder):
 
 
 def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
-    """What the encoder sees of every pixel: rgb, ray (moment, direction), canonical position.
+    """Returns what the encoder sees of every pixel: rgb, ray (moment, direction), canonical
+    position.
 
     Raises ValueError if images and cameras differ in size.
     """
@@ -227,8 +230,8 @@ def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "
 
 
 def photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
-    """What an encoder without cameras and poses sees of every pixel: rgb, then its place (x, y) in
-    [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
+    """Returns what an encoder without cameras and poses sees of every pixel: rgb, then its place
+    (x, y) in [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
     """
     height, width = inputs.images.shape[1:3]
 
@@ -244,7 +247,9 @@ def photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v 
 def touched_patches(
     foreground: Bool[Array, "v h w"], view_count: Int[Array, ""] | None, patch_size: int
 ) -> Bool[Array, " p"]:
-    """Which patches of all views the foreground touches; views beyond `view_count` are padding."""
+    """Says which patches of all views the foreground touches; views beyond `view_count` are
+    padding.
+    """
     if view_count is not None:
         foreground = foreground & (jnp.arange(len(foreground)) < view_count)[:, None, None]
     return jnp.any(patchify(foreground[..., None].astype(jnp.float32), patch_size) > 0, axis=(1, 2))
@@ -254,7 +259,7 @@ def touched_patches(
 def needed_tokens(
     foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int
 ) -> Int[Array, ""]:
-    """The token capacity that photos need: patches that the foreground touches.
+    """Counts the patches that the foreground touches: the token capacity that photos need.
 
     Of a batch, the largest.
     """

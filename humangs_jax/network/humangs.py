@@ -53,7 +53,7 @@ class HumanGS(nn.Module):
     """Whether a driver works from the features."""
 
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> HumanGSOutputs:
-        """The pass."""
+        """Runs the pass."""
         encoding = self.encoder(inputs, ctx)
         features = self.reader(encoding, inputs, ctx)
         outputs = self.decoder(features, inputs, ctx)
@@ -63,7 +63,7 @@ class HumanGS(nn.Module):
 
 
 def network(architecture: Architecture) -> HumanGS:
-    """The module of an architecture."""
+    """Returns the module of an architecture."""
     parts = architecture.encoder, architecture.reader, architecture.decoder
     return HumanGS(*parts, keeps_features=architecture.driver is not None, parent=None)
 
@@ -76,7 +76,7 @@ def apply_humangs(
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[HumanGSOutputs, Parameters]:
-    """The whole network for one subject: outputs and batch statistics.
+    """Runs the whole network for one subject: outputs and batch statistics.
 
     train: normalise by this subject's statistics and return updated running ones. Under a vmap over
     subjects give the vmap's `axis_name` to share the statistics over the batch; without it each
@@ -99,8 +99,8 @@ def apply_humangs(
 def intermediates(
     variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> dict[str, Any]:
-    """What every module of the pass returns, by its path, as "encoder.transformer.block_0", in the
-    order of the pass.
+    """Returns what every module of the pass returns, by its path, as "encoder.transformer.block_0",
+    in the order of the pass.
     """
     found = {}
 
@@ -118,7 +118,7 @@ def intermediates(
 @jax.jit
 @checked_arguments
 def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
-    """Fresh variables of a network, float32.
+    """Makes fresh variables of a network, float32.
 
     Args:
         key: of JAX's random numbers.
@@ -165,7 +165,7 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
 
 @functools.partial(jax.jit, static_argnames="config")
 def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
-    """The first part of `apply_humangs`, with the running batch statistics. Raises: as it."""
+    """Runs the first part of `apply_humangs`, with the running batch statistics. Raises: as it."""
     return cast(
         Encoding,
         config.architecture.encoder.apply(
@@ -178,7 +178,7 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
 def read(
     variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> PyTree:
-    """The second part of `apply_humangs`: features of the body. Raises: as it."""
+    """Runs the second part of `apply_humangs`: features of the body. Raises: as it."""
     return config.architecture.reader.apply(
         part_variables(variables, "reader"), encoding, inputs, config.forward_context()
     )
@@ -188,8 +188,8 @@ def read(
 def decode(
     variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """The third part of `apply_humangs`: canonical Gaussians, metric; `dropped_tokens` is 0 (it
-    belongs to the encoding).
+    """Runs the third part of `apply_humangs`: canonical Gaussians, metres; `dropped_tokens` is 0
+    (it belongs to the encoding).
     """
     own = part_variables(variables, "decoder")
     return cast(
@@ -199,12 +199,14 @@ def decode(
 
 
 def part_variables(variables: Variables, part: str) -> Variables:
-    """{"params": ..., "batch_stats": ...} of one part; what it does not have is absent."""
+    """Returns the {"params": ..., "batch_stats": ...} of one part; what it does not have is
+    absent.
+    """
     return {kind: cast(Parameters, tree[part]) for kind, tree in variables.items() if part in tree}
 
 
 def _example_inputs(parts: Architecture) -> HumanGSInputs:
-    """One view of two by two patches with one vertex: enough to find shapes."""
+    """Makes inputs of one view of two by two patches with one vertex: enough to find shapes."""
     side, wanted = 2 * parts.encoder.patch_size, parts.surface_map
     grid, vertex = jnp.zeros((1, side, side)), jnp.zeros((1, 1, 3))
     texels = None

@@ -45,8 +45,8 @@ def texel_indices(
     grid_size: tuple[int, int],
     convention: PixelGrid,
 ) -> Float[Array, "*p 2"]:
-    """Positions in pixels of an image -> texel indices of a grid that covers it; sizes are (width,
-    height).
+    """Turns positions in pixels of an image into texel indices of a grid that covers it; sizes are
+    (width, height).
     """
     image, grid = jnp.asarray(image_size, pixels.dtype), jnp.asarray(grid_size, pixels.dtype)
     if convention == "half_pixel":
@@ -57,7 +57,7 @@ def texel_indices(
 def sample_bilinear(
     grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0
 ) -> Float[Array, "*p c"]:
-    """Bilinear interpolation between texel centres; texels outside of the grid count as zeros.
+    """Interpolates bilinearly between texel centres; texels outside of the grid count as zeros.
 
     origin: the texel index, in both axes, that `indices` are relative to; counted from the middle,
     float32 positions keep more digits of their fractions. Positions that are outside by a texel or
@@ -88,7 +88,9 @@ def sample_bilinear(
 
 
 def sample_nearest(grid: Float[Array, "h w"], indices: Float[Array, "*p 2"]) -> Float[Array, "*p"]:
-    """The texel nearest to each position, halves to the even index; zero outside of the grid."""
+    """Returns the texel nearest to each position, halves to the even index; zero outside of the
+    grid.
+    """
     height, width = grid.shape
     nearest = jnp.round(indices)
     size = jnp.asarray([width, height], indices.dtype)
@@ -144,8 +146,8 @@ def convolve_neighborhoods(
     bias: Float[Array, " d"],
     dtype: Any = None,
 ) -> Float[Array, "n d"]:
-    """The sum above for all n positions, or for means of several: the products in `dtype`, the
-    result in that of the coverages.
+    """Returns the sum above for all n positions, or for means of several: the products in `dtype`,
+    the result in that of the coverages.
     """
     x, kernel = promote_dtype(neighborhoods, kernel, dtype=dtype)
     products = jnp.matmul(
@@ -157,7 +159,7 @@ def convolve_neighborhoods(
 def convolve(
     x: Float[Array, "v h w c"], kernel: Float[Array, "k k c d"]
 ) -> Float[Array, "v h w d"]:
-    """Every pixel's 3x3 neighbourhood, zeros outside of the map, times the kernel."""
+    """Multiplies every pixel's 3x3 neighbourhood, zeros outside of the map, by the kernel."""
     return lax.platform_dependent(x, kernel, cpu=_convolve_on_cpu, default=_convolve)
 
 

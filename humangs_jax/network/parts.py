@@ -93,7 +93,7 @@ class HumanGSInputs:
 
 
 def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
-    """s, metres per normalised unit: the canonical body's height over 1.8."""
+    """Returns s, metres per normalised unit: the canonical body's height over 1.8."""
     y = canonical_vertices[:, 1]
     return (jnp.max(y) - jnp.min(y)) / TARGET_HEIGHT
 
@@ -253,7 +253,7 @@ class Encoder(Part, nn.Module):
     """The side of photos is a multiple of it, pixels."""
 
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
-        """The encoding."""
+        """Returns the encoding."""
         raise NotImplementedError
 
 
@@ -261,7 +261,7 @@ class Reader(Part, nn.Module):
     """`Encoding` -> features of the body, in whatever form the decoder takes."""
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext) -> PyTree:
-        """Features."""
+        """Returns features."""
         raise NotImplementedError
 
 
@@ -271,7 +271,7 @@ class Decoder(Part, nn.Module):
     def __call__(
         self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
-        """Gaussians; `dropped_tokens` is set by the pass."""
+        """Returns Gaussians; `dropped_tokens` is set by the pass."""
         raise NotImplementedError
 
 
@@ -284,7 +284,7 @@ class TargetDecoder(Part, nn.Module):
     """Whether its images can be put on any background; else they are on white."""
 
     def __call__(self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext) -> PyTree:
-        """The outputs corrected for a target, or its image."""
+        """Returns the outputs corrected for a target, or its image."""
         raise NotImplementedError
 
     @nn.nowrap
@@ -298,8 +298,8 @@ class TargetDecoder(Part, nn.Module):
         backgrounds: Float[Array, "v 3"],
         config: PyTree,
     ) -> Drawn:
-        """The targets (`SubjectViews`) of one subject as a `TrainConfig` has them;
-        `training.forward.draw_targets` for others.
+        """Draws the targets (`SubjectViews`) of one subject as a `TrainConfig` has them;
+        `training.forward.draw_targets` draws others.
         """
         raise NotImplementedError
 
@@ -312,7 +312,8 @@ class TargetDecoder(Part, nn.Module):
         targets: PyTree,
         background: float,
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-        """Images and alpha of the person of one capture in the views of another, for evaluations.
+        """Returns images and alpha of the person of one capture in the views of another, for
+        evaluations.
         variables, config: the network's.
         """
         raise NotImplementedError
@@ -325,13 +326,13 @@ class Tap(nn.Module):
     """Whether each entry of the dict that the function returns is a stage by itself."""
 
     def __call__(self, function: Callable[..., T], *learned: Any) -> T:
-        """function(*learned)."""
+        """Returns function(*learned)."""
         return function(*learned)
 
 
 def tap(name: str, function: Callable[..., T], *learned: Any, apart: bool = False) -> T:
-    """function(*learned), a step beside the network: Linen's interceptors see it as they see the
-    network's modules.
+    """Returns function(*learned), as a step beside the network: Linen's interceptors see it as they
+    see the network's modules.
 
     learned: the arguments that depend on parameters.
     """

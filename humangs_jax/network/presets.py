@@ -16,7 +16,9 @@ SHELLS = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18)
 
 
 def published() -> HumanGSConfig:
-    """The authors' release, 99 M parameters, with its quirks; its encoder computes in bfloat16."""
+    """Configures the authors' release, 99 M parameters, with its quirks; its encoder computes in
+    bfloat16.
+    """
     return HumanGSConfig(
         conventions=Conventions(
             position_map="gouraud",
@@ -31,12 +33,15 @@ def published() -> HumanGSConfig:
 
 
 def paper() -> HumanGSConfig:
-    """The paper: visible views pooled, a plain position map; conventions otherwise ours."""
+    """Configures the paper's network: visible views pooled, a plain position map; conventions
+    otherwise ours.
+    """
     return HumanGSConfig(runtime=Runtime(dtype="bfloat16"))
 
 
 def small() -> HumanGSConfig:
-    """Trained on a CPU and shipped: tokens of the foreground only, color read off the photos.
+    """Configures what was trained on a CPU and is shipped: tokens of the foreground only, color
+    read off the photos.
 
     It has no upsampler, for its cost on a CPU (docs/training.md).
     """
@@ -74,8 +79,8 @@ def small() -> HumanGSConfig:
 
 
 def tiny() -> HumanGSConfig:
-    """The published parts with the conventions of `small`, for tests: every stage in the smallest
-    sizes.
+    """Configures the published parts with the conventions of `small`, for tests: every stage in the
+    smallest sizes.
     """
     decoder = paper_parts(small().architecture)[2]
     return HumanGSConfig(

@@ -86,7 +86,10 @@ class PixelAlignedReader(Reader):
     def __call__(
         self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> VertexFeatures:
-        """Features of the n vertices. Raises ValueError for shells without posed normals."""
+        """Returns the features of the n vertices.
+
+        Raises ValueError for shells without posed normals.
+        """
         grid = ctx.conventions.pixel_grid
         unit = subject_unit(inputs.canonical_vertices)
         maps = encoding.maps
@@ -147,8 +150,8 @@ def project_and_test(
     present: Bool[Array, " v"],
     grid: PixelGrid,
 ) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
-    """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees
-    none.
+    """Projects the posed vertices into every view, pixels, and says which of them it sees; padding
+    sees none.
     """
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
 
@@ -161,8 +164,8 @@ def project_and_test(
 def project_vertices(
     camera: Camera, vertices: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
-    """Pixel positions and depths z of one camera; finite, also in gradients, for vertices in its
-    plane or behind.
+    """Projects vertices into one camera: pixels and depths z; finite, also in gradients, for
+    vertices in its plane or behind.
     """
     p = transform.apply(camera.cam_from_world, vertices)
     depth = p[:, 2]
@@ -179,7 +182,7 @@ def visible_vertices(
     image_size: tuple[int, int],
     grid: PixelGrid,
 ) -> Bool[Array, " n"]:
-    """Which projected vertices lie inside the image, in front of the camera and not behind the
+    """Says which projected vertices lie inside the image, in front of the camera and not behind the
     rasterized surface.
 
     depth_map: rasterized z, -1 on background, so that a vertex over background is unseen.
@@ -198,7 +201,7 @@ def sum_over_views(
     indices: Float[Array, "v n 2"],
     weights: Float[Array, "v n"],
 ) -> PyTree:
-    """Sum over views of weight * read(map of the view, texel indices), one view after the other:
+    """Sums weight * read(map of the view, texel indices) over the views, one after the other:
     memory for one.
 
     read: (h, w, c), (n, 2) -> a pytree of (n, ...).
@@ -224,7 +227,7 @@ def photo_colors(
     visible: Bool[Array, "v n"],
     grid: PixelGrid,
 ) -> Float[Array, "n 3"]:
-    """Mean photo color over the views that see each vertex, grey where none does."""
+    """Returns the mean photo color over the views that see each vertex, grey where none does."""
     size = (images.shape[2], images.shape[1])
     colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))
     counts = jnp.sum(visible, axis=0)[:, None]
@@ -233,8 +236,8 @@ def photo_colors(
 
 
 def on_the_person(shells: Shells) -> Bool[Array, " n"]:
-    """Whether any photo shows the person at any distance along the normal of a vertex; true for
-    what no photo contains.
+    """Says whether any photo shows the person at any distance along the normal of a vertex; true
+    for what no photo contains.
     """
     return jnp.any(shells.inside > 0, axis=1)
 

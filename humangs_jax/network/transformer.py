@@ -43,7 +43,7 @@ GB a layer).
 
 
 def resolve_implementation(implementation: str, tokens: int, dtype: Any) -> AttentionKernel:
-    """What "auto" stands for on the default backend, for that many tokens of that dtype."""
+    """Returns what "auto" stands for on the default backend, for that many tokens of that dtype."""
     if implementation != "auto":
         return cast(AttentionKernel, implementation)
     backend = jax.default_backend()
@@ -62,8 +62,8 @@ def chunked_attention(
     count: Int[Array, ""] | None,
     query_chunk: int = QUERIES,
 ) -> Float[Array, "m h e"]:
-    """Exact attention, head by head and one block of queries after the other; softmax statistics in
-    float32 at least.
+    """Computes exact attention, head by head and one block of queries after the other; softmax
+    statistics are in float32 at least.
     """
     length, heads, width = q.shape
     blocks = -(-length // query_chunk)
@@ -106,7 +106,7 @@ def attention(
     count: Int[Array, ""] | None = None,
     implementation: str = "auto",
 ) -> Float[Array, "m h e"]:
-    """Attention of every query to the first `count` tokens (None: to all)."""
+    """Attends from every query to the first `count` tokens (None: to all)."""
     resolved = resolve_implementation(implementation, max(len(q), len(k)), q.dtype)
     if resolved == "chunked":
         return chunked_attention(q, k, v, count)
@@ -184,7 +184,7 @@ class TransformerConfig:
 
 
 def layer_norm(dtype: Any, name: str, use_bias: bool = False) -> nn.LayerNorm:
-    """The LayerNorm of the published network; the two-pass variance does not cancel."""
+    """Makes the LayerNorm of the published network; its two-pass variance does not cancel."""
     return nn.LayerNorm(
         epsilon=NORM_EPSILON, use_bias=use_bias, use_fast_variance=False, dtype=dtype, name=name
     )
@@ -253,7 +253,7 @@ class Transformer(nn.Module):
     def _scan_blocks(
         self, x: Float[Array, "l d"], count: Int[Array, ""] | None, quarters: tuple[int, ...]
     ) -> tuple[Float[Array, "l d"], list[Float[Array, "l d"]]]:
-        """The blocks as one loop over their stacked parameters: (output, outputs at the
+        """Runs the blocks as one loop over their stacked parameters: (output, outputs at the
         quarters).
         """
         config, remat = self.config, self.runtime.remat

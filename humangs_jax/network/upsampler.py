@@ -91,7 +91,10 @@ class Upsampler(nn.Module):
         train: bool = False,
         present: Bool[Array, " v"] | None = None,
     ) -> Float[Array, "v 4*h 4*w c"]:
-        """present: views that count in the batch statistics; None: all."""
+        """Fuses and upsamples the maps.
+
+        present: views that count in the batch statistics; None: all.
+        """
         hidden = self.config.hidden
         mask = None
         if present is not None:

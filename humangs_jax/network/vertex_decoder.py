@@ -102,7 +102,7 @@ class VertexDecoder(Decoder):
     def __call__(
         self, features: VertexFeatures, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
-        """Gaussians of the n vertices, vertex-major, metres.
+        """Returns Gaussians of the n vertices, vertex-major, metres.
 
         Raises ValueError for features that lack the normals.
         """
@@ -207,14 +207,14 @@ class VertexGaussians:
 
 
 def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
-    """x, then sin(f pi x), cos(f pi x) for f = 1, 2, 4, 8, 16, 32."""
+    """Returns x, then sin(f pi x), cos(f pi x) for f = 1, 2, 4, 8, 16, 32."""
     waves = [wave(f * np.pi * x) for f in FREQUENCIES for wave in (jnp.sin, jnp.cos)]
     return jnp.concatenate([x, *waves], axis=-1)
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
-    """What is configured of: local feature, global token, encoded position, photo color as 2 rgb -
-    1, visible fraction, normal, shells; in this order.
+    """Joins what is configured of: local feature, global token, encoded position, photo color as 2
+    rgb - 1, visible fraction, normal, shells; in this order.
     """
     vertices = canonical.shape[0]
     parts = [features.local]
@@ -240,8 +240,8 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
 
 
 def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
-    """Rotations that take z to each normal, smooth in the normal but for the direction opposite to
-    `OBLIQUE`.
+    """Returns rotations that take z to each normal, smooth in the normal but for the direction
+    opposite to `OBLIQUE`.
     """
     oblique = jnp.asarray(OBLIQUE, normals.dtype)
     upright = quaternion.between(jnp.asarray([0.0, 0.0, 1.0], normals.dtype), oblique)
@@ -251,8 +251,8 @@ def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
 def activate(
     raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None
 ) -> VertexGaussians:
-    """Quaternion normalised, scale softplus, color and opacity sigmoid, offset bounded if so
-    configured.
+    """Normalises quaternions, and applies a softplus to scales, a sigmoid to colors and opacities;
+    offsets are bounded if so configured.
 
     With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along
     the normal and the mean photo color are what its own offset and color correct.
@@ -287,8 +287,8 @@ def activate(
 
 
 def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[Array, "n k"]:
-    """(n, k) means of (s,) values under weights (n, k, s): metres, that an accelerator may not
-    round to 8 bits.
+    """Returns the means (n, k) of values (s,) under weights (n, k, s): metres, which an accelerator
+    must not round to 8 bits.
     """
     return jnp.matmul(weights, values, precision=EXACT)
 
@@ -296,8 +296,8 @@ def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[A
 def corrected_skinning_weights(
     weights: Float[Array, "n j"], offsets: Float[Array, "g j"] | None, gaussians_per_vertex: int
 ) -> Float[Array, "g j"]:
-    """Skinning weights of every Gaussian: its vertex's, or softmax(log(w + 1e-9) + offsets) with a
-    skinning head.
+    """Returns the skinning weights of every Gaussian: its vertex's, or softmax(log(w + 1e-9) +
+    offsets) with a skinning head.
     """
     weights = jnp.repeat(weights, gaussians_per_vertex, axis=0)
     if offsets is None:

@@ -33,12 +33,14 @@ SHIPPED = "assets/weights.safetensors"
 
 
 def expected_variables(config: HumanGSConfig) -> Variables:
-    """Shapes and dtypes of the variables of a configuration, without computing anything."""
+    """Returns the shapes and dtypes of the variables of a configuration, without computing
+    anything.
+    """
     return jax.eval_shape(lambda: init_humangs(jax.random.key(0), config))
 
 
 def flatten_variables(variables: PyTree) -> dict[str, Any]:
-    """{"params/encoder/...": leaf}."""
+    """Returns the variables by path, {"params/encoder/...": leaf}."""
     leaves = jax.tree_util.tree_leaves_with_path(variables)
     return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
 
@@ -81,8 +83,8 @@ def save_weights(
 
 
 def shipped_checksum() -> str:
-    """SHA-256, in hexadecimal, of the shipped weights file; "none" where the installation has
-    none.
+    """Returns the SHA-256, in hexadecimal, of the shipped weights file; "none" where the
+    installation has none.
     """
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
         if shipped.exists():
@@ -92,7 +94,7 @@ def shipped_checksum() -> str:
 
 @checked_arguments
 def load_weights(path: str | os.PathLike[str] | None = None) -> tuple[Variables, HumanGSConfig]:
-    """Variables (float32) and configuration of a weights file, with default `Runtime`.
+    """Reads variables (float32) and configuration of a weights file, with default `Runtime`.
 
     Args:
         path: a .safetensors file of this package. None: the shipped weights.
@@ -144,8 +146,8 @@ def _load_weights(path: str | os.PathLike[str]) -> tuple[Variables, HumanGSConfi
 def variables_from_tensors(
     tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str
 ) -> Variables:
-    """Float32 variables from flat tensors keyed by path; ValueError naming the key unless they are
-    exactly those.
+    """Makes float32 variables of flat tensors keyed by path; ValueError naming the key unless they
+    are exactly those.
     """
     expected = expected_variables(config)
     arrays = _check(tensors, expected, where)
@@ -155,8 +157,8 @@ def variables_from_tensors(
 
 
 def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
-    """The tensors as numpy arrays, in the order of the variables' leaves, if they are exactly
-    those.
+    """Checks that tensors are exactly the variables; returns them as numpy arrays, in the order of
+    the leaves.
     """
     expected = flatten_variables(variables)
     missing = sorted(set(expected) - set(tensors))

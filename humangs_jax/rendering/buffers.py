@@ -39,8 +39,8 @@ class BufferOverflowError(ValueError):
 
 
 def round_up(size: int, smallest: int = 64) -> int:
-    """The next (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation, at
-    most a fifth is spare.
+    """Rounds up to (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation,
+    and at most a fifth is spare.
     """
     size = max(size, smallest)
     unit = 1 << max(0, (size - 1).bit_length() - STEPS_PER_OCTAVE.bit_length())
@@ -48,8 +48,8 @@ def round_up(size: int, smallest: int = 64) -> int:
 
 
 def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
-    """`max_pairs` of a traced call that gives None: enough for a person, never more than can be
-    needed.
+    """Returns `max_pairs` for a traced call that gives None: enough for a person, never more than
+    can be needed.
 
     g: Gaussians. width, height, tile_size: pixels.
     """
@@ -58,7 +58,7 @@ def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
 
 
 def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
-    """`config`, with `default_pairs` if it leaves `max_pairs` open; for traced calls."""
+    """Sets `default_pairs` in a `config` that leaves `max_pairs` open; for traced calls."""
     if config.max_pairs is not None:
         return config
     pairs = default_pairs(gaussians.means.shape[0], camera.width, camera.height, config.tile_size)
@@ -72,8 +72,7 @@ def plan_buffers(
     config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
 ) -> SplatConfig:
-    """A configuration with buffers for one camera, or for the most demanding one of a batch, times
-    `margin`.
+    """Measures buffers for one camera, or for the most demanding one of a batch, times `margin`.
 
     Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation.
     Measures concrete arrays: call it outside of transformations.
@@ -138,7 +137,7 @@ def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | No
 
 
 def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[int]:
-    """Most rows and most pairs that any of the views needs."""
+    """Counts the most rows and the most pairs that any of the views needs."""
     gaussians, cameras = at_least_float32((gaussians, cameras))
     config = dataclasses.replace(
         config, max_pairs=None, max_rows=None
@@ -158,7 +157,9 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
 def _count(
     gaussians: Gaussians, camera: Camera, size: Int[Array, "2"], config: SplatConfig
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Rows and pairs of a camera whose image has `size` (width, height) in place of its own."""
+    """Counts rows and pairs of a camera whose image has `size` (width, height) in place of its
+    own.
+    """
     camera = replace(camera, width=size[0], height=size[1])
     projected = project_gaussians(gaussians, camera, config)
     footprints = footprints_by(projected, projected.dimmed(gaussians.opacities), config)

@@ -61,8 +61,8 @@ class Gaussians(Batchable):
 
 
 def added_variance(pixel_footprint: Float[Array, " g"] | None, eps2d: float) -> float:
-    """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the
-    scales contain a low-pass.
+    """Returns the pixels^2 that are added to the projected variances: `eps2d`, but no more than
+    `MIP_EPS2D` if the scales contain a low-pass.
     """
     if pixel_footprint is None:
         return eps2d
@@ -72,8 +72,8 @@ def added_variance(pixel_footprint: Float[Array, " g"] | None, eps2d: float) -> 
 def widened(
     scales: Float[Array, "g 3"], pixel_footprint: Float[Array, " g"] | None, sign: int = 1
 ) -> Float[Array, "g 3"]:
-    """Scales with the low-pass of pixels of a size in metres, all but `MIP_EPS2D` of it. sign: -1
-    takes it away again.
+    """Adds the low-pass of pixels of a size in metres to scales, all but `MIP_EPS2D` of it. sign:
+    -1 takes it away again.
     """
     if pixel_footprint is None:
         return scales
@@ -82,7 +82,7 @@ def widened(
 
 
 def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
-    """F = A R diag(s), so that the covariance is F F^T."""
+    """Returns F = A R diag(s), so that the covariance is F F^T."""
     quats = gaussians.quats
     if normalize_quats:
         quats = quaternion.normalize(gaussians.quats)
@@ -93,14 +93,14 @@ def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Fl
 
 
 def covariances(gaussians: Gaussians) -> Float[Array, "g 3 3"]:
-    """World-space covariance matrices, metres^2."""
+    """Returns the world-space covariance matrices, metres^2."""
     factors = covariance_factors(gaussians)
     return jnp.einsum("gik,gjk->gij", factors, factors, precision=transform.EXACT)
 
 
 def factored(gaussians: Gaussians) -> Gaussians:
-    """The same covariances without `deformations`: quats and scales from the singular vectors of A
-    R diag(s).
+    """Returns Gaussians of the same covariances without `deformations`: quats and scales from the
+    singular vectors of A R diag(s).
 
     Not meant to be differentiated: the factors are not unique where two scales coincide.
     """
@@ -181,8 +181,8 @@ class UnconstrainedGaussians(Batchable):
 
 @checked_arguments
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Inverse of `constrain`, but for opacities and colors within `OPACITY_MARGIN` and
-    `COLOR_MARGIN` of 0 or 1.
+    """Inverts `constrain`, but for opacities and colors within `OPACITY_MARGIN` and `COLOR_MARGIN`
+    of 0 or 1.
 
     Args:
         gaussians: without deformations. A low-pass is no parameter: it stays in the scales.
@@ -220,7 +220,8 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
 
 @checked_arguments
 def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
-    """The Gaussians that parameters stand for: scales are positive, opacities and colors in (0, 1).
+    """Returns the Gaussians that parameters stand for: scales are positive, opacities and colors in
+    (0, 1).
 
     Args:
         parameters: without bounds, as an optimizer of optax moves them.
@@ -273,7 +274,7 @@ def basis(
     z: Array | np.ndarray | float,
     count: int,
 ) -> list:
-    """Y_1 to Y_count of unit vectors, given as planes. Raises: as `check_count`."""
+    """Returns Y_1 to Y_count of unit vectors, given as planes. Raises: as `check_count`."""
     check_count(count)
     xx, yy, zz = x * x, y * y, z * z
     first = [-_C1 * y, _C1 * z, -_C1 * x]
@@ -294,7 +295,7 @@ def basis(
 def added_colors(
     harmonics: Float[Array, "g k 3"], x: Array, y: Array, z: Array
 ) -> Float[Array, "g 3"]:
-    """The sum over k for unit vectors d, given as planes of (g,)."""
+    """Returns the sum over k for unit vectors d, given as planes of (g,)."""
     values = jnp.stack(basis(x, y, z, harmonics.shape[1]), axis=-1)
     return jnp.sum(values[..., None] * harmonics, axis=1)
 
@@ -302,9 +303,7 @@ def added_colors(
 def turned_harmonics(
     harmonics: Float[Array, "*g k 3"], rotations: Float[Array, "*#g 3 3"]
 ) -> Float[Array, "*g k 3"]:
-    """Harmonics of the same colors after everything has been turned: those that were seen along d
-    are seen along R d.
-    """
+    """Turns harmonics with everything else: colors that were seen along d are seen along R d."""
     count = harmonics.shape[-2]
     points, inverse = _points(count)
     before = jnp.matmul(jnp.asarray(points, harmonics.dtype), rotations, precision=EXACT)
@@ -315,8 +314,8 @@ def turned_harmonics(
 
 @functools.cache
 def _points(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (p, 3) on a spiral, and the matrix (k, p) from the values there to the factors
-    of the functions.
+    """Returns the unit vectors (p, 3) on a spiral, and the matrix (k, p) from the values there to
+    the factors of the functions.
     """
     z = 1 - (2 * np.arange(POINTS) + 1) / POINTS
     angle = np.pi * (1 + math.sqrt(5)) * np.arange(POINTS)

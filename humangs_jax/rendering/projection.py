@@ -92,13 +92,13 @@ class ProjectedGaussians(NamedTuple):
     """What harmonics add to the colors as seen from here, (g, 3), RGB; None without harmonics."""
 
     def dimmed(self, opacities: Float[Array, " g"]) -> Float[Array, " g"]:
-        """Opacities as they are drawn."""
+        """Returns opacities as they are drawn."""
         if self.dimming is None:
             return opacities
         return opacities * self.dimming
 
     def seen_from_here(self, colors: Float[Array, "g 3"]) -> Float[Array, "g 3"]:
-        """Colors as they are drawn."""
+        """Returns colors as they are drawn."""
         if self.added_colors is None:
             return colors
         return jnp.maximum(colors + self.added_colors, 0.0)
@@ -118,7 +118,8 @@ class ProjectedGaussians(NamedTuple):
 def project_gaussians(
     gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG
 ) -> ProjectedGaussians:
-    """Every Gaussian on the image that `config` draws: the first half of `splatting.render`.
+    """Projects every Gaussian onto the image as `config` says: the first half of
+    `splatting.render`.
 
     A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the
     half field of view beyond the border, for cameras without lens.
@@ -204,7 +205,7 @@ def project_gaussians(
 
 
 def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Array, Array, Array]:
-    """xx, xy, yy and determinant of cov2d from the rows of M."""
+    """Returns xx, xy, yy and the determinant of cov2d for the rows of M."""
     xx, xy, yy = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1)
     normal = [_cross(m0, m1, 1, 2), _cross(m0, m1, 2, 0), _cross(m0, m1, 0, 1)]
     determinant = _dot(normal, normal) + eps2d * (xx + yy) + eps2d * eps2d
@@ -212,7 +213,7 @@ def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Ar
 
 
 def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, footprint: Array) -> Array:
-    """Factor of the opacity; `footprint` is in pixels.
+    """Returns the factor of the opacity; `footprint` is in pixels.
 
     1 for footprints whose determinant overflows.
     """
@@ -224,14 +225,14 @@ def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, footprint
 
 
 def _cross(m0: Planes, m1: Planes, j: int, i: int) -> Array:
-    """Cross product of the columns j and i of M."""
+    """Returns the cross product of the columns j and i of M."""
     return m0[j] * m1[i] - m1[j] * m0[i]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _conic_factor(m0: Planes, m1: Planes, eps2d: float) -> tuple[Array, Array, Array]:
-    """Upper triangular r with r^T r = cov2d^-1 / 2: r00, r01, r11. Where cov2d is singular, some
-    finite numbers.
+    """Returns the upper triangular r with r^T r = cov2d^-1 / 2: r00, r01, r11. Where cov2d is
+    singular, they are some finite numbers.
 
     Gradient. With k the symmetric matrix of k00 = r00 g00 + r01 g01, k01 = r11 g01, k11 = r11 g11
     (g: the cotangents),
@@ -281,7 +282,7 @@ _conic_factor.defvjp(_conic_factor_fwd, _conic_factor_bwd)
 def _times_factors(
     rows: Sequence[Planes], gaussians: Gaussians, normalize_quats: bool
 ) -> list[Planes]:
-    """Rows @ A R diag(s) for 2 x 3 rows of planes."""
+    """Returns rows @ A R diag(s), for 2 x 3 rows of planes."""
     if gaussians.deformations is not None:
         entries = _planes(gaussians.deformations.reshape(-1, 9))
         rows = _times(rows, [entries[:3], entries[3:6], entries[6:]])
@@ -294,7 +295,7 @@ def _times_factors(
 
 
 def _rotation_planes(quats: Float[Array, "g 4"]) -> list[Planes]:
-    """`quaternion.to_matrix`, entry by entry."""
+    """Does what `quaternion.to_matrix` does, entry by entry."""
     w, x, y, z = _planes(quats)
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -309,7 +310,7 @@ def _times(rows: Sequence[Planes], matrix: Sequence[Planes]) -> list[Planes]:
 
 @jax.custom_vjp
 def _planes(columns: Array) -> Planes:
-    """(g, c) -> c planes of (g,).
+    """Splits columns (g, c) into c planes of (g,).
 
     The gradient joins the planes by selection. Autodiff's concatenation (or sum of padded planes)
     gets fused with the expressions that it joins, and XLA's CPU backend then evaluates their common

@@ -43,8 +43,8 @@ def render_reference(
     features: Float[Array, "g n"] | None = None,
     shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
-    """The image of `render` by its definition, without tiles or buffers, in the precision of its
-    arguments.
+    """Draws the image of `render` by its definition, without tiles or buffers, in the precision of
+    its arguments.
 
     Of `config`, only what decides on what is drawn is read. Values are not checked.
 
@@ -152,8 +152,8 @@ def _reference(
 def _project(
     gaussians: Gaussians, camera: Camera, config: SplatConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie
-    at z = 1.
+    """Projects Gaussians: centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn;
+    those that are not lie at z = 1.
 
     Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d
     I.
@@ -193,7 +193,7 @@ def _project(
 def _project_by_lens(
     gaussians: Gaussians, camera: Camera, config: SplatConfig, p: Array, visible: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """As `_project`, with the Jacobian of the whole camera by autodiff."""
+    """Does the same as `_project`, with the Jacobian of the whole camera by autodiff."""
     slopes = p[:, :2] / jnp.where(visible, p[:, 2], 1.0)[:, None]
     visible &= within_reach(camera.lens, camera.distortion, *slopes.T)
     p = jnp.where(visible[:, None], p, jnp.asarray([0.0, 0.0, 1.0], p.dtype))
@@ -234,8 +234,8 @@ def _pixel(p: Float[Array, "3"], camera: Camera) -> Float[Array, "2"]:
 
 
 def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
-    """Real spherical harmonics of degrees 1 to `degree` of unit vectors: N P_l^m (cos m phi, sin m
-    phi), by recurrence.
+    """Returns the real spherical harmonics of degrees 1 to `degree` of unit vectors: N P_l^m (cos m
+    phi, sin m phi), by recurrence.
     """
     x, y, z = sight.T
     # of m phi, times sin(theta)^m, which P leaves out
@@ -261,19 +261,19 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
 
 
 def _root(x: Float[Array, " g"]) -> Float[Array, " g"]:
-    """Square roots, with zero gradient at 0."""
+    """Returns square roots, with zero gradient at 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:
-    """Determinant of axes axes^T + eps2d I (Cauchy-Binet): of a needle, the matrix itself cancels
-    in float64 too.
+    """Returns the determinant of axes axes^T + eps2d I (Cauchy-Binet): of a needle, the matrix
+    itself cancels in float64 too.
     """
     pairs = _cross(axes[..., jnp.asarray([0, 1, 2])], axes[..., jnp.asarray([1, 2, 0])])
     return jnp.sum(pairs**2, axis=-1) + eps2d * jnp.sum(axes**2, axis=(-1, -2)) + eps2d**2
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Cross products of the columns of two (..., 2, n): (..., n)."""
+    """Returns cross products of the columns of two (..., 2, n): (..., n)."""
     return a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :]

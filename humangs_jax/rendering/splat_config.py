@@ -199,7 +199,10 @@ published weights were trained with."""
 
 
 def splat_config(config: SplatConfig | str) -> SplatConfig:
-    """A configuration, or a preset by its name. Raises: ValueError for another name."""
+    """Returns a configuration as it is, or a preset by its name.
+
+    Raises: ValueError for another name.
+    """
     if not isinstance(config, str):
         return config
     try:
@@ -209,7 +212,8 @@ def splat_config(config: SplatConfig | str) -> SplatConfig:
 
 
 def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
-    """The configuration with the conventions of drawing that weights record, "exact" or "inria".
+    """Returns the configuration with the conventions of drawing that weights record, "exact" or
+    "inria".
 
     It is returned as it is where it has none of the other conventions: other knobs are the user's.
     """

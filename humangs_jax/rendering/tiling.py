@@ -131,7 +131,7 @@ class TileBlocks(NamedTuple):
 
 
 def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
-    """Inclusive running sum of int32 numbers >= 0, saturating at `SUM_LIMIT`.
+    """Returns the inclusive running sum of int32 numbers >= 0, saturating at `SUM_LIMIT`.
 
     Any 64 consecutive ones must sum to less than 2^24. Three levels: rows of 64 by a triangular
     matrix product, rows of 64 of their totals by another, and the few numbers left by comparing
@@ -161,7 +161,7 @@ def _in_rows(x: Int[Array, " n"]) -> Int[Array, "rows 64"]:
 
 
 def _sums_in_rows(rows: Int[Array, "rows 64"]) -> Int[Array, "rows 64"]:
-    """Running sums along each row, exact while they stay below 2^24."""
+    """Returns running sums along each row, exact while they stay below 2^24."""
     triangle = jnp.triu(jnp.ones((_ROW, _ROW), jnp.float32))
     return jnp.matmul(rows.astype(jnp.float32), triangle, precision=lax.Precision.HIGHEST).astype(
         jnp.int32
@@ -183,8 +183,8 @@ def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
 def owners(
     first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0
 ) -> Int[Array, " size"]:
-    """Which item owns each of the slots start .. start + size, if item i owns those from first[i]
-    to first[i + 1].
+    """Returns which item owns each of the slots start .. start + size, if item i owns those from
+    first[i] to first[i + 1].
 
     As many items begin at or before a slot as the running sum of marks says, and the last of them
     owns the slot: items without slots begin together with the next one that has any. (Exact below
@@ -197,7 +197,7 @@ def owners(
 def take(
     table: Shaped[Array, "n *rest"], indices: Int[Array, " slots"]
 ) -> Shaped[Array, "slots *rest"]:
-    """Rows of a table at indices that are known to be in range: no clamping, no wrapping of
+    """Takes rows of a table at indices that are known to be in range: no clamping, no wrapping of
     negative ones.
     """
     return (
@@ -206,7 +206,7 @@ def take(
 
 
 def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
-    """The same numbers, stored before they are used.
+    """Stores numbers before they are used.
 
     XLA's CPU backend would evaluate the expression behind a table anew for each number that a
     gather takes from it. It respects the barrier where a program is compiled with
@@ -216,13 +216,13 @@ def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
 
 
 def bits_for(count: int) -> int:
-    """Bits that hold the numbers 0 .. count - 1 (at least one)."""
+    """Counts the bits that hold the numbers 0 .. count - 1 (at least one)."""
     return max(1, (count - 1).bit_length())
 
 
 def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
-    """Ascending. Equal keys are identical, so a sort need not be stable; XLA's stable sort is a
-    third faster on CPUs, and elsewhere has to carry the positions along.
+    """Sorts keys, ascending. Equal keys are identical, so a sort need not be stable; XLA's stable
+    sort is a third faster on CPUs, and elsewhere has to carry the positions along.
     """
     return lax.platform_dependent(
         keys, cpu=jnp.sort, default=lambda keys: lax.sort(keys, is_stable=False)
@@ -232,8 +232,8 @@ def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
 def sort_into_tiles(
     tiles: Int[Array, " capacity"], items: Int[Array, " capacity"], tile_count: int, item_count: int
 ) -> TileLists:
-    """Pairs (tile, item) -> lists by tile, ascending by item. Pairs of tile `tile_count` ("no
-    tile") are left out.
+    """Sorts pairs (tile, item) into lists by tile, ascending by item. Pairs of tile `tile_count`
+    ("no tile") are left out.
 
     One sort of one uint32 where the tile number and the item number fit it together (sorting a key
     with a payload costs several times as much); otherwise a sort by two keys.
@@ -250,8 +250,8 @@ def sort_into_tiles(
 
 
 def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
-    """Tiles in blocks of `block`, by falling list length; equal ones, and ones too long for the
-    key, by number.
+    """Puts tiles into blocks of `block`, by falling list length; equal ones, and ones too long for
+    the key, by number.
     """
     t = counts.shape[0]
     bits = bits_for(t)
@@ -266,7 +266,7 @@ def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
 
 
 def tiles_to_image(tiles: Float[Array, "t c p"], grid: TileGrid) -> Float[Array, "h w c"]:
-    """The image of the pixels of each tile; pixels beyond it are cut off."""
+    """Puts the pixels of all tiles together; pixels beyond the image are cut off."""
     size, c = grid.tile_size, tiles.shape[1]
     image = tiles.reshape(grid.rows, grid.columns, c, size, size).transpose(0, 3, 1, 4, 2)
     return image.reshape(grid.rows * size, grid.columns * size, c)[: grid.height, : grid.width]
@@ -311,14 +311,14 @@ class Footprints(NamedTuple):
     """d^T cov2d^-1 d on the border of the ellipse, (g,); 0 where nothing is drawn."""
 
     def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """First row of tiles of each splat, and how many."""
+        """Returns the first row of tiles of each splat, and how many."""
         half = jnp.sqrt(self.reach * self.yy)
         row0 = _first(self.y - half, grid.tile_size, grid.rows)
         row1 = _last(self.y + half, grid.tile_size, grid.rows)
         return row0, jnp.where(self.reach > 0, jnp.maximum(row1 - row0 + 1, 0), 0)
 
     def half_sides(self) -> Float[Array, "g 2"]:
-        """Half the width and height of each, pixels."""
+        """Returns half the width and height of each, pixels."""
         return jnp.sqrt(self.reach[:, None] * jnp.stack([self.xx, self.yy], axis=-1))
 
     def bands(self) -> "_Bands":
@@ -359,7 +359,7 @@ class _Bands(NamedTuple):
     def columns(
         self, row: Int[Array, " g"], grid: TileGrid
     ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """First and last tile of each ellipse within one row of tiles."""
+        """Returns the first and last tile of each ellipse within one row of tiles."""
         size = grid.tile_size
         top = jnp.maximum(row * size + 0.5 - SLACK - self.y, -self.height)
         bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - self.y, self.height)
@@ -386,12 +386,12 @@ class Squares(NamedTuple):
     """Half a side, (g,), whole pixels; 0 where nothing is drawn."""
 
     def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """First row of tiles of each splat, and how many."""
+        """Returns the first row of tiles of each splat, and how many."""
         first, last = self._range(self.y, grid.tile_size, grid.rows)
         return first, jnp.where(self.radius > 0, jnp.maximum(last - first + 1, 0), 0)
 
     def half_sides(self) -> Float[Array, "g 2"]:
-        """Half the sides of each, pixels."""
+        """Returns half the sides of each, pixels."""
         return jnp.stack([self.radius, self.radius], axis=-1)
 
     def bands(self) -> "Squares":
@@ -400,7 +400,7 @@ class Squares(NamedTuple):
     def columns(
         self, row: Int[Array, " g"], grid: TileGrid
     ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """First and last tile of each square, the same in all its rows."""
+        """Returns the first and last tile of each square, the same in all its rows."""
         return self._range(self.x, grid.tile_size, grid.columns)
 
     def _range(self, center: Array, size: int, tiles: Size) -> tuple[Array, Array]:
@@ -425,7 +425,7 @@ class Pairs(NamedTuple):
 
 
 def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
-    """Stable order of positive depths, nearest first.
+    """Returns the stable order of positive depths, nearest first.
 
     float32: radix passes, each a sort of ONE uint32 (digit of the depth, then position), which
     XLA's CPU backend does four times as fast as an argsort. The bits of positive floats are ordered
@@ -447,7 +447,8 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
 def squared_reach(
     opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN
 ) -> Float[Array, " g"]:
-    """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below.
+    """Returns the d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts
+    below.
 
     No gradient.
     """
@@ -457,7 +458,9 @@ def squared_reach(
 
 
 def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Footprints:
-    """Ellipses of the visible splats, a little widened against rounding; the others get reach 0."""
+    """Returns ellipses of the visible splats, a little widened against rounding; the others get
+    reach 0.
+    """
     factor, more = REACH_SLACK
     reach = jnp.where(projected.visible & (reach > 0), reach * factor + more, 0.0)
     p = lax.stop_gradient(projected)
@@ -467,8 +470,8 @@ def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Foot
 def square_footprints(
     projected: ProjectedGaussians, reach: Float[Array, " g"], radius_sigma: float
 ) -> Squares:
-    """Squares of `radius_sigma` times the larger standard deviation, rounded up to pixels, where
-    reach is positive.
+    """Returns squares of `radius_sigma` times the larger standard deviation, rounded up to pixels,
+    where reach is positive.
     """
     p = lax.stop_gradient(projected)
     middle = 0.5 * (p.xx + p.yy)
@@ -482,7 +485,7 @@ def square_footprints(
 def footprints_by(
     projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig
 ) -> Footprints | Squares:
-    """The footprints that a configuration asks for: ellipses that end at `alpha_min` or
+    """Returns the footprints that a configuration asks for: ellipses that end at `alpha_min` or
     `radius_sigma`, or squares.
     """
     reach = squared_reach(opacities, config.alpha_min)
@@ -496,7 +499,7 @@ def footprints_by(
 def radii_on_image(
     footprints: Footprints | Squares, width: int, height: int
 ) -> Float[Array, "g 2"]:
-    """Half the sides of the footprints in pixels, 0 for those that lie beside the image.
+    """Returns half the sides of the footprints in pixels, 0 for those that lie beside the image.
 
     No gradient.
     """
@@ -510,7 +513,9 @@ def radii_on_image(
 def count_pairs(
     footprints: Footprints | Squares, grid: TileGrid
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """(rows, pairs) that `emit_pairs` needs, without any buffer; both saturate at `SUM_LIMIT`."""
+    """Counts the (rows, pairs) that `emit_pairs` needs, without any buffer; both saturate at
+    `SUM_LIMIT`.
+    """
     _, counts = footprints.rows(grid)
     return _saturating_sum(counts), _count_row_by_row(footprints, grid, jnp.max(counts, initial=0))
 
@@ -518,8 +523,8 @@ def count_pairs(
 def emit_pairs(
     footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int
 ) -> Pairs:
-    """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose
-    theirs.
+    """Lists all pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats
+    lose theirs.
     """
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
@@ -548,19 +553,21 @@ def emit_pairs(
 
 
 def _first(v: Array, tile_size: int, tiles: Size) -> Array:
-    """First of `tiles` whose last pixel centre is not left of v."""
+    """Returns the first tile whose last pixel centre is not left of v."""
     return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(
         jnp.int32
     )
 
 
 def _last(v: Array, tile_size: int, tiles: Size) -> Array:
-    """Last of `tiles` whose first pixel centre is not right of v."""
+    """Returns the last tile whose first pixel centre is not right of v."""
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 
 
 def _count_row_by_row(footprints: Footprints | Squares, grid: TileGrid, most_rows: Array) -> Array:
-    """Pairs of all splats: their first rows of tiles, then their second ones, and so on."""
+    """Counts the pairs of all splats: in their first rows of tiles, then in their second ones,
+    and so on.
+    """
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
 

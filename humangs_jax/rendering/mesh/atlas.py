@@ -70,8 +70,8 @@ def unwrap(
     size: int,
     density: Float[np.ndarray, " f"],
 ) -> Atlas:
-    """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size
-    texels.
+    """Cuts a mesh into charts, none across two `pieces` (a number per face), and packs them into
+    size x size texels.
 
     density: texels per metre of each face relative to others; the same all over a piece.
 
@@ -113,19 +113,19 @@ class _Flat:
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Vectors over their lengths along the last axis."""
+    """Divides vectors by their lengths along the last axis."""
     return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + NORMAL_FLOOR)
 
 
 def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
-    """(e, 2) directed edges of all faces, three per face."""
+    """Returns the directed edges of all faces, (e, 2), three per face."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def fill_gaps(
     image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w c"]:
-    """The image with every unknown texel replaced by the nearest known one."""
+    """Replaces every unknown texel of an image by the nearest known one."""
     from scipy.ndimage import distance_transform_edt
 
     rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
@@ -133,7 +133,7 @@ def fill_gaps(
 
 
 def _adjacent(faces: np.ndarray) -> np.ndarray:
-    """(p, 2) pairs of faces that share an edge."""
+    """Returns the pairs of faces that share an edge, (p, 2)."""
     edges = np.sort(edges_of(faces).astype(np.int64), axis=1)
     keys = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
     order = np.argsort(keys, kind="stable")
@@ -142,8 +142,8 @@ def _adjacent(faces: np.ndarray) -> np.ndarray:
 
 
 def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """(f,) side of each face: the one it looks at, unless its neighbours agree on another that it
-    can see as well.
+    """Chooses a side for each face, (f,): the one it looks at, unless its neighbours agree on
+    another that it can see as well.
     """
     cosines = normals @ SIDES.T
     allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))
@@ -158,7 +158,7 @@ def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _connected(count: int, pairs: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """(f,) index of the connected set of faces of one label that contains each face."""
+    """Numbers the connected sets of faces of one label; returns the number for each face, (f,)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -175,8 +175,8 @@ def _flatten(
     sides: np.ndarray,
     density: np.ndarray,
 ) -> _Flat:
-    """Every chart in a plane across its mean normal, turned so that its box is small, as large as
-    its density says.
+    """Lays every chart in a plane across its mean normal, turned so that its box is small, as large
+    as its density says.
     """
     count = int(charts.max()) + 1
     keys, inverse = np.unique(
@@ -206,8 +206,9 @@ def _flatten(
 
 
 def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) -> np.ndarray:
-    """Points (u, 2) with every chart turned by the one of a few angles that makes its bounding box
-    smallest, wide side right.
+    """Turns every chart by the one of a few angles that makes its bounding box smallest, wide side
+    right.
+    flat: its points (u, 2).
     """
     best_area, best = np.full(count, np.inf), flat
     for angle in np.arange(angles) * (np.pi / angles):
@@ -224,19 +225,19 @@ def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) ->
 
 
 def _extreme(function: np.ufunc, values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
-    """(charts, 2) the least or greatest values (u, 2) of each chart."""
+    """Returns the least or greatest values (u, 2) of each chart, (charts, 2)."""
     result = np.full((count, 2), np.inf if function is np.minimum else -np.inf)
     function.at(result, owner, values)
     return result
 
 
 def _sizes(flat: _Flat) -> np.ndarray:
-    """Widths and heights of the charts, metres."""
+    """Returns widths and heights of the charts, metres."""
     return _extreme(np.maximum, flat.points, flat.point_charts, int(flat.charts.max()) + 1).T
 
 
 def _hidden(flat: _Flat, size: int) -> np.ndarray:
-    """(f,) faces that lie below others of their chart, where charts overlap themselves."""
+    """Says which faces, (f,), lie below others of their chart, where charts overlap themselves."""
     corners, scale = _shelves(flat, size)
     pixels = (flat.points * scale + corners[flat.point_charts]).astype(np.float32)
     span = max(float(np.ptp(flat.heights)), 1e-6)
@@ -249,8 +250,8 @@ def _hidden(flat: _Flat, size: int) -> np.ndarray:
 
 
 def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
-    """Rough places (charts, 2) in texels and the scale (texels per metre): rows of charts of
-    falling height.
+    """Places charts roughly, in rows of falling height: places (charts, 2) in texels, and the scale
+    (texels per metre).
     """
     width, height = _sizes(flat)
     order = np.argsort(-height)
@@ -271,8 +272,8 @@ def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
 def _rasterize(
     pixels: np.ndarray, depth: np.ndarray | np.floating, faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(size, size) face of every texel (-1: none) and (size, size, 3) its weights; y up, row 0 on
-    top.
+    """Draws the faces: (size, size) face of every texel (-1: none) and (size, size, 3) its weights;
+    y up, row 0 on top.
     """
     points = np.stack(
         [pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1
@@ -287,7 +288,7 @@ def _rasterize(
 
 
 def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
-    """What every texel shows: its face (-1: none) and the weights of the face's corners.
+    """Returns what every texel shows: its face (-1: none) and the weights of the face's corners.
 
     Row 0 is the top (v = 1).
     """
@@ -295,7 +296,7 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
 
 
 def _pack(flat: _Flat, size: int) -> Atlas:
-    """Charts as bitmaps of cells at the first free place, shrunk together until all fit."""
+    """Puts charts as bitmaps of cells at the first free place, shrunk together until all fit."""
     scale = size / np.sqrt(
         np.prod(_sizes(flat), 0).sum()
     )  # the boxes alone would fill the square: a start that is too large
@@ -315,7 +316,7 @@ def _pack(flat: _Flat, size: int) -> Atlas:
 
 
 def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
-    """Corners (charts, 2) in texels, or None if the charts do not fit."""
+    """Returns the corners (charts, 2) in texels, or None if the charts do not fit."""
     cell = size // CELLS
     masks = _bitmaps(flat, scale, cell)
     if sum(np.count_nonzero(mask) for mask in masks) > CELLS * CELLS:
@@ -333,7 +334,7 @@ def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
 
 
 def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
-    """(row, column) at which all cells of a bitmap are free, the lowest one; None if there is
+    """Finds the lowest (row, column) at which all cells of a bitmap are free; None if there is
     none.
     """
     rows, columns = (n - m + 1 for n, m in zip(free.shape, mask.shape, strict=True))
@@ -349,8 +350,8 @@ def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
 
 
 def _bitmaps(flat: _Flat, scale: float, cell: int) -> list[np.ndarray]:
-    """For every chart the cells (rows, columns) that the boxes of its faces touch, half a gutter
-    around them included.
+    """Returns for every chart the cells (rows, columns) that the boxes of its faces touch, half a
+    gutter around them included.
     """
     corners = (flat.points * scale)[flat.faces]
     low = np.floor(corners.min(1) / cell).astype(np.int64)

@@ -97,7 +97,7 @@ def rasterize_mesh(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> Fragments:
-    """The nearest face at every pixel centre of one camera; batch with `jax.vmap`."""
+    """Finds the nearest face at every pixel centre of one camera; batch with `jax.vmap`."""
     vertices, camera = lax.stop_gradient((vertices, camera))
     if faces.shape[0] == 0 or vertices.shape[0] == 0:  # a face without area stands for no face
         vertices, faces = jnp.ones((1, 3), vertices.dtype), jnp.zeros((1, 3), jnp.int32)
@@ -131,8 +131,8 @@ def interpolate_attributes(
     attributes: Float[Array, "n c"],
     background: Float[Array, " c"],
 ) -> Float[Array, "h w c"]:
-    """Values at the corners of the faces, blended over the seen surface; `background` where there
-    is no face.
+    """Blends values at the corners of the faces over the seen surface; `background` where there is
+    no face.
 
     Corners may be numbered in another way: with `faces` the texture indices of the same faces, in
     the same order, and `attributes` the texture coordinates, this is the texture coordinate of
@@ -151,7 +151,7 @@ def interpolate_attributes(
 
 
 def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
-    """(n, 3): pixel position x, y and depth z.
+    """Returns the pixel position x, y and the depth z of vertices, (n, 3).
 
     Written out: matrix products are of low precision on GPU and TPU.
     """
@@ -167,12 +167,12 @@ def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3
 
 
 def _first_pixel(low: Array, size: int) -> Array:
-    """First pixel whose centre is at `low` or after; clipped to [0, size]."""
+    """Returns the first pixel whose centre is at `low` or after; clipped to [0, size]."""
     return jnp.clip(jnp.ceil(low - 0.5), 0, size).astype(jnp.int32)
 
 
 def _last_pixel(high: Array, size: int) -> Array:
-    """Last pixel whose centre is at `high` or before; clipped to [-1, size - 1]."""
+    """Returns the last pixel whose centre is at `high` or before; clipped to [-1, size - 1]."""
     return jnp.clip(jnp.floor(high - 0.5), -1, size - 1).astype(jnp.int32)
 
 
@@ -181,8 +181,8 @@ def _pixel_centers(pixel: Array, width: int, dtype: np.dtype) -> tuple[Array, Ar
 
 
 def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
-    """Faces before the near plane that have an area in the image; and how many faces are left out
-    that may be seen.
+    """Says which faces are before the near plane and have an area in the image; also counts the
+    faces that are left out but may be seen.
     """
     z = corners[:, 2::3]
     ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
@@ -198,8 +198,8 @@ def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
 def _rows(
     corners: Float[Array, "f 9"], drawn: Array, width: int, height: int
 ) -> tuple[Array, Array]:
-    """First row of pixel centres of every face, and how many; 0 rows if its bounding box holds no
-    pixel centre.
+    """Returns the first row of pixel centres of every face, and how many rows; 0 if its bounding
+    box holds no pixel centre.
     """
     x, y = (jnp.where(drawn[:, None], corners[:, i::3], 0.0) for i in range(2))
     drawn &= _first_pixel(x.min(-1), width) <= _last_pixel(x.max(-1), width)
@@ -208,7 +208,9 @@ def _rows(
 
 
 def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
-    """First column and number of the pixel centres of this row that may lie inside the face."""
+    """Returns the first column, and the number, of the pixel centres of this row that may lie
+    inside the face.
+    """
     y = row.astype(corners.dtype) + 0.5
     left, right = jnp.full_like(y, jnp.inf), jnp.full_like(y, -jnp.inf)
     x = [corners[:, 3 * i] for i in range(3)]
@@ -226,8 +228,8 @@ def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
 
 
 def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Array]:
-    """Perspective-correct weights (three arrays), depth, and whether the face covers the points (x,
-    y).
+    """Returns perspective-correct weights (three arrays), the depth, and whether the face covers
+    the points (x, y).
     """
     corner_x = [corners[..., 3 * i] for i in range(3)]
     corner_y = [corners[..., 3 * i + 1] for i in range(3)]
@@ -255,7 +257,7 @@ def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Arra
 
 
 def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_step: int) -> Array:
-    """(h w, 3) weights of the corners of each pixel's face.
+    """Returns the weights of the corners of each pixel's face, (h w, 3).
 
     In steps: small buffers are several times faster on CPU.
     """
@@ -269,8 +271,8 @@ def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_st
 
 
 def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, Array, Array]:
-    """Slots start .. start + size of items that own the slots first .. end: item of each, its place
-    in the item, used or not.
+    """Returns for the slots start .. start + size of items that own the slots first .. end the item
+    of each, its place in the item, and whether it is used.
     """
     item = owners(first, size, start)
     slot = start + jnp.arange(size, dtype=jnp.int32)
@@ -286,7 +288,9 @@ def _z_buffer(
     height: int,
     config: RasterConfig,
 ) -> tuple[Array, Array]:
-    """Depth and face of every pixel (h w): infinity and NO_FACE where there is none."""
+    """Returns the depth and the face of every pixel (h w): infinity and NO_FACE where there is
+    none.
+    """
 
     def draw_rows(state):
         start, depth, face_ids = state
@@ -336,8 +340,8 @@ def _z_buffer(
 def sample_texture(
     texture: Float[Array, "th tw c"], uv: Float[Array, "h w 2"]
 ) -> Float[Array, "h w c"]:
-    """Bilinear texture lookup. Differentiable with respect to the texture and, inside a texel, to
-    uv.
+    """Looks up a texture bilinearly. Differentiable with respect to the texture and, inside a
+    texel, to uv.
 
     As in OBJ files: u to the right, v UP, (0, 0) the lower left corner of the texture and (1, 1)
     its upper right one; row 0 is the top. Texel (row, column) is at u = (column + 0.5) / width, v =
@@ -388,7 +392,7 @@ def plain_position_map(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """Position map and depth map of one view; everything in normalised units."""
+    """Returns the position map and depth map of one view; everything in normalised units."""
     return _map(posed_vertices, canonical_vertices, faces, camera, config)
 
 
@@ -399,8 +403,8 @@ def gouraud_position_map(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """The release's position map (lit by a point light) and depth map of one view; everything in
-    normalised units.
+    """Returns the release's position map (lit by a point light) and depth map of one view;
+    everything in normalised units.
     """
     albedo = (canonical_vertices + 1) / 2
     colors = _light(albedo, posed_vertices, vertex_normals(posed_vertices, faces), camera.center)
@@ -409,8 +413,8 @@ def gouraud_position_map(
 
 @jax.jit
 def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "n 3"]:
-    """Unit normals: the sum of (v1 - v0) x (v2 - v0) over the faces at a vertex, as wound; 0 where
-    that vanishes.
+    """Returns unit normals: the sum of (v1 - v0) x (v2 - v0) over the faces at a vertex, as wound;
+    0 where that vanishes.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = jnp.cross(b - a, c - a)
@@ -420,7 +424,7 @@ def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> F
 
 @jax.jit
 def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
-    """Phong's light at the vertices: ambient and diffuse times the albedo, and a white
+    """Lights the vertices by Phong's model: ambient and diffuse times the albedo, and a white
     highlight.
     """
 
