@@ -9,7 +9,8 @@ one is looked into where a mark names its batch axes: `Annotated[Camera, Batch("
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+import operator
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,31 +48,46 @@ class ArrayField(NamedTuple):
     parts: tuple[Part, ...]
     """Parts that are checked by themselves."""
 
-    def shape(
-        self, array: Any, sizes: dict[str, int], batch: tuple[str, ...] = ()
-    ) -> tuple[int | str, ...]:
+    def shape(self, array: Any, sizes: dict[str, int]) -> tuple[int | str, ...]:
         """Returns the shape that an array should have; names stand for sizes that are not known.
 
-        Arguments: sizes: of axes by their names; those that this array is the first to have are
-        added. batch: names of the axes that come first.
+        sizes: of axes by their names; those that this array is the first to have are added.
         """
         own = np.shape(array)
         if self.axes is None:
             return own
-        axes = (*batch, *self.axes)
-        if len(own) == len(axes):
-            for axis, size in zip(axes, own, strict=True):
+        if len(own) == len(self.axes):
+            for axis, size in zip(self.axes, own, strict=True):
                 if isinstance(axis, str):
                     sizes.setdefault(axis, size)
-        return tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in axes)
+        return tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in self.axes)
+
+    def checks(self, array: Any, label: str) -> dict[str, tuple[Any, Values]]:
+        """Returns the array and its parts with the values that each may have, for `check_values`."""
+        if array is None or self.values is None:
+            return {}
+        found = {label: (array, self.values)}
+        if not isinstance(array, Tracer):
+            for part in self.parts:
+                found[f"{label} {part.words}"] = part.take(np.asarray(array)), part.values
+        return found
 
 
 @functools.cache
 def array_fields(record: Any) -> dict[str, ArrayField]:
-    """Returns the fields of a record that are arrays, by their names."""
+    """Returns the arrays of a class of records, and of the records in it that are looked into, by
+    their names: "images", "cameras.K".
+    """
     found = {}
     for field in dataclasses.fields(record):
         types_, marks = types_and_marks(field.type)
+        # a record in the record, whose arrays have some axes more
+        for batch in (mark.axes.split() for mark in marks if isinstance(mark, Batch)):
+            for name, inner in array_fields(types_[0]).items():
+                axes = None if inner.axes is None else (*batch, *inner.axes)
+                found[f"{field.name}.{name}"] = inner._replace(axes=axes)
+
+        # an array: its axes, and what its entries may be
         arrays = [each for each in types_ if hasattr(each, "dim_str")]
         if not arrays or field.metadata.get("static"):
             continue
@@ -86,51 +102,22 @@ def array_fields(record: Any) -> dict[str, ArrayField]:
     return found
 
 
-@functools.cache
-def _batches(record: Any) -> dict[str, tuple[str, ...]]:
-    """Returns the batch axes of the records in a record that are looked into."""
-    found = {}
-    for field in dataclasses.fields(record):
-        for mark in types_and_marks(field.type)[1]:
-            if isinstance(mark, Batch):
-                found[field.name] = tuple(mark.axes.split())
-    return found
-
-
-def named_arrays(
-    record: Any, name: str = "", batch: tuple[str, ...] = ()
-) -> Iterator[tuple[str, Any, ArrayField, tuple[str, ...]]]:
-    """Yields the arrays of a record and of the records in it that are looked into: name, array,
-    what its annotation says, and its batch axes. None has none.
-    """
-    if record is None:
-        return
-    start = f"{name}." if name else ""
-    for field, annotated in array_fields(type(record)).items():
-        array = getattr(record, field)
-        if array is not None:
-            yield start + field, array, annotated, batch
-    for field, axes in _batches(type(record)).items():
-        yield from named_arrays(getattr(record, field), start + field, (*batch, *axes))
-
-
 def record_values(
-    record: Any, name: str = "", *, on_host: bool = False
+    record: Any, name: str, *, on_host: bool = False
 ) -> dict[str, tuple[Any, Values]]:
     """Returns the arrays of a record with the values that each may have, for `check_values`.
 
-    Arguments: name: of the record, in errors. on_host: read all there, since they are few numbers.
+    Arguments: record: None has no arrays. name: of the record, in errors. on_host: read all there,
+    since they are few numbers.
     """
     found: dict[str, tuple[Any, Values]] = {}
-    for label, array, annotated, _ in named_arrays(record, name):
-        if annotated.values is None:
-            continue
-        known = not isinstance(array, Tracer)
-        if on_host and known:
+    if record is None:
+        return found
+    for field, annotated in array_fields(type(record)).items():
+        array = operator.attrgetter(field)(record)
+        if on_host and array is not None and not isinstance(array, Tracer):
             array = np.asarray(array)
-        found[label] = array, annotated.values
-        for part in annotated.parts if known else ():
-            found[f"{label} {part.words}"] = part.take(np.asarray(array)), part.values
+        found |= annotated.checks(array, f"{name}.{field}")
     return found
 
 
@@ -142,10 +129,14 @@ def check_record(record: Any, owner: str, sizes: Mapping[str, int] | None = None
 
     Raises: ValueError, one line: the array, what was expected and what it has.
     """
-    known = dict(sizes or {})
-    for name, array, annotated, batch in named_arrays(record):
-        expected, found = annotated.shape(array, known, batch), np.shape(array)
+    known, values = dict(sizes or {}), {}
+    for name, annotated in array_fields(type(record)).items():
+        array = operator.attrgetter(name)(record)
+        if array is None:
+            continue
+        expected, found = annotated.shape(array, known), np.shape(array)
         if found != expected:
             shown = f"({', '.join(map(str, expected))}{',' * (len(expected) == 1)})"
             raise ValueError(f"{owner}: {name}: expected shape {shown}, got {found}")
-    check_values(owner, record_values(record))
+        values |= annotated.checks(array, name)
+    check_values(owner, values)

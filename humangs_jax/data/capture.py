@@ -26,15 +26,15 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import UNIT, checked_arguments
 from humangs_jax.core.pytree import short_repr
-from humangs_jax.core.records import Batch
+from humangs_jax.core.records import Batch, check_record
 from humangs_jax.data.capture_checks import (
     CaptureError,
     body_parameters,
     check_names,
     check_place,
-    check_range,
     checked_camera,
     checked_frame,
+    in_unit_range,
     numbers,
 )
 from humangs_jax.data.masks import masks_at_edges
@@ -114,6 +114,21 @@ class Capture:
     @property
     def frame_count(self) -> int:
         return len(self.poses.translation)
+
+    def check(self, owner: str) -> None:
+        """Check a capture that may have been made by hand.
+
+        Raises: ValueError, one line that begins with `owner`, unless there are a photo, a mask, a
+        camera and a frame for each view, a body that fits the poses, and finite numbers in range.
+        """
+        if self.view_count == 0:
+            raise ValueError(f"{owner}: 0 views; at least one photo is needed")
+        require_pinhole(owner, self.cameras)
+        sizes = {"n": len(self.body.template), "j": len(self.body.parents)}
+        check_record(self, owner, {"m": self.frame_count, **sizes})
+        if not 0 <= np.min(self.frames) <= np.max(self.frames) < self.frame_count:
+            expected = f"expected 0 to {self.frame_count - 1}, got {self.frames}"
+            raise ValueError(f"{owner}: frames: {expected}")
 
     def pose(self, frame: int) -> BodyPose:
         """The pose of one frame (not of one view: that is `pose(capture.frames[view])`).
@@ -222,11 +237,10 @@ def capture_from_arrays(
     images = numbers(images, source, "images")
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
         raise CaptureError(source, "images", f"expected shape (views, h, w, 3), got {images.shape}")
-    check_range(images, source, "images")
+    images = in_unit_range(images, source, "images")
     v, height, width, _ = images.shape
     if masks is not None:
-        masks = numbers(masks, source, "masks", (v, height, width))
-        check_range(masks, source, "masks")
+        masks = in_unit_range(numbers(masks, source, "masks", (v, height, width)), source, "masks")
     K = numbers(K, source, "K")
     K = numbers(np.broadcast_to(K, (v, 3, 3)) if K.shape == (3, 3) else K, source, "K", (v, 3, 3))
     cam_from_world = numbers(cam_from_world, source, "cam_from_world", (v, 4, 4))
@@ -447,38 +461,31 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
 
 
 def _check_before_writing(capture: Capture) -> None:
-    """Everything that reading would check, of a `Capture` made by hand."""
-    v, (height, width) = len(capture.images), capture.images.shape[1:3]
-    cameras, poses = capture.cameras, capture.poses
-    require_pinhole("a capture", cameras)
-    # arrays give cameras of the images' number and size; a `Capture` may hold others
-    if len(cameras.K) != v:
-        raise CaptureError(
-            "capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}"
-        )
-    if (cameras.width, cameras.height) != (width, height):
+    """Raises: CaptureError for what reading would refuse of a `Capture` that was made by hand."""
+    # what the annotations say
+    try:
+        capture.check("capture")
+    except ValueError as error:
+        raise CaptureError("", "", error) from error
+
+    # cameras of the size of the photos, with rigid poses
+    cameras, size = capture.cameras, capture.images.shape[2:0:-1]
+    if (cameras.width, cameras.height) != size:
+        expected = f"expected the image size {size[0]} x {size[1]}"
         got = f"{cameras.width} x {cameras.height}"
-        raise CaptureError(
-            "capture", "cameras", f"expected the image size {width} x {height}, got {got}"
-        )
-    # all else, without keeping the result
-    capture_from_arrays(
-        capture.images,
-        np.asarray(cameras.K),
-        np.asarray(cameras.cam_from_world),
-        np.asarray(poses.rotations),
-        np.asarray(poses.translation),
-        betas=capture.betas,
-        shape_names=capture.body.shape_names[: len(capture.betas)] or None,
-        masks=capture.masks,
-        frames=capture.frames,
-        names=capture.names,
-        background="white",
-        body=capture.body,
-        displacement=capture.displacement,
-        unknown=capture.unknown,
-        source="capture",
-    )
+        raise CaptureError("capture", "cameras", f"{expected}, got {got}")
+    K, cam_from_world = np.asarray(cameras.K), np.asarray(cameras.cam_from_world)
+    for i in range(capture.view_count):
+        checked_camera(K[i], cam_from_world[i], *size, "capture", f"view {i}")
+
+    # numbers of a size that people have, coefficients that the body has, names that files can have
+    body, poses = capture.body, capture.poses
+    values = capture.betas, poses.rotations, poses.translation
+    names = body.shape_names[: len(capture.betas)] or None
+    body_parameters(body, *values, "capture", names, capture.displacement)
+    check_names(capture.names, capture.view_count, "capture")
+    if capture.unknown is not None and capture.masks is None:
+        raise CaptureError("capture", "unknown", "expected masks, too")
 
 
 def _write_folder(folder: Path, capture: Capture, target: Path) -> None:

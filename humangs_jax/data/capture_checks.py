@@ -142,11 +142,14 @@ def floats(
     return array.reshape(shape)
 
 
-def check_range(array: np.ndarray, file: object, field: str) -> None:
-    """Colors and coverage lie in [0, 1]."""
+def in_unit_range(
+    array: Float[np.ndarray, "*shape"], file: object, field: str
+) -> Float[np.ndarray, "*shape"]:
+    """Colors or coverage in [0, 1]; what overshoots by less than `COLOR_SLACK` is clipped."""
     low, high = float(array.min()), float(array.max())
     if low < -COLOR_SLACK or high > 1 + COLOR_SLACK:
         raise CaptureError(file, field, f"expected values in [0, 1], got {low:.4g} to {high:.4g}")
+    return np.clip(array, 0, 1)
 
 
 # Parts of a capture

@@ -494,9 +494,9 @@ def bad_captures():
         "images": spoiled(images=capture.images * np.float32(255)),
         "masks": spoiled(masks=capture.masks * np.float32(np.nan)),
         "cameras: expected the image size": spoiled(cameras=half),
-        "cameras: expected 3": spoiled(cameras=capture.select([0, 1]).cameras),
-        "rotations": spoiled(poses=poses),
-        "frames[0]": spoiled(frames=np.full(VIEWS, 7)),
+        "cameras.K: expected shape (3, 3, 3)": spoiled(cameras=capture.select([0, 1]).cameras),
+        "poses.rotations": spoiled(poses=poses),
+        "frames: expected 0 to": spoiled(frames=np.full(VIEWS, 7)),
         "names": spoiled(names=("a", "b", "c/d")),
         "betas": spoiled(betas=np.ones(7, np.float32)),
         "displacement": spoiled(displacement=np.ones((4, 3), np.float32)),
@@ -579,3 +579,14 @@ def test_of_an_older_capture_the_run_that_made_it_tells_whether_cameras_are_cali
     save_capture(tmp_path / "me", load_capture("demo_capture", views=[0]).resized(32))
     write_json(tmp_path / "me" / "start.json", mark)
     assert load_capture(tmp_path / "me").calibrated == calibrated
+
+
+def test_photos_that_overshoot_by_a_rounding_are_used_and_written(tmp_path):
+    """Resampling may leave 1.0004; what is read, used and written is 1."""
+    given = arrays()
+    given["images"] = np.where(given["images"] > 0.5, np.float32(1.0004), given["images"])
+    capture = capture_from_arrays(**given)
+    assert capture.images.max() == 1
+    capture.check("capture")
+    save_capture(tmp_path / "me", capture)
+    assert load(tmp_path / "me").images.max() == 1
