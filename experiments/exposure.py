@@ -20,7 +20,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import (
     PARTS,
     body_parts,
-    camera_gains,
+    exposure_gains,
     gains_of,
     linked_views,
     part_colors,
@@ -164,7 +164,7 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
         colors, seen = points_of(photos)
         common = gains_of(colors, seen)
         gains = {"photographed": np.ones_like(common), "common points": common}
-        gains["now"] = camera_gains(photos)
+        gains["now"] = 1 / exposure_gains(photos)
         in_flat = points_of(truth.select(views))[0]
         parts = body_parts(body)
         row: dict[str, object] = {
@@ -173,7 +173,7 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
         }
         same = one.select(views)
         points = points_of(same)
-        moved = np.log(camera_gains(same) / gains_of(*points))
+        moved = np.log(exposure_gains(same) * gains_of(*points))
         row["in one light"] = float(np.abs(moved).max())
         row["groups"] = int(linked_views(*points).max()) + 1
         rows[name] = row

@@ -19,7 +19,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import apply_gain, camera_gains
+from humangs_jax.data.exposure import apply_gain, exposure_gains
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import mean_scores
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
@@ -43,13 +43,13 @@ def held_out_scores(
     truth, masks: photos and masks of the person alone on white. Default: those of the capture.
     """
     rows: dict[str, list[Scores]] = {"own": [], "shared": []}
-    gains = camera_gains(capture)
+    gains = 1 / exposure_gains(capture)
     for view in views:
         others = [other for other in range(capture.view_count) if other != view]
         rest, shown = capture.select(others), capture.select([view])
         avatar = make(rest)
         # of the others alone the gains are the same but for one factor
-        factor = np.exp(np.mean(np.log(gains[others] / camera_gains(rest)), axis=0))
+        factor = np.exp(np.mean(np.log(gains[others] * exposure_gains(rest)), axis=0))
         told = dataclasses.replace(
             shown,
             images=shown.images if truth is None else truth[[view]],

@@ -14,6 +14,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.unseen import with_guesses
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import prepare_capture
+from humangs_jax.data.views import to_network_views
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import PROTOCOLS, mean_scores, score_views
 from humangs_jax.losses.loss_networks import load_lpips
@@ -84,8 +85,9 @@ def unseen(
 def both_avatars(variables: Any, config: HumanGSConfig, capture: Capture) -> dict[str, Avatar]:
     """The avatars of a capture as the network makes it, and with guesses, by one pass."""
     prepared = prepare_capture(capture, config)
-    body, views = prepared.body, reconstruction.network_views(prepared, config)
+    body, size, crop = prepared.body, config.image_size, config.runtime.crop
     assert body is not None  # prepared for this network
+    views = to_network_views(prepared.capture, size, crop, prepared.displacement)
     inputs = reconstruction._prepare(body, views, config)
     sized = reconstruction.fit_buffers(inputs.foreground, inputs.view_count, config)
     outputs = _network(variables, sized, inputs)

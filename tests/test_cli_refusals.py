@@ -301,8 +301,8 @@ def test_a_capture_that_looks_wrong_is_warned_about(capture_folder, tmp_path, mo
     """The quick part of `check`; here the command ends after it."""
     monkeypatch.setattr(
         many,
-        "reconstruct_many",
-        lambda variables, config, captures, batch: iter([captures["turned"]()][1:]),
+        "reconstruct_batch",
+        lambda variables, config, captures, batch: iter([captures[0]()][1:]),
     )
     turned = shutil.copytree(capture_folder, tmp_path / "turned")
     edit_npz(turned / "body.npz", rotations=np.degrees)

@@ -28,7 +28,7 @@ from humangs_jax.core.arrays import from_host
 from humangs_jax.core.progress import COMPILING, stage
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.data.view_choice import select_views
+from humangs_jax.data.view_choice import best_views
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import add_files, check_ours
@@ -120,7 +120,7 @@ def _write_demo(
     with stage("loading"):
         inputs = _timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE))
         if settings.views is not None:
-            inputs = inputs.select(select_views(inputs, settings.views))
+            inputs = inputs.select(best_views(inputs, settings.views))
         truth, motion = load_capture(f"{DEMO_CAPTURE}/held_out"), load_motion()
         variables, config = _timed(timings, "load_weights", lambda: load_weights(weights))
         config = settings.network(config)

@@ -56,7 +56,7 @@ class Settings:
     views: Count | None = knob(
         None, cost="what the other photos show", gain="time in proportion", measured=MEASURED
     )
-    """The most photos that are used, chosen by `select_views`; None for all."""
+    """The most photos that are used, chosen by `prepare_capture`; None for all."""
     runtime: Runtime = dataclasses.field(default_factory=Runtime)
     """How the network runs."""
     refine_iterations: Iterations = knob(

@@ -71,22 +71,22 @@ def draw(
     cameras: Iterable[Camera],
     background: Background = None,
     how: SplatConfig | None = None,
-    exposures: Float[np.ndarray, "v 3"] | None = None,
+    exposure_gains: Float[np.ndarray, "v 3"] | None = None,
 ) -> Iterator[Rendering]:
     """One rendering per pose and camera. how: None for what the avatar's weights were trained with.
-    exposures: of the cameras, see `data.exposure`.
+    exposure_gains: of the cameras, see `data.exposure`.
     """
     if how is None:
         how = SPLAT_PRESETS[avatar.rendering]
     gaussians = (posed(avatar, pose) for pose in poses)
-    if exposures is not None:
+    if exposure_gains is not None:
 
         def lit(g, e):
             return replace(
                 g, **jax.tree.map(lambda x: x * e, {"colors": g.colors, "harmonics": g.harmonics})
             )
 
-        gaussians = (lit(g, e) for g, e in zip(gaussians, exposures, strict=True))
+        gaussians = (lit(g, e) for g, e in zip(gaussians, exposure_gains, strict=True))
     return draw_gaussians(gaussians, cameras, background, how)
 
 

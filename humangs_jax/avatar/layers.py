@@ -106,14 +106,14 @@ def write_views(
     shot: Shot,
     exr: ExrLayers | None = None,
     progress: bool = True,
-    exposures: Float[np.ndarray, "v 3"] | None = None,
+    exposure_gains: Float[np.ndarray, "v 3"] | None = None,
     names: Sequence[str] | None = None,
 ) -> int:
     """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and
     views.exr if asked.
 
-    exposures: of the cameras, see `data.exposure`. names: of the images, instead of view_000 and so
-    on.
+    exposure_gains: of the cameras, see `data.exposure`. names: of the images, instead of view_000
+    and so on.
 
     The files appear together when all are drawn; other views of an earlier call are removed.
     Returns the number of views.
@@ -137,7 +137,7 @@ def write_views(
     check_ours((out / f"{name}.png" for name in names), is_own_output)
 
     def write(folder: Path):
-        drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposures)
+        drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposure_gains)
         views = []
         for i, rendering in enumerate(
             bar(drawn, total=count, desc="render", unit="view", first=COMPILING, shown=progress)

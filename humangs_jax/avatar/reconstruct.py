@@ -5,8 +5,8 @@ few sizes (`buffers.round_up`), and padding is masked.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,6 @@ from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.processes import compile_ahead
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
-from humangs_jax.core.records import check_record
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import (
@@ -54,7 +53,6 @@ from humangs_jax.data.views import (
     to_network_views,
 )
 from humangs_jax.geometry import transform
-from humangs_jax.geometry.camera import require_pinhole
 from humangs_jax.io.reading import check_limit
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import needed_tokens
@@ -74,7 +72,7 @@ they are not inverted.
 """
 POSED = "the posed vertices, which all arrays of the body move"
 BATCH = 8
-"""Captures of `reconstruct_many` at a time: beyond it memory grows, and little else."""
+"""Captures of `reconstruct_batch` at a time: beyond it memory grows, and little else."""
 
 
 @checked_arguments
@@ -112,20 +110,25 @@ def reconstruct(
     """
     _check(capture, "capture")
     prepared = prepare_capture(capture, config)
-    body, views = prepared.body, network_views(prepared, config)
+    body, photos = prepared.body, prepared.capture
     assert body is not None  # prepared for a network
 
-    # few numbers of views are compiled, and the photos say how many tokens there are
-    count = len(views.images)
-    bucket = round_up(count, smallest=1)
-    if bucket > count:
+    # few numbers of views are compiled: the others are padded
+    size, crop = config.image_size, config.runtime.crop
+    views = to_network_views(photos, size, crop, prepared.displacement)
+    bucket = round_up(photos.view_count, smallest=1)
+    if bucket > photos.view_count:
         views = pad_views(views, bucket)
     with compiling(("reconstruct", config, views.images.shape)):
-        # two programs are compiled side by side, where masks alone say how many tokens there are
-        sized = _sized_by_masks(views, config)
-        if sized is not None:
+        # masks alone say how many tokens there are, where every photo has one and the network reads
+        # the person's pixels alone: then two programs are compiled side by side
+        person, sized = np.asarray(views.masks) > MASK_THRESHOLD, None
+        if config.conventions.pixels == "person" and person.any(axis=(1, 2)).all():
+            sized = fit_buffers(from_host(person), views.view_count, config)
             shapes = jax.eval_shape(_prepare, body, views, config)
             compile_ahead(_reconstruct, variables, sized, body, views, shapes)
+
+        # the body as each photo shows it, then the network
         inputs = _prepare(body, views, config)
         check_values("reconstruct: capture", {POSED: (inputs.posed_vertices, FINITE)})
         if sized is None:
@@ -136,110 +139,84 @@ def reconstruct(
     return avatar
 
 
-@checked_arguments
-def reconstruct_batch(
-    variables: Variables, config: HumanGSConfig, captures: Sequence[Capture | PreparedCapture]
-) -> list[Avatar]:
-    """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of
-    views.
-
-    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the
-    number of people. People in skirts, whose bodies have more vertices, are reconstructed alone.
-
-    Args:
-        variables: of the network; with `config`, what `load_weights` returns.
-        config: of the network.
-        captures: of people with one body model; their shapes may differ.
-
-    Returns:
-        An avatar for each capture.
-
-    Raises:
-        ValueError: if there is no capture, one has no view or values that are not finite or out of
-            range, or their bodies differ.
-
-    Examples:
-        >>> avatars = hg.reconstruct_batch(*hg.load_weights(), captures)
-    """
-    _check_all(captures)
-    everybody = [prepare_capture(capture, config) for capture in captures]
-    together = [prepared for prepared in everybody if not prepared.skirt]
-    # people without a skirt share a mesh, and are reconstructed together
-    batch = iter(())
-    if together:
-        body, views, sized = _stacked(config, together)
-        with compiling(("reconstruct_batch", sized, views.images.shape)):
-            avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(
-                variables, sized, body, views
-            )
-        batch = iter(avatars)
-
-    # the others have meshes of several sizes
-    found = []
-    for prepared in everybody:
-        if prepared.skirt:
-            found.append(reconstruct(variables, config, prepared))
-        else:
-            avatar = next(batch)
-            found.append(replace(avatar, light=None) if prepared.turned else avatar)
-    return found
-
-
 class Reconstructed(NamedTuple):
-    """A capture by name with its avatar, or with what is wrong with it."""
+    """A capture of a batch with its avatar, or with what is wrong with it."""
 
-    name: str
-    """The name of the capture."""
-    capture: Capture | PreparedCapture | None = None
-    """The capture; None if it could not be read."""
+    capture: PreparedCapture | None = None
+    """The capture as it was used; None if there is an error."""
     avatar: Avatar | None = None
     """The avatar; None if there is an error."""
     error: Exception | None = None
     """What is wrong; None if nothing is."""
 
 
-def reconstruct_many(
+@checked_arguments
+def reconstruct_batch(
     variables: Variables,
     config: HumanGSConfig,
-    captures: Mapping[str, Callable[[], Capture | PreparedCapture]],
-    batch: int | None = None,
+    captures: Sequence[Capture | PreparedCapture | Callable[[], Capture | PreparedCapture]],
+    batch: int = BATCH,
 ) -> Iterator[Reconstructed]:
-    """Yields the avatar of each capture, in their order; `batch` captures at a time are read and
-    reconstructed by one `vmap`. A capture that cannot be used does not stop the others.
+    """Reconstruct several people, `batch` at a time in one program, whatever their numbers of
+    views.
 
-    Arguments: captures: functions that load one each, by its name; ValueError and OSError that they
-    raise are yielded.
-    batch: None for `BATCH`.
+    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the
+    number of people. People in skirts, whose bodies have more vertices, are reconstructed alone,
+    as those are whose body model or whose upright axis is not that of the others. A capture that
+    cannot be used does not stop the others.
+
+    Args:
+        variables: of the network; with `config`, what `load_weights` returns.
+        config: of the network.
+        captures: of people, whose shapes may differ; or functions that load one each, when its
+            turn comes.
+        batch: captures at a time.
+
+    Yields:
+        Each capture with its avatar, in their order; in place of both the ValueError or OSError
+        that a capture, or the function that loads it, has raised.
+
+    Examples:
+        >>> for capture, avatar, error in hg.reconstruct_batch(*hg.load_weights(), captures):
+        ...     print(error or avatar)
     """
-    names, batch = list(captures), batch or BATCH
-    for start in range(0, len(names), batch):
-        done = [_loaded(name, captures[name]) for name in names[start : start + batch]]
-        good = [each.capture for each in done if each.capture is not None]
-        avatars: Iterator[Avatar] = iter(())
-        if len(good) > 1:
-            with contextlib.suppress(ValueError):  # of one of them: which one is found below
-                avatars = iter(reconstruct_batch(variables, config, good))
+    for start in range(0, len(captures), batch):
+        # what is wrong with one capture is kept in its place
+        done = []
+        for given in captures[start : start + batch]:
+            try:
+                capture: Any = given() if callable(given) else given
+                _check(capture, "capture")
+                done.append(Reconstructed(prepare_capture(capture, config)))
+            except (ValueError, OSError) as error:
+                done.append(Reconstructed(error=error))
+
+        # people who share a mesh and a way up are one batch; if one of them fails, each is alone
+        bare = [each.capture for each in done if each.capture and not each.capture.skirt]
+        alike = [
+            each for each in bare if each.turned == bare[0].turned and _same_body(each, bare[0])
+        ]
+        avatars: dict[int, Avatar] = {}
+        if len(alike) > 1:
+            with contextlib.suppress(ValueError):
+                body, views, sized = stack_captures(config, alike)
+                with compiling(("reconstruct_batch", sized, views.images.shape)):
+                    found, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(
+                        variables, sized, body, views
+                    )
+                avatars = {id(each): avatar for each, avatar in zip(alike, found, strict=True)}
+
         for each in done:
-            avatar = None
-            if each.capture is not None:
-                avatar = next(avatars, None)
-            if avatar is not None:
-                yield each._replace(avatar=avatar)
-            elif each.capture is not None:
-                try:
-                    yield each._replace(avatar=reconstruct(variables, config, each.capture))
-                except ValueError as error:
-                    yield each._replace(error=error)
-            else:
+            if each.capture is None:
                 yield each
-
-
-def _loaded(name: str, load: Callable[[], Capture | PreparedCapture]) -> Reconstructed:
-    """A capture without its avatar, or what is wrong with it."""
-    try:
-        return Reconstructed(name, capture=load())
-    except (ValueError, OSError) as error:
-        return Reconstructed(name, error=error)
+                continue
+            try:
+                avatar = avatars.get(id(each.capture))
+                if avatar is None:
+                    avatar = reconstruct(variables, config, each.capture)
+                yield each._replace(avatar=avatar)
+            except ValueError as error:
+                yield Reconstructed(error=error)
 
 
 @checked_arguments
@@ -260,7 +237,8 @@ def stack_captures(
         photos need.
 
     Raises:
-        ValueError: as `reconstruct_batch`; also if some worlds, but not all, are not y-up and the
+        ValueError: if there is no capture, one has no view or values that are not finite or out of
+            range, or their bodies differ; also if some worlds, but not all, are not y-up and the
             avatars are to have the light of their photos: in a batch all have one or none has.
 
     Examples:
@@ -268,9 +246,18 @@ def stack_captures(
         >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
         >>> avatars, dropped = batched(variables, config, body, views)  # all as one batch
     """
-    _check_all(captures)
+    if not captures:
+        raise ValueError("captures: none given")
+    for index, capture in enumerate(captures):
+        _check(capture, f"captures[{index}]")
     everybody = [prepare_capture(capture, config) for capture in captures]
-    body, views, config = _stacked(config, everybody)
+    for index, prepared in enumerate(everybody):
+        if not _same_body(prepared, everybody[0]):
+            raise ValueError(
+                f"captures[{index}]: its body is not the one of captures[0]; a batch shares one"
+                " body model"
+            )
+
     # light needs to know which way is up
     turned = [prepared.turned for prepared in everybody]
     if config.conventions.light and any(turned):
@@ -280,69 +267,28 @@ def stack_captures(
                 " light, but others have: stack them apart, or use reconstruct_batch"
             )
         config = config.with_conventions(light=False)
-    return body, views, config
 
-
-def _stacked(
-    config: HumanGSConfig, everybody: Sequence[PreparedCapture]
-) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
-    """The body, the views of all people, and the configuration with room for their tokens.
-
-    Skirts are left out: a batch shares one body.
-    """
+    # one number of views, of shape coefficients and of vertices for all
     body = gaussian_body(everybody[0].capture.body, config)
     bucket = round_up(max(each.capture.view_count for each in everybody), smallest=1)
     coefficients = max(len(each.capture.betas) for each in everybody)
     subjects = []
     for prepared in everybody:
-        views = pad_views(network_views(prepared, config), bucket)
-        betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
-        displacement = views.displacement
-        if displacement is not None:
-            displacement = displacement[: len(body.template)]
+        moved = prepared.displacement
+        if moved is not None:
+            moved = moved[: len(body.template)]
         elif allows_vertex_offsets(config):
-            displacement = jnp.zeros_like(body.template)  # of photos without masks
-        subjects.append(replace(views, betas=betas, displacement=displacement))
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
-    inputs = _prepare_batch(body, batch, config)
+            moved = np.zeros(body.template.shape, body.template.dtype)  # of photos without masks
+        size, crop = config.image_size, config.runtime.crop
+        views = pad_views(to_network_views(prepared.capture, size, crop, moved), bucket)
+        betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
+        subjects.append(replace(views, betas=betas))
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
+
+    # room for the tokens of the photos that need most
+    inputs = _prepare_batch(body, views, config)
     check_values("reconstruct: captures", {POSED: (inputs.posed_vertices, FINITE)})
-    return body, batch, fit_buffers(inputs.foreground, inputs.view_count, config)
-
-
-def _check_all(captures: Sequence) -> None:
-    """Raises: TypeError, ValueError unless these are captures of one body model that can be
-    reconstructed.
-    """
-    if not captures:
-        raise ValueError("captures: none given")
-    for index, capture in enumerate(captures):
-        if not isinstance(capture, Capture | PreparedCapture):
-            raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")
-        _check(capture, f"captures[{index}]")
-        body, first = _views_of(capture).body, _views_of(captures[0]).body
-        if body is not first and not _equal(body, first):
-            raise ValueError(
-                f"captures[{index}]: its body is not the one of captures[0]; a batch shares one"
-                " body model"
-            )
-
-
-def network_views(prepared: PreparedCapture, config: HumanGSConfig) -> SubjectViews:
-    """The photos as the network wants them, and how far the body moves."""
-    views = to_network_views(prepared.capture, config.image_size, config.runtime.crop)
-    if prepared.displacement is not None:
-        views = replace(views, displacement=from_host(prepared.displacement))
-    return views
-
-
-def _sized_by_masks(views: SubjectViews, config: HumanGSConfig) -> HumanGSConfig | None:
-    """What `fit_buffers` will make of the network's inputs, where the network reads the person's
-    pixels alone and every photo has a mask; None elsewhere.
-    """
-    person = np.asarray(views.masks) > MASK_THRESHOLD
-    if config.conventions.pixels != "person" or not person.any(axis=(1, 2)).all():
-        return None
-    return fit_buffers(from_host(person), views.view_count, config)
+    return body, views, fit_buffers(inputs.foreground, inputs.view_count, config)
 
 
 def fit_buffers(
@@ -539,35 +485,25 @@ def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Av
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
 
 
-def _views_of(capture: Capture | PreparedCapture) -> Capture:
-    if isinstance(capture, PreparedCapture):
-        return capture.capture
-    return capture
-
-
 def _check(given: Capture | PreparedCapture, name: str) -> None:
-    capture = _views_of(given)
-    if capture.view_count == 0:
-        raise ValueError(f"{name}: 0 views; at least one photo is needed")
+    """Raises: TypeError, ValueError unless this is a capture that can be reconstructed."""
+    capture = given.capture if isinstance(given, PreparedCapture) else given
+    if not isinstance(capture, Capture):
+        raise TypeError(f"{name}: expected Capture, got {type(capture).__name__}")
     check_limit("network_views", capture.view_count, f"photos in {name}")
-    require_pinhole(f"reconstruct: {name}", capture.cameras)
-    # a photo, mask, camera and frame for each view, a body that fits the poses, finite numbers
-    body, owner = capture.body, f"reconstruct: {name}"
-    sizes = {"m": capture.frame_count, "n": len(body.template), "j": len(body.parents)}
-    check_record(capture, owner, sizes)
+    capture.check(f"reconstruct: {name}")
+    # what poses move has to be finite, too
+    body = capture.body
     arrays = {"template": body.template, "skinning_weights": body.skinning_weights}
-    check_values(owner, {f"body.{name}": (array, FINITE) for name, array in arrays.items()})
-    # each view shows a pose that there is
-    if not 0 <= np.min(capture.frames) <= np.max(capture.frames) < capture.frame_count:
-        raise ValueError(
-            f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got"
-            f" {capture.frames}"
-        )
+    check_values(f"reconstruct: {name}", {f"body.{key}": (x, FINITE) for key, x in arrays.items()})
 
 
-def _equal(body: BodyModel, other: BodyModel) -> bool:
-    return jax.tree.structure(body) == jax.tree.structure(other) and jax.tree.all(
-        jax.tree.map(np.array_equal, body, other)
+def _same_body(one: PreparedCapture, other: PreparedCapture) -> bool:
+    """Whether the people have one body model, which may have been read twice."""
+    mine, theirs = one.capture.body, other.capture.body
+    return mine is theirs or (
+        jax.tree.structure(mine) == jax.tree.structure(theirs)
+        and jax.tree.all(jax.tree.map(np.array_equal, mine, theirs))
     )
 
 

@@ -234,7 +234,7 @@ class Render:
             from humangs_jax.avatar.layers import ExrLayers, write_views
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.data.exposure import exposures
+            from humangs_jax.data.exposure import exposure_gains
 
             # everything that can be wrong with the options is found before the avatar is read
             check_video(
@@ -258,7 +258,7 @@ class Render:
                 poses = repeated(pose, len(names))
             elif self.capture is not None:
                 capture = load_capture(self.capture)
-                (poses, cameras), exposed = capture_views(avatar, capture), exposures(capture)
+                (poses, cameras), exposed = capture_views(avatar, capture), exposure_gains(capture)
             else:
                 pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
                 poses, cameras = turntable_views(avatar, pose, views, shot)
@@ -276,7 +276,7 @@ class Render:
             else:
                 exr = layers if self.exr else None
                 written = write_views(
-                    self.out, avatar, poses, cameras, shot, exr, exposures=exposed, names=names
+                    self.out, avatar, poses, cameras, shot, exr, exposure_gains=exposed, names=names
                 )
                 what = (
                     f"{_counted(written, 'view')} of {cameras.width} x"

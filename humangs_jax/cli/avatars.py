@@ -162,7 +162,7 @@ class Reconstruct:
             )
         require_place(out, "--out", Place() if several else AVATAR)
         with stage("starting"):
-            from humangs_jax.avatar.reconstruct import reconstruct_many
+            from humangs_jax.avatar.reconstruct import BATCH, reconstruct_batch
             from humangs_jax.avatar.unseen import guess_line
             from humangs_jax.data.capture import capture_checksum
             from humangs_jax.network.weights import load_weights
@@ -210,10 +210,11 @@ class Reconstruct:
         )
         failed = []
         with stage("reconstructing"):
-            made = reconstruct_many(variables, config, load, self.batch)
-            for name, photos, avatar, error in bar(
-                made, total=len(load), shown=several, desc="reconstruct"
-            ):
+            made = reconstruct_batch(variables, config, [*load.values()], self.batch or BATCH)
+            named = bar(
+                zip(load, made, strict=True), total=len(load), shown=several, desc="reconstruct"
+            )
+            for name, (photos, avatar, error) in named:
                 if error is not None:
                     if not several:
                         raise error

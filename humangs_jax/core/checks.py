@@ -41,6 +41,7 @@ HINTS = {
     ("Avatar", "Gaussians"): "an Avatar has what they need to be posed",
     ("Avatar", "tuple"): "reconstruct_views returns (avatar, dropped)",
     ("Avatar", "list"): "one at a time",
+    ("Avatar", "Reconstructed"): "it has one, .avatar",
     ("Camera", "Capture"): "it has a batch of them, capture.cameras",
     ("Camera", "list"): "stack_cameras makes a batch of them",
     ("BodyPose", "Capture"): "capture.pose(frame) is one",

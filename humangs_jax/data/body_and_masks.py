@@ -20,7 +20,7 @@ the host, by numpy and scipy: nothing is compiled.
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -50,34 +50,23 @@ POINTS = 1000
 """The number of points on the skin."""
 
 
-def drop_views_without_person(capture: Capture) -> Capture:
-    """The capture with the views that show the person: all but those of `views_without_person`,
-    which a warning names.
-
-    The same object where these are all, and without masks. Raises: as `without_views`.
-    """
-    return without_views(capture, views_without_person(capture))
-
-
-def without_views(capture: Capture, reasons: dict[int, str]) -> Capture:
-    """The capture without some views, which a warning names with the reasons; the same object where
-    these are none.
+def report_left_out(names: Sequence[str], reasons: dict[int, str]) -> None:
+    """Warns of views that are left out, by their names, with the reasons of `views_without_person`.
 
     Raises: CaptureError, one line that names the views, if none is left.
     """
     if not reasons:
-        return capture
+        return
     lines = []
     for reason in dict.fromkeys(reasons.values()):
-        names = [capture.names[view] for view in reasons if reasons[view] == reason]
-        lines.append(f"{', '.join(names)}: {reason}")
-    if len(reasons) == capture.view_count:
+        views = [names[view] for view in reasons if reasons[view] == reason]
+        lines.append(f"{', '.join(views)}: {reason}")
+    if len(reasons) == len(names):
         problem = f"no view is left that shows the person: {'; '.join(lines)}"
         raise CaptureError("capture", "masks", problem)
     verb = "is" if len(reasons) == 1 else "are"
-    count = f"{len(reasons)} of {capture.view_count} views {verb}"
+    count = f"{len(reasons)} of {len(names)} views {verb}"
     logger.warning("%s left out: %s", count, "; ".join(lines))
-    return capture.select([view for view in range(capture.view_count) if view not in reasons])
 
 
 def views_without_person(capture: Capture) -> dict[int, str]:

@@ -68,46 +68,38 @@ def equalize_exposure(capture: Capture) -> Capture:
     """The capture in equal exposure, which is what network and refinement see, with the gains
     recorded; the same object where they are recorded already.
 
-    Without masks nothing is known of the exposure, and nothing is recorded. All masks show the
-    person.
+    Without masks nothing is known of the exposure, and nothing is recorded.
+
+    capture: photos on white; all masks show the person.
     """
     if capture.masks is None or capture.gains is not None:
         return capture
-    gains = camera_gains(capture)
+    gains = np.ones((capture.view_count, 3))
+    if capture.view_count > 1:
+        # by the points that views share, then by the parts of the body between views that do not
+        colors, seen = points_of(capture)
+        gains = gains_of(colors, seen)
+        groups = linked_views(colors, seen)
+        if groups.max() > 0:
+            parts, frames = body_parts(capture.body), np.asarray(capture.frames)
+            gains = gains * gains_between(colors * gains[:, None], seen, parts, groups, frames)
     images = capture.images
     if (gains != 1).any():
         images = apply_gain(images, capture.masks, gains)
     return dataclasses.replace(capture, images=images, gains=gains)
 
 
-def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
+def exposure_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
     """Gain per view and channel with which a rendered avatar looks as each camera exposed it."""
     if capture.gains is not None:
         return 1 / capture.gains
     apart, found = views_without_person(capture), np.ones((capture.view_count, 3))
     usable = [i for i in range(capture.view_count) if i not in apart]
     if usable:
-        found[usable] = 1 / camera_gains(capture.select(usable))
+        gains = equalize_exposure(capture.select(usable)).gains
+        if gains is not None:
+            found[usable] = 1 / gains
     return found
-
-
-def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """Gain per view and channel that equalises exposure, see `gains_of` and `gains_between`.
-
-    All are 1 without masks, and for photos that have been made equal.
-
-    capture: photos on white, all of which show the person.
-    """
-    if capture.masks is None or capture.gains is not None or capture.view_count < 2:
-        return np.ones((capture.view_count, 3))
-    colors, seen = points_of(capture)
-    gains = gains_of(colors, seen)
-    groups = linked_views(colors, seen)
-    if groups.max() == 0:
-        return gains
-    parts = body_parts(capture.body)
-    equal = colors * gains[:, None]
-    return gains * gains_between(equal, seen, parts, groups, np.asarray(capture.frames))
 
 
 def points_of(

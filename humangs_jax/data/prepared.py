@@ -16,7 +16,11 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import short_repr
-from humangs_jax.data.body_and_masks import fit_vertex_offsets, views_without_person, without_views
+from humangs_jax.data.body_and_masks import (
+    fit_vertex_offsets,
+    report_left_out,
+    views_without_person,
+)
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equalize_exposure
 from humangs_jax.data.skirt import add_skirt
@@ -86,6 +90,31 @@ class PreparedCapture:
         smaller = self.capture.resized(longest)
         return PreparedCapture(self.given, smaller, self.left_out, self.up, self.chosen)
 
+    def with_body(self, config: HumanGSConfig) -> "PreparedCapture":
+        """The same with the body that carries the Gaussians of a network."""
+        capture = self.capture
+        body = gaussian_body(capture.body, config)
+        moved, skirted = None, None
+
+        # how far the body moves: as the capture says, else to the edges of the masks
+        if allows_vertex_offsets(config) and capture.displacement is not None:
+            moved = np.asarray(on_gaussian_body(capture.displacement, capture.body, config))
+        elif allows_vertex_offsets(config) and capture.masks is not None:
+            moved = fit_vertex_offsets(body, capture, always=config.runtime.displacement is True)
+
+        # a skirt, where the masks show one
+        if moved is not None:
+            skirted = add_skirt(body, capture, moved)
+        if skirted is not None:
+            body, moved = skirted
+        return dataclasses.replace(
+            self,
+            body=body,
+            displacement=moved,
+            skirt=skirted is not None,
+            network=_network_key(config),
+        )
+
 
 @checked_arguments
 def prepare_capture(
@@ -116,69 +145,37 @@ def prepare_capture(
         >>> photos = hg.prepare_capture(hg.load_capture("demo_capture"), config)
         >>> avatar = hg.refine(hg.reconstruct(variables, config, photos), photos)
     """
-    # a capture that is prepared already is only narrowed to the views
-    prepared = capture
+    # which views show the person
+    prepared, is_new = capture, False
     if isinstance(prepared, Capture):
-        prepared = _prepared_photos(prepared, views)
-    elif views is not None:
-        chosen = _chosen(prepared.capture, views)
-        if chosen is not None:
-            prepared = prepared.select(chosen)
+        is_new, reasons = True, views_without_person(prepared)
+        report_left_out(prepared.names, reasons)
+        left_out = {prepared.names[view]: reason for view, reason in reasons.items()}
+        shown = prepared
+        if reasons:
+            shown = shown.select([i for i in range(shown.view_count) if i not in reasons])
+        prepared = PreparedCapture(prepared, shown, left_out, up="y")
+
+    # the best of them, if not all are to be used
+    most = None if isinstance(views, str) else views
+    if views is not None and (most is None or most < prepared.capture.view_count):
+        prepared = prepared.select(best_views(prepared.capture, most))
+
+    # equal exposure, then the world with y up, if person and cameras stand along another axis
+    if is_new:
+        shown = equalize_exposure(prepared.capture)
+        poses, cameras = shown.poses, shown.cameras
+        up = world_up(np.asarray(poses.rotations)[shown.frames, 0], cameras)
+        if up != "y":
+            pelvis = np.asarray(shape_body(shown.body, from_host(shown.betas)).joints[0])
+            poses, cameras = turned_world(poses, cameras, up, pelvis)
+            shown = dataclasses.replace(shown, poses=poses, cameras=cameras)
+        prepared = dataclasses.replace(prepared, capture=shown, up=up)
+
+    # the body that carries the Gaussians of the network
     if config is None or prepared.network == _network_key(config):
         return prepared
-    return _with_body(prepared, config)
-
-
-def _prepared_photos(given: Capture, views: int | str | None) -> PreparedCapture:
-    """The views that show the person, or the best of them, in equal exposure and with y up."""
-    reasons = views_without_person(given)
-    capture = without_views(given, reasons)
-    chosen = _chosen(capture, views)
-    if chosen is not None:
-        capture = capture.select(chosen)
-    capture = equalize_exposure(capture)
-
-    # the world with y up, if person and cameras stand along another axis
-    up = world_up(np.asarray(capture.poses.rotations)[capture.frames, 0], capture.cameras)
-    if up != "y":
-        pelvis = np.asarray(shape_body(capture.body, from_host(capture.betas)).joints[0])
-        poses, cameras = turned_world(capture.poses, capture.cameras, up, pelvis)
-        capture = dataclasses.replace(capture, poses=poses, cameras=cameras)
-    left_out = {given.names[view]: reason for view, reason in reasons.items()}
-    return PreparedCapture(given, capture, left_out, up, chosen is not None)
-
-
-def _chosen(capture: Capture, views: int | str | None) -> list[int] | None:
-    """Which photos of those that show the person are used; None: all."""
-    if views is None or (isinstance(views, int) and views >= capture.view_count):
-        return None
-    return best_views(capture, None if isinstance(views, str) else views)
-
-
-def _with_body(prepared: PreparedCapture, config: HumanGSConfig) -> PreparedCapture:
-    """The same with the body that carries the Gaussians of a network."""
-    capture = prepared.capture
-    body = gaussian_body(capture.body, config)
-    moved, skirted = None, None
-
-    # how far the body moves: as the capture says, else to the edges of the masks
-    if allows_vertex_offsets(config) and capture.displacement is not None:
-        moved = np.asarray(on_gaussian_body(capture.displacement, capture.body, config))
-    elif allows_vertex_offsets(config) and capture.masks is not None:
-        moved = fit_vertex_offsets(body, capture, always=config.runtime.displacement is True)
-
-    # a skirt, where the masks show one
-    if moved is not None:
-        skirted = add_skirt(body, capture, moved)
-    if skirted is not None:
-        body, moved = skirted
-    return dataclasses.replace(
-        prepared,
-        body=body,
-        displacement=moved,
-        skirt=skirted is not None,
-        network=_network_key(config),
-    )
+    return prepared.with_body(config)
 
 
 def allows_vertex_offsets(config: HumanGSConfig) -> bool:

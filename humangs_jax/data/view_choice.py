@@ -7,8 +7,6 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.checks import checked_arguments
-from humangs_jax.data.body_and_masks import views_without_person, without_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, prepare_inputs, to_network_views
 from humangs_jax.network import presets
@@ -26,23 +24,6 @@ Only where no number of photos is given.
 """
 
 
-@checked_arguments
-def select_views(capture: Capture, count: int | None) -> list[int]:
-    """The numbers of `count` photos, in ascending order, that together show the body best; all of
-    them if there are no more.
-
-    Photos whose mask does not show the person are never chosen. See `best_views`.
-
-    Raises: ValueError for a count below 1; CaptureError if no photo shows the person.
-    """
-    if count is not None and count < 1:
-        raise ValueError(f"select_views: expected at least 1 photo, got {count}")
-    unusable = views_without_person(capture)
-    shown = without_views(capture, unusable)
-    usable = [view for view in range(capture.view_count) if view not in unusable]
-    return [usable[view] for view in best_views(shown, count)]
-
-
 def best_views(capture: Capture, count: int | None) -> list[int]:
     """The numbers of `count` photos, in ascending order, that together show the body best; all of
     them if there are no more.
@@ -55,7 +36,11 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
     Arguments:
         capture: photos that all show the person.
         count: None leaves out the photos that add less than `LEAST_GAIN` to what the others show.
+
+    Raises: ValueError for a count below 1.
     """
+    if count is not None and count < 1:
+        raise ValueError(f"views: expected at least 1 photo, got {count}")
     if count is not None and capture.view_count <= count:
         return list(range(capture.view_count))
     body = capture.body

@@ -264,23 +264,31 @@ CROP_MARGIN = 0.04
 """The room on each side of the person, as a share of the crop's side."""
 
 
-def cropped(capture: Capture, size: int) -> Capture:
-    """The photos, each cut to a square around the person in its mask and resized to `size` pixels.
+def crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int, int]] | None:
+    """The square (left, top, side) around the person in each mask, pixels.
 
-    All stay as they are if there are no masks, if one is empty, or if no crop is smaller than its
-    photo.
+    None if there are no masks, if one is empty, or if no square is smaller than its photo.
     """
-    if capture.masks is None:
-        return capture
-    height, width = capture.masks.shape[1:]
+    if masks is None:
+        return None
     boxes = []
-    for mask in capture.masks > MASK_THRESHOLD:
+    for mask in masks > MASK_THRESHOLD:
         low, high = person_box(mask)[::-1].T
         if not high.any():
-            return capture
+            return None
         side = int(np.ceil((high - low).max() / (1 - 2 * CROP_MARGIN)))
         boxes.append((*((low + high - side) // 2).tolist(), side))
-    if min(side for *_, side in boxes) >= max(height, width):
+    if min(side for *_, side in boxes) >= max(masks.shape[1:]):
+        return None
+    return boxes
+
+
+def cropped(capture: Capture, size: int) -> Capture:
+    """The photos, each cut to a square around the person in its mask and resized to `size` pixels;
+    all as they are where there are no such squares (`crop_boxes`).
+    """
+    boxes = crop_boxes(capture.masks)
+    if boxes is None or capture.masks is None:
         return capture
     images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
     unknown = capture.unknown
@@ -403,18 +411,26 @@ def turned_world(
     return turned, replace(cameras, cam_from_world=matrices)
 
 
-def to_network_views(capture: Capture, size: int, crop: bool = False) -> SubjectViews:
+def to_network_views(
+    capture: Capture,
+    size: int,
+    crop: bool = False,
+    displacement: Float[np.ndarray, "n 3"] | None = None,
+) -> SubjectViews:
     """A capture's photos as the network wants them: padded with white to a centred square and
     resized to `size`.
 
     Intrinsics follow the pixels. Without masks only what the posed body covers will count as
-    foreground. crop: cut to the person first, see `cropped`.
+    foreground. crop: cut to the person where that is less than the photo, see `crop_boxes`.
+    displacement: of the body that carries the Gaussians, see `SubjectViews`.
     """
+    boxes = None
     if crop:
-        capture = cropped(capture, size)
-    height, width = capture.images.shape[1:3]
-    side = max(height, width)
-    boxes = [(-((side - width) // 2), -((side - height) // 2), side)] * capture.view_count
+        boxes = crop_boxes(capture.masks)
+    if boxes is None:
+        height, width = capture.images.shape[1:3]
+        side = max(height, width)
+        boxes = [(-((side - width) // 2), -((side - height) // 2), side)] * capture.view_count
     images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
     if masks is None:
         masks = np.zeros(images.shape[:3], np.float32)
@@ -426,4 +442,5 @@ def to_network_views(capture: Capture, size: int, crop: bool = False) -> Subject
         rotations=from_host(np.asarray(capture.poses.rotations)[frames]),
         translations=from_host(np.asarray(capture.poses.translation)[frames]),
         betas=from_host(capture.betas),
+        displacement=None if displacement is None else from_host(displacement),
     )

@@ -1,4 +1,4 @@
-"""`humangs reconstruct` of a folder of captures, and `reconstruct_many`, on the tiny network."""
+"""`humangs reconstruct` of a folder of captures, and `reconstruct_batch`, on the tiny network."""
 
 import dataclasses
 import shutil
@@ -9,7 +9,7 @@ import pytest
 
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.reconstruct import reconstruct_many
+from humangs_jax.avatar.reconstruct import reconstruct_batch
 from humangs_jax.data.capture import save_capture
 from humangs_jax.network import presets
 from humangs_jax.network.humangs import init_humangs
@@ -79,18 +79,18 @@ def test_a_folder_of_captures_goes_on_with_what_is_missing_and_mixes_nothing(peo
 
 @pytest.mark.slow
 def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(network, small):
-    """13 cannot be read; 7 can be read, and fails in every batch."""
+    """The second cannot be read; the third can be read, and fails in every batch."""
 
     def unreadable():
         raise OSError("thirteen")
 
     bright = dataclasses.replace(small, images=small.images * 255)
-    captures = {"1": lambda: small, "13": unreadable, "7": lambda: bright, "4": lambda: small}
-    found = list(reconstruct_many(*network, captures, batch=3))
-    assert [each.name for each in found] == list(captures)
-    errors = {each.name: str(each.error) for each in found if each.avatar is None}
-    assert set(errors) == {"13", "7"} and errors["13"] == "thirteen"
-    assert "images: expected numbers in" in errors["7"]
+    captures = [lambda: small, unreadable, lambda: bright, small]
+    found = list(reconstruct_batch(*network, captures, batch=3))
+    assert [each.avatar is None for each in found] == [False, True, True, False]
+    assert [each.capture is None for each in found] == [False, True, True, False]
+    errors = [str(each.error) for each in found]
+    assert errors[1] == "thirteen" and "images: expected numbers in" in errors[2]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from humangs_jax.data.exposure import (
     PARTS,
     apply_gain,
     body_parts,
-    camera_gains,
     equalize_exposure,
     gains_between,
     gains_of,
@@ -179,4 +178,4 @@ def test_front_and_back_of_the_demo_on_two_days_get_one_color(front_and_back, ba
 
 def test_photos_that_share_points_are_not_compared_by_parts(demo, monkeypatch):
     monkeypatch.setattr(exposure, "gains_between", lambda *_: pytest.fail("compared by parts"))
-    np.testing.assert_array_equal(camera_gains(demo), gains_of(*points_of(demo)))
+    np.testing.assert_array_equal(equalize_exposure(demo).gains, gains_of(*points_of(demo)))

@@ -17,22 +17,17 @@ from humangs_jax.apps.settings import Settings
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import view_choice as module
-from humangs_jax.data.body_and_masks import (
-    _sampling,
-    drop_views_without_person,
-    views_without_person,
-)
+from humangs_jax.data.body_and_masks import _sampling, views_without_person
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import (
     EXPECTED,
     apply_gain,
-    camera_gains,
     equalize_exposure,
-    exposures,
+    exposure_gains,
     gains_of,
 )
 from humangs_jax.data.prepared import prepare_capture
-from humangs_jax.data.view_choice import greedy_cover, select_views
+from humangs_jax.data.view_choice import best_views, greedy_cover
 from humangs_jax.data.views import to_network_views
 from humangs_jax.refinement.photos import crop_to_person
 
@@ -77,7 +72,7 @@ def test_a_spoiled_mask_leaves_its_view_out_by_name(demo, spoiled, caplog):
     change, reason = SPOILED[spoiled]
     capture = with_mask(demo, 1, change(demo.masks[1]))
     with caplog.at_level(logging.WARNING):
-        left = drop_views_without_person(capture)
+        left = prepare_capture(capture).capture
     assert left.names == tuple(np.delete(demo.names, 1))
     (record,) = caplog.records
     assert (
@@ -93,7 +88,7 @@ def test_other_masks_are_kept(demo, mask):
         if mask is None
         else with_mask(demo, 1, KEPT[mask](demo.masks[1]))
     )
-    assert drop_views_without_person(capture) is capture
+    assert not views_without_person(capture)
 
 
 def test_exact_masks_hold_the_body(demo, monkeypatch):
@@ -113,13 +108,12 @@ def test_points_are_spread_by_the_area_of_the_skin():
 def test_a_body_that_is_out_of_the_frame_meets_no_mask(demo):
     poses = replace(demo.poses, translation=demo.poses.translation + jnp.asarray([50.0, 0, 0]))
     with pytest.raises(CaptureError, match=r"no view is left that shows the person: .*hardly meet"):
-        drop_views_without_person(dataclasses.replace(demo, poses=poses))
+        prepare_capture(dataclasses.replace(demo, poses=poses))
 
 
 def test_all_that_reads_photos_leaves_it_out(demo):
     capture, usable = with_mask(demo, 1, 0), [0, 2, 3]
     expected = demo.select(usable)
-    assert select_views(capture, 3) == select_views(capture, 9) == usable
     assert (
         Settings().photos(capture).capture.names
         == Settings(views=9).photos(capture).capture.names
@@ -134,11 +128,7 @@ def test_all_that_reads_photos_leaves_it_out(demo):
 
 def test_no_view_left_is_an_error_that_names_them(demo):
     nobody = dataclasses.replace(demo, masks=0 * demo.masks)
-    for read in (
-        drop_views_without_person,
-        lambda c: select_views(c, 2),
-        prepare_capture,
-    ):
+    for read in (prepare_capture, lambda c: prepare_capture(c, views=2)):
         with pytest.raises(
             CaptureError,
             match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty",
@@ -169,7 +159,7 @@ def test_the_greedy_choice_keeps_its_guarantee(quality, count):
 def test_repeated_photos_are_left_out(demo):
     """Of four photos, three of which are one, two different ones show more."""
     doubled = demo.select([0, 0, 2, 0])
-    chosen = select_views(doubled, 2)
+    chosen = best_views(doubled, 2)
     assert 2 in chosen and len(set(chosen)) == 2
 
 
@@ -178,20 +168,20 @@ def test_a_photo_without_the_person_is_not_chosen(demo):
     empty = views.masks.copy()
     empty[1] = 0
     empty[1, :8, :8] = 1  # an empty mask would be no mask
-    chosen = select_views(dataclasses.replace(views, masks=empty), 3)
-    assert chosen == [0, 2, 3]
+    chosen = prepare_capture(dataclasses.replace(views, masks=empty), views=3)
+    assert chosen.capture.names == tuple(np.delete(demo.names, 1))
 
 
 def test_few_photos_are_all_taken_and_none_is_refused(demo):
-    assert select_views(demo.select(range(3)), 5) == [0, 1, 2]
+    assert best_views(demo.select(range(3)), 5) == [0, 1, 2]
     with pytest.raises(ValueError, match="at least 1 photo, got 0"):
-        select_views(demo, 0)
+        best_views(demo, 0)
 
 
 def test_without_a_number_what_adds_nothing_is_left_out(demo):
     """Photos from four sides add something each; their copies do not."""
-    assert select_views(demo, None) == [0, 1, 2, 3]
-    assert len(select_views(demo.select([0, 2, 0, 2]), None)) == 2
+    assert best_views(demo, None) == [0, 1, 2, 3]
+    assert len(best_views(demo.select([0, 2, 0, 2]), None)) == 2
 
 
 @given(arrays(float, (6, 5), elements=st.floats(0, 1)), st.floats(0, 1))
@@ -235,7 +225,7 @@ def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
         return np.stack([small, ~small]).astype(float)
 
     monkeypatch.setattr(module, "view_quality", quality)
-    assert select_views(demo.select([0, 1]), 1) == [1]
+    assert best_views(demo.select([0, 1]), 1) == [1]
 
 
 # Equal exposure
@@ -320,10 +310,10 @@ def test_a_capture_in_different_exposures_is_made_equal(demo):
         np.asarray([[0.15, 0.1, 0.1], [-0.15, -0.1, -0.2], [0.1, 0.2, 0.15], [-0.1, -0.2, -0.15]])
     )
     changed = exposed(demo, logs)
-    gains = camera_gains(changed)
+    gains = equalize_exposure(changed).gains
     left, before = (np.sqrt(np.mean(np.square(x))) for x in (np.log(gains) - logs, logs))
     assert left < 0.6 * before
-    np.testing.assert_allclose(exposures(changed) * gains, 1, rtol=1e-12)
+    np.testing.assert_allclose(exposure_gains(changed) * gains, 1, rtol=1e-12)
     equal = equalize_exposure(changed)
     outside = demo.masks == 0
     np.testing.assert_array_equal(equal.images[outside], 1)
@@ -338,20 +328,19 @@ def test_a_capture_in_different_exposures_is_made_equal(demo):
     views=st.lists(st.integers(0, 3), min_size=1, max_size=4, unique=True),
 )
 @settings(max_examples=4)
-def test_gains_are_found_once_for_a_capture_whatever_its_exposures(demo, logs, views):
+def test_gains_are_found_once_for_a_capture_whatever_its_exposure_gains(demo, logs, views):
     """Equal photos, some of them, and smaller ones are never given gains again."""
     equal = equalize_exposure(exposed(demo, logs))
     assert equalize_exposure(equal) is equal
     some = equal.select(views)
     assert equalize_exposure(some) is some
     assert equalize_exposure(some.resized(64)).gains is some.gains
-    np.testing.assert_array_equal(camera_gains(some), 1)
-    np.testing.assert_array_equal(exposures(some), 1 / equal.gains[views])
+    np.testing.assert_array_equal(exposure_gains(some), 1 / equal.gains[views])
 
 
 def test_without_masks_nothing_is_changed(demo):
     bare = dataclasses.replace(demo, masks=None)
     assert equalize_exposure(bare) is bare
-    np.testing.assert_array_equal(exposures(bare), 1)
+    np.testing.assert_array_equal(exposure_gains(bare), 1)
     nobody = dataclasses.replace(demo, masks=np.zeros_like(demo.masks))
-    np.testing.assert_array_equal(exposures(nobody), 1)
+    np.testing.assert_array_equal(exposure_gains(nobody), 1)
