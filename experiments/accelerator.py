@@ -19,9 +19,9 @@ from experiments.reconstruction import benchmark_inputs, foreground, random_vari
 from experiments.results import markdown_table, page_of, publish, significant
 from experiments.splatting import demo_scene
 from experiments.timing import medians, timed
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import motion_frames
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
@@ -310,7 +310,7 @@ def frames(small: bool) -> Iterator[Measurement]:
     def measure(size: int) -> dict[str, Any]:
         avatar = reconstruct(*load_weights(), load_capture(DEMO_CAPTURE))
         motion = load_motion()
-        draw = lambda: list(motion_frames(avatar, motion, Shot(size=size), progress=False))
+        draw = lambda: list(motion_frames(avatar, motion, FrameSettings(size=size), progress=False))
         wall = float(medians({"all": draw}, 1)["all"][0])
         return {"frames a second": 1e3 * len(motion.translations) / wall}
 

@@ -18,7 +18,7 @@ from experiments.subjects import TASKS, People, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.views import gaussian_body, prepare_inputs, to_network_views
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.refinement.config import HEAD_STEPS, ITERATIONS, RefineConfig
@@ -80,7 +80,7 @@ def appearance(
             subject = with_body_off(person(size), wrong)
             truth, inputs = subject.held_out, subject.inputs(VIEWS)
             drawn = {
-                name: draw_views(_made(start, inputs, *how), truth)
+                name: predict_views(_made(start, inputs, *how), truth)
                 for name, how in VARIANTS.items()
             }
             scores = {name: by_task(each, truth, networks) for name, each in drawn.items()}

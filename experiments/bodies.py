@@ -21,7 +21,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
+from humangs_jax.evaluation.cases import draw_painted_body, painted_body, predict_views
 from humangs_jax.network.config import HumanGSConfig
 
 SMPLX_SEED_VERTICES = 3493
@@ -58,7 +58,9 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
         for name, case in cases.items():
             other = subject.with_body(case.carrier)
             avatar = reconstruct(start.variables, config, other.inputs(views))
-            row[name] = score_tasks(draw_views(avatar, other.held_out).images, truth, start.lpips)
+            row[name] = score_tasks(
+                predict_views(avatar, other.held_out).images, truth, start.lpips
+            )
         return row
 
     rows = start.rows(run, measure, {"views": views})

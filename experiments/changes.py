@@ -16,7 +16,7 @@ from experiments.subjects import HeldOut, make_evaluation_subject, score_tasks
 from humangs_jax.apps.quick_check import likely_mistakes
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import resized
 from humangs_jax.synthetic.subject import make_subject, seeds_of
@@ -48,7 +48,7 @@ def outcome(network, capture, held_out) -> dict[str, Any]:
     """
     try:
         avatar = reconstruct(*network, capture)
-        drawn = draw_views(avatar, held_out)
+        drawn = predict_views(avatar, held_out)
     except ValueError as error:
         return {"error": str(error)}
     gaussians, rest = avatar.gaussians, np.asarray(avatar.rest_vertices)

@@ -20,7 +20,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import apply_gain, exposure_gains
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.evaluation.scores import mean_scores
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.losses.perceptual import Lpips
@@ -56,7 +56,7 @@ def held_out_scores(
             masks=shown.masks if masks is None else masks[[view]],
         )
         for pose, drawn in (("own", shown), ("shared", in_shared_pose(rest, shown))):
-            found = draw_views(avatar, drawn)
+            found = predict_views(avatar, drawn)
             images = apply_gain(found.images, np.asarray(found.alpha), (factor / gains[view])[None])
             rows[pose].append(photo_scores(images, told))
     return {

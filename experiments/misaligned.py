@@ -20,7 +20,7 @@ from experiments.subjects import (
 )
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.capture import Capture
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.refinement import search
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
@@ -74,7 +74,7 @@ def _measured(start: Start, seed: int, far: float, views: int) -> dict[str, Any]
     alone = RefineConfig(steps=0, head_steps=0)
 
     def scored(made: Any) -> dict[str, Any]:
-        drawn = draw_views(made, truth)
+        drawn = predict_views(made, truth)
         scores = score_tasks(drawn.images, truth, start.lpips, drawn.alpha)["novel"]
         return {name: scores[name] for name in SHOWN}
 

@@ -21,7 +21,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.hidden import with_hidden_parts
 from humangs_jax.data.view_choice import view_quality
 from humangs_jax.data.views import to_network_views
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine
@@ -128,7 +128,7 @@ def measured(start: Start, seed: int, kind: str) -> dict[str, dict[str, float]] 
 
 def psnr(avatar: Avatar, truth: Capture, pixels: Bool[np.ndarray, "v h w"]) -> float:
     """PSNR of an avatar in the views of a capture, of some pixels, dB."""
-    drawn = draw_views(avatar, truth).images
+    drawn = predict_views(avatar, truth).images
     return float(-10 * np.log10(np.mean((drawn - truth.images)[pixels] ** 2)))
 
 

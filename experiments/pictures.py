@@ -16,6 +16,7 @@ from experiments.harness import Run, entry
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.attach_face import with_face
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import (
     a_pose_of,
     images,
@@ -23,7 +24,6 @@ from humangs_jax.avatar.frames import (
     rest_pose_of,
     turntable_views,
 )
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile, write_video
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
@@ -130,7 +130,7 @@ def readme_pictures(
     size: height of a picture, pixels
     """
     person, photos = Avatar.load(avatar), load_capture("demo_capture")
-    shot = Shot(size=size, azimuth=0.0)
+    shot = FrameSettings(size=size, azimuth=0.0)
 
     drawn = lambda pose, shot: next(images(person, *turntable_views(person, pose, 1, shot), shot))
 

@@ -12,7 +12,7 @@ from experiments.harness import Run, entry, figure, means
 from experiments.results import cells, markdown_table, page_of
 from experiments.subjects import RING, TASKS, People, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
+from humangs_jax.evaluation.cases import draw_painted_body, painted_body, predict_views
 
 COLUMNS = {  # heading and digits
     "psnr": ("PSNR", 2),
@@ -50,7 +50,7 @@ def evaluation_views(
 
     def measure(seed, count):
         truth, inputs = subject(seed).held_out, subject(seed).inputs(count)
-        drawn = draw_views(reconstruct(start.variables, start.config, inputs), truth).images
+        drawn = predict_views(reconstruct(start.variables, start.config, inputs), truth).images
         ours, baseline = (
             score_tasks(x, truth, start.lpips)
             for x in (drawn, draw_painted_body(painted_body(inputs), truth))

@@ -22,9 +22,9 @@ from experiments.real_capture import FRAMES, RealFrame, prepare
 from experiments.results import cells, markdown_table
 from experiments.subjects import shipped_digest
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import images, motion_views, turntable_views
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile, write_video
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.processes import enable_compile_cache
@@ -224,7 +224,7 @@ def avatar_of(capture: Capture) -> Avatar:
 
 def draw_sheet(capture: Capture, path: Path) -> None:
     """The avatar from six sides in the pose of its photos, and walking; no photo."""
-    avatar, shot = avatar_of(capture), Shot(width=200, height=300)
+    avatar, shot = avatar_of(capture), FrameSettings(width=200, height=300)
     around = images(avatar, *turntable_views(avatar, capture.pose(0), SIDES, shot), shot)
     motion = load_motion(rest_joints=avatar.rest_joints)
     chosen = np.linspace(0, len(motion.translations) - 1, SIDES).astype(int)

@@ -15,7 +15,7 @@ from experiments.results import REPOSITORY, cells, markdown_table, significant
 from experiments.subjects import TASKS, People, score_tasks, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.pytree import replace
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.losses.losses import semi_transparent
 from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
@@ -171,7 +171,7 @@ def score_all(
     """Scores by task, also the semi-transparent foreground of the true images, and the image of a
     view.
     """
-    drawn = draw_views(avatar, held_out)
+    drawn = predict_views(avatar, held_out)
     scores = score_tasks(drawn.images, held_out, lpips, drawn.alpha)
     for task, views in task_views(held_out).items():
         if task in scores:

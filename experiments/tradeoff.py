@@ -34,8 +34,8 @@ from experiments.subjects import (
 from experiments.timing import timed
 from experiments.tradeoff_report import DEFAULT, points
 from humangs_jax.apps.settings import reconstruct_with
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import capture_views, draw, splatting_of, without_unseen
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.core.processes import peak_memory
@@ -230,7 +230,7 @@ class Bench:
 
     @staticmethod
     def how(point, avatar):
-        return splatting_of(point.settings.shot(Shot()), avatar)
+        return splatting_of(point.settings.shot(FrameSettings()), avatar)
 
     # Times and memory
     # ----------------------------------------------------------------------------------------------

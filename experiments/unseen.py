@@ -15,7 +15,7 @@ from humangs_jax.avatar.unseen import with_guesses
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.data.views import to_network_views
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.evaluation.scores import PROTOCOLS, mean_scores, score_views
 from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.network.config import HumanGSConfig
@@ -50,7 +50,7 @@ def unseen(
     person = functools.cache(lambda seed: start.subject(seed, (RING,)).photos)
 
     def scores(avatar: Avatar, truth: Capture) -> dict[str, Any]:
-        drawn = draw_views(avatar, truth)
+        drawn = predict_views(avatar, truth)
         rows = score_views(drawn.images, truth, protocol, drawn.alpha, {"alex": lpips})
         mean = mean_scores(list(rows))
         return {name: mean[name] for name in SHOWN}

@@ -10,6 +10,7 @@ from PIL import Image
 from experiments.harness import Run, entry
 from experiments.subjects import shipped_person
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import (
     a_pose_of,
     draw,
@@ -20,7 +21,6 @@ from humangs_jax.avatar.frames import (
     turntable_views,
 )
 from humangs_jax.avatar.layers import LAYERS, exr_view
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
@@ -71,7 +71,7 @@ def forward_walk() -> Motion:
 
 def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.ndarray]]:
     """Frames of the walk, seen from the side."""
-    shot = Shot(size=240, azimuth=70.0)
+    shot = FrameSettings(size=240, azimuth=70.0)
     poses, cameras = motion_views(avatar, motion, shot, follow=follow)
     chosen = np.linspace(0, len(poses) - 1, SHOWN).astype(int)
     drawn = images(avatar, poses[chosen], cameras[chosen], shot)
@@ -93,7 +93,7 @@ def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
         ("splat", "fast"),
     ]
     for name, value in changes:
-        shot = dataclasses.replace(Shot(size=240, azimuth=20.0), **{name: value})
+        shot = dataclasses.replace(FrameSettings(size=240, azimuth=20.0), **{name: value})
         poses, cameras = motion_views(avatar, motion, shot)
         one = slice(FIRST, FIRST + 1)
         drawn.append((f"--{name} {value}", next(images(avatar, poses[one], cameras[one], shot))))
@@ -105,7 +105,7 @@ def posed_before(avatar: Avatar) -> list[tuple[str, np.ndarray]]:
     drawn = []
     for name, pose in (("T-pose", rest_pose_of(avatar)), ("--pose a", a_pose_of(avatar))):
         for color in ("white", "#24425c", "transparent"):
-            shot = Shot(size=240, azimuth=30.0, background=color)
+            shot = FrameSettings(size=240, azimuth=30.0, background=color)
             image = next(images(avatar, *turntable_views(avatar, pose, 1, shot), shot))
             drawn.append((f"{name}, {color}", over_checks(image)))
     return drawn
@@ -122,7 +122,7 @@ def over_checks(image: np.ndarray) -> np.ndarray:
 
 def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     """The layers of an EXR file, as colors."""
-    shot = Shot(size=240, azimuth=20.0)
+    shot = FrameSettings(size=240, azimuth=20.0)
     poses, cameras = motion_views(avatar, motion, shot)
     pose, camera, how = poses[FIRST], cameras[FIRST], splatting_of(shot, avatar)
     rendering = next(draw(avatar, [pose], [camera], jnp.zeros(3), how))

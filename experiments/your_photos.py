@@ -9,8 +9,8 @@ from PIL import Image, ImageDraw
 from experiments.harness import Run, entry
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import a_pose_of, images, turntable_views
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import tile
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
@@ -126,7 +126,7 @@ def draw_figures(out: Path, points: np.ndarray) -> None:
     ]
     save(tile(rows, labels=labels, columns=VIEWS), IMAGES / "your_photos_material.jpg")
     save(read_image(out / "me" / "check.png")[0], IMAGES / "your_photos_check.jpg")
-    avatar, shot = Avatar.load(out / "me" / "avatar.npz"), Shot(size=SIZE)
+    avatar, shot = Avatar.load(out / "me" / "avatar.npz"), FrameSettings(size=SIZE)
     turn = turntable_views(avatar, a_pose_of(avatar), VIEWS, shot)
     save(
         tile(np.stack(list(images(avatar, *turn, shot))), columns=VIEWS),

@@ -40,8 +40,8 @@ from humangs_jax.evaluation.cases import (
     Method,
     Predicted,
     draw_painted_body,
-    draw_views,
     painted_body,
+    predict_views,
 )
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.evaluation.scores import EvaluationProtocol, person_means
@@ -419,7 +419,7 @@ def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple
         predicted = Predicted(images, alpha, tuple(range(case.truth.view_count)))
     else:
         avatar = jax.block_until_ready(reconstruct(*weights, case.inputs))
-        modelled, predicted = time.perf_counter(), draw_views(avatar, case.truth, background)
+        modelled, predicted = time.perf_counter(), predict_views(avatar, case.truth, background)
     return predicted, modelled - start, time.perf_counter() - modelled
 
 

@@ -19,10 +19,10 @@ from humangs_jax.apps.settings import Settings
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export.gaussians import export
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import capture_renderings, motion_frames, splatting_of
 from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import contact_sheet, side_by_side, write_video
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.progress import COMPILING, stage
@@ -126,7 +126,7 @@ def _write_demo(
         config = settings.network(config)
 
     def held_out(avatar: Avatar, background: float = 1.0) -> tuple[Any, list[Rendering]]:
-        how = splatting_of(settings.shot(Shot()), avatar)
+        how = splatting_of(settings.shot(FrameSettings()), avatar)
         return capture_renderings(avatar, truth, from_host(np.full(3, background)), how)
 
     with stage("reconstructing"):
@@ -174,7 +174,7 @@ def _write_demo(
         times = {name: round(getattr(run, name), 1) for name in ("seconds", "compile_seconds")}
         report["refined"] = _scores(refined, truth) | counts | times
     with stage("animating"):
-        shot = settings.shot(Shot(size=frame_size, azimuth=25.0))
+        shot = settings.shot(FrameSettings(size=frame_size, azimuth=25.0))
 
         def draw():
             return np.stack(list(motion_frames(avatar, motion, shot, turn=40.0)))

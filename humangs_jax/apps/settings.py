@@ -16,9 +16,9 @@ import jax
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import draw, rest_pose_of, splatting_of, turntable_views
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import (
     Count,
@@ -78,14 +78,14 @@ class Settings:
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
     )
-    """How frames are splatted, as `Shot.splat`."""
+    """How frames are splatted, as `FrameSettings.splat`."""
     prune: bool = knob(
         False,
         cost="less than 0.001 dB",
         gain="time of frames that are drawn often",
         measured=MEASURED,
     )
-    """Whether Gaussians that no image shows are left out, as `Shot.prune`."""
+    """Whether Gaussians that no image shows are left out, as `FrameSettings.prune`."""
 
     @property
     def refinement(self) -> RefineConfig | None:
@@ -113,7 +113,7 @@ class Settings:
         """The photos that are used."""
         return prepare_capture(capture, views=self.views)
 
-    def shot(self, shot: Shot) -> Shot:
+    def shot(self, shot: FrameSettings) -> FrameSettings:
         """A shot, drawn in this way where it does not say how."""
         splat = self.splat if shot.splat == "as_trained" else shot.splat
         return dataclasses.replace(shot, splat=splat, prune=shot.prune or self.prune)
@@ -331,7 +331,7 @@ def measure(
 
     # The first avatar and the first frame compile; what follows is timed.
     avatar = make()
-    shot = settings.shot(Shot(size=size))
+    shot = settings.shot(FrameSettings(size=size))
     poses, cameras = turntable_views(avatar, rest_pose_of(avatar), FRAMES + 1, shot)
 
     def pose(i):

@@ -34,7 +34,7 @@ from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 from humangs_jax.data.prepared import PreparedCapture, prepare_capture
 from humangs_jax.data.view_choice import best_views
 from humangs_jax.data.views import cropped
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.geometry import quaternion
 from humangs_jax.io.images import PHOTO_SUFFIXES, image_size
@@ -357,7 +357,7 @@ def held_out_psnr(
         )  # heads hardly change the number
     photo = cropped(_with_unknown(capture.select([view])), SIZE)
     assert photo.masks is not None and photo.unknown is not None
-    drawn = draw_views(avatar, photo)
+    drawn = predict_views(avatar, photo)
     assert drawn.alpha is not None
     psnr = float(score(drawn.images, photo).psnr_fg)
     aligned = aligned_psnr(

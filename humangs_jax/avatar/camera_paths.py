@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import rest_pose_of
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.arrays import from_host
@@ -26,7 +26,7 @@ from humangs_jax.io.reading import check_limit, reading
 logger = logging.getLogger(__name__)
 
 
-def file_cameras(path: Path, shot: Shot, upright: bool = False) -> dict[str, Camera]:
+def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict[str, Camera]:
     """The cameras of a calibration, in the order of its file, by unique names; lens distortion is
     left out, which is logged.
 

@@ -15,7 +15,7 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import ExportFormat
 from humangs_jax.avatar.export.gaussians import world_matrix
-from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.body.model import BodyPose, RestBody, blend_transforms, joint_transforms
 from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Array, Float
@@ -112,7 +112,7 @@ def draw_gaussians(
         yield rendering
 
 
-def splatting_of(shot: Shot, avatar: Avatar) -> SplatConfig:
+def splatting_of(shot: FrameSettings, avatar: Avatar) -> SplatConfig:
     """The preset of a shot; near_exact and fast keep the conventions that the avatar's weights were
     trained with.
     """
@@ -174,7 +174,7 @@ def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"
 
 
 def shot_cameras(
-    shot: Shot,
+    shot: FrameSettings,
     points: Float[np.ndarray, "m p 3"],
     azimuths: Float[np.ndarray, " v"],
     smoothing: float | None,
@@ -236,7 +236,7 @@ def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.nda
 
 
 def _fitting_distance(
-    shot: Shot, points: np.ndarray, targets: np.ndarray, axes: np.ndarray
+    shot: FrameSettings, points: np.ndarray, targets: np.ndarray, axes: np.ndarray
 ) -> float:
     """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z
     behind the target.
@@ -334,7 +334,7 @@ def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
 
 
 def motion_views(
-    avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, follow: bool = True
+    avatar: Avatar, motion: Motion, shot: FrameSettings, turn: float = 0.0, follow: bool = True
 ) -> tuple[BodyPose, Camera]:
     """A pose and a camera for each frame of a motion, which is put on the floor.
 
@@ -353,7 +353,7 @@ def motion_views(
 
 
 def turntable_views(
-    avatar: Avatar, pose: BodyPose, views: int, shot: Shot
+    avatar: Avatar, pose: BodyPose, views: int, shot: FrameSettings
 ) -> tuple[BodyPose, Camera]:
     """One pose, and cameras on a circle that starts at the azimuth of the shot.
 
@@ -396,7 +396,11 @@ def capture_renderings(
 
 
 def images(
-    avatar: Avatar, poses: BodyPose, cameras: Camera, shot: Shot, progress: str | None = None
+    avatar: Avatar,
+    poses: BodyPose,
+    cameras: Camera,
+    shot: FrameSettings,
+    progress: str | None = None,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """One image per pose and camera, drawn when asked for, (h, w, 3) or with alpha (h, w, 4), see
     `composite_over`.
@@ -419,14 +423,14 @@ def images(
 def motion_frames(
     avatar: Avatar,
     motion: Motion,
-    shot: Shot | None = None,
+    shot: FrameSettings | None = None,
     *,
     turn: float = 0.0,
     progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Frames of a moving avatar, drawn when asked for; see `motion_views` and `images`."""
     if shot is None:
-        shot = Shot()
+        shot = FrameSettings()
     poses, cameras = motion_views(avatar, motion, shot, turn)
     return images(avatar, poses, cameras, shot, "animate" if progress else None)
 
@@ -472,7 +476,7 @@ PAIRS = 4_000_000
 
 
 def circle_cameras(
-    gaussians: Gaussians, form: ExportFormat, views: int, shot: Shot
+    gaussians: Gaussians, form: ExportFormat, views: int, shot: FrameSettings
 ) -> dict[str, Camera]:
     """Cameras around the middle of the Gaussians, by name.
 
@@ -509,7 +513,7 @@ def circle_cameras(
 
 
 def splat_images(
-    gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot
+    gaussians: Gaussians, cameras: Mapping[str, Camera], shot: FrameSettings
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """One image for each camera, in bounded memory; with alpha where the shot's background is
     transparent.
@@ -523,7 +527,7 @@ def splat_images(
 
 
 def write_splat_views(
-    out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot
+    out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: FrameSettings
 ) -> int:
     """Images NAME.png in a folder, which appear together; other files stay. Returns how many.
 

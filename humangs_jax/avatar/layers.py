@@ -30,8 +30,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar, surface_normals, turned_normals
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import composite_over, draw, posed, splatting_of
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import ArgumentError
@@ -103,7 +103,7 @@ def write_views(
     avatar: Avatar,
     poses: BodyPose,
     cameras: Camera,
-    shot: Shot,
+    shot: FrameSettings,
     exr: ExrLayers | None = None,
     progress: bool = True,
     exposure_gains: Float[np.ndarray, "v 3"] | None = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.avatar.export import EXPORTS, OTHERS, READ_ONLY, VIDEOS
-from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.cli.options import (
     WHOLE,
     PartOfMotion,
@@ -43,7 +43,7 @@ MOTION_OR_VIDEO = (
     f"{MOTIONS.listed()}; or a video, whose motion is kept beside it as NAME.motion.npz. Default:"
     " the shipped walk."
 )
-FROM_THE_SIDE = Shot(azimuth=20.0)
+FROM_THE_SIDE = FrameSettings(azimuth=20.0)
 SPLATS = {
     suffix: each
     for each in (*EXPORTS.values(), *READ_ONLY.values())
@@ -74,7 +74,7 @@ class Animate:
     )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
-    shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
+    shot: OmitArgPrefixes[FrameSettings] = FROM_THE_SIDE
     motion: Annotated[Path | None, arg(help=MOTION_OR_VIDEO)] = None
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
     out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path(
@@ -181,7 +181,7 @@ class Render:
     )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`; or Gaussians: .ply, .splat, .spz or .glb."""
-    shot: OmitArgPrefixes[Shot]
+    shot: OmitArgPrefixes[FrameSettings]
     camera: Annotated[Path | None, arg(help=f"{OF_A_FILE} {CAMERAS.listed()}")] = None
     out: Annotated[
         Path,
@@ -339,15 +339,15 @@ class Render:
             said += [
                 name
                 for name in ("size", "width", "height")
-                if getattr(self.shot, name) != getattr(Shot(), name)
+                if getattr(self.shot, name) != getattr(FrameSettings(), name)
             ]
-            _require_no_circle("--capture", self.shot, Shot(), said)
+            _require_no_circle("--capture", self.shot, FrameSettings(), said)
             if self.out.suffix:
                 raise UsageError(
                     f"--out {self.out}: expected a folder: the views of a capture are no video"
                 )
         elif self.camera is not None:
-            _require_no_circle("--camera", self.shot, Shot(), said)
+            _require_no_circle("--camera", self.shot, FrameSettings(), said)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -385,12 +385,14 @@ class View:
         serve(text, self.port, self.browser)
 
 
-def _drawn_by(shot: Shot, preset: Preset | None, config: Path | None) -> Shot:
+def _drawn_by(shot: FrameSettings, preset: Preset | None, config: Path | None) -> FrameSettings:
     settings = chosen_settings(preset, config)
     return shot if settings is None else settings.shot(shot)
 
 
-def _pruned(avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: Shot) -> "Avatar":
+def _pruned(
+    avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: FrameSettings
+) -> "Avatar":
     """The avatar without what no image shows, if that is asked for; the count is printed."""
     from humangs_jax.avatar.frames import splatting_of, without_unseen
 
@@ -407,7 +409,9 @@ ON_A_CIRCLE = ("azimuth", "elevation", "distance", "fov")
 """Fields of a shot that say where cameras on a circle stand."""
 
 
-def _require_no_circle(option: str, shot: Shot, usual: Shot, said: list[str]) -> None:
+def _require_no_circle(
+    option: str, shot: FrameSettings, usual: FrameSettings, said: list[str]
+) -> None:
     """Refuse options of a circle of cameras beside an option that brings cameras. said: names of
     further options that are given.
 

@@ -307,7 +307,7 @@ def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
 # --------------------------------------------------------------------------------------------------
 
 
-def draw_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Predicted:
+def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Predicted:
     """An avatar in the poses and from the cameras of a capture."""
     drawn = capture_renderings(avatar, views, jnp.full(3, background))[1]
     images = np.stack([np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in drawn])
@@ -332,12 +332,12 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
             loaded = avatar
         else:
             loaded = Avatar.load(avatar)
-        return lambda case, background: draw_views(loaded, case.truth, background)
+        return lambda case, background: predict_views(loaded, case.truth, background)
 
     def one_of(case: Case, background: float) -> Predicted:
         file = folder / f"{case.name}.npz"
         if file.is_file():
-            return draw_views(Avatar.load(file), case.truth, background)
+            return predict_views(Avatar.load(file), case.truth, background)
         return _nothing(case, (str(file),))
 
     return one_of
@@ -355,7 +355,7 @@ def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
         if driver is not None:
             images, alpha = driver.show(variables, config, case.inputs, case.truth, background)
             return Predicted(images, alpha, tuple(range(len(images))))
-        return draw_views(reconstruct(variables, config, case.inputs), case.truth, background)
+        return predict_views(reconstruct(variables, config, case.inputs), case.truth, background)
 
     return method
 

@@ -191,7 +191,7 @@ SPLAT_PRESETS: Presets[SplatConfig] = Presets(
             tile_size=16,  # matters where a square cuts splats off: they are drawn on whole tiles
         ),
     },
-    '; "as_trained" of Settings and Shot is SPLAT_PRESETS[avatar.rendering]',
+    '; "as_trained" of Settings and FrameSettings is SPLAT_PRESETS[avatar.rendering]',
 )
 """exact: every alpha of 1/255 and more, in float32. near_exact and fast: see docs/performance.md
 for their errors and gains. inria: the conventions of diff-gaussian-rasterization, which the

@@ -19,7 +19,7 @@ from humangs_jax.apps.settings import (
     tune,
 )
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.cli.options import Preset
 from humangs_jax.data.capture import Capture, load_capture, save_capture
 from humangs_jax.network import presets
@@ -75,8 +75,8 @@ def test_presets_have_one_set_of_names():
 
 def test_what_a_shot_says_wins_over_the_settings():
     settings = Settings(splat="fast", prune=True)
-    assert settings.shot(Shot(size=99)) == Shot(size=99, splat="fast", prune=True)
-    assert settings.shot(Shot(splat="exact")).splat == "exact"
+    assert settings.shot(FrameSettings(size=99)) == FrameSettings(size=99, splat="fast", prune=True)
+    assert settings.shot(FrameSettings(splat="exact")).splat == "exact"
 
 
 def test_presets_are_in_the_order_of_their_quality_on_the_page():

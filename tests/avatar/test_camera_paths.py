@@ -10,7 +10,7 @@ from small import small_avatar
 
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.camera_paths import camera_path, file_cameras, one_size, repeated, standing
-from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
@@ -95,7 +95,7 @@ def test_the_world_of_a_file_is_turned_so_that_its_up_is_ours(tmp_path):
     cameras = around([0.0, 0.7, 2.0])
     found = file_cameras(
         write_transforms(tmp_path / "transforms.json", cameras, names=("c", "a", "b")),
-        Shot(),
+        FrameSettings(),
         upright=True,
     )
     assert list(found) == ["c", "a", "b"]
@@ -112,8 +112,11 @@ def test_images_of_several_sizes_are_refused_unless_a_size_is_given(tmp_path):
         ValueError,
         match=r"several sizes, 0001 has 32 x 40, 0000 has 40 x 32: expected one size, or a width",
     ):
-        one_size(file, file_cameras(file, Shot(), upright=True))
-    assert one_size(file, file_cameras(file, Shot(width=20, height=16), upright=True)).width == 20
+        one_size(file, file_cameras(file, FrameSettings(), upright=True))
+    assert (
+        one_size(file, file_cameras(file, FrameSettings(width=20, height=16), upright=True)).width
+        == 20
+    )
 
 
 def test_whoever_stands_has_the_soles_on_the_floor_at_the_middle():

@@ -9,7 +9,7 @@ from avatar_cases import two_balls
 from command_line import run
 from exr_files import read_exr
 
-from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.body.motion import Motion
 from humangs_jax.cli.animate import Animate, Render
 from humangs_jax.io.images import read_image
@@ -35,7 +35,9 @@ def test_both_commands_have_the_options_of_a_shot(monkeypatch, capsys):
     for command in (Animate, Render):
         assert any(field.name == "shot" for field in dataclasses.fields(command))
     texts = [run(monkeypatch, capsys, command, "--help")[1] for command in ("animate", "render")]
-    assert all(f"--{field.name}" in text for text in texts for field in dataclasses.fields(Shot))
+    assert all(
+        f"--{field.name}" in text for text in texts for field in dataclasses.fields(FrameSettings)
+    )
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from avatar_cases import CENTRES, RADIUS, two_balls
 
 from humangs_jax.avatar import frames
-from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.motion import Motion
 from humangs_jax.geometry.camera import Camera
@@ -61,7 +61,7 @@ def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
 def test_each_camera_has_its_exposure():
     avatar = two_balls(1)
     pose, how = frames.rest_pose_of(avatar), SPLAT_PRESETS["exact"]
-    camera = frames.shot_cameras(Shot(size=64), CENTRES[None], np.zeros(1), None)[0]
+    camera = frames.shot_cameras(FrameSettings(size=64), CENTRES[None], np.zeros(1), None)[0]
     gains = np.asarray([[1.0, 1, 1], [0.5, 0.7, 0.9]])
     plain, darker = frames.draw(avatar, [pose] * 2, [camera] * 2, jnp.zeros(3), how, gains)
     np.testing.assert_allclose(darker.rgb, plain.rgb * gains[1], atol=ROUNDING)
@@ -94,9 +94,9 @@ def walker(metres=3.0, frames_per_second=30, seconds=3.0):
 
 
 SHOTS = {
-    "square": Shot(),
-    "portrait from above": Shot(width=90, height=160, azimuth=40.0, elevation=50.0),
-    "landscape, wide angle, from behind": Shot(
+    "square": FrameSettings(),
+    "portrait from above": FrameSettings(width=90, height=160, azimuth=40.0, elevation=50.0),
+    "landscape, wide angle, from behind": FrameSettings(
         width=640, height=200, azimuth=200.0, fov=90.0, elevation=-20.0
     ),
 }
@@ -116,7 +116,7 @@ def test_the_camera_is_as_near_as_everything_fits(name, smoothing):
 
 
 def test_the_camera_goes_along_and_does_not_bob():
-    points, shot = walker(), Shot(size=100)
+    points, shot = walker(), FrameSettings(size=100)
     cameras = frames.shot_cameras(shot, points, np.zeros(len(points)), 0.5 * 30)
     seen = pixels(cameras, points)
     heights = np.ptp(seen[..., 1], axis=1)
@@ -136,7 +136,7 @@ def test_the_camera_goes_along_and_does_not_bob():
 
 def test_distance_and_angles_are_those_that_are_asked_for():
     points = walker()[:1]
-    shot = Shot(distance=2.5, azimuth=90.0, elevation=30.0, fov=40.0, width=80, height=60)
+    shot = FrameSettings(distance=2.5, azimuth=90.0, elevation=30.0, fov=40.0, width=80, height=60)
     camera = frames.shot_cameras(shot, points, np.zeros(1), None)[0]
     middle = 0.5 * (points[0].min(0) + points[0].max(0))
     towards = np.asarray([np.cos(np.radians(30)), 0.5, 0])  # azimuth 90 is +x, the left side
@@ -160,7 +160,7 @@ def test_smoothing_keeps_straight_paths_and_short_ones():
 def test_a_turntable_shows_the_person_from_all_sides():
     avatar = two_balls(2)
     poses, cameras = frames.turntable_views(
-        avatar, frames.rest_pose_of(avatar), 4, Shot(elevation=0.0)
+        avatar, frames.rest_pose_of(avatar), 4, FrameSettings(elevation=0.0)
     )
     assert len(poses) == len(cameras) == 4
     middle = CENTRES.mean(axis=0)
@@ -170,7 +170,7 @@ def test_a_turntable_shows_the_person_from_all_sides():
         directions, [[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]], atol=0.02
     )
     with pytest.raises(ValueError, match="views 0: expected at least 1"):
-        frames.turntable_views(avatar, frames.rest_pose_of(avatar), 0, Shot())
+        frames.turntable_views(avatar, frames.rest_pose_of(avatar), 0, FrameSettings())
 
 
 def test_what_is_tracked_moves_with_the_joints():
@@ -267,11 +267,11 @@ def test_presets_keep_the_conventions_of_the_weights():
 
     ours = two_balls(1)
     theirs = replace(ours, rendering="inria")
-    assert frames.splatting_of(Shot(), ours) == SPLAT_PRESETS["exact"]
-    assert frames.splatting_of(Shot(), theirs) == SPLAT_PRESETS["inria"]
-    assert frames.splatting_of(Shot(splat="fast"), ours) == SPLAT_PRESETS["fast"]
-    assert frames.splatting_of(Shot(splat="exact"), theirs) == SPLAT_PRESETS["exact"]
-    fast = frames.splatting_of(Shot(splat="fast"), theirs)
+    assert frames.splatting_of(FrameSettings(), ours) == SPLAT_PRESETS["exact"]
+    assert frames.splatting_of(FrameSettings(), theirs) == SPLAT_PRESETS["inria"]
+    assert frames.splatting_of(FrameSettings(splat="fast"), ours) == SPLAT_PRESETS["fast"]
+    assert frames.splatting_of(FrameSettings(splat="exact"), theirs) == SPLAT_PRESETS["exact"]
+    fast = frames.splatting_of(FrameSettings(splat="fast"), theirs)
     assert fast.square and fast.transmittance_stop == SPLAT_PRESETS["fast"].transmittance_stop
 
 
@@ -290,17 +290,19 @@ BAD_SHOTS = {
 @pytest.mark.parametrize("message", BAD_SHOTS)
 def test_a_shot_that_cannot_be_taken_is_named(message):
     with pytest.raises(ValueError) as error:
-        Shot(**BAD_SHOTS[message]).check()
+        FrameSettings(**BAD_SHOTS[message]).check()
     assert str(error.value).startswith(message) and "expected" in str(error.value)
 
 
 def test_colors_have_names_and_numbers():
     assert (
-        Shot().color()
+        FrameSettings().color()
         == (1, 1, 1)
-        == Shot(background="#ffffff").color()
-        == Shot(background="rgb(255,255,255)").color()
+        == FrameSettings(background="#ffffff").color()
+        == FrameSettings(background="rgb(255,255,255)").color()
     )
-    assert Shot(background=" Transparent ").color() is None
-    assert Shot(background="#336699").color() == (0.2, 0.4, 0.6)
-    assert Shot(width=20).resolution == (20, 512) and Shot(size=9, height=5).resolution == (9, 5)
+    assert FrameSettings(background=" Transparent ").color() is None
+    assert FrameSettings(background="#336699").color() == (0.2, 0.4, 0.6)
+    assert FrameSettings(width=20).resolution == (20, 512) and FrameSettings(
+        size=9, height=5
+    ).resolution == (9, 5)

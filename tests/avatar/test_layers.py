@@ -9,7 +9,7 @@ from exr_files import read_exr
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.avatar import frames, layers
-from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import project
@@ -52,7 +52,7 @@ def test_normals_are_turned_with_the_body():
 
 def test_positions_project_to_their_pixels():
     camera = frames.shot_cameras(
-        Shot(width=30, height=20, azimuth=35.0), CENTRES[None], np.zeros(1), None
+        FrameSettings(width=30, height=20, azimuth=35.0), CENTRES[None], np.zeros(1), None
     )[0]
     depth = np.random.default_rng(0).uniform(1, 5, (20, 30)).astype(np.float32)
     points = layers.unprojected(camera, depth)
@@ -64,13 +64,17 @@ def test_positions_project_to_their_pixels():
 
 def test_what_does_not_fit_is_refused_before_anything_is_drawn(tmp_path):
     avatar = two_balls(1)
-    poses, cameras = frames.turntable_views(avatar, frames.rest_pose_of(avatar), 2, Shot(size=64))
+    poses, cameras = frames.turntable_views(
+        avatar, frames.rest_pose_of(avatar), 2, FrameSettings(size=64)
+    )
     set_limits(Limits(array_bytes=100_000))
     try:
         with pytest.raises(
             ValueError, match=r"views.exr: 2 views are 1.64e\+05 bytes, more than 1e\+05"
         ):
-            layers.write_views(tmp_path, avatar, poses, cameras, Shot(size=64), layers.ExrLayers())
+            layers.write_views(
+                tmp_path, avatar, poses, cameras, FrameSettings(size=64), layers.ExrLayers()
+            )
     finally:
         set_limits(None)
     assert list(tmp_path.iterdir()) == []
@@ -84,7 +88,7 @@ def test_exr_colors_are_premultiplied(tmp_path, monkeypatch):
     """A compositing program shows what was rendered when it adds (1 - alpha) times the
     background.
     """
-    avatar, shot = two_balls(1), Shot(width=3, height=1, background="#336699")
+    avatar, shot = two_balls(1), FrameSettings(width=3, height=1, background="#336699")
     alpha = np.asarray([[0.0, 0.5, 1.0]], np.float32)
     rendering = Rendering(
         jnp.asarray(0.25 * alpha[..., None] * np.ones(3)),
@@ -118,7 +122,11 @@ def test_layers_of_the_two_balls(tmp_path):
     """Drawn, written, read: the ray through each pixel says where surface, normal and part must
     be.
     """
-    avatar, pose, shot = two_balls(), turned_pose(), Shot(width=72, height=96, azimuth=25.0)
+    avatar, pose, shot = (
+        two_balls(),
+        turned_pose(),
+        FrameSettings(width=72, height=96, azimuth=25.0),
+    )
     still = frames.rest_pose_of(avatar)
     poses = jax.tree.map(lambda *leaves: jnp.stack(leaves), still, pose)
     points = frames.tracked_points(avatar, poses)
@@ -187,7 +195,7 @@ def test_what_no_frame_shows_can_be_left_out():
     avatar = replace(
         avatar, gaussians=replace(avatar.gaussians, means=means, opacities=opaque, scales=scales)
     )
-    shot = Shot(size=64)
+    shot = FrameSettings(size=64)
     poses, cameras = frames.turntable_views(avatar, frames.rest_pose_of(avatar), 6, shot)
     how = frames.splatting_of(shot, avatar)
     less = frames.without_unseen(avatar, poses, cameras, how)

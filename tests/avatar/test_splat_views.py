@@ -13,8 +13,8 @@ from humangs_jax import cli
 from humangs_jax.avatar.camera_paths import file_cameras
 from humangs_jax.avatar.export import EXPORTS
 from humangs_jax.avatar.export.gaussians import export, world_matrix
+from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import circle_cameras
-from humangs_jax.avatar.shot import Shot
 from humangs_jax.geometry.camera import project
 from humangs_jax.io.images import read_image
 
@@ -64,7 +64,7 @@ def test_a_circle_shows_the_whole_scene_upright(tmp_path, monkeypatch, capsys):
         "view_002.png",
     ]
     loaded = hg.load_gaussians(tmp_path / "a.ply")
-    cameras = circle_cameras(loaded, EXPORTS["ply"], 3, Shot(size=64))
+    cameras = circle_cameras(loaded, EXPORTS["ply"], 3, FrameSettings(size=64))
     for name, camera in cameras.items():
         drawn = hg.render(loaded, camera, background="black")
         np.testing.assert_allclose(
@@ -120,7 +120,9 @@ def test_the_first_view_of_every_format_shows_a_person_upright_and_from_the_fron
     np.testing.assert_array_equal(
         world_matrix(EXPORTS[name]), np.diag([signs[letter] for letter in AXES[name]])
     )
-    (camera,) = circle_cameras(loaded, EXPORTS[name], 1, Shot(size=64, elevation=0.0)).values()
+    (camera,) = circle_cameras(
+        loaded, EXPORTS[name], 1, FrameSettings(size=64, elevation=0.0)
+    ).values()
     up, front = (world_matrix(EXPORTS[name])[:, axis] for axis in (1, 2))
     np.testing.assert_allclose(looking(camera), -front, atol=1e-5)
     np.testing.assert_allclose(np.asarray(camera.cam_from_world)[1, :3], -up, atol=1e-5)
@@ -140,7 +142,7 @@ def test_another_axis_may_be_up_in_every_format(up, tmp_path):
 def test_a_person_of_a_file_is_shown_with_a_margin(size):
     gaussians = person_like()
     for camera in circle_cameras(
-        gaussians, EXPORTS["glb"], 4, Shot(width=size[0], height=size[1])
+        gaussians, EXPORTS["glb"], 4, FrameSettings(width=size[0], height=size[1])
     ).values():
         uv, depth = project(camera, gaussians.means)
         assert (depth > 0).all()
@@ -148,8 +150,8 @@ def test_a_person_of_a_file_is_shown_with_a_margin(size):
 
 
 def test_what_is_far_away_of_a_scene_does_not_make_it_small():
-    near = circle_cameras(person_like(), EXPORTS["glb"], 1, Shot(size=64))["view_000"]
-    far = circle_cameras(person_like(40), EXPORTS["glb"], 1, Shot(size=64))["view_000"]
+    near = circle_cameras(person_like(), EXPORTS["glb"], 1, FrameSettings(size=64))["view_000"]
+    far = circle_cameras(person_like(40), EXPORTS["glb"], 1, FrameSettings(size=64))["view_000"]
     assert np.linalg.norm(far.center) < 1.5 * np.linalg.norm(near.center)
 
 
@@ -180,5 +182,5 @@ def test_cameras_of_a_file_are_in_the_world_of_the_gaussians(tmp_path, monkeypat
     expected = np.clip(hg.render(gaussians, camera).rgb, 0, 1)
     np.testing.assert_allclose(read_image(out / "b.png")[0], expected, atol=STEP + 1e-4)
     assert np.mean(expected < 0.9) > 0.05
-    larger = file_cameras(tmp_path / "transforms.json", Shot(width=96, height=64))["b"]
+    larger = file_cameras(tmp_path / "transforms.json", FrameSettings(width=96, height=64))["b"]
     assert (larger.width, larger.height) == (96, 64) and float(larger.K[0, 0]) == pytest.approx(120)

@@ -18,8 +18,8 @@ from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSa
 from humangs_jax.data.loading.captures import find_captures, read_summary
 from humangs_jax.data.loading.examples import (
     StoredSubject,
-    draw_views,
     nearest_view,
+    sample_views,
     shrink,
     subject_order,
 )
@@ -144,7 +144,7 @@ def test_views_carry_their_own_pose_camera_and_size(folder, source):
 def test_inputs_and_targets_are_disjoint_and_of_the_subject(seed, input_count, poses):
     sampling = ViewSampling(input_counts=(input_count,), target_count=3)
     subject = fake_subject(12, poses, seed)
-    inputs, targets = draw_views(np.random.default_rng(seed), subject, input_count, sampling)
+    inputs, targets = sample_views(np.random.default_rng(seed), subject, input_count, sampling)
     assert len(set(inputs)) == input_count and len(set(targets)) == 3
     assert not set(inputs) & set(targets)
     assert set(inputs) | set(targets) <= set(range(12))
@@ -155,7 +155,7 @@ def test_inputs_of_one_pose_stand_around_the_subject():
     subject = fake_subject(24, 2)._replace(azimuths=azimuths)
     sampling = ViewSampling(jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0)
     for seed in range(20):
-        inputs, _ = draw_views(np.random.default_rng(seed), subject, 4, sampling)
+        inputs, _ = sample_views(np.random.default_rng(seed), subject, 4, sampling)
         assert len(set(subject.frames[inputs])) == 1
         gaps = np.diff(np.sort(azimuths[inputs]))
         np.testing.assert_allclose(
@@ -166,7 +166,7 @@ def test_inputs_of_one_pose_stand_around_the_subject():
 def test_mixed_poses_are_mixed():
     sampling = ViewSampling(mixed_pose_share=1.0)
     frames = [
-        len(set(s.frames[draw_views(np.random.default_rng(i), s, 4, sampling)[0]]))
+        len(set(s.frames[sample_views(np.random.default_rng(i), s, 4, sampling)[0]]))
         for i, s in enumerate([fake_subject(24, 2)] * 20)
     ]
     assert max(frames) == 2
@@ -401,7 +401,7 @@ def test_the_window_rule_is_the_release_s():
     """
     distances, subject = set(), fake_subject(60, 1)
     for seed in range(3000):
-        inputs, targets = draw_views(np.random.default_rng(seed), subject, 4, WINDOW)
+        inputs, targets = sample_views(np.random.default_rng(seed), subject, 4, WINDOW)
         first, last, *inside = inputs + targets
         distances.add(last - first)
         assert len(inputs) == len(targets) == 4 and len({*inputs, *targets}) == 8
@@ -412,7 +412,9 @@ def test_the_window_rule_is_the_release_s():
 @pytest.mark.parametrize("count", [8, 12, 120])
 def test_the_window_rule_scales_with_the_number_of_views(count):
     for seed in range(200):
-        inputs, targets = draw_views(np.random.default_rng(seed), fake_subject(count, 1), 4, WINDOW)
+        inputs, targets = sample_views(
+            np.random.default_rng(seed), fake_subject(count, 1), 4, WINDOW
+        )
         assert len({*inputs, *targets}) == 8 and min(inputs) >= 0 and max(inputs) < count
         assert (
             max(7, round(25 * count / 60))
@@ -420,4 +422,4 @@ def test_the_window_rule_scales_with_the_number_of_views(count):
             <= max(7, round(59 * count / 60))
         )
     with pytest.raises(ValueError, match="7 views, but inputs and targets need 8"):
-        draw_views(np.random.default_rng(0), fake_subject(7, 1), 4, WINDOW)
+        sample_views(np.random.default_rng(0), fake_subject(7, 1), 4, WINDOW)

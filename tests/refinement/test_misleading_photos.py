@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.refine import refine_with_report
 
@@ -65,7 +65,7 @@ def test_views_that_nothing_saw_do_not_get_worse(wrong):
     capture = WRONG[wrong](load_capture("demo_capture").resized(SIZE))
 
     def score(avatar):
-        squared = np.square(draw_views(avatar, truth).images - truth.images).mean(-1)
+        squared = np.square(predict_views(avatar, truth).images - truth.images).mean(-1)
         inside = (squared * truth.masks).sum((1, 2)) / truth.masks.sum((1, 2))
         return np.asarray([np.mean(-10 * np.log10(x)) for x in (squared.mean((1, 2)), inside)])
 

@@ -20,7 +20,7 @@ from humangs_jax.data.loading.examples import (
     Example,
     StoredSubject,
     ViewSampling,
-    draw_views,
+    sample_views,
     shrink,
     subject_order,
     subject_views,
@@ -375,7 +375,7 @@ class CaptureSource:
 
         Raises: ValueError where there are too few, or too small ones.
         """
-        views = draw_views(generator, summary, input_count, self.sampling)
+        views = sample_views(generator, summary, input_count, self.sampling)
         for size in (self.input_size, self.target_size):
             shrink(summary.images, size)  # of no views: whether images of this size can be shrunk
         return views

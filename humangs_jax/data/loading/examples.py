@@ -146,7 +146,7 @@ def nearest_view(subject: StoredSubject, azimuth: float, allowed: np.ndarray) ->
     return int(np.argmin(np.where(allowed, away, np.inf)))
 
 
-def draw_views(
+def sample_views(
     generator: np.random.Generator, subject: StoredSubject, input_count: int, sampling: ViewSampling
 ) -> tuple[list[int], list[int]]:
     """Disjoint indices of input and target views.

@@ -1,8 +1,8 @@
 """How an avatar is filmed: the size of the images, what is behind the person, where the camera
 stands.
 
-`Shot` is what `humangs animate` and `humangs render` have in common; their command line is made
-from it, so this module imports nothing heavy. `avatar.frames` draws by it.
+`FrameSettings` is what `humangs animate` and `humangs render` have in common; their command line is
+made from it, so this module imports nothing heavy. `avatar.frames` draws by it.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ LARGEST_SIDE = 8192
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
+class FrameSettings:
     """The images: their size, what is behind the person, where the camera stands."""
 
     size: Annotated[int, Range(1, LARGEST_SIDE)] = 512
@@ -48,7 +48,7 @@ class Shot:
         # not on construction: the command line would make a box of it
         """Raises: ValueError naming what is out of range."""
         for field in dataclasses.fields(self):
-            check_range(Shot, field.name, getattr(self, field.name), field.name)
+            check_range(FrameSettings, field.name, getattr(self, field.name), field.name)
         self.color()
 
     @property
