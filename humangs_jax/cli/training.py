@@ -88,9 +88,9 @@ class Preprocess:
         if not self.body.is_file():
             raise UsageError(f"--body {self.body}: no such file")
         with stage("starting"):
-            from humangs_jax.data.preprocess.run import Settings, preprocess
+            from humangs_jax.data.preprocess.run import PreprocessConfig, preprocess
 
-        settings = Settings(
+        settings = PreprocessConfig(
             self.kind,
             self.layout,
             self.size,

@@ -19,7 +19,7 @@ from experiments.training import abstract_batch, random_networks
 from humangs_jax.body.library import load_body
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.preprocess.run import Settings, preprocess
+from humangs_jax.data.preprocess.run import PreprocessConfig, preprocess
 from humangs_jax.losses.loss_networks import installed_lpips
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.conversion import to_release
@@ -352,7 +352,7 @@ def test_a_table_is_one_command_on_a_data_set(tmp_path, monkeypatch, capsys):
     )
     assert code == 0, error
     for name, factors in (("scenes", (1.0, 1.75)), ("near", (2.0, 2.0))):
-        settings = Settings("thuman", size=64, views=10, factors=factors, supersample=1)
+        settings = PreprocessConfig("thuman", size=64, views=10, factors=factors, supersample=1)
         settings = dataclasses.replace(settings, train=1, test=1)
         preprocess(data, tmp_path / name, str(body), settings, progress=False)
     (tmp_path / "config.json").write_text(config_to_json(dataclasses.replace(tiny(), steps=2)))

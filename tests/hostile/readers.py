@@ -42,7 +42,7 @@ from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.loading.captures import read_summary
 from humangs_jax.data.photos import load_photos
-from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
+from humangs_jax.data.preprocess.run import PreprocessConfig, preprocess, scan_content
 from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.images import (
@@ -138,7 +138,7 @@ def read_data_set(folder):
 def read_scans(folder):
     """What preprocessing reads and computes of scans before it renders them."""
     for name in open_thuman(folder)[0]:
-        scan_content(folder, name, data_body(), Settings("thuman", views=1))
+        scan_content(folder, name, data_body(), PreprocessConfig("thuman", views=1))
 
 
 def continue_preprocessing(folder):
@@ -164,7 +164,7 @@ def film(path):
 
 
 SIDE = 16
-PREPROCESSED = Settings("avatarrex", size=SIDE)
+PREPROCESSED = PreprocessConfig("avatarrex", size=SIDE)
 
 
 def write_preprocessed(folder):

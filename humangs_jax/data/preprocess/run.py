@@ -86,7 +86,7 @@ Layout = Literal["scenes", "capture"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class PreprocessConfig:
     """What a preprocessed set is made with."""
 
     kind: str
@@ -142,7 +142,7 @@ def preprocess(
     source: str | Path,
     out: str | Path,
     body_file: str | Path,
-    settings: Settings,
+    settings: PreprocessConfig,
     shard: tuple[int, int] = (0, 1),
     workers: int = 1,
     progress: bool = True,
@@ -197,7 +197,7 @@ def preprocess(
     return Report(out, done, counts["scenes"], counts["views"], manifest["skipped"])
 
 
-def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[str, str]]:
+def _subjects(source: Path, settings: PreprocessConfig) -> tuple[dict[str, Path], dict[str, str]]:
     data_set = DATASETS[settings.kind]
     if data_set.scans:
         names, skipped = open_thuman(source)
@@ -220,7 +220,7 @@ def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[s
 # --------------------------------------------------------------------------------------------------
 
 
-def _made_with(source: Path, body: FileBody, settings: Settings) -> dict[str, Any]:
+def _made_with(source: Path, body: FileBody, settings: PreprocessConfig) -> dict[str, Any]:
     """What the scenes depend on.
 
     The data set by the name of its folder: it may lie elsewhere on another machine.
@@ -233,7 +233,7 @@ def _made_with(source: Path, body: FileBody, settings: Settings) -> dict[str, An
     return {"settings": dataclasses.asdict(settings) | {"factors": list(settings.factors)} | known}
 
 
-def _source_key(name: str, source: Path, settings: Settings) -> str:
+def _source_key(name: str, source: Path, settings: PreprocessConfig) -> str:
     """A checksum of the files that a scene is made from, see `sets.files_key`."""
     if DATASETS[settings.kind].scans:
         scan, fit = scan_files(source, name)
@@ -242,7 +242,7 @@ def _source_key(name: str, source: Path, settings: Settings) -> str:
     return files_key(source.parent, files)
 
 
-def _check_source(file: Path, name: str, source: Path, settings: Settings) -> None:
+def _check_source(file: Path, name: str, source: Path, settings: PreprocessConfig) -> None:
     """A finished scene was made from what the data set holds now, if its scene.json says from what.
 
     Raises: CaptureError.
@@ -263,7 +263,7 @@ def _skip(out: Path, name: str, reason: str) -> None:
     write_json(out / SKIPPED / f"{name}.json", {"reason": reason})
 
 
-def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
+def _read_scene(file: Path, settings: PreprocessConfig) -> dict[str, Any]:
     """What a finished folder says of itself. Raises: CaptureError naming file and key."""
     content = checked_json(file)
     (known,) = members(content, file, known=dict)
@@ -279,7 +279,7 @@ def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
 
 
 def _write_lists(
-    out: Path, names: Sequence[str], settings: Settings, made_with: dict[str, Any]
+    out: Path, names: Sequence[str], settings: PreprocessConfig, made_with: dict[str, Any]
 ) -> dict[str, Any]:
     """Lists and manifest of what is there."""
     # all that lies in the folder counts, whichever run has made it
@@ -374,13 +374,18 @@ class Content:
 
 
 def _make_scan(
-    body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool
+    body: FileBody,
+    folder: Path,
+    name: str,
+    source: Path,
+    settings: PreprocessConfig,
+    progress: bool,
 ) -> None:
     content = scan_content(source, name, body, settings)
     _write(folder, content, body, settings, _source_key(name, source, settings))
 
 
-def scan_content(source: Path, name: str, body: FileBody, settings: Settings) -> Content:
+def scan_content(source: Path, name: str, body: FileBody, settings: PreprocessConfig) -> Content:
     """What is written of a scan; its views are rendered when they are asked for.
 
     Raises: ValueError naming file and key.
@@ -418,7 +423,12 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
 
 
 def _make_video(
-    body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool
+    body: FileBody,
+    folder: Path,
+    name: str,
+    source: Path,
+    settings: PreprocessConfig,
+    progress: bool,
 ) -> None:
     """Frames of a video from all cameras, `every` apart."""
     # the frames to take
@@ -462,7 +472,7 @@ def _make_video(
 
 
 def _write(
-    folder: Path, content: Content, body: FileBody, settings: Settings, made_from: str
+    folder: Path, content: Content, body: FileBody, settings: PreprocessConfig, made_from: str
 ) -> None:
     """Photos and masks, then what the layout says of them. made_from: `_source_key`."""
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
-from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
+from humangs_jax.data.preprocess.run import PreprocessConfig, preprocess, scan_content
 from humangs_jax.io.reading import FileError
 
 SIZE = 16
@@ -35,7 +35,7 @@ def read(layout, folder, body):
     if layout == "thuman":
         names, missing = open_thuman(folder)
         for name in names:
-            scan_content(folder, name, body, Settings("thuman", views=1))
+            scan_content(folder, name, body, PreprocessConfig("thuman", views=1))
         return missing
     for person in open_people(folder, body, SIZE):
         subject = person.subject
@@ -473,7 +473,7 @@ def test_preprocessing_names_all_damage_and_makes_the_rest(honest, body, tmp_pat
         tmp_path / "in",
         tmp_path / "out",
         body.file,
-        Settings("avatarrex", size=SIZE),
+        PreprocessConfig("avatarrex", size=SIZE),
         progress=False,
     )
     scenes = json.loads((tmp_path / "out" / "manifest.json").read_text())["scenes"]

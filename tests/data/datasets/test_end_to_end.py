@@ -23,7 +23,7 @@ from humangs_jax.capture.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.photos import load_photos
-from humangs_jax.data.preprocess.run import Settings, preprocess
+from humangs_jax.data.preprocess.run import PreprocessConfig, preprocess
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
 from humangs_jax.synthetic.subject import render_view
@@ -32,11 +32,11 @@ TIGHT_IOU = 0.9
 """Least mean overlap of the posed body and the silhouette of a person in tight clothes."""
 SIZE = 256
 SETTINGS = {
-    "thuman": Settings(
+    "thuman": PreprocessConfig(
         "thuman", size=SIZE, views=6, factors=(1.75, 1.75), supersample=2, train=1, test=0
     ),
-    "avatarrex": Settings("avatarrex", size=SIZE),
-    "thuman4": Settings("thuman4", size=SIZE, every=1),
+    "avatarrex": PreprocessConfig("avatarrex", size=SIZE),
+    "thuman4": PreprocessConfig("thuman4", size=SIZE, every=1),
 }
 OPTIONS = {
     "thuman": {"seeds": made_up.SEEDS[:1], "texture_size": 512},

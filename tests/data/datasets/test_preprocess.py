@@ -34,7 +34,7 @@ from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.preprocess import protocol
 from humangs_jax.data.preprocess import run as set_run
 from humangs_jax.data.preprocess.protocol import AMBIENT, HEADLIGHT, ScanRenderer, smooth_normals
-from humangs_jax.data.preprocess.run import Settings, preprocess
+from humangs_jax.data.preprocess.run import PreprocessConfig, preprocess
 from humangs_jax.io import atomic
 from humangs_jax.io.images import read_image
 
@@ -64,7 +64,7 @@ def videos(tmp_path_factory):
 
 
 def settings(layout="scenes", **changes):
-    return Settings("avatarrex", layout, SIZE, every=1, **changes)
+    return PreprocessConfig("avatarrex", layout, SIZE, every=1, **changes)
 
 
 def run(source, out, body, asked, **options):
@@ -150,7 +150,7 @@ def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path,
     with pytest.raises(
         ValueError, match=r"manifest.json: settings: .*size 16 -> 32.*another folder"
     ):
-        run(videos, out, body, Settings("avatarrex", "scenes", 32, every=1))
+        run(videos, out, body, PreprocessConfig("avatarrex", "scenes", 32, every=1))
     other = tmp_path / "other.npz"
     other.write_bytes(Path(body.file).read_bytes())
     assert preprocess(videos, out, other, settings(), progress=False).made == 0
@@ -278,7 +278,7 @@ def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
 def test_the_split_is_that_of_all_scans_also_where_one_lacks_a_file(tmp_path, body):
     source = write_thuman(tmp_path / "thuman", model_arrays())
     names = sorted(folder.name for folder in (source / "model").iterdir())
-    options = Settings("thuman", "scenes", SIZE, views=2, train=len(names) - 1, test=1)
+    options = PreprocessConfig("thuman", "scenes", SIZE, views=2, train=len(names) - 1, test=1)
     run(source, tmp_path / "all", body, options)
     whole = json.loads((tmp_path / "all" / "manifest.json").read_text())["split"]
     (source / "smplx" / whole["train"][0] / "mesh_smplx.obj").unlink()
@@ -327,7 +327,7 @@ def test_sequences_of_several_actors_have_names_of_their_own(tmp_path, body):
         tmp_path / "raw",
         tmp_path / "out",
         body.file,
-        Settings("actorshq", size=SIZE),
+        PreprocessConfig("actorshq", size=SIZE),
         progress=False,
     )
     assert report.scenes == 2
@@ -382,7 +382,7 @@ def test_listed_missing_photos_are_in_the_manifest(tmp_path, body):
         tmp_path,
         tmp_path.parent / "out4",
         body.file,
-        Settings("thuman4", size=SIZE, every=2),
+        PreprocessConfig("thuman4", size=SIZE, every=2),
         progress=False,
     )
     manifest = json.loads((tmp_path.parent / "out4" / "manifest.json").read_text())

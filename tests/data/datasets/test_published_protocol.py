@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.preprocess import protocol
-from humangs_jax.data.preprocess.run import Settings, scan_content
+from humangs_jax.data.preprocess.run import PreprocessConfig, scan_content
 
 PUBLISHED = 2e-4
 """Of the body's size, the bound that the arrays have to keep."""
@@ -98,7 +98,7 @@ def test_preprocessing_reproduces_the_published_arrays(tmp_path):
     arrays, body = model_arrays(), write_model(tmp_path)
     folder = write_thuman(tmp_path / "thuman", arrays)
     for i, (name, kind) in enumerate(zip(open_thuman(folder)[0], "ABC", strict=True)):
-        content = scan_content(folder, name, body, Settings("thuman"))
+        content = scan_content(folder, name, body, PreprocessConfig("thuman"))
         assert content.known["fit_kind"] == kind and content.known["fit_error_mm"][1] < 0.01
         rest, mesh, transforms = scan_vertices(arrays, fit_values(kind, i))
         # T: the middle of the raw scan's bounding box, here that of the mesh; R: pelvis -> neck
@@ -138,6 +138,6 @@ def test_another_body_or_another_kind_of_fit_is_noticed_by_its_mesh(tmp_path):
         ValueError,
         match=r"mesh_smplx.obj: the fit \(kind A\) is .* mm from this mesh on average.*male",
     ):
-        scan_content(folder, "0000", other, Settings("thuman"))
+        scan_content(folder, "0000", other, PreprocessConfig("thuman"))
     with pytest.raises(ValueError, match=r"kind C.*neutral"):
-        scan_content(folder, "0002", other, Settings("thuman"))
+        scan_content(folder, "0002", other, PreprocessConfig("thuman"))
